@@ -1,0 +1,39 @@
+# What each target does: `make help`. Everything happens in .venv; nothing else on the machine is touched.
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test lint
+
+BIN := .venv/bin
+STAMP := .venv/installed
+CORES ?= 2
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-6s %s\n", $$1, $$2}' Makefile
+
+venv: $(STAMP)  ## .venv with the locked version of everything, extras included
+
+demo: $(STAMP)  ## the shipped demonstration, from trial sheet to results/demo/report.html
+	@$(BIN)/snakemake --cores $(CORES) --quiet rules host
+
+test: $(STAMP)  ## all tests
+	$(BIN)/python -m pytest
+
+lint: $(STAMP)  ## style, types and the workflow's formatting
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/snakefmt --check Snakefile
+
+# The stamp is written last: an installation that was broken off starts again.
+$(STAMP): requirements.lock pyproject.toml
+	@python=''; for candidate in $(PYTHON) python3.11 python3.12 python3.13 python3.14 python3; do \
+	  if "$$candidate" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; \
+	  then python=$$candidate; break; fi; done; \
+	if [ -z "$$python" ]; then \
+	  echo 'vinetrack needs Python 3.11 or newer with its venv module, and found none. Install one' >&2; \
+	  echo '(Debian, Ubuntu: apt install python3-venv), or name it: make PYTHON=/path/to/python3 $(MAKECMDGOALS)' >&2; \
+	  exit 1; fi; \
+	echo "Setting up .venv with $$($$python --version), about a minute the first time."; \
+	rm -f $(STAMP); $(BIN)/python -c '' 2>/dev/null || "$$python" -m venv --clear .venv
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch $(STAMP)
