@@ -1,0 +1,82 @@
+"""What is wrong with an experiment, said so that a person can put it right.
+
+Reading an experiment collects every problem before it gives up, so that a sheet is mended in one go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+LONGEST_VALUE = 60
+"""A value quoted in a message is cut here: a whole paragraph pasted in one cell would hide the rest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """One fault (`severity` "error") or oddity ("warning"): where it is, what was given, what is allowed, what to do.
+
+    `file` is relative to the experiment; `line` counts from 1, 0 where it makes no sense; other fields are blank
+    where they do not apply. `value` is None where there is none, "" for a blank cell.
+    """
+
+    message: str
+    severity: str = "error"
+    file: str = ""
+    trial: str = ""
+    line: int = 0
+    column: str = ""
+    value: str | None = None
+    allowed: str = ""
+    remedy: str = ""
+
+    @property
+    def reason(self) -> str:
+        """The problem without file, line and trial, for the row of a trial that failed.
+
+        >>> Problem(message="is not a number", column="pressure_kPa", value="12 kPa", remedy="write 12").reason
+        "pressure_kPa '12 kPa' is not a number: write 12"
+        """
+        shown = "" if self.value is None or self.value == "" else repr(_shorten(self.value))
+        subject = " ".join(part for part in (self.column, shown, self.message) if part)
+        allowed = f" (allowed: {self.allowed})" if self.allowed else ""
+        return _one_line(f"{subject}{allowed}{': ' + self.remedy if self.remedy else ''}")
+
+    def __str__(self) -> str:
+        """One line naming severity, file, line, trial, column, value, what is allowed and the remedy."""
+        place = self.file + (f" line {self.line}" if self.line else "")
+        trial = f"trial {self.trial}" if self.trial else ""
+        where = ", ".join(part for part in (place, trial) if part)
+        return _one_line(": ".join(part for part in (self.severity, where, self.reason) if part))
+
+
+class ExperimentError(Exception):
+    """An experiment that cannot be read; `problems` holds everything that was found, errors first."""
+
+    def __init__(self, problems: Iterable[Problem]) -> None:
+        self.problems = tuple(sorted(problems, key=lambda problem: problem.severity != "error"))
+        super().__init__("\n".join(format_problems(self.problems)))
+
+
+def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
+    """Say the problems in at most `limit` lines, errors first; where there are more, the last line says how many.
+
+    >>> format_problems([Problem(message="is blank", column=f"c{i}") for i in range(4)], limit=3)
+    ['error: c0 is blank', 'error: c1 is blank', '… and 2 more (2 errors, 0 warnings)']
+    """
+    ordered = sorted(problems, key=lambda problem: problem.severity != "error")
+    if len(ordered) <= limit:
+        return [str(problem) for problem in ordered]
+    rest = ordered[limit - 1 :]
+    errors = sum(problem.severity == "error" for problem in rest)
+    more = f"… and {len(rest)} more ({errors} errors, {len(rest) - errors} warnings)"
+    return [*(str(problem) for problem in ordered[: limit - 1]), more]
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 1] + "…"
+
+
+def _one_line(text: str) -> str:
+    """Replace line breaks and control characters: a hostile cell must not forge further lines of a report."""
+    return "".join(char if char.isprintable() else " " for char in text)
