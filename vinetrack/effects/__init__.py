@@ -1,0 +1,36 @@
+"""The catalogue of physical and measurement effects, one file each.
+
+`vinetrack.effects.gravity` is the effect of that name; `catalogue()` all of them; `load_effect(path)` a user's own.
+"""
+
+from __future__ import annotations
+
+from vinetrack.effects._base import HOOKS, Effect, Parameter, Rig, State, Worked
+from vinetrack.effects._catalogue import BASE_EFFECTS, EffectError, catalogue, find_effect, load_effect
+
+__all__ = [
+    "BASE_EFFECTS",
+    "HOOKS",
+    "Effect",
+    "EffectError",
+    "Parameter",
+    "Rig",
+    "State",
+    "Worked",
+    "catalogue",
+    "find_effect",
+    "load_effect",
+]
+
+
+def __getattr__(name: str) -> Effect:
+    if name.startswith("_"):
+        raise AttributeError(name)
+    try:
+        return catalogue()[name]
+    except KeyError:
+        raise AttributeError(f"there is no effect named {name!r}") from None
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *catalogue()]

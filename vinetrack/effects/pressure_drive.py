@@ -1,0 +1,22 @@
+"""Pressure drive: the gas pushes the tip on.
+
+    tip force +PA, on the tail +½PA
+
+P is the gauge pressure that the other effects leave at the tip, A = πD²/4. Everything else in the model is
+measured against this term.
+
+Source: Blumenschein, Okamura, Hawkes (2017), Biomimetic and Biohybrid Systems, 522–531; Alvarez et al. (2025), Eq. (1).
+"""
+
+from vinetrack.effects import Worked
+
+KIND = "base"
+
+
+def tip_force(s, rig):  # noqa: ARG001, D103
+    return s.pressure * s.area
+
+
+WORKED = (
+    Worked("tip_force", 12.667, "28 kPa × π(24 mm)²/4 = 28000 × 4.5239e-4", state={"pressure": 28e3, "area": 4.5239e-4}),
+)

@@ -1,0 +1,59 @@
+"""Reservoir depletion: the chamber's gas expands into the growing vine, and its pressure falls.
+
+    P → (P₀ + P_atm) (V₀ / (V₀ + A y))^γ − P_atm
+
+V₀ is the chamber's volume and A·y what the vine has swept. Boyle's law needs absolute pressure: a volume change of a
+few per cent takes tens of per cent off a small gauge pressure. With 3.7 L and a vine of 24 mm × 280 mm, 28 kPa falls by 15 %
+(γ = 1, slow enough to stay at room temperature) to 21 % (γ = 1.4, too fast to exchange heat); 7 kPa by 51 to 71 %.
+
+Matters wherever A·L is more than a thousandth of V₀, most at low gauge pressure and late in growth. Reduce it on the
+rig with a larger chamber beside the inlet, or measure the pressure during growth. A regulator that refills the chamber
+works against it.
+
+Source: the gas laws; Alvarez et al. (2025), section III-B, uses gauge pressure in P₂ = P₁V₁/V₂, which hides the effect.
+"""
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "physical"
+NEEDS = ("chamber_l",)
+IN_TRACE = True
+EASILY_TAKEN_FOR = ("tail_friction", "leak")
+PARAMETERS = (
+    Parameter("gamma", "γ", "1", 1.4, bounds=(1.0, 1.4), plausible=(1.0, 1.4), meaning="1 isothermal, 1.4 adiabatic"),
+)
+
+
+def pressure(s, rig, gamma):  # noqa: D103
+    volume_ratio = rig.chamber_volume / (rig.chamber_volume + s.area * s.lead_position)
+    return (s.pressure + rig.ambient_pressure) * volume_ratio**gamma - rig.ambient_pressure
+
+
+_PAPER = {"chamber_volume": 3.7e-3, "ambient_pressure": 101_325.0}
+_GROWN = {"area": 4.5239e-4, "lead_position": 0.28}
+WORKED = (
+    Worked(
+        "pressure",
+        23.72e3,
+        "129325 × 3.7/(3.7 + 0.12667) − 101325: 15 % below 28 kPa",
+        state={"pressure": 28e3, **_GROWN},
+        rig=_PAPER,
+        parameters={"gamma": 1.0},
+    ),
+    Worked(
+        "pressure",
+        2.061e3,
+        "108325 × (3.7/3.82667)^1.4 − 101325: 71 % below 7 kPa",
+        state={"pressure": 7e3, **_GROWN},
+        rig=_PAPER,
+        parameters={"gamma": 1.4},
+    ),
+    Worked(
+        "pressure",
+        28e3,
+        "of no size, γ = 0, it changes nothing",
+        state={"pressure": 28e3, **_GROWN},
+        rig=_PAPER,
+        parameters={"gamma": 0.0},
+    ),
+)

@@ -1,0 +1,23 @@
+"""Yield pressure: the film resists being folded even when that is done slowly.
+
+    tip force −P_y A, on the tail −½P_y A
+
+P_y is the gauge pressure at which eversion begins, measured for each vine on the same gauge as P (`yield_pressure_kPa`
+of the trial sheet, with its error). It dominates near the threshold: at 7 kPa a P_y of 3 kPa takes 43 % of the drive.
+
+Source: Blumenschein, Okamura, Hawkes (2017); Alvarez et al. (2025), fourth term of Eq. (1).
+"""
+
+from vinetrack.effects import Worked
+
+KIND = "base"
+NEEDS = ("yield_pressure_kPa",)
+
+
+def tip_force(s, rig):  # noqa: D103
+    return -rig.yield_pressure * s.area
+
+
+WORKED = (
+    Worked("tip_force", -1.3572, "3 kPa × 4.5239e-4 m²", state={"area": 4.5239e-4}, rig={"yield_pressure": 3e3}),
+)

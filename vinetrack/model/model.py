@@ -1,0 +1,127 @@
+"""A model is a sum of effects with values for their parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
+from vinetrack.records import Floats
+
+Value = float | Mapping[str, float]
+"""A parameter's value: one number, or one for each vine by name."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A sum of effects; `model + effect` and `model - effect` (or its name) give new models.
+
+    `values` holds parameters by `effect.parameter` (B of `eversion_damping` is `"eversion_damping.B"`), SI; what is not
+    given stands at its default. A value shared per vine may be a mapping from the vine's name.
+
+    Examples
+    --------
+    >>> import vinetrack.effects as effects
+    >>> model = base_model() + effects.reservoir_depletion
+    >>> print(model)
+    m(x) ẍ = tip force +PA, on the tail +½PA
+             tail force +m(x) g cosθ
+             tip force −B ẋⁿ, on the tail −½B ẋⁿ
+             tip force −P_y A, on the tail −½P_y A
+             P → (P₀ + P_atm) (V₀ / (V₀ + A y))^γ − P_atm
+      B = 3 N·(s/m)ⁿ
+      n = 0.37
+      γ = 1.4
+    """
+
+    effects: tuple[Effect, ...]
+    values: Mapping[str, Value] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names = [effect.name for effect in self.effects]
+        if len(set(names)) != len(names):
+            raise EffectError(f"An effect stands twice in the model: {', '.join(names)}.")
+        unknown = set(self.values) - set(self.parameter_names)
+        if unknown:
+            raise EffectError(
+                f"No effect of the model has the parameter {', '.join(sorted(unknown))}; it has "
+                f"{', '.join(self.parameter_names) or 'none'}."
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, in order."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Every parameter as `effect.parameter`, in the order of `parameters_for`."""
+        return tuple(f"{effect.name}.{parameter.name}" for effect in self.effects for parameter in effect.parameters)
+
+    def __add__(self, other: Effect) -> Model:
+        return replace(self, effects=(*self.effects, other))
+
+    def __sub__(self, other: Effect | str) -> Model:
+        name = other if isinstance(other, str) else other.name
+        if name not in self.names:
+            raise EffectError(f"The model has no effect {name!r}; it has {', '.join(self.names)}.")
+        values = {key: value for key, value in self.values.items() if key.split(".")[0] != name}
+        return Model(tuple(effect for effect in self.effects if effect.name != name), values)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __iter__(self) -> Iterator[Effect]:
+        return iter(self.effects)
+
+    def with_values(self, values: Mapping[str, Value]) -> Model:
+        """The same sum with these parameter values in place of its own."""
+        return replace(self, values={**self.values, **values})
+
+    def parameters_for(self, vine: str) -> Floats:
+        """Values of all parameters for one vine, shape (n_parameters,), in the order of `parameter_names`.
+
+        Raises
+        ------
+        EffectError
+            If a value is given per vine and this vine is not among them.
+        """
+        numbers = []
+        for effect in self.effects:
+            for parameter in effect.parameters:
+                value = self.values.get(f"{effect.name}.{parameter.name}", parameter.default)
+                if isinstance(value, Mapping):
+                    if vine not in value:
+                        raise EffectError(f"{effect.name}.{parameter.name} has no value for the vine {vine!r}.")
+                    value = value[vine]
+                numbers.append(float(value))
+        return np.array(numbers)
+
+    def __str__(self) -> str:
+        terms = "\n         ".join(effect.formula for effect in self.effects)
+        lines = [f"m(x) ẍ = {terms}"]
+        for effect in self.effects:
+            for parameter in effect.parameters:
+                value = self.values.get(f"{effect.name}.{parameter.name}", parameter.default)
+                unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+                pairs = sorted(value.items()) if isinstance(value, Mapping) else [("", value)]
+                lines += [f"  {parameter.symbol}{f' ({vine})' if vine else ''} = {number:.6g}{unit}" for vine, number in pairs]
+        return "\n".join(lines)
+
+
+def make_model(names: Iterable[str] = BASE_EFFECTS, own: Mapping[str, Effect] | None = None) -> Model:
+    """The model with these effects, looked up among the user's `own` and in the catalogue.
+
+    Raises
+    ------
+    EffectError
+        If a name is unknown or stands twice.
+    """
+    return Model(tuple(find_effect(name, own) for name in names))
+
+
+def base_model() -> Model:
+    """The four base effects: the equation of motion of the paper, Eq. (2)."""
+    return make_model()
