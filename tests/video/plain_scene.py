@@ -1,0 +1,164 @@
+"""Recordings with a known leading edge, drawn by code that shares nothing with the package.
+
+A truth of another hand than the laboratory's: no import of `vinetrack`, another tip, another film, another door.
+`plain_scene` draws frames in memory, `write_video` and `write_images` put them in files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is in the picture. Lengths in px, speeds in px a frame, brightness in grey levels of 255."""
+
+    seed: int = 0
+    width: int = 960
+    height: int = 240
+    from_px: tuple[float, float] = (40.0, 120.0)
+    angle_deg: float = 0.0
+    start_px: float = 60.0
+    end_px: float = 840.0
+    rest_frames: int = 12
+    end_frames: int = 8
+    speed: float = 20.0
+    rise_frames: float = 8.0
+    exposure: float = 0.2
+    radius: float = 30.0
+    tip_depth: float = 10.0
+    background: float = 70.0
+    background_sd: float = 8.0
+    film: float = 175.0
+    opacity: float = 0.75
+    wall_sd: float = 10.0
+    tail_sd: float = 10.0
+    psf: float = 0.9
+    noise: float = 2.0
+    flicker: float = 0.0
+    shake: float = 0.0
+    wobble: float = 0.0
+    door: bool = False
+    gradient: float = 0.0
+    payload: bool = False
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Frames, shape (n, height, width), uint8, and the true edge at mid-exposure, shape (n,), px from `from_px`."""
+
+    plan: Plan
+    frames: np.ndarray
+    edge_px: np.ndarray
+    moving: np.ndarray
+    extra: dict = field(default_factory=dict)
+
+
+def texture(rng: np.random.Generator, shape: tuple[int, int], scale: float, sd: float) -> np.ndarray:
+    """Smooth random brightness of zero mean."""
+    field_ = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), scale)
+    return (field_ - field_.mean()) / max(float(field_.std()), 1e-6) * sd
+
+
+def travel(plan: Plan, time: np.ndarray) -> np.ndarray:
+    """Edge against time in frames: rest, exponential approach to `speed`, dead stop at `end_px`."""
+    t = np.clip(time - plan.rest_frames, 0.0, None)
+    run = plan.speed * (t - plan.rise_frames * (1 - np.exp(-t / plan.rise_frames)))
+    return np.minimum(plan.start_px + run, plan.end_px)
+
+
+def plain_scene(plan: Plan) -> Scene:
+    """Draw the plan."""
+    rng = np.random.default_rng(plan.seed)
+    long_time = np.arange(100_000)
+    reached = int(np.argmax(travel(plan, long_time.astype(float)) >= plan.end_px))
+    n_frames = (reached if travel(plan, long_time[-1:])[0] >= plan.end_px else 400) + plan.end_frames
+    h, w = plan.height, plan.width
+    yy, xx = np.mgrid[0:h, 0:w].astype(np.float32)
+    angle = np.radians(plan.angle_deg)
+    along = (xx - plan.from_px[0]) * np.cos(angle) + (yy - plan.from_px[1]) * np.sin(angle)
+    across = -(xx - plan.from_px[0]) * np.sin(angle) + (yy - plan.from_px[1]) * np.cos(angle)
+    back = plan.background + plan.gradient * (along / w) + texture(rng, (h, w), 2.0, plan.background_sd)
+    ticks = (np.mod(along, 27.5) < 2.0) & (np.abs(across - plan.radius - 16) < 6)
+    back = np.where(ticks, back - 40, back)
+    wall = texture(rng, (h, w), 2.5, plan.wall_sd)
+    tail = texture(rng, (64, 8192), 3.0, plan.tail_sd)
+    frames = np.empty((n_frames, h, w), np.uint8)
+    phase = rng.uniform(0, 2 * np.pi, 4)
+    edge = travel(plan, np.arange(n_frames) + plan.exposure / 2)
+    speed = travel(plan, np.arange(n_frames) + plan.exposure) - travel(plan, np.arange(n_frames, dtype=float))
+    for i in range(n_frames):
+        sway = plan.wobble * np.sin(0.4 * i + phase[0]) * np.clip(along / w, 0, 1) if plan.wobble else 0.0
+        off = across - sway
+        inside = np.clip(plan.radius - np.abs(off) + 0.5, 0, 1)
+        bulge = plan.tip_depth * (1 - np.sqrt(np.clip(1 - (off / plan.radius) ** 2, 0, 1)))
+        parts = int(np.clip(2 * speed[i], 4, 80))
+        cover = np.zeros((h, w), np.float32)
+        inner = np.zeros((h, w), np.float32)
+        for j in range(parts):
+            now = travel(plan, np.array([i + plan.exposure * (j + 0.5) / parts]))[0]
+            cover += np.clip(now - bulge - along + 0.5, 0, 1)
+            rows = np.clip(off + 32, 0, 63).astype(np.int32)
+            columns = np.mod((along - 2 * now).astype(np.int32), 8192)
+            inner += tail[rows, columns] * (np.abs(off) < 0.6 * plan.radius)
+        cover, inner = cover / parts * inside, inner / parts
+        shade = 1 - 0.25 * np.clip(off / plan.radius, -1, 1) ** 2
+        tube = plan.opacity * (plan.film * shade + wall) + (1 - plan.opacity) * back + inner
+        picture = back + cover * (tube - back)
+        if plan.door:
+            swing = 14.0 * max(0.0, i - plan.rest_frames + 3)
+            panel = (along > plan.start_px + 24 + 0.6 * swing) & (along < plan.start_px + 60 + 0.6 * swing)
+            picture = np.where(panel & (across < 60 - swing), 25.0, picture)
+        if plan.payload and edge[i] > 0.75 * plan.end_px:
+            ahead = edge[i] + 3.0 * (edge[i] - 0.75 * plan.end_px)
+            picture = np.where((np.abs(along - ahead) < 12) & (np.abs(across) < 10), 230.0, picture)
+        picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
+        if plan.shake:
+            dx, dy = plan.shake * np.sin(0.55 * i + phase[1]), plan.shake * np.sin(0.37 * i + phase[2])
+            move = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
+            picture = cv2.warpAffine(picture, move, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        picture = picture * (1 + plan.flicker * np.sin(0.9 * i + phase[3]))
+        grain = rng.standard_normal((h, w)).astype(np.float32) * plan.noise * np.sqrt(np.clip(picture, 1, None) / 100)
+        frames[i] = np.clip(np.rint(picture + grain), 0, 255).astype(np.uint8)
+    later = travel(plan, np.arange(n_frames) + plan.exposure)
+    moving = (later > plan.start_px) & (travel(plan, np.arange(n_frames, dtype=float)) < plan.end_px)
+    return Scene(plan, frames, edge, moving)
+
+
+def write_video(
+    path: Path,
+    frames: np.ndarray,
+    codec: str = "libx264",
+    pix_fmt: str = "yuv420p",
+    bit_rate: int = 0,
+    options: dict[str, str] | None = None,
+    playback_fps: int = 60,
+) -> Path:
+    """Write frames (n, h, w) as a video whose container claims `playback_fps`."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(playback_fps), options=options or {})
+        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], pix_fmt
+        if bit_rate:
+            stream.bit_rate = bit_rate
+        source = "gray16le" if frames.dtype == np.uint16 else "gray"
+        for i, picture in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=source)
+            frame = frame.reformat(format=pix_fmt)
+            frame.pts = i
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+def write_images(folder: Path, frames: np.ndarray, suffix: str = ".png", first: int = 1, step: int = 1) -> Path:
+    """Write frames as a folder of numbered images."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, picture in enumerate(frames):
+        cv2.imwrite(str(folder / f"frame_{first + i * step:04d}{suffix}"), picture)
+    return folder

@@ -1,0 +1,318 @@
+"""Frames out of any recording: brightness as the camera wrote it, and everything that is wrong with the file.
+
+The Y plane is copied straight from the decoder's buffer: converting to grey or colour first costs up to half the
+decoding speed. A recording's clock is never read from its container, which knows the playback rate only; DNG frames
+carry the true rate (tag 51044) and the exposure (33434), other image files carry neither.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import av
+
+CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine"})
+IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
+DECODER_THREADS = 2
+
+
+class RecordingError(ValueError):
+    """A recording that cannot be used, said in one sentence."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Rectangle of a picture in whole pixels: columns `left` to `right`, rows `top` to `bottom`, ends left out."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width, px."""
+        return self.bottom - self.top, self.right - self.left
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the rectangle in a (height, width) picture."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a recording says about itself, before its frames are decoded.
+
+    `declared_frames` is the file's own count (None where it gives none); `capture_fps` and `exposure_s` are those of
+    DNG frames, None elsewhere; `notes` are sentences for a person.
+    """
+
+    path: Path
+    kind: str
+    width: int
+    height: int
+    bit_depth: int
+    declared_frames: int | None
+    capture_fps: float | None = None
+    exposure_s: float | None = None
+    files: tuple[Path, ...] = ()
+    numbers: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def whole(self) -> Region:
+        """The full picture."""
+        return Region(0, 0, self.width, self.height)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Decoded frames of one region.
+
+    `luma` has shape (n_frames, height, width), uint8 or uint16; `slot` shape (n_frames,) counts capture periods from
+    the first frame, as the timestamps (or the numbers of image files) tell: 0, 1, 2 … where none is missing.
+    `damaged` marks frames the decoder calls corrupt; `notes` are sentences for a person.
+    """
+
+    recording: Recording
+    region: Region
+    luma: NDArray[Any]
+    slot: NDArray[np.int_]
+    damaged: NDArray[np.bool_]
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.luma)
+
+
+@dataclass
+class _Decoded:
+    """What decoding a container gathers on the way."""
+
+    pictures: list[NDArray[Any]] = field(default_factory=list)
+    pts: list[float] = field(default_factory=list)
+    corrupt: list[bool] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)
+
+
+def inspect_recording(path: Path | str) -> Recording:
+    """Open a recording and read its header, without decoding more than one frame.
+
+    Raises
+    ------
+    RecordingError
+        In one sentence, where there is nothing usable.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise RecordingError(f"{path.name}: there is no such file or folder")
+    if path.is_dir() or path.suffix.lower() in IMAGES:
+        from vinetrack.video.images import inspect_images
+
+        return inspect_images(path)
+    if path.stat().st_size == 0:
+        raise RecordingError(f"{path.name}: the file is empty; copy it from the camera again")
+    return _inspect_container(path)
+
+
+def read_frames(path: Path | str | Recording, region: Region | None = None, threads: int = DECODER_THREADS) -> Frames:
+    """Decode every frame of a recording, or the `region` of it.
+
+    Raises
+    ------
+    RecordingError
+        In one sentence, where not one frame can be decoded.
+    """
+    recording = path if isinstance(path, Recording) else inspect_recording(path)
+    region = region or recording.whole
+    if recording.kind != "container":
+        from vinetrack.video.images import read_images
+
+        return read_images(recording, region)
+    decoded = _Decoded()
+    _fill(decoded, recording, region, threads)
+    return _assemble(recording, region, decoded)
+
+
+def iterate_frames(recording: Recording, region: Region | None = None) -> Iterator[NDArray[Any]]:
+    """Yield the region of one frame after another; each is a copy of its own. Stops where decoding does."""
+    region = region or recording.whole
+    if recording.kind != "container":
+        from vinetrack.video.images import iterate_images
+
+        yield from iterate_images(recording, region)
+        return
+    import av
+
+    with av.open(str(recording.path)) as container:
+        try:
+            for frame in container.decode(video=0):
+                yield luma_plane(frame, region)
+        except av.error.FFmpegError:
+            return
+
+
+def luma_plane(frame: av.VideoFrame, region: Region) -> NDArray[Any]:
+    """Brightness of one decoded frame inside `region`: a copy, shape region.shape, uint8 or uint16."""
+    name = frame.format.name
+    depth = frame.format.components[0].bits
+    if not (name.startswith(("yuv", "gray", "nv12", "nv16", "nv21", "p010")) and frame.format.is_planar) and (
+        name not in {"gray", "gray10le", "gray12le", "gray14le", "gray16le"}
+    ):
+        target = "gray16le" if depth > 8 else "gray"
+        return np.array(frame.to_ndarray(format=target)[region.slices])
+    plane = frame.planes[0]
+    dtype = np.dtype(np.uint8) if depth <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
+    rows = np.frombuffer(plane, dtype=dtype).reshape(-1, plane.line_size // dtype.itemsize)
+    copied = rows[region.slices].copy()
+    return copied if dtype.itemsize == 1 else copied.astype(np.uint16, copy=False)
+
+
+def _inspect_container(path: Path) -> Recording:
+    import av
+
+    try:
+        with _quiet_log() as complaints, av.open(str(path)) as container:
+            if not container.streams.video:
+                raise RecordingError(f"{path.name}: holds no picture; name a video file")
+            stream = container.streams.video[0]
+            first = next(container.decode(stream), None)
+            if first is None:
+                raise RecordingError(f"{path.name}: not one frame can be decoded; the file is damaged or empty")
+            depth = first.format.components[0].bits
+            declared = _declared_frames(stream, container)
+            return Recording(path, "container", first.width, first.height, depth, declared)
+    except av.error.FFmpegError as error:
+        raise RecordingError(_why_unreadable(path, complaints, str(error))) from error
+
+
+def _declared_frames(stream: Any, container: Any) -> int | None:
+    """The header's count of frames; where there is none, duration times playback rate."""
+    if stream.frames > 0:
+        return int(stream.frames)
+    seconds = None
+    if stream.duration is not None and stream.time_base is not None:
+        seconds = float(stream.duration * stream.time_base)
+    elif container.duration is not None:
+        seconds = container.duration / 1e6
+    if seconds is None or not stream.average_rate:
+        return None
+    return max(round(seconds * float(stream.average_rate)), 0) or None
+
+
+def _why_unreadable(path: Path, complaints: list[str], error: str) -> str:
+    text = " ".join([*complaints, error])
+    if "moov atom not found" in text and _looks_like_mp4(path):
+        return f"{path.name}: cut short: the index that is written last is missing; copy the file again, or repair it"
+    if path.suffix.lower() not in CONTAINERS:
+        return f"{path.name}: not a video that can be read; bring mp4, mov, avi, mkv, or a folder of images"
+    return f"{path.name}: not a video, or its beginning is damaged; copy it from the camera again"
+
+
+def _looks_like_mp4(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}
+
+
+def _fill(decoded: _Decoded, recording: Recording, region: Region, threads: int) -> None:
+    import av
+
+    with _quiet_log() as complaints:
+        try:
+            with av.open(str(recording.path)) as container:
+                stream = container.streams.video[0]
+                stream.thread_type = "AUTO"
+                stream.codec_context.thread_count = threads
+                base = float(stream.time_base) if stream.time_base else 1.0
+                for frame in container.decode(stream):
+                    if (frame.height, frame.width) != (recording.height, recording.width):
+                        complaints.append("the size of the picture changes")
+                        break
+                    decoded.pictures.append(luma_plane(frame, region))
+                    decoded.pts.append(float("nan") if frame.pts is None else frame.pts * base)
+                    decoded.corrupt.append(bool(frame.is_corrupt))
+        except av.error.FFmpegError as error:
+            complaints.append(str(error.strerror or error))
+    decoded.complaints = list(complaints)
+
+
+def _assemble(recording: Recording, region: Region, decoded: _Decoded) -> Frames:
+    n = len(decoded.pictures)
+    name = recording.path.name
+    if n == 0:
+        raise RecordingError(f"{name}: not one frame can be decoded; the file is damaged")
+    notes = list(recording.notes)
+    if recording.declared_frames is not None and n < recording.declared_frames:
+        notes.append(
+            f"{name}: {n} frames decoded where the file declares {recording.declared_frames}: "
+            "cut short or damaged; copy it from the camera again"
+        )
+    damaged = np.array(decoded.corrupt, dtype=bool)
+    if decoded.complaints or damaged.any():
+        said = f"; the decoder says: {decoded.complaints[0].strip()}" if decoded.complaints else ""
+        notes.append(
+            f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt"
+            f" ({len(decoded.complaints)} complaints of the decoder{said})"
+        )
+    slot, irregular = slots_from_times(np.array(decoded.pts))
+    if irregular:
+        notes.append(f"{name}: {irregular}")
+    return Frames(recording, region, np.stack(decoded.pictures), slot, damaged, tuple(notes))
+
+
+def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]:
+    """Capture period of every frame from its timestamp, and what is irregular about them ("" where nothing is).
+
+    Timestamps are rounded to whole periods of their median spacing: a missing frame leaves a gap of one. Timestamps
+    that repeat, run backwards, or fit no common period say nothing, and the plain index is used.
+    """
+    plain = np.arange(len(times))
+    if len(times) < 3 or not np.all(np.isfinite(times)):
+        return plain, ""
+    steps = np.diff(times)
+    period = float(np.median(steps))
+    if period <= 0 or np.any(steps <= 0):
+        return plain, "timestamps repeat or run backwards; frames are timed by their index"
+    periods = steps / period
+    if np.any(np.abs(periods - np.rint(periods)) > 0.25) or np.any(np.rint(periods) < 1):
+        return plain, "the container's frame rate varies; frames are timed by their index"
+    slot = np.concatenate([[0], np.cumsum(np.rint(periods).astype(int))])
+    missing = int(slot[-1] - plain[-1])
+    # A recorder drops single frames; where a tenth of all is missing the container counts in other units.
+    if missing == 0 or missing > max(3, len(times) // 10):
+        return plain, "" if missing == 0 else "its timestamps are irregular; frames are timed by their index"
+    return slot, f"{missing} frames are missing by the timestamps; the others keep their own time"
+
+
+def with_notes(recording: Recording, *notes: str) -> Recording:
+    """The same recording with more to say."""
+    return replace(recording, notes=(*recording.notes, *notes))
+
+
+class _quiet_log:  # noqa: N801 - used as a context, like a function
+    """Collect the decoder's complaints instead of printing or losing them; the log level is put back."""
+
+    def __enter__(self) -> list[str]:
+        import av.logging
+
+        self._level = av.logging.get_level()
+        av.logging.set_level(av.logging.ERROR)
+        self._capture = av.logging.Capture(False)
+        self._logs = self._capture.__enter__()
+        self._complaints: list[str] = []
+        return self._complaints
+
+    def __exit__(self, *exc: object) -> None:
+        import av.logging
+
+        self._capture.__exit__(*exc)
+        self._complaints.extend(message.strip() for _, _, message in self._logs)
+        av.logging.set_level(self._level)
