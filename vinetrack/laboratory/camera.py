@@ -1,0 +1,95 @@
+"""The laboratory's camera: where a point of the plane of growth lands in the picture, and back.
+
+A pinhole with radial distortion looks at a plane that may be tilted. Pixel centres have whole-number coordinates,
+x to the right and y down. *Plane pixels* are metres in the plane divided by `m_per_px`, with the plane's origin put on
+the picture's centre: without tilt and distortion they are the picture's own pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+UNDISTORT_STEPS = 25
+"""Newton steps of the inverse of the distortion; it is exact to rounding after about six."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """Size of the picture, scale, lens and pose.
+
+    `m_per_px` is the scale at the picture's centre before tilt; the camera stands `focal_px · m_per_px` away from the
+    plane of growth. `k1`, `k2` are radial distortion as OpenCV defines it; `tilt_x_deg`, `tilt_y_deg` turn the plane
+    about the picture's horizontal and vertical, x first.
+    """
+
+    width_px: int = 960
+    height_px: int = 320
+    m_per_px: float = 1 / 2750
+    focal_px: float = 2600.0
+    k1: float = 0.0
+    k2: float = 0.0
+    tilt_x_deg: float = 0.0
+    tilt_y_deg: float = 0.0
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Where the optical axis meets the picture: its middle, px."""
+        return (self.width_px - 1) / 2, (self.height_px - 1) / 2
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether plane pixels and picture pixels are the same thing."""
+        return self.k1 == self.k2 == self.tilt_x_deg == self.tilt_y_deg == 0
+
+    @property
+    def matrix(self) -> Floats:
+        """Camera matrix, shape (3, 3), px."""
+        cx, cy = self.centre_px
+        return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]], dtype=float)
+
+    @property
+    def rotation(self) -> Floats:
+        """Rotation of the plane against the picture, shape (3, 3)."""
+        ax, ay = math.radians(self.tilt_x_deg), math.radians(self.tilt_y_deg)
+        about_x = np.array([[1, 0, 0], [0, math.cos(ax), -math.sin(ax)], [0, math.sin(ax), math.cos(ax)]])
+        about_y = np.array([[math.cos(ay), 0, math.sin(ay)], [0, 1, 0], [-math.sin(ay), 0, math.cos(ay)]])
+        return np.asarray(about_y @ about_x, dtype=float)
+
+    def picture_from_plane(self, plane_px: Floats) -> Floats:
+        """Plane pixels, shape (..., 2), to picture pixels, shape (..., 2)."""
+        offset = np.asarray(plane_px, dtype=float) - self.centre_px
+        spatial = offset @ self.rotation[:, :2].T + np.array([0.0, 0.0, self.focal_px])
+        ray = spatial[..., :2] / spatial[..., 2:]
+        radius2 = (ray**2).sum(axis=-1, keepdims=True)
+        bent = ray * (1 + self.k1 * radius2 + self.k2 * radius2**2)
+        return np.asarray(bent * self.focal_px + self.centre_px)
+
+    def plane_from_picture(self, picture_px: Floats) -> Floats:
+        """Picture pixels, shape (..., 2), to plane pixels, shape (..., 2)."""
+        bent = (np.asarray(picture_px, dtype=float) - self.centre_px) / self.focal_px
+        ray = np.concatenate([self._undistorted(bent), np.ones((*bent.shape[:-1], 1))], axis=-1)
+        normal = self.rotation[:, 2]
+        depth = normal[2] * self.focal_px / (ray @ normal)
+        spatial = ray * depth[..., None] - np.array([0.0, 0.0, self.focal_px])
+        return np.asarray(spatial @ self.rotation[:, :2] + self.centre_px)
+
+    def _undistorted(self, bent: Floats) -> Floats:
+        """Newton's method on the radius r(1 + k1 r² + k2 r⁴) = r_bent."""
+        bent_radius = np.sqrt((bent**2).sum(axis=-1, keepdims=True))
+        radius = bent_radius.copy()
+        for _ in range(UNDISTORT_STEPS):
+            excess = radius * (1 + self.k1 * radius**2 + self.k2 * radius**4) - bent_radius
+            radius -= excess / (1 + 3 * self.k1 * radius**2 + 5 * self.k2 * radius**4)
+        return bent * np.divide(radius, bent_radius, out=np.ones_like(radius), where=bent_radius > 0)
+
+    def plane_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Plane pixel seen by each pixel of the picture: x and y, each of shape (height_px, width_px)."""
+        grid = np.stack(np.meshgrid(np.arange(self.width_px), np.arange(self.height_px)), axis=-1).astype(float)
+        plane = grid if self.is_plain else self.plane_from_picture(grid)
+        return plane[..., 0].astype(np.float32), plane[..., 1].astype(np.float32)

@@ -1,0 +1,210 @@
+"""Compiled loops of the renderer: tube, ball and sensor, each one pass over the pixels it touches."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+
+NORMAL_BITS = 12
+"""Bits of a random number per normal deviate: 4096 quantiles, in steps too fine to be seen in one grey level."""
+
+
+@njit(cache=True)
+def _ramp(z: float) -> float:
+    """Integral of the normal distribution's Φ from −∞ to z: zΦ(z) + φ(z)."""
+    if z > 8:
+        return z
+    if z < -8:
+        return 0.0
+    return 0.5 * z * (1 + math.erf(z / math.sqrt(2.0))) + math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+
+
+@njit(cache=True)
+def coverage_table(path_px, sigmas_px, first_px, step_px, n):
+    """Share of the exposure for which a point has been passed by a blurred edge, shape (len(sigmas_px), n).
+
+    Column i is a point `first_px + i·step_px` ahead of the edge's reference; `path_px` are positions of the edge
+    against that reference at equal times, moving evenly between them, so each piece is integrated exactly:
+    the mean of Φ((p − e)/σ) over p from a to b is σ [ramp((b−e)/σ) − ramp((a−e)/σ)] / (b − a).
+    """
+    table = np.empty((sigmas_px.size, n), dtype=np.float32)
+    pieces = path_px.size - 1
+    for j in range(sigmas_px.size):
+        sigma = sigmas_px[j]
+        for i in range(n):
+            e = first_px + i * step_px
+            total = 0.0
+            before = _ramp((path_px[0] - e) / sigma)
+            for k in range(pieces):
+                after = _ramp((path_px[k + 1] - e) / sigma)
+                length = (path_px[k + 1] - path_px[k]) / sigma
+                if abs(length) > 1e-3:
+                    total += (after - before) / length
+                else:
+                    middle = (0.5 * (path_px[k + 1] + path_px[k]) - e) / sigma
+                    total += 0.5 * (1 + math.erf(middle / math.sqrt(2.0)))
+                before = after
+            table[j, i] = total / pieces
+    return table
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def sample_backdrop(canvas, map_x, map_y, shift_x, shift_y, out):
+    """Backdrop as the camera sees it when everything is moved by (shift_x, shift_y) px; bilinear, into `out`."""
+    rows, columns = canvas.shape
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            fx = min(max(map_x[y, x] - shift_x, 0.0), columns - 1.001)
+            fy = min(max(map_y[y, x] - shift_y, 0.0), rows - 1.001)
+            ix, iy = int(fx), int(fy)
+            ax, ay = np.float32(fx - ix), np.float32(fy - iy)
+            top = canvas[iy, ix] + ax * (canvas[iy, ix + 1] - canvas[iy, ix])
+            bottom = canvas[iy + 1, ix] + ax * (canvas[iy + 1, ix + 1] - canvas[iy + 1, ix])
+            out[y, x] = top + ay * (bottom - top)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def shade_tube(
+    out, along, across, first_x, last_x, shift_along, shift_across, tip_px, sway, sway_length, table, table_first,
+    table_step, fold_row, setback, slope_row, side, core, per_px, transmission, glow, tail, tail_from, tail_to,
+    tail_end, tail_opacity, tail_level, tail_contrast, fold_glow, ghost, ghost_across,
+):  # fmt: skip
+    """Lay the tube over `out` (height, width), in place.
+
+    `along`, `across` are coordinates (px) of each pixel at rest; `first_x`, `last_x` the columns of each row that the
+    tube can touch; `tip_px` the reference of `table` (see `coverage_table`), whose row `fold_row` is the fold's glow;
+    `setback`, `slope_row`, `side`, `core` are profiles over the distance from the axis, `per_px` entries a pixel.
+    The tail's texture is averaged from `tail_from` to `tail_to`, its displacements at both ends of the exposure.
+    """
+    half_profile = (setback.size - 1) // 2
+    reach = (half_profile - 1) / per_px
+    half_rows = (transmission.shape[0] - 1) // 2
+    half_tail = (tail.shape[0] - 1) // 2
+    period = tail.shape[1] - 1
+    columns = transmission.shape[1]
+    n = table.shape[1]
+    for y in range(out.shape[0]):
+        for x in range(first_x[y], last_x[y]):
+            u = along[y, x] - shift_along
+            v = across[y, x] - shift_across
+            grown = min(max(u / sway_length, 0.0), 1.5)
+            v -= sway * grown * grown
+            if ghost > 0 and abs(v - ghost_across) < reach:
+                i = int((v - ghost_across) * per_px + half_profile + 0.5)
+                place = (u + setback[i] - tip_px - table_first) / table_step
+                seen = table[slope_row[i], min(max(int(place), 0), n - 1)] if u > 0 else 0.0
+                out[y, x] += ghost * seen * side[i]
+            if abs(v) >= reach or u < -1:
+                continue
+            i = int(v * per_px + half_profile + 0.5)
+            place = (u + setback[i] - tip_px - table_first) / table_step
+            if place >= n - 1:
+                continue
+            if place <= 0:
+                cover, fold = np.float32(1.0), np.float32(0.0)
+            else:
+                k = int(place)
+                part = np.float32(place - k)
+                row = slope_row[i]
+                cover = table[row, k] + part * (table[row, k + 1] - table[row, k])
+                fold = table[fold_row, k] + part * (table[fold_row, k + 1] - table[fold_row, k])
+            cover *= side[i] * min(max(u + 0.5, 0.0), 1.0)
+            behind = out[y, x]
+            if core[i] > 0 and u > tail_end:
+                a, b = (u - tail_to) % period, (u - tail_from) % period
+                if b < a:
+                    b += period
+                line = int(v + half_tail + 0.5)
+                ia = int(a)
+                low = tail[line, ia] + (a - ia) * (tail[line, ia + 1] - tail[line, ia])
+                c = b - period if b >= period else b
+                ic = int(c)
+                high = tail[line, ic] + (c - ic) * (tail[line, ic + 1] - tail[line, ic])
+                weight = tail_opacity * core[i] * min(u - tail_end, 1.0)
+                behind += weight * (tail_level * (1 + tail_contrast * (high - low) / (b - a)) - behind)
+            fu, fv = min(max(u, 0.0), columns - 1.001), v + half_rows
+            iu, iv = int(fu), int(fv)
+            au, av = np.float32(fu - iu), np.float32(fv - iv)
+            t0 = transmission[iv, iu] + au * (transmission[iv, iu + 1] - transmission[iv, iu])
+            t1 = transmission[iv + 1, iu] + au * (transmission[iv + 1, iu + 1] - transmission[iv + 1, iu])
+            g0 = glow[iv, iu] + au * (glow[iv, iu + 1] - glow[iv, iu])
+            g1 = glow[iv + 1, iu] + au * (glow[iv + 1, iu + 1] - glow[iv + 1, iu])
+            film = behind * (t0 + av * (t1 - t0)) + g0 + av * (g1 - g0) + fold_glow * fold
+            out[y, x] += cover * (film - out[y, x])
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def shade_ball(out, along, across, shift_along, shift_across, path_px, radius_px, sigma_px, surface, box, min_along):
+    """Lay a ball over `out` within `box` (x0, y0, x1, y1), averaged over its centres `path_px` along the path."""
+    half = (surface.shape[0] - 1) // 2
+    for y in range(box[1], box[3]):
+        for x in range(box[0], box[2]):
+            v = across[y, x] - shift_across
+            if abs(v) >= half - 1:
+                continue
+            cover_sum = 0.0
+            light_sum = 0.0
+            place = along[y, x] - shift_along
+            for k in range(path_px.size):
+                u = place - path_px[k]
+                inside = (radius_px - math.sqrt(u * u + v * v)) / sigma_px
+                if inside < -3.5 or place < min_along or abs(u) >= half - 1:
+                    continue
+                cover = 1.0 if inside > 3.5 else 0.5 * (1 + math.erf(inside * 0.7071067811865476))
+                fu, fv = u + half, v + half
+                iu, iv = int(fu), int(fv)
+                au, av = fu - iu, fv - iv
+                s0 = surface[iv, iu] + au * (surface[iv, iu + 1] - surface[iv, iu])
+                s1 = surface[iv + 1, iu] + au * (surface[iv + 1, iu + 1] - surface[iv + 1, iu])
+                cover_sum += cover
+                light_sum += cover * (s0 + av * (s1 - s0))
+            out[y, x] += np.float32((light_sum - cover_sum * out[y, x]) / path_px.size)
+
+
+@njit(cache=True)
+def _mixed(z):
+    """Splitmix64's finaliser (Steele et al. 2014): neighbouring seeds give unrelated streams."""
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def expose(light, gain, lamp, full_well_e, read_noise_e, seed, frame, normals, tone, low, span, out):
+    """Turn radiance into grey levels with shot and read noise, into `out`; returns nothing.
+
+    Level = low + span · tone(signal); the noise of a signal s has standard deviation √(s·well + read²)/well. Normal
+    deviates are looked up in `normals` (2^NORMAL_BITS quantiles), four for each step of a 64-bit xorshift generator
+    seeded by (seed, frame, row). A `full_well_e` of 0 means no noise.
+    """
+    rows, columns = out.shape
+    mask = np.uint64((1 << NORMAL_BITS) - 1)
+    steps = tone.size - 1
+    per_well = np.float32(1.0 / full_well_e) if full_well_e > 0 else np.float32(0.0)
+    read2 = np.float32((read_noise_e * per_well) ** 2)
+    linear = steps < 2
+    for y in range(rows):
+        state = _mixed(np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + _mixed(np.uint64(frame * 65536 + y + 1)))
+        bits = np.uint64(0)
+        for x in range(columns):
+            signal = max(light[y, x] * gain[y, x] * lamp, np.float32(0.0))
+            if full_well_e > 0:
+                if x % 4 == 0:
+                    state ^= state << np.uint64(13)
+                    state ^= state >> np.uint64(7)
+                    state ^= state << np.uint64(17)
+                    bits = state
+                deviate = normals[np.int64(bits & mask)]
+                bits >>= np.uint64(16)
+                signal += deviate * np.sqrt(signal * per_well + read2)
+            signal = min(max(signal, np.float32(0.0)), np.float32(1.0))
+            if not linear:
+                place = signal * steps
+                k = min(int(place), steps - 1)
+                signal = tone[k] + (place - k) * (tone[k + 1] - tone[k])
+            out[y, x] = np.int64(low + span * signal + 0.5)

@@ -1,0 +1,215 @@
+"""Surfaces of the virtual laboratory, painted once a recording: backdrop with ruler and launcher, film, tail, ball.
+
+All are float32 radiances or fractions on a grid of plane pixels. Each takes its own random generator, so that one
+surface does not change when another gets more detail.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.laboratory.scene import Ball, Scene, Tube
+
+Image = NDArray[np.float32]
+
+OVERSAMPLING = 4
+"""Sub-pixels per pixel when lines are drawn, so that their edges lie within 1/8 px of where they belong."""
+
+
+def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
+    """Periodic Gaussian noise of mean 0 and standard deviation 1, smooth over `sigma_y`, `sigma_x` px; shape `shape`."""
+    white = np.fft.rfft2(rng.standard_normal(shape))
+    fy = np.fft.fftfreq(shape[0])[:, None]
+    fx = np.fft.rfftfreq(shape[1])[None, :]
+    white *= np.exp(-2 * np.pi**2 * ((fy * sigma_y) ** 2 + (fx * sigma_x) ** 2))
+    white[0, 0] = 0
+    field = np.fft.irfft2(white, s=shape)
+    return (field / field.std()).astype(np.float32)
+
+
+def _along_and_across(scene: Scene, shape: tuple[int, int], corner: tuple[int, int]) -> tuple[Image, Image]:
+    """Distances along the path and across it (px) of each canvas pixel, each of shape `shape`."""
+    yy, xx = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+    dx, dy = xx + corner[0] - scene.origin[0], yy + corner[1] - scene.origin[1]
+    ux, uy = scene.direction
+    return (dx * ux + dy * uy).astype(np.float32), (dy * ux - dx * uy).astype(np.float32)
+
+
+def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
+    """The wall behind: a gradient along the path, soft blotches and grain."""
+    look = scene.backdrop
+    shape = (along.shape[0], along.shape[1])
+    span = max(float(along.max()), 1.0)
+    ramp = look.brightness + look.gradient * (np.clip(along / span, 0, 1) - 0.5)
+    blotches = 0.6 * smooth_noise(rng, shape, 45, 45) + 0.45 * smooth_noise(rng, shape, 9, 14)
+    grain = 0.35 * smooth_noise(rng, shape, 1.2, 1.2) + 0.25 * smooth_noise(rng, shape, 0.8, 6)
+    return (ramp * (1 + look.texture * (blotches + grain))).astype(np.float32)
+
+
+def _paste(canvas: Image, patch: Image, mask: Image, matrix: NDArray[np.float64]) -> Image:
+    """Lay `patch` over `canvas` through the affine `matrix` (patch to canvas) where `mask` is 1."""
+    import cv2
+
+    size = (canvas.shape[1], canvas.shape[0])
+    weight = cv2.warpAffine(mask, matrix, size, flags=cv2.INTER_LINEAR)
+    laid = cv2.warpAffine(patch * mask, matrix, size, flags=cv2.INTER_LINEAR)
+    return np.asarray(canvas * (1 - weight) + laid, dtype=np.float32)
+
+
+def _axis_matrix(
+    scene: Scene, corner: tuple[int, int], along_px: float, across_px: float, turned: bool = False
+) -> NDArray[np.float64]:
+    """Affine that puts a patch drawn along the path with its top left at (along_px, across_px) on the canvas."""
+    ux, uy = scene.direction
+    x0 = scene.origin[0] - corner[0] + along_px * ux - across_px * uy
+    y0 = scene.origin[1] - corner[1] + along_px * uy + across_px * ux
+    if turned:
+        return np.array([[-ux, uy, x0], [-uy, -ux, y0]])
+    return np.array([[ux, -uy, x0], [uy, ux, y0]])
+
+
+def ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.Generator) -> Image:
+    """A steel ruler: tick k mm is centred k·px_per_mm from the first column; shape (width_px, length_px)."""
+    import cv2
+
+    k = OVERSAMPLING
+    big = np.full((width_px * k, length_px * k), 0.62, dtype=np.float32)
+    ink = np.zeros(big.shape, dtype=np.uint8)
+    finest_mm = next((step for step in (1, 2, 5, 10) if step * px_per_mm >= 2.2), 10)
+    for mm in range(0, int(length_px / px_per_mm), finest_mm):
+        height = 0.45 if mm % 10 == 0 else (0.34 if mm % 5 == 0 else 0.22)
+        # Sub-pixel j covers [(j − k/2 − 0.5)/k, …]: pixel 0 is centred on 0, its sub-pixels straddle it.
+        middle = (mm * px_per_mm + 0.5) * k
+        thick = 0.75 * k
+        lo, hi = round(middle - thick / 2), round(middle + thick / 2)
+        big[: int(height * width_px * k), max(lo, 0) : max(hi, 0)] = 0.10
+        if mm % 10 == 0 and mm:
+            place = (int(middle - 3.5 * k * (1 if mm < 100 else 2)), int(0.83 * width_px * k))
+            cv2.putText(ink, str(mm // 10), place, cv2.FONT_HERSHEY_SIMPLEX, 0.30 * k, 255, max(k - 2, 1))
+    big[ink > 127] = 0.13
+    fine = cv2.resize(big, (length_px, width_px), interpolation=cv2.INTER_AREA)
+    brushed = 1 + 0.03 * smooth_noise(rng, (width_px, length_px), 0.6, 60)
+    glare = 1 + 0.25 * np.sin(np.linspace(0, 5.0, length_px) + rng.uniform(0, 6))[None, :] ** 4
+    return (fine * brushed * glare).astype(np.float32)
+
+
+def _launcher_patch(radius_px: float, rng: np.random.Generator, reach_px: int) -> Image:
+    """The block the tube comes out of: dark anodised aluminium with a clamp ring and screws."""
+    import cv2
+
+    height, width = int(2.9 * radius_px), reach_px
+    across = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
+    patch = 0.11 + 0.08 * np.exp(-(((across + 0.55) / 0.18) ** 2)) + np.zeros((1, width), dtype=np.float32)
+    patch *= 1 + 0.05 * smooth_noise(rng, (height, width), 0.7, 25)
+    ring = max(int(0.4 * radius_px), 4)
+    patch[:, width - ring :] *= np.float32(2.1)
+    patch[:, width - ring - 2 : width - ring] *= np.float32(0.4)
+    patch[[0, -1], :] = 0.28
+    for along in (0.35, 0.75):
+        for side in (0.16, 0.84):
+            centre = (int(along * (width - ring)), int(side * height))
+            cv2.circle(patch, centre, max(int(0.13 * radius_px), 2), 0.30, -1)
+            cv2.circle(patch, centre, max(int(0.06 * radius_px), 1), 0.03, -1)
+    return patch.astype(np.float32)
+
+
+def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator, corner: tuple[int, int]) -> Image:
+    """Out-of-focus things on the wall: an aluminium profile with its slot, a cable, a label."""
+    import cv2
+
+    height, width = canvas.shape
+    level = scene.backdrop.brightness
+    things = canvas.copy()
+    post = int(rng.uniform(0.55, 0.8) * width)
+    cv2.rectangle(things, (post, 0), (post + 26, height), 1.35 * level, -1)
+    cv2.rectangle(things, (post + 10, 0), (post + 16, height), 0.5 * level, -1)
+    turns = np.linspace(0, 1, 60)
+    cable_x = width * (0.15 + 0.3 * turns)
+    cable_y = height * (0.98 - 0.16 * np.sin(3.1 * turns + rng.uniform(0, 1)))
+    cable = np.stack([cable_x, cable_y], axis=-1).astype(np.int32)
+    cv2.polylines(things, [cable], isClosed=False, color=0.35 * level, thickness=5)
+    label = (int(0.86 * width), int(0.12 * height))
+    cv2.rectangle(things, label, (label[0] + 62, label[1] + 34), min(2.4 * level, 0.9), -1)
+    for line in range(4):
+        end = label[0] + 8 + int(rng.uniform(20, 46))
+        cv2.line(things, (label[0] + 8, label[1] + 7 + 7 * line), (end, label[1] + 7 + 7 * line), 0.6 * level, 2)
+    return np.asarray(cv2.GaussianBlur(things, (0, 0), 2.2), dtype=np.float32)
+
+
+def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, int], corner: tuple[int, int]) -> Image:
+    """Everything that does not move, on plane pixels from `corner` (x, y) on; shape `shape`, blurred by the optics."""
+    import cv2
+
+    along, _ = _along_and_across(scene, shape, corner)
+    canvas = _wall_paper(scene, rng, along)
+    if scene.backdrop.clutter:
+        canvas = _clutter(canvas, scene, rng, corner)
+    radius = scene.subject.diameter_m / scene.camera.m_per_px / 2
+    if scene.backdrop.ruler:
+        length, width = int(along.max()) + 40, 34
+        patch = ruler_patch(length, width, 1e-3 / scene.camera.m_per_px, rng)
+        matrix = _axis_matrix(scene, corner, 0.0, round(1.9 * radius + 14))
+        canvas = _paste(canvas, patch, np.ones_like(patch), matrix)
+    if scene.backdrop.launcher:
+        patch = _launcher_patch(radius, rng, 400)
+        matrix = _axis_matrix(scene, corner, -399.0, -patch.shape[0] / 2)
+        canvas = _paste(canvas, patch, np.ones_like(patch), matrix)
+    return np.asarray(cv2.GaussianBlur(canvas, (0, 0), scene.psf_px), dtype=np.float32).clip(0, 1.5)
+
+
+def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px: int) -> tuple[Image, Image]:
+    """Everted wall, at rest: transmission and glow, each of shape (2·ceil(radius)+15, length_px).
+
+    Row `i` lies `i − (rows − 1)/2` px off the axis. Towards its limb a look through the wall crosses more film:
+    transmission (1 − opacity) to the power of 1/√(1 − (v/R)²), kept finite.
+    """
+    half = math.ceil(radius_px) + 7
+    shape = (2 * half + 1, length_px)
+    v = (np.arange(shape[0]) - half)[:, None] / radius_px
+    depth = 1 / np.sqrt(np.clip(1 - v**2, 0, 1) + 0.04)
+    wrinkles = 0.55 * smooth_noise(rng, shape, 1.3, 22) + 0.5 * smooth_noise(rng, shape, 2.5, 6)
+    wrinkles += 0.45 * smooth_noise(rng, shape, 7.0, 1.1) + 0.3 * smooth_noise(rng, shape, 6, 40)
+    crumple = smooth_noise(rng, shape, 2.2, 3.0)
+    ridges = np.exp(-((crumple / 0.18) ** 2))
+    wrinkles = (wrinkles + 0.6 * (ridges - ridges.mean())) * tube.texture
+    clear = np.clip(1 - tube.opacity * (1 + wrinkles), 0.0, 1.0) if tube.opacity < 1 else np.zeros(shape)
+    transmission = clear**depth
+    light = 0.86 - 0.16 * v + 0.08 * np.cos(2.6 * v) if tube.texture else 1.0
+    glow = (1 - transmission) * tube.brightness * light * (1 + 1.3 * wrinkles)
+    for place, width, strength in ((-0.52, 0.07, 1.0), (0.30, 0.045, 0.45), (-0.05, 0.03, 0.25)):
+        wander = place + 0.03 * smooth_noise(rng, (4, length_px), 1, 60)[:1]
+        broken = np.clip(0.35 + 0.6 * smooth_noise(rng, (4, length_px), 1, 7)[:1], 0, 1.6)
+        glow = glow + tube.specular * strength * broken * np.exp(-(((v - wander) / width) ** 2))
+    return transmission.astype(np.float32), glow.astype(np.float32)
+
+
+def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px: int) -> Image:
+    """Running sums along the tail's texture, shape (rows, period_px + 1); the texture is periodic, of mean 0.
+
+    The mean over any stretch, as motion blur takes it, is a difference of two entries.
+    """
+    rows = 2 * math.ceil(radius_px * tube.tail_width) + 5
+    shape = (rows, period_px)
+    texture = 0.7 * smooth_noise(rng, shape, 1.4, 9) + 0.7 * smooth_noise(rng, shape, 3.0, 2.5)
+    texture -= texture.mean(axis=1, keepdims=True)
+    sums = np.zeros((rows, period_px + 1))
+    np.cumsum(texture, axis=1, dtype=float, out=sums[:, 1:])
+    return sums.astype(np.float32)
+
+
+def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Image:
+    """A sphere lit from the upper left, with texture and two glints; square of side 2·(ceil(radius)+4)+1."""
+    half = math.ceil(radius_px) + 4
+    grid = np.arange(-half, half + 1) / radius_px
+    r2 = np.clip(grid[:, None] ** 2 + grid[None, :] ** 2, 0, 1)
+    facing = np.clip(0.55 * np.sqrt(1 - r2) - 0.35 * grid[:, None] - 0.25 * grid[None, :], 0, None)
+    marks = smooth_noise(rng, r2.shape, 2.2, 2.2) + 0.5 * smooth_noise(rng, r2.shape, 6, 6)
+    surface = ball.brightness * (0.45 + 0.9 * facing) * (1 + ball.texture * marks)
+    for gy, gx, width in ((-0.25, 0.05, 0.07), (-0.2, -0.12, 0.05)):
+        surface = surface + ball.specular * np.exp(
+            -((grid[:, None] - gy) ** 2 + (grid[None, :] - gx) ** 2) / (2 * width**2)
+        )
+    return surface.clip(0, 2).astype(np.float32)
