@@ -1,0 +1,248 @@
+"""Steady windows: where a trial moves at one speed, by our gated rule, by the paper's literal rule, by hand.
+
+Speeds in a `Window` are **tail** speeds. The gated rule looks for the longest stretch, well above rest, whose change of speed is
+shown to be small (equivalence) rather than merely not shown to be large.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.motion.plateau import RangeExtremes, WindowMoments, chord_bounds, judge
+from vinetrack.records import Floats, Kinematics, Track, Window
+
+STEPS = 72
+"""Starts and ends tried in the first pass; the best is then moved point by point."""
+
+BAND_SIGMAS = 4.0
+"""How many standard errors a single velocity may lie outside the band: 1 in 16 000 by chance."""
+
+
+def gated_window(
+    track: Track,
+    kinematics: Kinematics,
+    *,
+    drift_limit: float = 0.03,
+    start_fraction: float = 0.2,
+    start_sigmas: float = 5.0,
+) -> Window:
+    """The longest window in which the vine provably moves at one speed.
+
+    Parameters
+    ----------
+    track, kinematics
+        The track and the motion made from it.
+    drift_limit
+        Largest change of speed across the window, and of any velocity in it from the mean, as a fraction of the mean.
+    start_fraction, start_sigmas
+        The search begins where the velocity exceeds this fraction of its maximum and this many of its standard errors.
+
+    Returns
+    -------
+    Window
+        Rule `gated`. Where nothing is steady, `accepted` is False and `reason` says what was nearest.
+    """
+    time_s, position_m = _points(track, kinematics)
+    first, last, why = _gate(kinematics, start_fraction, start_sigmas)
+    if why:
+        return Window("gated", False, why)
+    inside = slice(first, last + 1)
+    search = _Search(time_s[inside], position_m[inside], kinematics, inside, drift_limit)
+    found, nearest = search.longest()
+    if found is None:
+        return Window("gated", False, nearest)
+    window = judge(time_s, position_m, kinematics, first + found[0], first + found[1], "gated")
+    reason = (
+        f"steady over {window.n_points} points: speed changes by {_percent(window)},"
+        f" inside ±{100 * drift_limit:g} %"
+    )
+    return _with(window, True, reason)
+
+
+def user_window(track: Track, kinematics: Kinematics, window_s: tuple[float, float]) -> Window:
+    """The window chosen by hand, always used; `reason` warns where it is not steady.
+
+    Raises
+    ------
+    ValueError
+        Fewer than three usable points between the two times.
+    """
+    time_s, position_m = _points(track, kinematics)
+    inside = np.flatnonzero((time_s >= window_s[0]) & (time_s <= window_s[1]))
+    if inside.size < 3:
+        raise ValueError(
+            f"the chosen window {window_s[0]:g}:{window_s[1]:g} s holds {inside.size} usable points, at least 3 are"
+            f" needed; the track runs from {time_s[0]:g} to {time_s[-1]:g} s"
+        )
+    window = judge(time_s, position_m, kinematics, int(inside[0]), int(inside[-1]), "user")
+    if not window.x_ss_m_s > 0:
+        return _with(window, True, f"chosen by hand; warning: the mean tail speed is {window.x_ss_m_s:.3g} m/s")
+    steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= 0.03
+    verdict = "chosen by hand" if steady else "chosen by hand; warning: not shown to be steady"
+    return _with(window, True, f"{verdict}: speed changes by {_percent(window)} over {window.n_points} points")
+
+
+def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, min_points: int = 3) -> Window:
+    """The published rule to the letter: the longest run whose velocities vary by less than 3 %, wherever it is.
+
+    Velocities are central differences of the raw positions, as Physics Tracker computes them; the run holds at
+    least `min_points` consecutive velocities with (sample standard deviation)/(mean) below `cv_limit`; x_ss is
+    their mean, and its error s/√n, which is what the rule implies and not what the data allow.
+    """
+    usable = track.usable
+    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
+    if time_s.size < min_points + 2:
+        return Window("paper", False, f"{time_s.size} points are too few for {min_points} central differences")
+    velocity = (position_m[2:] - position_m[:-2]) / (time_s[2:] - time_s[:-2])
+    run = _longest_run(velocity, cv_limit, min_points)
+    if run is None:
+        return Window("paper", False, f"no {min_points} consecutive velocities vary by less than {cv_limit:.0%}")
+    start, stop = run
+    chosen = velocity[start : stop + 1] * travel_ratio
+    mean, sd = float(chosen.mean()), float(chosen.std(ddof=1))
+    drift = float(np.polyfit(np.linspace(-0.5, 0.5, chosen.size), chosen, 1)[0]) / mean
+    cv = sd / abs(mean)
+    return Window(
+        rule="paper",
+        accepted=True,
+        reason=f"longest run with a coefficient of variation below {cv_limit:.0%}: {chosen.size} velocities, {cv:.2%}",
+        from_s=float(time_s[start + 1]),
+        to_s=float(time_s[stop + 1]),
+        n_points=chosen.size,
+        x_ss_m_s=mean,
+        x_ss_sigma_m_s=sd / math.sqrt(chosen.size),
+        drift=drift,
+        cv=cv,
+    )
+
+
+def _points(track: Track, kinematics: Kinematics) -> tuple[Floats, Floats]:
+    """Times and raw positions at the points of the kinematics."""
+    usable = track.usable
+    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
+    if not np.array_equal(time_s, kinematics.time_s):
+        raise ValueError("the kinematics were not made from this track; call estimate_kinematics on it again")
+    return time_s, position_m
+
+
+def _gate(kinematics: Kinematics, start_fraction: float, start_sigmas: float) -> tuple[int, int, str]:
+    """First and last point between which a window may lie, or why there is none."""
+    velocity, sigma = kinematics.lead_velocity_m_s, kinematics.lead_velocity_sigma_m_s
+    surely = float(np.max(velocity - 3 * sigma))
+    if velocity.size < 3 or surely <= 0:
+        return 0, 0, "nothing moves faster than three standard errors of its velocity"
+    moving = velocity > np.maximum(start_fraction * surely, start_sigmas * sigma)
+    points = np.flatnonzero(moving)
+    if points.size < 3:
+        return 0, 0, (
+            f"only {points.size} points move faster than {start_fraction:g} of the top speed and"
+            f" {start_sigmas:g} standard errors"
+        )
+    return int(points[0]), int(points[-1]), ""
+
+
+class _Search:
+    """All windows between two points, judged by cumulative sums."""
+
+    def __init__(
+        self, time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, drift_limit: float
+    ) -> None:
+        self.n = time_s.size
+        self.limit = drift_limit
+        self.moments = WindowMoments(time_s, position_m, kinematics.noise_m, kinematics.noise_correlation)
+        self.width = kinematics.window_points[inside]
+        velocity, sigma = kinematics.lead_velocity_m_s[inside], kinematics.lead_velocity_sigma_m_s[inside]
+        self.smooth_low = RangeExtremes(velocity - BAND_SIGMAS * sigma)
+        self.smooth_high = RangeExtremes(-(velocity + BAND_SIGMAS * sigma))
+        self.chords = chord_bounds(
+            time_s, position_m, kinematics.noise_m, kinematics.noise_correlation, BAND_SIGMAS
+        )
+
+    def longest(self) -> tuple[tuple[int, int] | None, str]:
+        """First and last point of the longest steady window, or the reason why there is none."""
+        stride = max(1, math.ceil(self.n / STEPS))
+        edges = np.arange(0, self.n, stride)
+        best, score = self._best(edges, np.union1d(edges, [self.n - 1]))
+        if best is None:
+            return None, score
+        for reach in (stride, stride):
+            near = np.arange(-reach, reach + 1)
+            starts = np.unique(np.clip(best[0] + near, 0, self.n - 1))
+            ends = np.unique(np.clip(best[1] + near, 0, self.n - 1))
+            better, _ = self._best(starts, ends)
+            if better is None or better == best:
+                break
+            best = better
+        return best, ""
+
+    def _best(
+        self, starts: NDArray[np.int_], ends: NDArray[np.int_]
+    ) -> tuple[tuple[int, int] | None, str]:
+        first, last = (grid.ravel() for grid in np.meshgrid(starts, ends, indexing="ij"))
+        long_enough = last - first + 1 >= 3
+        first, last = first[long_enough], last[long_enough]
+        points = last - first + 1
+        keep = points >= np.maximum(3, self.width[(first + last) // 2] / 2 + 2)
+        first, last, points = first[keep], last[keep], points[keep]
+        if first.size == 0:
+            return None, "fewer points move than one smoothing window holds"
+        mean, drift, drift_sigma = self.moments.drift(first, last)
+        worst = np.abs(drift) + 1.96 * drift_sigma
+        steady = (mean > 0) & (worst <= self.limit)
+        for bounds in (self._smooth, *self.chords):
+            index = np.flatnonzero(steady)
+            if index.size == 0:
+                break
+            low, high = bounds(first[index], last[index])
+            inside = (low <= (1 + self.limit) * mean[index]) & (high >= (1 - self.limit) * mean[index])
+            steady[index[~inside]] = False
+        if not steady.any():
+            return None, self._nearest(first, last, mean, drift, drift_sigma)
+        index = np.flatnonzero(steady)
+        winner = index[np.lexsort((worst[index], -points[index]))[0]]
+        return (int(first[winner]), int(last[winner])), ""
+
+    def _smooth(self, first: NDArray[np.int_], last: NDArray[np.int_]) -> tuple[Floats, Floats]:
+        return self.smooth_low.maximum(first, last), -self.smooth_high.maximum(first, last)
+
+    def _nearest(
+        self, first: NDArray[np.int_], last: NDArray[np.int_], mean: Floats, drift: Floats, sigma: Floats
+    ) -> str:
+        worst = np.where(mean > 0, np.abs(drift) + 1.96 * sigma, np.inf)
+        near = int(np.argmin(worst))
+        return (
+            f"no window is shown to be steady within ±{100 * self.limit:g} %: the nearest, {last[near] - first[near] + 1}"
+            f" points, changes by {100 * drift[near]:.2g} ± {196 * sigma[near]:.2g} % across it"
+        )
+
+
+def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[int, int] | None:
+    """First and last index of the longest run with coefficient of variation below the limit; the steadiest of ties."""
+    n = velocity.size
+    level = float(np.median(velocity))
+    total = np.concatenate([[0.0], np.cumsum(velocity - level)])
+    square = np.concatenate([[0.0], np.cumsum((velocity - level) ** 2)])
+    for length in range(n, min_points - 1, -1):
+        sums = total[length:] - total[:-length]
+        spread = np.maximum(square[length:] - square[:-length] - sums**2 / length, 0.0) / (length - 1)
+        mean = sums / length + level
+        good = (spread < (cv_limit * mean) ** 2) & (mean != 0)
+        if good.any():
+            where = np.flatnonzero(good)
+            start = int(where[np.argmin(spread[where] / mean[where] ** 2)])
+            return start, start + length - 1
+    return None
+
+
+def _percent(window: Window) -> str:
+    low, high = window.drift_95
+    return f"{100 * window.drift:.2g} % (95 %: {100 * low:.2g} to {100 * high:.2g} %)"
+
+
+def _with(window: Window, accepted: bool, reason: str) -> Window:
+    from dataclasses import replace
+
+    return replace(window, accepted=accepted, reason=reason)
