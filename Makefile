@@ -32,7 +32,7 @@ $(STAMP): requirements.lock pyproject.toml
 	  echo 'vinetrack needs Python 3.11 or newer with its venv module, and found none. Install one' >&2; \
 	  echo '(Debian, Ubuntu: apt install python3-venv), or name it: make PYTHON=/path/to/python3 $(MAKECMDGOALS)' >&2; \
 	  exit 1; fi; \
-	echo "Setting up .venv with $$($$python --version), about a minute the first time."; \
+	echo "Setting up .venv with $$("$$python" --version), about a minute the first time."; \
 	rm -f $(STAMP); $(BIN)/python -c '' 2>/dev/null || "$$python" -m venv --clear .venv
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .

@@ -1,0 +1,166 @@
+"""One look for every figure: colours that colour-blind readers can tell apart, sizes that can be read in a talk.
+
+Figures are made without pyplot, so drawing one leaves no state behind and many can be drawn in parallel. Their
+background is transparent and everything neutral is drawn in INK or GRID, so that a page can recolour an inlined SVG
+for a dark screen; a PNG gets a white background.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import textwrap
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK = "#20242a"
+MUTED = "#7b828c"
+GRID = "#d9dde3"
+PAPER = "#fdfdfe"
+"""Filling of hollow markers; a page may recolour it like INK and GRID."""
+
+BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
+"""Okabe and Ito's palette without its black and its yellow, which vanish on one background or the other."""
+
+VINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE)
+VINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+RULE_COLOURS = {"gated": BLUE, "paper": VERMILLION, "user": GREEN}
+"""The three ways of choosing a steady window, the same colours in every figure."""
+
+RULE_NAMES = {"gated": "gated rule", "paper": "paper's rule (3 %)", "user": "chosen by hand"}
+
+METHOD_COLOURS = {"log_log": VERMILLION, "both_axes": BLUE}
+METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
+METHOD_LINES = {"log_log": (0, (4, 2)), "both_axes": "-"}
+
+_RC: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 11,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.labelsize": 11,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": INK,
+    "axes.linewidth": 0.8,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.7,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 10,
+    "ytick.labelsize": 10,
+    "legend.frameon": False,
+    "legend.fontsize": 10,
+    "lines.linewidth": 1.6,
+    "figure.facecolor": "none",
+    "savefig.facecolor": "none",
+    "svg.hashsalt": "vinetrack",
+    "svg.fonttype": "path",
+    "path.simplify": True,
+}
+
+
+@dataclass(frozen=True)
+class VineStyle:
+    """How one vine is drawn wherever it appears."""
+
+    colour: str
+    marker: str
+
+
+@contextmanager
+def look() -> Iterator[None]:
+    """Draw inside this: matplotlib's settings are as the project wants them, and restored afterwards."""
+    import matplotlib as mpl
+
+    with mpl.rc_context(_RC):
+        yield
+
+
+def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
+    """Give each vine, in the order of first appearance, a colour and a marker; 42 pairs before one repeats."""
+    names = list(dict.fromkeys(vines))
+    n_colours, n_markers = len(VINE_COLOURS), len(VINE_MARKERS)
+    return {
+        name: VineStyle(VINE_COLOURS[i % n_colours], VINE_MARKERS[(i + i // n_colours // n_markers) % n_markers])
+        for i, name in enumerate(names)
+    }
+
+
+def rows(table: pd.DataFrame) -> Iterator[Any]:
+    """Rows of a table with its columns as attributes; pandas' own type of them fits no number."""
+    return iter(table.itertuples(index=False))
+
+
+def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure:
+    """Return a figure that says why there is nothing to draw; the place of a missing picture is never left empty."""
+    from matplotlib.figure import Figure
+
+    with look():
+        fig = Figure(figsize=(width_in, height_in))
+        wrapped = textwrap.fill(message, int(width_in * 11))
+        fig.text(0.5, 0.5, wrapped, ha="center", va="center", color=MUTED)
+    return fig
+
+
+def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
+    """Put the legend over the axes, where no datum can lie under it."""
+    handles, labels = ax.get_legend_handles_labels()
+    handles = keywords.pop("handles", handles)
+    if handles:
+        ax.legend(
+            handles=handles,
+            labels=[handle.get_label() for handle in handles] if not labels else None,
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.01),
+            borderaxespad=0.0,
+            ncols=n_columns,
+            handlelength=1.8,
+            columnspacing=1.4,
+            **keywords,
+        )
+
+
+def plain_log_ticks(ax: Axes, which: str = "both") -> None:
+    """Ticks at 1, 2, 5 written as plain numbers, so that less than a decade still has readable values."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axes = {"x": (ax.xaxis,), "y": (ax.yaxis,), "both": (ax.xaxis, ax.yaxis)}[which]
+    for axis in axes:
+        low, high = _at_least_an_octave(*axis.get_view_interval())
+        axis.set_view_interval(low, high, ignore=True)
+        decades = math.log10(high / low)
+        steps = (1, 2, 3, 5, 7) if decades < 1 else (1, 2, 5) if decades < 3.2 else (1,)
+        axis.set_major_locator(LogLocator(subs=steps))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_locator(NullLocator())
+
+
+def _at_least_an_octave(low: float, high: float) -> tuple[float, float]:
+    """Limits a factor two apart or more: a single point must not fill the figure with its error bars."""
+    middle = math.sqrt(low * high)
+    return min(low, middle / math.sqrt(2)), max(high, middle * math.sqrt(2))
+
+
+def render(fig: Figure, *, png_dpi: int = 160, tight: bool = False) -> tuple[bytes, bytes]:
+    """Return the figure as PNG (white background) and as SVG (transparent), the same bytes for the same figure."""
+    box = "tight" if tight else None
+    with look():
+        png, svg = io.BytesIO(), io.BytesIO()
+        fig.savefig(png, format="png", dpi=png_dpi, facecolor="white", bbox_inches=box, metadata={"Software": None})
+        fig.savefig(svg, format="svg", bbox_inches=box, metadata={"Date": None, "Creator": None})
+    return png.getvalue(), svg.getvalue()
