@@ -44,7 +44,8 @@ class Table:
     """Cells of a CSV, as text without blanks around it.
 
     `rows[i]` maps each column to its cell ("" where blank or where the line is short); `lines[i]` is its line in the
-    file, from 1; `extra[i]` holds what stands beyond the last column. `decimal` is the decimal mark the file uses, "."
+    file, from 1; `extra[i]` holds what stands beyond the last column; `nameless` tells that a column without a name
+    holds something. `decimal` is the decimal mark the file uses, "."
     or ",", or "" where it uses both.
     """
 
@@ -54,6 +55,7 @@ class Table:
     extra: tuple[tuple[str, ...], ...]
     delimiter: str
     decimal: str
+    nameless: bool = False
 
     def numbers(self, column: str, *, blank_is_nan: bool = False) -> NDArray[np.float64]:
         """A column as numbers, shape (n_rows,); blank cells are NaN if `blank_is_nan`, else refused.
@@ -120,7 +122,7 @@ def decode_text(data: bytes) -> str:
     r"""Text of a file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`.
 
     >>> decode_text("µ\r\n".encode("cp1252")), decode_text("µ".encode("utf-16"))
-    ('µ\\n', 'µ')
+    ('µ\n', 'µ')
     """
     if data.startswith((b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff")):
         encodings = ["utf-32"]
@@ -194,12 +196,11 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
         {name: cell for name, cell in zip(columns, cells + [""] * (width - len(cells)), strict=False) if name}
         for _, cells in body
     )
-    extra = tuple(
-        tuple(cell for i, cell in enumerate(cells) if cell and (i >= width or not columns[i])) for _, cells in body
-    )
+    extra = tuple(tuple(filter(None, cells[width:])) for _, cells in body)
+    nameless = any(cell and not name for _, cells in body for name, cell in zip(columns, cells, strict=False))
     found = [cell for _, cells in body for cell in cells]
     lines_of_rows = tuple(line + skip_lines for line, _ in body)
-    return Table(tuple(named), rows, lines_of_rows, extra, delimiter, _find_decimal(found, delimiter))
+    return Table(tuple(named), rows, lines_of_rows, extra, delimiter, _find_decimal(found, delimiter), nameless)
 
 
 def _find_delimiter(header: str) -> str:
