@@ -186,7 +186,7 @@ class DampingSettings(_Strict):
     """How the damping law and its intervals are computed; see `vinetrack.motion.damping`."""
 
     resamples: Annotated[Count, Field(ge=100)] = 2000
-    seed: Annotated[Count, Field(ge=0)] = 20250
+    seed: Annotated[Count, Field(ge=0)] = 1
 
 
 class FigureSettings(_Strict):

@@ -1,9 +1,9 @@
 """Files of Physics Tracker (OSP): its project (`.trk`, XML) and its text export.
 
 A project stores the marks of a point mass in image pixels, frame by frame, and the axes: origin (px, image y
-downwards), angle (degrees, counter-clockwise) and scale (px per unit of length). The same transform as in Tracker's source,
-`org.opensourcephysics.media.core.ImageCoordSystem`, leads to world coordinates. Where origin, angle or scale change, a
-project holds them for key frames; each is valid until the next.
+downwards), angle (degrees, counter-clockwise) and scale (px per unit of length). The same transform as in Tracker's
+source, `org.opensourcephysics.media.core.ImageCoordSystem`, leads to world coordinates. Where origin, angle or scale
+change, a project holds them for key frames; each is valid until the next.
 """
 
 from __future__ import annotations
@@ -208,12 +208,10 @@ def read_export(table: Table) -> Track:
     TrackError
         If a unit is not understood, or see `new_track`.
     """
-    columns = {
-        name: (column, unit)
-        for column in table.columns
-        if (name := _column(column)[0])
-        for unit in [_column(column)[1]]
-    }
+    columns: dict[str, tuple[str, str]] = {}
+    for column in table.columns:
+        name, unit = _column(column)
+        columns.setdefault(name, (column, unit))
     time_s = table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS)
     check_times(time_s, table.lines)
     axes = [
