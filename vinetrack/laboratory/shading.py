@@ -12,6 +12,8 @@ Image = NDArray[np.float32]
 
 NORMAL_BITS = 12
 """Bits of a random number per normal deviate: 4096 quantiles, in steps too fine to be seen in one grey level."""
+TAIL_TAPER_PX = 30.0
+"""Over this length the tail's end, a crumpled bunch of film, comes to nothing."""
 
 
 @njit(cache=True)
@@ -71,7 +73,7 @@ def sample_backdrop(canvas, map_x, map_y, shift_x, shift_y, out):
 @njit(cache=True, fastmath=True, nogil=True)
 def shade_tube(
     out, along, across, first_x, last_x, shift_along, shift_across, tip_px, sway, sway_length, table, table_first,
-    table_step, fold_row, setback, slope_row, side, core, per_px, transmission, glow, tail, tail_from, tail_to,
+    table_step, fold_row, setback, slope_row, side, core, per_px, transmission, glow, girth, tail, tail_from, tail_to,
     tail_end, tail_opacity, tail_level, tail_contrast, fold_glow, ghost, ghost_across,
 ):  # fmt: skip
     """Lay the tube over `out` (height, width), in place.
@@ -99,7 +101,10 @@ def shade_tube(
                 place = (u + setback[i] - tip_px - table_first) / table_step
                 seen = table[slope_row[i], min(max(int(place), 0), n - 1)] if u > 0 else 0.0
                 out[y, x] += ghost * seen * side[i]
-            if abs(v) >= reach or u < -1:
+            if u < -1:
+                continue
+            v *= girth[min(int(u) + 1, columns - 1)]
+            if abs(v) >= reach:
                 continue
             i = int(v * per_px + half_profile + 0.5)
             place = (u + setback[i] - tip_px - table_first) / table_step
@@ -125,7 +130,7 @@ def shade_tube(
                 c = b - period if b >= period else b
                 ic = int(c)
                 high = tail[line, ic] + (c - ic) * (tail[line, ic + 1] - tail[line, ic])
-                weight = tail_opacity * core[i] * min(u - tail_end, 1.0)
+                weight = tail_opacity * core[i] * min((u - tail_end) / TAIL_TAPER_PX, 1.0)
                 behind += weight * (tail_level * (1 + tail_contrast * (high - low) / (b - a)) - behind)
             fu, fv = min(max(u, 0.0), columns - 1.001), v + half_rows
             iu, iv = int(fu), int(fv)

@@ -20,7 +20,7 @@ OVERSAMPLING = 4
 
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
-    """Periodic Gaussian noise of mean 0 and standard deviation 1, smooth over `sigma_y`, `sigma_x` px; shape `shape`."""
+    """Periodic Gaussian noise of mean 0 and standard deviation 1, smooth over `sigma_y`, `sigma_x` px."""
     white = np.fft.rfft2(rng.standard_normal(shape))
     fy = np.fft.fftfreq(shape[0])[:, None]
     fx = np.fft.rfftfreq(shape[1])[None, :]
@@ -46,7 +46,10 @@ def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
     ramp = look.brightness + look.gradient * (np.clip(along / span, 0, 1) - 0.5)
     blotches = 0.6 * smooth_noise(rng, shape, 45, 45) + 0.45 * smooth_noise(rng, shape, 9, 14)
     grain = 0.35 * smooth_noise(rng, shape, 1.2, 1.2) + 0.25 * smooth_noise(rng, shape, 0.8, 6)
-    return (ramp * (1 + look.texture * (blotches + grain))).astype(np.float32)
+    yy, xx = np.mgrid[: shape[0], : shape[1]]
+    lit = np.exp(-(((xx / shape[1] - 0.45) / 0.65) ** 2) - ((yy / shape[0] - 0.35) / 0.9) ** 2)
+    pool = 1 + 2.5 * look.texture * (lit - 0.6)
+    return (ramp * pool * (1 + look.texture * (blotches + grain))).astype(np.float32)
 
 
 def _paste(canvas: Image, patch: Image, mask: Image, matrix: NDArray[np.float64]) -> Image:
@@ -97,46 +100,51 @@ def ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.
 
 
 def _launcher_patch(radius_px: float, rng: np.random.Generator, reach_px: int) -> Image:
-    """The block the tube comes out of: dark anodised aluminium with a clamp ring and screws."""
+    """The block the tube comes out of: dark anodised aluminium with a knurled clamp ring and screws."""
     import cv2
 
     height, width = int(2.9 * radius_px), reach_px
     across = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
-    patch = 0.11 + 0.08 * np.exp(-(((across + 0.55) / 0.18) ** 2)) + np.zeros((1, width), dtype=np.float32)
-    patch *= 1 + 0.05 * smooth_noise(rng, (height, width), 0.7, 25)
-    ring = max(int(0.4 * radius_px), 4)
-    patch[:, width - ring :] *= np.float32(2.1)
-    patch[:, width - ring - 2 : width - ring] *= np.float32(0.4)
-    patch[[0, -1], :] = 0.28
-    for along in (0.35, 0.75):
-        for side in (0.16, 0.84):
-            centre = (int(along * (width - ring)), int(side * height))
-            cv2.circle(patch, centre, max(int(0.13 * radius_px), 2), 0.30, -1)
-            cv2.circle(patch, centre, max(int(0.06 * radius_px), 1), 0.03, -1)
+    patch = 0.10 + 0.10 * np.exp(-(((across + 0.6) / 0.16) ** 2)) + np.zeros((1, width), dtype=np.float32)
+    patch *= 1 + 0.06 * smooth_noise(rng, (height, width), 0.7, 25)
+    patch[[0, 1, -2, -1], :] = 0.26
+    ring = max(int(0.5 * radius_px), 5)
+    round_light = 0.16 + 0.42 * np.exp(-(((across + 0.45) / 0.22) ** 2)) + 0.12 * np.exp(-(((across - 0.6) / 0.2) ** 2))
+    knurls = 1 + 0.25 * np.sign(np.sin(np.arcsin(across.clip(-0.99, 0.99)) * 34))
+    patch[:, width - ring :] = round_light * knurls * np.linspace(0.75, 1.1, ring)
+    patch[:, width - ring - 3 : width - ring] = 0.03
+    for back in (1.0, 2.6):
+        for side in (0.17, 0.83):
+            centre = (int(width - ring - back * radius_px), int(side * height))
+            cv2.circle(patch, centre, max(int(0.17 * radius_px), 2), 0.34, -1)
+            cv2.circle(patch, centre, max(int(0.09 * radius_px), 1), 0.02, -1)
     return patch.astype(np.float32)
 
 
-def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator, corner: tuple[int, int]) -> Image:
-    """Out-of-focus things on the wall: an aluminium profile with its slot, a cable, a label."""
+def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
+    """Out-of-focus things on the wall: an aluminium profile with its slot, a hose, a label."""
     import cv2
 
     height, width = canvas.shape
     level = scene.backdrop.brightness
     things = canvas.copy()
     post = int(rng.uniform(0.55, 0.8) * width)
-    cv2.rectangle(things, (post, 0), (post + 26, height), 1.35 * level, -1)
-    cv2.rectangle(things, (post + 10, 0), (post + 16, height), 0.5 * level, -1)
-    turns = np.linspace(0, 1, 60)
-    cable_x = width * (0.15 + 0.3 * turns)
-    cable_y = height * (0.98 - 0.16 * np.sin(3.1 * turns + rng.uniform(0, 1)))
-    cable = np.stack([cable_x, cable_y], axis=-1).astype(np.int32)
-    cv2.polylines(things, [cable], isClosed=False, color=0.35 * level, thickness=5)
-    label = (int(0.86 * width), int(0.12 * height))
-    cv2.rectangle(things, label, (label[0] + 62, label[1] + 34), min(2.4 * level, 0.9), -1)
+    cv2.rectangle(things, (post, -5), (post + 30, height + 5), 1.5 * level, -1)
+    cv2.rectangle(things, (post + 4, -5), (post + 7, height + 5), 1.9 * level, -1)
+    cv2.rectangle(things, (post + 12, -5), (post + 19, height + 5), 0.4 * level, -1)
+    turns = np.linspace(-0.05, 1.05, 90)
+    start, end = rng.uniform(-0.1, 0.25) * width, rng.uniform(0.35, 0.6) * width
+    hose_x = start + (end - start) * turns
+    hose_y = height * (1.06 - 0.2 * np.sin(np.pi * turns.clip(0, 1)) + 0.3 * (np.abs(turns - 0.5) > 0.5))
+    hose = np.stack([hose_x, hose_y], axis=-1).astype(np.int32)
+    cv2.polylines(things, [hose], isClosed=False, color=0.3 * level, thickness=9)
+    cv2.polylines(things, [hose - [0, 2]], isClosed=False, color=0.9 * level, thickness=2)
+    left, top = int(0.86 * width), int(0.12 * height)
+    cv2.rectangle(things, (left, top), (left + 62, top + 34), min(2.2 * level, 0.9), -1)
     for line in range(4):
-        end = label[0] + 8 + int(rng.uniform(20, 46))
-        cv2.line(things, (label[0] + 8, label[1] + 7 + 7 * line), (end, label[1] + 7 + 7 * line), 0.6 * level, 2)
-    return np.asarray(cv2.GaussianBlur(things, (0, 0), 2.2), dtype=np.float32)
+        stop = left + 8 + int(rng.uniform(20, 46))
+        cv2.line(things, (left + 8, top + 7 + 7 * line), (stop, top + 7 + 7 * line), 0.6 * level, 2)
+    return np.asarray(cv2.GaussianBlur(things, (0, 0), 2.4), dtype=np.float32)
 
 
 def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, int], corner: tuple[int, int]) -> Image:
@@ -146,7 +154,7 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
     along, _ = _along_and_across(scene, shape, corner)
     canvas = _wall_paper(scene, rng, along)
     if scene.backdrop.clutter:
-        canvas = _clutter(canvas, scene, rng, corner)
+        canvas = _clutter(canvas, scene, rng)
     radius = scene.subject.diameter_m / scene.camera.m_per_px / 2
     if scene.backdrop.ruler:
         length, width = int(along.max()) + 40, 34
@@ -160,6 +168,30 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
     return np.asarray(cv2.GaussianBlur(canvas, (0, 0), scene.psf_px), dtype=np.float32).clip(0, 1.5)
 
 
+def film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
+    """Relief of crumpled film, mean 0 and standard deviation 1: soft folds along it, sharp creases at all slants.
+
+    A crease is a bright flank beside a dark one; most are short and lie within 60° of the tube's axis.
+    """
+    import cv2
+
+    rows, columns = shape
+    lines = np.zeros((2 * rows, 2 * columns), dtype=np.float32)
+    for _ in range(max(columns // 3, 8)):
+        slant, length = rng.normal(0, 0.7), rng.gamma(2.0, 14.0)
+        across, along = rng.uniform(0, 2 * rows), rng.uniform(0, 2 * columns)
+        bend = rng.normal(0, 4)
+        turn = np.array([[math.cos(slant), math.sin(slant)], [-math.sin(slant), math.cos(slant)]])
+        curve = np.array([[-length, 0], [-length / 3, bend], [length / 3, bend], [length, 0]]) @ turn + [along, across]
+        cv2.polylines(lines, [curve.astype(np.int32)], isClosed=False, color=float(rng.standard_t(3)), thickness=1)
+    creases = cv2.resize(cv2.GaussianBlur(lines, (0, 0), 1.9), (columns, rows), interpolation=cv2.INTER_AREA)
+    flanks = creases - np.roll(creases, 2, axis=0)
+    folds = 0.8 * smooth_noise(rng, shape, 3.5, 60) + 0.5 * smooth_noise(rng, shape, 2.0, 18)
+    folds += 0.45 * smooth_noise(rng, shape, 9, 9) + 0.15 * smooth_noise(rng, shape, 0.9, 1.5)
+    relief = folds + 0.3 * creases / max(float(creases.std()), 1e-6) + 0.45 * flanks / max(float(flanks.std()), 1e-6)
+    return np.asarray((relief - relief.mean()) / relief.std(), dtype=np.float32)
+
+
 def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px: int) -> tuple[Image, Image]:
     """Everted wall, at rest: transmission and glow, each of shape (2·ceil(radius)+15, length_px).
 
@@ -170,20 +202,22 @@ def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px:
     shape = (2 * half + 1, length_px)
     v = (np.arange(shape[0]) - half)[:, None] / radius_px
     depth = 1 / np.sqrt(np.clip(1 - v**2, 0, 1) + 0.04)
-    wrinkles = 0.55 * smooth_noise(rng, shape, 1.3, 22) + 0.5 * smooth_noise(rng, shape, 2.5, 6)
-    wrinkles += 0.45 * smooth_noise(rng, shape, 7.0, 1.1) + 0.3 * smooth_noise(rng, shape, 6, 40)
-    crumple = smooth_noise(rng, shape, 2.2, 3.0)
-    ridges = np.exp(-((crumple / 0.18) ** 2))
-    wrinkles = (wrinkles + 0.6 * (ridges - ridges.mean())) * tube.texture
+    wrinkles = tube.texture * film_relief(rng, shape)
     clear = np.clip(1 - tube.opacity * (1 + wrinkles), 0.0, 1.0) if tube.opacity < 1 else np.zeros(shape)
     transmission = clear**depth
     light = 0.86 - 0.16 * v + 0.08 * np.cos(2.6 * v) if tube.texture else 1.0
     glow = (1 - transmission) * tube.brightness * light * (1 + 1.3 * wrinkles)
-    for place, width, strength in ((-0.52, 0.07, 1.0), (0.30, 0.045, 0.45), (-0.05, 0.03, 0.25)):
+    for place, width, strength in ((-0.55, 0.075, 1.4), (0.34, 0.05, 0.6), (-0.05, 0.03, 0.3)):
         wander = place + 0.03 * smooth_noise(rng, (4, length_px), 1, 60)[:1]
         broken = np.clip(0.35 + 0.6 * smooth_noise(rng, (4, length_px), 1, 7)[:1], 0, 1.6)
         glow = glow + tube.specular * strength * broken * np.exp(-(((v - wander) / width) ** 2))
     return transmission.astype(np.float32), glow.astype(np.float32)
+
+
+def film_girth(tube: Tube, rng: np.random.Generator, length_px: int) -> Image:
+    """Relative stretch of distances from the axis along the everted wall, shape (length_px,): its sides ripple."""
+    ripple = 0.7 * smooth_noise(rng, (4, length_px), 1, 9)[0] + 0.7 * smooth_noise(rng, (4, length_px), 1, 40)[0]
+    return (1 + 0.08 * tube.texture * ripple).astype(np.float32)
 
 
 def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px: int) -> Image:
