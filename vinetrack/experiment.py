@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from vinetrack.naming import with_names
 from vinetrack.problems import ExperimentError, Problem, format_problems
 from vinetrack.records import Trial
 from vinetrack.settings import ExperimentSettings, read_experiment_settings
-from vinetrack.sheet import SHEET, Row, complete, make_trial, read_row
+from vinetrack.sheet import SHEET, Row, find_missing, judge_pressures, judge_row, make_trial, read_row
 from vinetrack.tables import Table, TableError, read_table, safe_join
 from vinetrack.video.importers import TrackError, load_track, read_pressure_trace, read_track
 
@@ -81,16 +80,19 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     settings = _read_settings(folder, problems)
     table = _read_sheet(folder, problems)
     rows = [read_row(table, i, settings or ExperimentSettings()) for i in range(len(table.rows))] if table else []
-    absent: Counter[str] = Counter()
+    absent: set[str] = set()
     for row in rows:
-        absent.update(complete(row, folder, table.columns if table else ()) if row.in_use else ())
+        if row.in_use:
+            judge_row(row, folder)
+            # Without the shared settings nobody knows what is missing.
+            absent |= find_missing(row, folder, table.columns) if table and settings else set()
     problems += _compare_names(rows)
-    if settings is not None:
-        problems += [_absent_column(name) for name in COLUMNS if absent[name]]
+    problems += [_absent_column(name) for name in COLUMNS if name in absent]
     sheet_is_sound = not any(problem.severity == "error" for problem in problems)
     for row in rows:
         if sheet_is_sound and row.in_use and not row.failed:
             _take_pressure_from_recording(row, folder)
+            judge_pressures(row)
     problems += _merge_warnings(problem for row in rows for problem in row.problems)
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.failed and row.in_use for row in rows)):
@@ -156,7 +158,10 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
 
 def _missing_sheet_remedy(folder: Path) -> str:
     """What to do where there is no sheet: a name that comes close, or else what was expected."""
-    names = sorted(path.name for path in folder.iterdir())
+    try:
+        names = sorted(path.name for path in folder.iterdir())
+    except OSError:
+        return "allow its folder to be read"
     close = difflib.get_close_matches(SHEET, [name for name in names if "tri" in name.lower()], 1, 0.5)
     if close and not close[0].endswith(".csv"):
         return f"save {close[0]} as {SHEET}"
@@ -225,7 +230,12 @@ def _take_pressure_from_recording(row: Row, folder: Path) -> None:
         remedy = "fill it in, or give the track a column pressure_kPa"
         row.add("is blank, and the track carries no pressure", "pressure_kPa", remedy=remedy)
         return
-    row.values["pressure_kPa"] = float(f"{float(pressure[0]) / 1000:.3g}")
+    nominal_kPa = float(f"{float(pressure[0]) / 1000:.3g}")
+    if nominal_kPa < 0:
+        remedy = f"fill it in: the measured pressure starts at {nominal_kPa:g} kPa, which is none"
+        row.add("is blank", "pressure_kPa", value="", remedy=remedy)
+        return
+    row.values["pressure_kPa"] = nominal_kPa
 
 
 def _merge_warnings(problems: Iterable[Problem]) -> list[Problem]:
@@ -276,17 +286,27 @@ def check_experiment(folder: Path | str, open_video: VideoCheck | None = None) -
 
 
 def _check_track(trial: Trial) -> list[Problem]:
-    """Read the track and its pressure, and hold its spacing against the rate of capture."""
-    shown = trial.track.name if trial.track else ""
+    """Read the track and its pressure, and hold both against what the sheet says of the trial."""
+    place: dict[str, Any] = {"column": "track", "value": trial.track.name if trial.track else ""}
     try:
         track = load_track(trial)
     except TrackError as error:
-        return [_from_table_error(error, SHEET, column="track", value=shown)]
+        return [_from_table_error(error, SHEET, **place)]
+    found = []
     frames = float(np.median(np.diff(track.time_s))) * trial.capture_fps
-    if np.isfinite(frames) and abs(frames - 1) > 0.02:
-        message = f"has points {frames:.4g} frames of capture_fps apart: is capture_fps right?"
-        return [Problem(message=message, severity="warning", column="track", value=shown)]
-    return []
+    if abs(frames - 1) > 0.02:
+        found.append(f"has points {frames:.4g} frames of capture_fps apart: is capture_fps right?")
+    travel_m = float(np.ptp(track.lead_position_m[track.usable]))
+    # Twice the length leaves room for an axis in the wrong unit of angle or a poor scale, not for mm taken as m.
+    if travel_m > 2 * trial.length_m:
+        found.append(f"travels {travel_m:.4g} m, the vine is {trial.length_m:g} m long: are its positions in metres?")
+    if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
+        found.append("runs backwards: position should grow as the vine does")
+    if track.pressure_Pa is not None and trial.pressure_Pa > 0:
+        highest_kPa = float(np.max(track.pressure_Pa)) / 1000
+        if not 0.5 < highest_kPa / (trial.pressure_Pa / 1000) < 2:
+            found.append(f"has pressures up to {highest_kPa:.4g} kPa, the sheet says {trial.pressure_Pa / 1000:g} kPa")
+    return [Problem(message=message, severity="warning", **place) for message in found]
 
 
 def _check_video(trial: Trial) -> list[Problem]:

@@ -76,6 +76,8 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
     if table.extra[index]:
         remedy = "put decimal commas and text with separators in quotes"
         row.add(f"has more cells than the header ({table.extra[index][0][:40]!r} …)", remedy=remedy)
+    if not row.in_use:
+        row.problems = [replace(problem, severity="warning") for problem in row.problems]
     return row
 
 
@@ -91,15 +93,27 @@ def _judge_name(row: Row) -> None:
     row.add(message, "trial", value=given, allowed=allowed, remedy=remedy)
 
 
-def complete(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
-    """Judge a row as a whole: what is missing, what contradicts, which paths lead out.
-
-    Returns the required columns that the row lacks because neither sheet nor settings have them at all: a fault of
-    the sheet, to be reported once.
-    """
+def judge_row(row: Row, folder: Path) -> None:
+    """Judge a row as a whole: paths that lead out, and values that contradict each other."""
     _judge_paths(row, folder)
+    _judge_wall(row)
+    fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
+    # 2 % allows for rounding of both; a shutter that stays open longer than its frame does not exist.
+    if exposure > 1.02e6 / fps:
+        message = f"is longer than a frame at {fps:g} frames a second ({1e6 / fps:.4g} µs)"
+        row.add(message, "exposure_us", "warning", value=f"{exposure:g}")
+
+
+def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
+    """Note required cells that are blank in a row whose shared settings are filled in.
+
+    Returns the required columns that neither sheet nor settings have at all: a fault of the sheet, to be reported
+    once. Where the travel ratio is broken, what the row needs is not known.
+    """
     broken = {problem.column for problem in row.problems if problem.severity == "error"}
-    absent = set()
+    absent: set[str] = set()
+    if "travel_ratio" in broken:
+        return absent
     for name in NEEDED if row.travel_ratio == 2 else NEEDED[:1]:
         if name in row.values or name in broken:
             continue
@@ -109,8 +123,10 @@ def complete(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
             row.add("is blank", name, value="", allowed=COLUMNS[name].allowed, remedy="fill it in")
         else:
             absent.add(name)
-    _judge_capture(row, folder, broken)
-    _judge_physics(row)
+    rate_is_blank = "capture_fps" not in row.values and "capture_fps" not in broken
+    if "video" in row.values and rate_is_blank and not _has_dng_frames(folder, row.values["video"]):
+        remedy = "write the rate of capture: the file's own rate is that of playback"
+        row.add("is blank", "capture_fps", value="", allowed=COLUMNS["capture_fps"].allowed, remedy=remedy)
     return absent
 
 
@@ -129,19 +145,6 @@ def _judge_paths(row: Row, folder: Path) -> None:
         row.add("has neither a video nor a track", remedy="name the recording under video, or positions under track")
 
 
-def _judge_capture(row: Row, folder: Path, broken: set[str]) -> None:
-    """A video needs its rate of capture; frames cannot be exposed for longer than they last."""
-    values = row.values
-    rate_is_blank = "capture_fps" not in values and "capture_fps" not in broken
-    if "video" in values and rate_is_blank and not _has_dng_frames(folder, values["video"]):
-        remedy = "write the rate of capture: the file's own rate is that of playback"
-        row.add("is blank", "capture_fps", value="", allowed=COLUMNS["capture_fps"].allowed, remedy=remedy)
-    fps, exposure = values.get("capture_fps", math.nan), values.get("exposure_us", math.nan)
-    if exposure > 1.02e6 / fps:
-        message = f"is longer than a frame at {fps:g} frames a second ({1e6 / fps:.4g} µs)"
-        row.add(message, "exposure_us", "warning", value=f"{exposure:g}")
-
-
 def _has_dng_frames(folder: Path, video: str) -> bool:
     """Whether a recording is a DNG frame or a folder of them, which carry the rate of capture."""
     try:
@@ -151,15 +154,19 @@ def _has_dng_frames(folder: Path, video: str) -> bool:
         return False
 
 
-def _judge_physics(row: Row) -> None:
-    """What no vine can be, and what is legal but hardly meant."""
-    values = row.values
-    diameter, thickness = values.get("diameter_mm", math.nan), values.get("thickness_um", math.nan)
+def _judge_wall(row: Row) -> None:
+    """Refuse a wall that no tube of this diameter can have."""
+    diameter, thickness = row.values.get("diameter_mm", math.nan), row.values.get("thickness_um", math.nan)
     if thickness / 1000 > diameter / 4:
         message = f"is a wall above a quarter of the diameter of {diameter:g} mm"
         allowed, remedy = f"at most {250 * diameter:g} µm", "the wall is in µm, the diameter in mm"
         row.add(message, "thickness_um", value=f"{thickness:g}", allowed=allowed, remedy=remedy)
-    pressure, onset = values.get("pressure_kPa", math.nan), values.get("yield_pressure_kPa", math.nan)
+
+
+def judge_pressures(row: Row) -> None:
+    """Warn of pressures that are legal but hardly meant."""
+    pressure = row.values.get("pressure_kPa", math.nan)
+    onset = row.values.get("yield_pressure_kPa", math.nan)
     if row.travel_ratio == 2 and onset >= pressure:
         message = f"is not below the pressure of {pressure:g} kPa: nothing would move (psi? 1 psi is 6.895 kPa)"
         row.add(message, "yield_pressure_kPa", "warning", value=f"{onset:g}")

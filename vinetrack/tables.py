@@ -66,12 +66,13 @@ class Table:
             Naming line, column and cell of the first that is not a number.
         """
         cells = [row[column] for row in self.rows]
-        joined = "\n".join(cells)
-        # A column of plain numbers, the usual case, is read 10 times faster without looking at each cell.
-        if _PLAIN_COLUMN.fullmatch(joined) and self.decimal == "." and "" not in cells:
+        # Plain numbers, the usual case, are read 10 times faster without looking at each cell.
+        joined = "\n".join(cells).replace(",", ".") if self.decimal == "," else "\n".join(cells)
+        unambiguous = self.decimal == "." or (self.decimal == "," and not any("." in cell for cell in cells))
+        if unambiguous and _PLAIN_COLUMN.fullmatch(joined):
             with contextlib.suppress(ValueError):
-                values = np.array([float(cell) for cell in cells], dtype=float)
-                if np.all(np.isfinite(values)):
+                values = np.array([float(cell) for cell in joined.split("\n")], dtype=float)
+                if len(values) == len(cells) and np.all(np.isfinite(values)):
                     return values
         values = np.full(len(cells), np.nan)
         for i, cell in enumerate(cells):
@@ -233,6 +234,8 @@ def _cut(text: str, delimiter: str, strict: bool) -> list[tuple[int, list[str]]]
 
 def _find_decimal(cells: list[str], delimiter: str) -> str:
     """Decimal mark of a table: that of the numbers that can be read one way only, else what its separator suggests."""
+    if not any("," in cell for cell in cells):
+        return "."
     marks: set[str] = set()
     doubtful: set[str] = set()
     for cell in cells:
