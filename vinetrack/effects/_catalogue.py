@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
+import hashlib
 import importlib.util
 import inspect
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +24,9 @@ class EffectError(ValueError):
 
 
 def load_module(path: Path) -> ModuleType:
-    """Run one effect file and return it as a module (it is not entered in `sys.modules`).
+    """Run one effect file and return it as a module.
+
+    It is entered in `sys.modules` under a name made of its path and text: the compiled form of a model looks there.
 
     Raises
     ------
@@ -30,13 +35,19 @@ def load_module(path: Path) -> ModuleType:
     """
     if not path.is_file():
         raise EffectError(f"{path}: there is no such effect file; `effects:` lists paths of Python files.")
-    spec = importlib.util.spec_from_file_location(f"vinetrack_effect_{path.stem}", path)
+    digest = hashlib.sha256(str(path.resolve()).encode() + path.read_bytes()).hexdigest()[:12]
+    name = f"vinetrack_effect_{path.stem}_{digest}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise EffectError(f"{path}: an effect is a Python file whose name ends in .py.")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
     except Exception as error:
+        del sys.modules[name]
         raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
     return module
 
@@ -113,8 +124,6 @@ def find_effect(name: str, own: Mapping[str, Effect] | None = None) -> Effect:
     EffectError
         If there is none; the message suggests the nearest name.
     """
-    import difflib
-
     known = {**catalogue(), **(own or {})}
     if name in known:
         return known[name]

@@ -127,8 +127,8 @@ def radau_step(time, x, v, chamber, slope, h, z1, z2, z3, scale, rtol, on, rig, 
         before = size
     if not converged:
         return False, 1e300, x, v, slope, chamber, z1, z2, z3
-    start_slope = slope_in_speed(time, x, v, chamber, slope, scale, on, rig, theta, trace_time, trace_pressure)
-    raw = (slope + (E1 * z1 + E2 * z2 + E3 * z3) / h) / (MU / h - min(start_slope, 0.0))
+    # Hairer filters this with (μ/h − J)⁻¹. Not here: it hides what a long stiff step does wrong at its far end.
+    raw = (h * slope + E1 * z1 + E2 * z2 + E3 * z3) / MU
     weight = rtol * max(scale, abs(v), abs(v + z3))
     x_end = x + h * (v + A31 * z1 + A32 * z2 + A33 * z3)
     chamber_end = chamber + h * (A31 * g1 + A32 * g2 + A33 * g3)
@@ -193,10 +193,10 @@ def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pr
 
 
 @njit(nogil=True)
-def integrate(times, on, rig, theta, trace_time, trace_pressure, stop, rtol, out):
+def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rtol, out):
     """Follow one trajectory from rest at time 0; fill `out` (n_times, 3) with x, v, a of the tail at `times`.
 
-    `times` must increase; before 0 the vine is at rest, after the end of growth (x = `stop`; infinite for a body that
+    `kink` is where along x the film's mass reaches its floor: a step ends there, for none is good across it. `times` must increase; before 0 the vine is at rest, after the end of growth (x = `stop`; infinite for a body that
     moves as a whole) it stays there with its last speed and acceleration given as 0.
 
     Returns
@@ -248,6 +248,9 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, stop, rtol, out
             h = 1e-3 * scale / slope
             v = 0.0
             have_guess = False
+        ahead = (kink if x < kink else stop) - x
+        if v > 0 and h * v > 1.05 * ahead:
+            h = 1.02 * ahead / v
         if have_guess:
             # The last step's polynomial, carried on into this one, relative to where this one starts.
             r = h / h_before
@@ -280,6 +283,10 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, stop, rtol, out
             continue
         if error > 1:
             h *= max(0.2, 0.9 * error**-0.25)
+            have_guess = False
+            continue
+        if x < kink and x_end > kink + 1e-7 * stop:
+            h *= time_of_end(kink + 5e-8 * stop, h, x, v, slope, x_end, v_end, slope_end)
             have_guess = False
             continue
         last = time + h
@@ -316,7 +323,7 @@ def carry_on(s, z1, z2, z3):
 
 
 @njit(nogil=True)
-def integrate_many(starts, times, on, rigs, thetas, trace_starts, trace_time, trace_pressure, stops, rtol, out, ends):
+def integrate_many(starts, times, on, rigs, thetas, trace_starts, trace_time, trace_pressure, kinks, stops, rtol, out, ends):
     """`integrate` for many trials: trial i has times[starts[i]:starts[i+1]], rigs[i], thetas[i] and its own trace.
 
     Fills `out` (n_times, 3) and `ends` (n_trials, 4) with status, end time, end speed, number of steps.
@@ -325,7 +332,7 @@ def integrate_many(starts, times, on, rigs, thetas, trace_starts, trace_time, tr
         low, high = starts[i], starts[i + 1]
         trace = slice(trace_starts[i], trace_starts[i + 1])
         status, end_time, end_speed, n_steps = integrate(
-            times[low:high], on, rigs[i], thetas[i], trace_time[trace], trace_pressure[trace], stops[i], rtol, out[low:high]
+            times[low:high], on, rigs[i], thetas[i], trace_time[trace], trace_pressure[trace], kinks[i], stops[i], rtol, out[low:high]
         )
         ends[i, 0] = status
         ends[i, 1] = end_time

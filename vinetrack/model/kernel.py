@@ -8,6 +8,7 @@ cache under a name made of everything it depends on, so that it is found again b
 from __future__ import annotations
 
 import hashlib
+import inspect
 import importlib.util
 import os
 import sys
@@ -19,6 +20,7 @@ from types import ModuleType
 
 from vinetrack.effects import Effect, Rig
 from vinetrack.effects import _base as effects_base
+from vinetrack.effects._catalogue import load_module
 
 INTEGRATOR = Path(__file__).with_name("integrator.py")
 MARK = "# ---- what follows is set behind the rates of one model ----\n"
@@ -129,7 +131,7 @@ def kernel(effects: tuple[Effect, ...]) -> ModuleType:
     import numba
 
     source = _module_source(effects)
-    parts = [source, Path(effects_base.__file__).read_text(), numba.__version__, sys.version]
+    parts = [source, inspect.getsource(effects_base), inspect.getsource(load_module), numba.__version__, sys.version]
     parts += [effect.path.read_text() for effect in effects]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     path = _cache_folder() / f"kernel_{digest}.py"

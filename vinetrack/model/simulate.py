@@ -144,15 +144,21 @@ def simulate_many(
     given = [trace for trace in traces if trace is not None]
     trace_time = np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0)
     trace_pressure = np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0)
-    stops = np.array([rig[Rig._fields.index("length")] * trial.travel_ratio for rig, trial in zip(rigs, trials, strict=True)])
-    stops[stops == 0] = np.inf
+    limits = np.array([_limits(Rig(*rig)) for rig in rigs]).reshape(-1, 2)
     times = np.concatenate([np.asarray(t, float) for t in times_s]) if len(times_s) else np.empty(0)
     out, ends = np.empty((times.size, 3)), np.empty((len(trials), 4))
     on = np.ones(len(model.effects), dtype=bool)
     kernel(model.effects).integrate_many(
-        starts, times, on, rigs, thetas, trace_starts, trace_time, trace_pressure, stops, relative_tolerance, out, ends
+        starts, times, on, rigs, thetas, trace_starts, trace_time, trace_pressure, *limits.T.copy(), relative_tolerance, out, ends
     )
     return [_trajectory(trials[i], times[a:b], out[a:b], ends[i]) for i, (a, b) in enumerate(zip(starts, starts[1:], strict=False))]
+
+
+def _limits(rig: Rig) -> tuple[float, float]:
+    """Tail travel at which the film's mass reaches its floor, and at which growth ends, m; infinite where there is none."""
+    end = rig.length * rig.travel_ratio or math.inf
+    floor = (rig.linear_density * rig.length - rig.least_mass) / rig.mass_loss if rig.mass_loss > 0 else math.inf
+    return max(floor, 0.0), end
 
 
 def _trajectory(trial: Trial, times_s: Floats, out: Floats, end: Floats) -> Trajectory:
