@@ -1,0 +1,338 @@
+"""Compiled loops of the edge tracker, over strips of shape (n_frames, n_across, n_along).
+
+A strip is kept as the camera wrote it; `scale[t] * value + offset[t]` is its brightness freed of flicker. An edge
+`y` blurred by optics (Gaussian of width `blur`) and by motion (a box of `length`) covers the pixel at `s` by
+p(y − s), see `cover_table`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+STEP = 0.05
+"""Spacing of the table of covers, px: linear interpolation then errs by under 4e-4."""
+BEHIND = 25
+"""Columns behind the edge whose film is looked at: neighbours that stand in where film is never seen."""
+BLOCK = 1
+"""Columns in a block whose sum tells how far noise adds up: about one grain of film."""
+
+
+@njit(cache=True)
+def cover_table(length: float, blur: float, reach: float) -> np.ndarray:
+    """Cover p and slope dp/dx at x = −reach, −reach + STEP, … ; shape (n, 2).
+
+    p is the mean of the normal distribution function over a box of `length`: ∫Φ = zΦ(z) + φ(z).
+    """
+    n = int(2 * reach / STEP) + 2
+    table = np.empty((n, 2))
+    length = max(length, 0.02)
+    for i in range(n):
+        x = -reach + i * STEP
+        a = (x + length / 2) / blur
+        b = (x - length / 2) / blur
+        cdf_a = 0.5 * (1 + math.erf(a * 0.7071067811865476))
+        cdf_b = 0.5 * (1 + math.erf(b * 0.7071067811865476))
+        ga = a * cdf_a + 0.3989422804014327 * math.exp(-0.5 * a * a)
+        gb = b * cdf_b + 0.3989422804014327 * math.exp(-0.5 * b * b)
+        table[i, 0] = (ga - gb) * blur / length
+        table[i, 1] = (cdf_a - cdf_b) / length
+    return table
+
+
+@njit(cache=True)
+def _look_up(table: np.ndarray, reach: float, x: float) -> tuple[float, float]:
+    if x <= -reach:
+        return 0.0, 0.0
+    if x >= reach:
+        return 1.0, 0.0
+    at = (x + reach) / STEP
+    i = int(at)
+    f = at - i
+    return table[i, 0] + f * (table[i + 1, 0] - table[i, 0]), table[i, 1] + f * (table[i + 1, 1] - table[i, 1])
+
+
+@njit(cache=True)
+def gather(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    edge: np.ndarray,
+    lengths: np.ndarray,
+    lag: np.ndarray,
+    blur: float,
+    span: int,
+    after: np.ndarray,
+    before: np.ndarray,
+    clip: float,
+) -> np.ndarray:
+    """Sums for the least squares of (before, after) at every pixel; shape (9, n_across, n_along).
+
+    Frame t speaks of the columns that the edge passes within `span` frames of it. Rows of the answer: Σwq², Σwqp,
+    Σwp², ΣwqV, ΣwpV (q = 1 − p), then count and sum of V where only background, and where only film, is seen.
+    With `clip` > 0 a value that strays from the last solution is weighed down by 1/(1 + (r/clip)²).
+    """
+    n, rows, columns = strip.shape
+    sums = np.zeros((9, rows, columns), np.float32)
+    for t in range(n):
+        if not math.isfinite(edge[t]):
+            continue
+        reach = 0.5 * lengths[t] + 4 * blur + 0.5
+        table = cover_table(lengths[t], blur, reach)
+        low = edge[t] - reach - 2
+        high = edge[t] + reach + 2
+        for k in range(max(0, t - span), min(n, t + span + 1)):
+            if math.isfinite(edge[k]):
+                low = min(low, edge[k] - reach - 2)
+                high = max(high, edge[k] + reach + 2)
+        first = max(0, int(low - lag.max()) - BEHIND)
+        last = min(columns, int(high) + 2)
+        for u in range(rows):
+            at = edge[t] - lag[u]
+            for s in range(first, last):
+                p, _ = _look_up(table, reach, at - s)
+                q = 1 - p
+                value = strip[t, u, s] * scale[t] + offset[t]
+                w = 1.0
+                if clip > 0:
+                    r = (value - before[u, s] * q - after[u, s] * p) / clip
+                    w = 1 / (1 + r * r)
+                sums[0, u, s] += w * q * q
+                sums[1, u, s] += w * q * p
+                sums[2, u, s] += w * p * p
+                sums[3, u, s] += w * q * value
+                sums[4, u, s] += w * p * value
+                if q > 0.98:
+                    sums[5, u, s] += w
+                    sums[6, u, s] += w * value
+                elif p > 0.98:
+                    sums[7, u, s] += w
+                    sums[8, u, s] += w * value
+    return sums
+
+
+@njit(cache=True)
+def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float) -> tuple[np.ndarray, np.ndarray]:
+    """Brightness after and before the edge at every pixel, each of shape (n_across, n_along).
+
+    A pixel that never shows one of the two takes it, by `ridge`, from its row: film from the columns behind it,
+    background from those ahead, with weights falling as `memory`^distance.
+    """
+    _, rows, columns = sums.shape
+    after = np.empty((rows, columns), np.float32)
+    before = np.empty((rows, columns), np.float32)
+    guess = np.empty(columns)
+    for u in range(rows):
+        total, count, level = 0.0, 0.0, fallback
+        for s in range(columns - 1, -1, -1):
+            if count > 1e-3:
+                level = total / count
+            guess[s] = level
+            total = total * memory + sums[6, u, s]
+            count = count * memory + sums[5, u, s]
+        for s in range(columns - 1, -1, -1):
+            if guess[s] != fallback:
+                break
+            guess[s] = sums[6, u, s] / sums[5, u, s] if sums[5, u, s] > 0 else fallback
+        total, count, level = 0.0, 0.0, fallback
+        for s in range(columns):
+            if count > 1e-3:
+                level = total / count
+            elif sums[7, u, s] > 0:
+                level = sums[8, u, s] / sums[7, u, s]
+            total = total * memory + sums[8, u, s]
+            count = count * memory + sums[7, u, s]
+            # Never seen bare: what a half-covered pixel seems to show would follow any error of the edge.
+            rq = ridge if sums[5, u, s] > 0.3 else 50 * (1 + sums[0, u, s])
+            rp = ridge if sums[7, u, s] > 0.3 else 50 * (1 + sums[2, u, s])
+            qq, qp, pp = sums[0, u, s] + rq, sums[1, u, s], sums[2, u, s] + rp
+            vq, vp = sums[3, u, s] + rq * guess[s], sums[4, u, s] + rp * level
+            det = qq * pp - qp * qp
+            before[u, s] = (vq * pp - vp * qp) / det
+            after[u, s] = (vp * qq - vq * qp) / det
+    return after, before
+
+
+@njit(cache=True)
+def kymograph(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, after: np.ndarray, before: np.ndarray, noise: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cover by signed contrast, shape (n_frames, n_along), and the weight of each column, shape (n_along,).
+
+    cover = Σ C (V − before) / Σ C² with C = after − before, summed across: the least-squares amplitude.
+    """
+    n, rows, columns = strip.shape
+    cover = np.zeros((n, columns), np.float32)
+    weight = np.zeros(columns, np.float64)
+    contrast = after - before
+    for u in range(rows):
+        for s in range(columns):
+            weight[s] += contrast[u, s] ** 2
+    for t in range(n):
+        for u in range(rows):
+            for s in range(columns):
+                value = strip[t, u, s] * scale[t] + offset[t]
+                cover[t, s] += contrast[u, s] * (value - before[u, s])
+        for s in range(columns):
+            cover[t, s] /= weight[s] + 1e-6
+    return cover, weight / noise**2
+
+
+@njit(cache=True)
+def fit_edges(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    start: np.ndarray,
+    lengths: np.ndarray,
+    lag: np.ndarray,
+    blur: float,
+    after: np.ndarray,
+    before: np.ndarray,
+    spread: np.ndarray,
+    prior_sd: float,
+    margin: float,
+    rounds: int,
+) -> np.ndarray:
+    """Most likely edge in every frame by Gauss-Newton; shape (n_frames, 6).
+
+    Columns: edge, its Fisher sigma, mean squared weighted residual, amplitude − 1, level, pixels used. Amplitude and
+    level of the contrast are free within `prior_sd`. `spread[i]` is the noise variance i − len/2 px ahead of the edge.
+    """
+    n, rows, columns = strip.shape
+    out = np.full((n, 6), np.nan)
+    middle = len(spread) // 2
+    deepest = lag.max()
+    for t in range(n):
+        y = start[t]
+        if not math.isfinite(y):
+            continue
+        reach = 0.5 * lengths[t] + 4 * blur + 0.5
+        table = cover_table(lengths[t], blur, reach)
+        half = reach + margin
+        gain, level = 0.0, 0.0
+        for _ in range(rounds):
+            first = max(0, int(math.ceil(y - half - deepest)))
+            last = min(columns, int(y + half) + 1)
+            yy, yg, yl, gg, gl, ll = 1e-12, 0.0, 0.0, prior_sd**-2, 0.0, prior_sd**-2
+            ry, rg, rl = 0.0, -gain * prior_sd**-2, -level * prior_sd**-2
+            chi, used = 0.0, 0.0
+            for u in range(rows):
+                at = y - lag[u]
+                for s in range(first, last):
+                    x = at - s
+                    if x > half or x < -half:
+                        continue
+                    p, slope = _look_up(table, reach, x)
+                    contrast = after[u, s] - before[u, s]
+                    value = strip[t, u, s] * scale[t] + offset[t]
+                    r = value - before[u, s] - contrast * ((1 + gain) * p + level)
+                    i = int(middle - x)
+                    variance = spread[min(max(i, 0), len(spread) - 1)]
+                    w = 1 / (variance * (1 + r * r / (9 * variance)))
+                    dy = contrast * (1 + gain) * slope
+                    dg = contrast * p
+                    yy += w * dy * dy
+                    yg += w * dy * dg
+                    yl += w * dy * contrast
+                    gg += w * dg * dg
+                    gl += w * dg * contrast
+                    ll += w * contrast * contrast
+                    ry += w * dy * r
+                    rg += w * dg * r
+                    rl += w * contrast * r
+                    chi += w * r * r
+                    used += 1
+            # Level and amplitude eliminated from the 3 by 3 normal equations.
+            det = gg * ll - gl * gl
+            ag, al = (yg * ll - yl * gl) / det, (yl * gg - yg * gl) / det
+            info = yy - yg * ag - yl * al
+            if info <= 1e-9:
+                break
+            step = (ry - ag * rg - al * rl) / info
+            gain += (ll * (rg - yg * step) - gl * (rl - yl * step)) / det
+            level += (gg * (rl - yl * step) - gl * (rg - yg * step)) / det
+            gain, level = min(max(gain, -0.7), 1.5), min(max(level, -0.7), 0.7)
+            limit = 1.0 + 0.25 * lengths[t]
+            y += min(max(step, -limit), limit)
+            out[t, 1] = 1 / math.sqrt(info)
+            out[t, 2] = chi / max(used, 1.0)
+            out[t, 5] = used
+            if abs(step) < 1e-3:
+                break
+        out[t, 0], out[t, 3], out[t, 4] = y, gain, level
+    return out
+
+
+@njit(cache=True)
+def residual_sums(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    fit: np.ndarray,
+    lengths: np.ndarray,
+    lag: np.ndarray,
+    blur: float,
+    after: np.ndarray,
+    before: np.ndarray,
+    margin: float,
+    use: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """What the fit leaves: by distance ahead of the edge, by row, and in all.
+
+    First answer: shape (n, 2), bins of 1 px about the middle: Σ (ΣCr)²/ΣC² over blocks of BLOCK columns and all
+    rows, and the count of blocks: a variance per pixel that contains how far noise adds up across neighbours (grain
+    of the film, its tail moving inside), equal to the plain variance for white noise. Second: shape (n_across, 2),
+    Σ g r and Σ g² with g the slope of the model in the row's own lag. Third: the mean of log(1 + r²/25), a robust
+    misfit for comparing blurs.
+    """
+    n, rows, columns = strip.shape
+    widest = 0.0
+    for t in range(n):
+        widest = max(widest, 0.5 * lengths[t])
+    bins = int(2 * (widest + 4 * blur + margin + lag.max())) + 5
+    middle = bins // 2
+    by_distance = np.zeros((bins, 2))
+    column = np.zeros((bins, 2))
+    by_row = np.zeros((rows, 2))
+    misfit, count = 0.0, 0
+    for t in range(n):
+        if not use[t]:
+            continue
+        y = fit[t, 0]
+        reach = 0.5 * lengths[t] + 4 * blur + 0.5
+        table = cover_table(lengths[t], blur, reach)
+        half = reach + margin
+        first = max(0, int(math.ceil(y - half - lag.max())))
+        last = min(columns, int(y + half) + 1)
+        column[:] = 0.0
+        for u in range(rows):
+            at = y - lag[u]
+            for s in range(first, last):
+                x = at - s
+                if x > half or x < -half:
+                    continue
+                p, slope = _look_up(table, reach, x)
+                contrast = after[u, s] - before[u, s]
+                value = strip[t, u, s] * scale[t] + offset[t]
+                r = value - before[u, s] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
+                i = min(max(int(middle - x), 0), bins - 1)
+                column[i, 0] += contrast * r
+                column[i, 1] += contrast * contrast
+                g = -contrast * slope
+                w = 1 / (1 + r * r / 225)
+                by_row[u, 0] += w * g * r
+                by_row[u, 1] += w * g * g
+                misfit += math.log(1 + r * r / 25)
+                count += 1
+        for i in range(BLOCK // 2, bins - BLOCK // 2):
+            a, b = 0.0, 0.0
+            for k in range(i - BLOCK // 2, i + BLOCK // 2 + 1):
+                a += column[k, 0]
+                b += column[k, 1]
+            if b > 0:
+                by_distance[i, 0] += a * a / b
+                by_distance[i, 1] += 1
+    return by_distance, by_row, misfit / max(count, 1)

@@ -1,0 +1,135 @@
+"""The front as a monotone path through space and time, by dynamic programming.
+
+Two passes. The first knows nothing of film or background: a column changes once, when the front passes it, and the
+path collects the change of every column. The second knows both, and asks of every column in every frame whether it
+is covered, with clipped residuals, so that a door, a payload flying ahead or a reflection cannot steal the path.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+@njit(cache=True)
+def change_score(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, window: int, bunch: int, noise: float
+) -> np.ndarray:
+    """How much each column changes at each frame, shape (n_frames, n_along).
+
+    Sum of squares between the means of the `window` frames before and from frame t on, rows bunched by `bunch`, in
+    units of its expectation under noise, which is subtracted.
+    """
+    n, rows, columns = strip.shape
+    groups = rows // bunch
+    binned = np.zeros((n + 1, columns), np.float32)
+    score = np.zeros((n, columns), np.float32)
+    for g in range(groups):
+        for t in range(n):
+            for s in range(columns):
+                binned[t + 1, s] = 0.0
+            for k in range(bunch):
+                for s in range(columns):
+                    binned[t + 1, s] += strip[t, g * bunch + k, s] * scale[t] + offset[t]
+            for s in range(columns):
+                binned[t + 1, s] = binned[t, s] + binned[t + 1, s] / bunch
+        for t in range(1, n):
+            a, b = min(n, t + window), max(0, t - window)
+            after, before = a - t, t - b
+            factor = after * before / (after + before)
+            for s in range(columns):
+                d = (binned[a, s] - binned[t, s]) / after - (binned[t, s] - binned[b, s]) / before
+                score[t, s] += factor * d * d
+    unit = noise * noise / bunch * max(groups, 1)
+    for t in range(n):
+        for s in range(columns):
+            score[t, s] = score[t, s] / unit - 1
+    return score
+
+
+@njit(cache=True)
+def collect_path(score: np.ndarray) -> np.ndarray:
+    """Monotone path that collects most of `score` (n_frames, n_along), each column once; edge by frame, (n_frames,)."""
+    n, columns = score.shape
+    best = np.zeros((n, columns + 1), np.float32)
+    came = np.zeros((n, columns + 1), np.uint8)
+    for t in range(n):
+        for s in range(columns + 1):
+            top = -1.0
+            if t > 0:
+                top = best[t - 1, s]
+            elif s == 0:
+                top = 0.0
+            else:
+                # A path may begin anywhere: columns behind its beginning were covered before the first frame.
+                top = 0.0
+            if s > 0 and t > 0:
+                across = best[t, s - 1] + score[t, s - 1]
+                if across > top:
+                    top = across
+                    came[t, s] = 1
+            best[t, s] = top
+    path = np.zeros(n)
+    s = int(np.argmax(best[n - 1]))
+    for t in range(n - 1, -1, -1):
+        path[t] = s
+        while s > 0 and came[t, s] == 1:
+            s -= 1
+    return path
+
+
+@njit(cache=True)
+def covered_path(cover: np.ndarray, weight: np.ndarray, clip: float, back: int) -> np.ndarray:
+    """Edge by frame, shape (n_frames,), that best divides covered from free columns.
+
+    `cover` (n_frames, n_along) is near 1 behind the front and near 0 ahead. The cost of a column is its squared
+    residual, clipped at `clip`² and weighed; from frame to frame the edge retreats by `back` px at most.
+    """
+    n, columns = cover.shape
+    best = np.zeros((n, columns + 1), np.float64)
+    came = np.zeros((n, columns + 1), np.int32)
+    cost = np.zeros(columns + 1)
+    for t in range(n):
+        cost[0] = 0.0
+        for s in range(columns):
+            free = min(cover[t, s] ** 2, clip * clip)
+            film = min((1 - cover[t, s]) ** 2, clip * clip)
+            cost[s + 1] = cost[s] + weight[s] * (film - free)
+        if t == 0:
+            best[0] = cost
+            continue
+        running, where = np.inf, 0
+        for s in range(columns + 1):
+            reach = min(s + back, columns)
+            if s == 0:
+                for k in range(reach + 1):
+                    if best[t - 1, k] < running:
+                        running, where = best[t - 1, k], k
+            elif best[t - 1, reach] < running:
+                running, where = best[t - 1, reach], reach
+            best[t, s] = running + cost[s]
+            came[t, s] = where
+    path = np.zeros(n)
+    s = int(np.argmin(best[n - 1]))
+    for t in range(n - 1, -1, -1):
+        path[t] = s
+        s = came[t, s]
+    return path
+
+
+def first_path(
+    strip: NDArray, scale: NDArray[np.float64], offset: NDArray[np.float64], noise: float, window: int = 10
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Front by frame from changes alone, shape (n_frames,), and the scores it collected.
+
+    Within a column the score is linear in the change, so that the strongest change wins; between columns only its
+    logarithm counts, so that a bright glint in a few columns cannot outvote the rest.
+    """
+    bunch = int(np.clip(strip.shape[1] // 12, 1, 4))
+    score = change_score(strip, scale, offset, window, bunch, noise)
+    peak = score.max(axis=0)
+    worth = np.where(peak > 3.0, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(np.float32)
+    score = score * worth[None, :]
+    score = np.where(worth[None, :] > 0, score - 0.15 * score.max(axis=0, keepdims=True), -0.2).astype(np.float32)
+    return collect_path(score), score
