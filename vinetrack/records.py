@@ -124,8 +124,11 @@ class Track:
     @property
     def usable(self) -> NDArray[np.bool_]:
         """Mask, shape (n_frames,): points that say where the leading edge was."""
-        blocked = np.array([bool(UNUSABLE_FLAGS.intersection(flag.split(";"))) for flag in self.flag], dtype=bool)
-        return ~blocked & np.isfinite(self.lead_position_m) & np.isfinite(self.time_s)
+        usable = np.isfinite(self.lead_position_m) & np.isfinite(self.time_s)
+        for flag in {str(flag) for flag in self.flag[self.flag != ""]}:
+            if UNUSABLE_FLAGS.intersection(flag.split(";")):
+                usable &= self.flag != flag
+        return usable
 
 
 @dataclass(frozen=True)

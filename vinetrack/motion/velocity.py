@@ -1,24 +1,35 @@
 """Velocity of the leading edge by Savitzky–Golay smoothing with a window chosen for each point.
 
-At every point a cubic is fitted by least squares to windows of growing width (Savitzky and Golay 1964, Anal. Chem.
-36:1627), and the widest window is kept whose velocity agrees with those of all narrower ones (Lepski 1991, Theory
-Probab. Appl. 35:454; as intersecting confidence intervals: Goldenshluger and Nemirovski 1997, Math. Methods Stat. 6:135). Wide windows serve plateaus, narrow ones the
-release. Position, velocity and acceleration always come from the same fit.
+Around every point a cubic is fitted to windows of growing width, centred or to one side. Windows in which the cubic
+does not follow the points (release, the end of growth) are out; among the centred ones the widest is kept whose
+velocity agrees with all narrower ones (Lepski 1991, Theory Probab. Appl. 35:454); and of all windows that agree with
+it the one with the smallest error is used. Wide windows serve plateaus, narrow or one-sided ones the release.
+Position, velocity and acceleration always come from the same fit.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.motion.noise import estimate_noise
+from vinetrack.motion.windows import Indices, Mask, WindowFits, fit_all_windows
 from vinetrack.records import Floats, Kinematics, Track
 
-WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
-"""Widths tried, in points; each about 1.35 times the one before."""
+WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)
+"""Widths tried, in points; each about 1.45 times the one before."""
 
-EVEN_TOLERANCE = 0.01
-"""Spacings within this fraction of their median count as even: printed times are rounded."""
+SIDES = (0.0, -0.5, 0.5, -1.0, 1.0)
+"""Where the point lies in its window: 0 in the middle, −1 at its beginning, 1 at its end."""
+
+MISFIT_LIMITS = {0: np.inf, 1: 12.0, 2: 15.3, 3: 18.0, 4: 20.5}
+"""Largest misfit of a window that follows its points, by number of terms: χ² exceeded by 5 in 10 000, and a tenth."""
+
+KINK_GAIN = 2.5
+"""A kink within five points errs the velocity by 0.7–3.5 times what its residual, taken as noise, would."""
+
+TRUSTED_GAIN = 0.5
+"""A one-sided window may claim half the error of the centred ones, no less: what bends within its first points is
+beyond what they can tell."""
 
 
 def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, kappa: float = 3.0) -> Kinematics:
@@ -39,7 +50,7 @@ def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, ka
     -------
     Kinematics
         `lead_velocity_sigma_m_s` is the standard error that the noise of position, with its correlation, gives the
-        velocity of the window chosen.
+        velocity of the window chosen; where no window follows the points, that of their misfit.
 
     Raises
     ------
@@ -52,132 +63,83 @@ def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, ka
         raise ValueError(f"the track has {time_s.size} usable points; a velocity needs at least 2")
     if np.any(np.diff(time_s) <= 0):
         raise ValueError("the times of the track do not increase; sort its rows or drop repeated ones")
-    noise_m, correlation = estimate_noise(track)
+    noise_m, rho = estimate_noise(track)
     origin_m = float(position_m[0])
-    fits = fit_windows(time_s, position_m - origin_m, noise_m, correlation, order=order)
-    widths = np.array([fit.width for fit in fits])
-    chosen = choose_windows(
-        np.array([fit.values[1] for fit in fits]), np.array([fit.velocity_sigma for fit in fits]), widths, kappa
-    )
-    points = np.arange(time_s.size)
-    values = np.array([fit.values for fit in fits])[chosen, :, points]
-    sigma = np.array([fit.velocity_sigma for fit in fits])[chosen, points]
+    values, sigma, widths = smooth(time_s, position_m - origin_m, noise_m, rho, order=order, kappa=kappa)
     return Kinematics(
         time_s=time_s,
-        lead_position_m=values[:, 0] + origin_m,
-        lead_velocity_m_s=values[:, 1],
+        lead_position_m=values[0] + origin_m,
+        lead_velocity_m_s=values[1],
         lead_velocity_sigma_m_s=sigma,
-        lead_acceleration_m_s2=values[:, 2],
-        window_points=widths[chosen],
+        lead_acceleration_m_s2=values[2],
+        window_points=widths,
         noise_m=noise_m,
-        noise_correlation=correlation,
+        noise_correlation=rho,
         travel_ratio=travel_ratio,
     )
 
 
-class WindowFit:
-    """One width of window at every point: position, velocity and acceleration, and the error of velocity."""
+def smooth(
+    time_s: Floats, position_m: Floats, noise_m: float, rho: float, *, order: int = 3, kappa: float = 3.0
+) -> tuple[Floats, Floats, Indices]:
+    """Position, velocity, acceleration (3, n), error of velocity (n,) and width of window (n,), noise being known.
 
-    __slots__ = ("values", "velocity_sigma", "width")
-
-    def __init__(self, width: int, values: Floats, velocity_sigma: Floats) -> None:
-        self.width = width
-        self.values = values
-        self.velocity_sigma = velocity_sigma
-
-
-def fit_windows(
-    time_s: Floats, position_m: Floats, noise_m: float, correlation: float, *, order: int = 3
-) -> list[WindowFit]:
-    """Fit a polynomial of `order` around every point with every width that the track can hold, narrowest first."""
+    A window is used only if the next wider one at the same side agrees too: the widest that agrees has just begun to
+    disagree, and its bias may be several times its error. Each step in width changes their ratio by 1.45^5.5 = 8.
+    """
     n = time_s.size
     least = min(n, max(WINDOWS[0], order + 2))
-    widths = [least] + [width for width in WINDOWS if least < width <= n]
-    return [_fit_width(time_s, position_m, width, noise_m, correlation, min(order, width - 1)) for width in widths]
-
-
-def choose_windows(velocity: Floats, sigma: Floats, widths: NDArray[np.int_], kappa: float) -> NDArray[np.int_]:
-    """Index of the width to use at each point, shape (n,), from the velocities and errors of all, shape (k, n).
-
-    The widest window whose interval v ± κσ shares a value with those of all narrower ones. A window may reach no
-    further than its neighbours' do (half-widths change by at most one from point to point), for what stopped the
-    neighbour lies within reach.
-    """
-    low = np.maximum.accumulate(velocity - kappa * sigma, axis=0)
-    high = np.minimum.accumulate(velocity + kappa * sigma, axis=0)
-    agrees = np.logical_and.accumulate(low <= high, axis=0)
-    agrees[0] = True
-    return agrees.sum(axis=0) - 1
-
-
-def _fit_width(
-    time_s: Floats, position_m: Floats, width: int, noise_m: float, correlation: float, order: int
-) -> WindowFit:
-    """Convolution where the spacing is even, least squares over the nearest points at ends and around gaps."""
-    n = time_s.size
-    half = width // 2
+    widths = [least, *(width for width in WINDOWS if least < width <= n)]
+    fits = [fit_all_windows(time_s, position_m, width, min(order, width - 1), rho) for width in widths]
+    follows = [fit.misfit <= noise_m**2 * MISFIT_LIMITS[fit.misfit_terms] for fit in fits]
+    centred = [fit.velocities(time_s, 0.0) for fit in fits]
+    low, high, centred_error = _agreement(centred, follows, noise_m, kappa)
+    best, window_used, _, sigma = _narrowest(fits[0], centred[0], follows[0], noise_m)
+    fit_used = np.zeros(n, dtype=int)
+    for side in SIDES:
+        wider_agrees = np.full(n, len(fits) == 1)
+        for k in reversed(range(len(fits))):
+            window, velocity, gain = centred[k] if side == 0 else fits[k].velocities(time_s, side)
+            error = noise_m * gain
+            slack = kappa * error
+            agrees = follows[k][window] & (velocity >= low - slack) & (velocity <= high + slack)
+            better = agrees & wider_agrees & (error < best)
+            wider_agrees = agrees
+            fit_used[better], window_used[better] = k, window[better]
+            sigma[better] = best[better] = error[better]
     values = np.empty((3, n))
-    sigma = np.empty(n)
-    spacing = np.diff(time_s)
-    step_s = float(np.median(spacing))
-    uneven = np.abs(spacing / step_s - 1) > EVEN_TOLERANCE
-    first = np.clip(np.arange(n) - half, 0, n - width)
-    crossed = np.concatenate([[0], np.cumsum(uneven)])
-    special = (crossed[first + width - 1] > crossed[first]) | (np.arange(n) - half != first)
-    if width % 2 == 1 and not special.all():
-        values[:, half : n - half], sigma_even = _convolve(position_m, width, order, step_s, correlation)
-        sigma[half : n - half] = noise_m * sigma_even
-    else:
-        special[:] = True
-    if special.any():
-        values[:, special], gain = _least_squares(time_s, position_m, special, first[special], width, order, correlation)
-        sigma[special] = noise_m * gain
-    return WindowFit(width, values, sigma)
+    for k, fit in enumerate(fits):
+        points = np.flatnonzero(fit_used == k)
+        values[:, points] = fit.at(time_s[points], window_used[points])[0]
+    return values, np.maximum(sigma, TRUSTED_GAIN * centred_error), np.array(widths)[fit_used]
 
 
-def _convolve(
-    position_m: Floats, width: int, order: int, step_s: float, correlation: float
-) -> tuple[Floats, float]:
-    """Savitzky–Golay at all points with a whole window: values, shape (3, n − width + 1), and velocity gain, 1/s."""
-    from scipy.signal import savgol_coeffs
-
-    weights = [savgol_coeffs(width, order, deriv=d, delta=step_s) if d <= order else np.zeros(width) for d in range(3)]
-    values = np.array([np.convolve(position_m, w, mode="valid") for w in weights])
-    return values, float(noise_gain(weights[1][None, :], correlation)[0])
+Centred = tuple[Indices, Floats, Floats]
 
 
-def _least_squares(
-    time_s: Floats,
-    position_m: Floats,
-    special: NDArray[np.bool_],
-    first: NDArray[np.int_],
-    width: int,
-    order: int,
-    correlation: float,
-) -> tuple[Floats, Floats]:
-    """Polynomials through `width` points from `first`, taken at the special points: values (3, m), gain (m,)."""
-    take = first[:, None] + np.arange(width)
-    offset = time_s[take] - time_s[special][:, None]
-    scale = np.maximum(np.abs(offset).max(axis=1), np.finfo(float).tiny)
-    u = offset / scale[:, None]
-    middle = u.mean(axis=1, keepdims=True)
-    # Powers of a centred time keep the normal equations well conditioned; the point itself is then at u = −middle.
-    basis = (u - middle)[:, :, None] ** np.arange(order + 1)
-    pseudo_inverse = np.linalg.solve(basis.transpose(0, 2, 1) @ basis, basis.transpose(0, 2, 1))
-    at = -middle[:, 0]
-    weights = np.zeros((3, *u.shape))
-    for derivative in range(min(order, 2) + 1):
-        for power in range(derivative, order + 1):
-            factor = float(np.prod(np.arange(power - derivative + 1, power + 1)))
-            row = (factor * at ** (power - derivative) / scale**derivative)[:, None]
-            weights[derivative] += row * pseudo_inverse[:, power, :]
-    values = np.einsum("dmw,mw->dm", weights, position_m[take])
-    return values, noise_gain(weights[1], correlation)
+def _narrowest(fit: WindowFits, centred: Centred, follows: Mask, noise_m: float) -> tuple[Floats, Indices, Floats, Floats]:
+    """Where nothing wider serves: the narrowest window, its error that of the noise or of its misfit if larger."""
+    window, velocity, gain = centred
+    good = follows[window]
+    sigma = np.where(good, noise_m, np.maximum(noise_m, KINK_GAIN * np.sqrt(fit.misfit[window]))) * gain
+    return np.where(good, sigma, np.inf), window.copy(), velocity, sigma
 
 
-def noise_gain(weights: Floats, correlation: float) -> Floats:
-    """Standard deviation of Σ w_i e_i for unit AR(1) noise e: √(wᵀRw) with R_ij = ρ^|i−j|; `weights` (m, w)."""
-    if correlation == 0:
-        return np.sqrt(np.sum(weights**2, axis=1))
-    lag = np.abs(np.subtract.outer(np.arange(weights.shape[1]), np.arange(weights.shape[1])))
-    return np.sqrt(np.maximum(np.sum((weights @ correlation**lag) * weights, axis=1), 0.0))
+def _agreement(
+    centred: list[Centred], follows: list[Mask], noise_m: float, kappa: float
+) -> tuple[Floats, Floats, Floats]:
+    """Velocities on which the centred windows agree, from the narrowest up: lowest, highest, least error; (n,) each.
+
+    Unbounded where not even the narrowest window follows its points: then one-sided windows decide.
+    """
+    n = centred[0][0].size
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    least_error = np.zeros(n)
+    going = np.ones(n, dtype=bool)
+    for (window, velocity, gain), good in zip(centred, follows, strict=True):
+        reach = kappa * noise_m * gain
+        lower, upper = np.maximum(low, velocity - reach), np.minimum(high, velocity + reach)
+        going &= good[window] & (lower <= upper)
+        low, high = np.where(going, lower, low), np.where(going, upper, high)
+        least_error = np.where(going, noise_m * gain, least_error)
+    return low, high, least_error
