@@ -8,8 +8,8 @@ cache under a name made of everything it depends on, so that it is found again b
 from __future__ import annotations
 
 import hashlib
-import inspect
 import importlib.util
+import inspect
 import os
 import sys
 import tempfile

@@ -131,14 +131,21 @@ def simulate_many(
     times_s: Sequence[Floats],
     *,
     traces: Sequence[Trace | None] | None = None,
+    parameters: Floats | None = None,
     relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> list[Trajectory]:
-    """`simulate` for many trials in one call of the compiled kernel."""
+    """`simulate` for many trials in one call of the compiled kernel.
+
+    `parameters`, shape (n_trials, n_parameters) in the order of `model.parameter_names`, gives every trial values of its
+    own in place of the model's.
+    """
     traces = traces or [None] * len(trials)
     for trial in trials:
         check_needs(model, trial)
     rigs = np.array([rig_of(trial) for trial in trials], dtype=float).reshape(len(trials), len(Rig._fields))
-    thetas = np.array([model.parameters_for(trial.vine) for trial in trials]).reshape(len(trials), -1)
+    if parameters is None:
+        parameters = np.array([model.parameters_for(trial.vine) for trial in trials])
+    thetas = np.ascontiguousarray(parameters, dtype=float).reshape(len(trials), len(model.parameter_names))
     starts = np.concatenate([[0], np.cumsum([len(times) for times in times_s])]).astype(np.int64)
     trace_starts = np.concatenate([[0], np.cumsum([0 if t is None else len(t[0]) for t in traces])]).astype(np.int64)
     given = [trace for trace in traces if trace is not None]

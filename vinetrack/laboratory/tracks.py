@@ -1,0 +1,225 @@
+"""A campaign grown in the virtual laboratory and measured as tracks.
+
+Every trial draws from its own stream of random numbers, so that leaving one out changes no other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from vinetrack.laboratory.nature import Nature
+from vinetrack.model.simulate import Trajectory, pressure_along, simulate_many
+from vinetrack.records import Floats, Track, Trial
+from vinetrack.tables import write_csv, write_json, write_text
+
+
+@dataclass(frozen=True)
+class VirtualTrial:
+    """One trial as it was grown and as it was measured.
+
+    `stated` is the trial as the sheet states it, `true` as it was. `track` is what the analysis gets; its zeros are arbitrary.
+    The rest is the truth at the track's rows: SI, the release at `release_s` on the track's clock.
+    """
+
+    stated: Trial
+    true: Trial
+    damping: float
+    track: Track
+    release_s: float
+    origin_m: float
+    true_lead_position_m: Floats
+    true_lead_velocity_m_s: Floats
+    true_pressure_Pa: Floats
+    dropped: tuple[int, ...]
+    repeated: tuple[int, ...]
+
+
+def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
+    """Grow and measure these trials; the same seed gives the same numbers."""
+    model = nature.model()
+    draws = [np.random.default_rng([nature.seed, i]) for i in range(len(trials))]
+    errors = _yield_errors(trials, nature)
+    true, damping = [], []
+    theta = np.array([model.parameters_for(trial.vine) for trial in trials])
+    column = model.parameter_names.index("eversion_damping.B") if "eversion_damping" in model else None
+    for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
+        pressure_Pa = trial.pressure_Pa * (1 + nature.pressure_scatter * draw.standard_normal())
+        factor = 1 + nature.damping_scatter * draw.standard_normal()
+        true.append(replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=trial.yield_pressure_Pa + errors[trial.vine]))
+        if column is not None:
+            theta[i, column] *= factor
+        damping.append(float(theta[i, column]) if column is not None else math.nan)
+    times, release = zip(*(_frame_times(trial, nature, draw) for trial, draw in zip(trials, draws, strict=True)), strict=True)
+    moved = simulate_many(model, true, [t - t0 for t, t0 in zip(times, release, strict=True)], parameters=theta)
+    grown = []
+    for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
+        trial_model = model.with_values(dict(zip(model.parameter_names, theta[i].tolist(), strict=True)))
+        pressure_Pa = pressure_along(
+            trial_model, true[i], times[i] - release[i], moved[i].lead_position_m, moved[i].lead_velocity_m_s
+        )
+        grown.append(_measure(trial, true[i], damping[i], times[i], release[i], moved[i], pressure_Pa, nature, draw))
+    return grown
+
+
+def _yield_errors(trials: Sequence[Trial], nature: Nature) -> dict[str, float]:
+    """How far the true yield pressure of each vine lies from the stated one, Pa."""
+    draw = np.random.default_rng([nature.seed, 1_000_003])
+    vines = list(dict.fromkeys(trial.vine for trial in trials))
+    return {vine: 1e3 * nature.yield_error_kPa * draw.standard_normal() for vine in vines}
+
+
+def _frame_times(trial: Trial, nature: Nature, draw: np.random.Generator) -> tuple[Floats, float]:
+    """Times of all frames the camera could take, and the instant of release on the same clock, s."""
+    step_s = 1 / trial.capture_fps
+    resting = draw.integers(nature.release_frames[0], nature.release_frames[1], endpoint=True)
+    release_s = (resting - 1 + draw.uniform()) * step_s
+    return np.arange(nature.longest_frames) * step_s, float(release_s)
+
+
+def _measure(
+    trial: Trial,
+    true: Trial,
+    damping: float,
+    time_s: Floats,
+    release_s: float,
+    moved: Trajectory,
+    pressure_Pa: Floats,
+    nature: Nature,
+    draw: np.random.Generator,
+) -> VirtualTrial:
+    """What the camera and the gauge make of a trajectory: noise, an arbitrary origin, frames lost and repeated."""
+    stop = time_s.size
+    if moved.status == "ended":
+        stop = min(stop, int(np.searchsorted(time_s - release_s, moved.end_time_s)) + nature.frames_after_end)
+    origin_m = draw.uniform(*nature.origin_m)
+    noise = _ar1(stop, nature.noise_m, nature.noise_correlation, draw)
+    shown, index, dropped, repeated = _faults(moved.lead_velocity_m_s[:stop], nature, draw)
+    measured = (origin_m + moved.lead_position_m[:stop] + noise)[shown]
+    gauge = None
+    if nature.trace_sigma_kPa is not None:
+        gauge = pressure_Pa[shown] + 1e3 * nature.trace_sigma_kPa * draw.standard_normal(shown.size)
+    track = Track(
+        time_s=time_s[index],
+        lead_position_m=measured,
+        lead_position_sigma_m=np.full(shown.size, nature.noise_m if nature.stated_sigma else math.nan),
+        flag=np.full(shown.size, "", dtype="<U32"),
+        edge_px=np.full(shown.size, math.nan),
+        pressure_Pa=gauge,
+    )
+    return VirtualTrial(
+        stated=trial,
+        true=true,
+        damping=damping,
+        track=track,
+        release_s=release_s,
+        origin_m=origin_m,
+        true_lead_position_m=moved.lead_position_m[shown],
+        true_lead_velocity_m_s=moved.lead_velocity_m_s[shown],
+        true_pressure_Pa=pressure_Pa[shown],
+        dropped=dropped,
+        repeated=repeated,
+    )
+
+
+def _ar1(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
+    """Stationary noise with this standard deviation and lag-one correlation, shape (count,)."""
+    from scipy.signal import lfilter
+
+    white = draw.standard_normal(count)
+    if correlation == 0:
+        return sd * white
+    white[1:] *= math.sqrt(1 - correlation**2)
+    return sd * np.asarray(lfilter([1.0], [1.0, -correlation], white))
+
+
+def _faults(
+    velocity_m_s: Floats, nature: Nature, draw: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, tuple[int, ...], tuple[int, ...]]:
+    """Which true frame each row shows, and which instant its index claims.
+
+    A dropped frame is missing and nobody knows: the rows after it claim one frame too early. A repeated frame shows its predecessor once
+    more in place of itself.
+    """
+    moving = velocity_m_s > 0
+    lost = moving & (draw.uniform(size=velocity_m_s.size) < nature.dropped)
+    shown = np.flatnonzero(~lost)
+    stale = moving[shown] & (draw.uniform(size=shown.size) < nature.repeated)
+    stale[0] = False
+    shown = shown.copy()
+    shown[stale] = shown[np.flatnonzero(stale) - 1]
+    rows = np.flatnonzero(stale)
+    return shown, np.arange(shown.size), tuple(np.flatnonzero(lost).tolist()), tuple(rows.tolist())
+
+
+def write_tracks(grown: Sequence[VirtualTrial], folder: Path) -> None:
+    """Write the track of each trial to `folder/<trial>.csv`."""
+    for trial in grown:
+        columns = {"time_s": trial.track.time_s.round(9), "position_m": trial.track.lead_position_m.round(8)}
+        if np.isfinite(trial.track.lead_position_sigma_m).any():
+            columns["sigma_m"] = trial.track.lead_position_sigma_m
+        if trial.track.pressure_Pa is not None:
+            columns["pressure_kPa"] = (trial.track.pressure_Pa / 1e3).round(5)
+        write_csv(folder / f"{trial.stated.name}.csv", pd.DataFrame(columns))
+
+
+SHEET_COLUMNS = ("trial", "track", "capture_fps", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa", "payload_g")
+
+
+def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
+    """The trial sheet of a campaign whose tracks lie in `tracks/`."""
+    rows = [
+        (
+            trial.name,
+            f"tracks/{trial.name}.csv",
+            trial.capture_fps,
+            round(trial.diameter_m * 1e3, 6),
+            round(trial.thickness_m * 1e6, 6),
+            round(trial.length_m * 1e3, 6),
+            round(trial.pressure_Pa / 1e3, 6),
+            round(trial.yield_pressure_Pa / 1e3, 6),
+            round(trial.payload_kg * 1e3, 6),
+        )
+        for trial in trials
+    ]
+    return pd.DataFrame(rows, columns=list(SHEET_COLUMNS))
+
+
+def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str = "") -> None:
+    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`. No truth goes there."""
+    write_tracks(grown, folder / "tracks")
+    write_csv(folder / "trials.csv", sheet([trial.stated for trial in grown]))
+    if settings:
+        write_text(folder / "experiment.yaml", settings)
+
+
+def write_truth(grown: Sequence[VirtualTrial], nature: Nature, path: Path) -> None:
+    """Write what is hidden to a JSON file.
+
+    Raises
+    ------
+    ValueError
+        If the file would lie in a folder that holds a trial sheet, or below one: the analysis looks there.
+    """
+    for parent in path.absolute().parents:
+        if (parent / "trials.csv").exists():
+            raise ValueError(f"{path}: the truth must not lie inside the experiment {parent}")
+    trials = {
+        trial.stated.name: {
+            "pressure_Pa": trial.true.pressure_Pa,
+            "yield_pressure_Pa": trial.true.yield_pressure_Pa,
+            "B": trial.damping,
+            "release_s": trial.release_s,
+            "origin_m": trial.origin_m,
+            "dropped": trial.dropped,
+            "repeated": trial.repeated,
+            "true_lead_position_m": trial.true_lead_position_m.tolist(),
+        }
+        for trial in grown
+    }
+    write_json(path, {"nature": asdict(nature), "trials": trials})
