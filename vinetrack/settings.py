@@ -192,8 +192,15 @@ class DampingSettings(_Strict):
 class FigureSettings(_Strict):
     """Files that every figure is saved as."""
 
-    formats: Annotated[tuple[Literal["png", "svg", "pdf"], ...], Field(min_length=1)] = ("png", "svg")
+    formats: tuple[Literal["png", "svg", "pdf"], ...] = ("png", "svg")
     dpi: Annotated[Count, Field(ge=50, le=1200)] = 150
+
+    @field_validator("formats")
+    @classmethod
+    def _at_least_one(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
+        if not formats:
+            raise ValueError("is empty: name at least one of png, svg, pdf")
+        return formats
 
 
 class RunSettings(_Strict):

@@ -24,6 +24,8 @@ LONGEST_NAME = 100
 NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
 """What a trial of an everting vine must have; a body that moves as a whole needs its diameter only."""
 
+RATE_REMEDY = "write the rate of capture: the file's own rate is that of playback"
+
 
 @dataclass
 class Row:
@@ -58,7 +60,7 @@ class Row:
 def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
     """Read one row of the sheet, shared settings filled in where its cells are blank, and judge every cell."""
     cells, line = table.rows[index], table.lines[index]
-    row = Row(cells.get("trial", ""), line)
+    row = Row(cells.get("trial", f"line-{line}"), line)
     _judge_name(row)
     for name, column in COLUMNS.items():
         text = cells.get(name, "")
@@ -114,20 +116,24 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
     absent: set[str] = set()
     if "travel_ratio" in broken:
         return absent
-    for name in NEEDED if row.travel_ratio == 2 else NEEDED[:1]:
-        if name in row.values or name in broken:
-            continue
-        if name == "pressure_kPa" and ("pressure_trace" in row.values or "track" in row.values):
-            continue
+    needed = [name for name in _needed(row, folder) if name not in row.values and name not in broken]
+    for name in needed:
         if name in columns:
-            row.add("is blank", name, value="", allowed=COLUMNS[name].allowed, remedy="fill it in")
+            remedy = RATE_REMEDY if name == "capture_fps" else "fill it in"
+            row.add("is blank", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
         else:
             absent.add(name)
-    rate_is_blank = "capture_fps" not in row.values and "capture_fps" not in broken
-    if "video" in row.values and rate_is_blank and not _has_dng_frames(folder, row.values["video"]):
-        remedy = "write the rate of capture: the file's own rate is that of playback"
-        row.add("is blank", "capture_fps", value="", allowed=COLUMNS["capture_fps"].allowed, remedy=remedy)
     return absent
+
+
+def _needed(row: Row, folder: Path) -> list[str]:
+    """Columns that a row with this travel ratio and these recordings cannot do without."""
+    needed = list(NEEDED if row.travel_ratio == 2 else NEEDED[:1])
+    if "pressure_kPa" in needed and ("pressure_trace" in row.values or "track" in row.values):
+        needed.remove("pressure_kPa")
+    if "video" in row.values and "track" not in row.values and not _has_dng_frames(folder, row.values["video"]):
+        needed.append("capture_fps")
+    return needed
 
 
 def _judge_paths(row: Row, folder: Path) -> None:
