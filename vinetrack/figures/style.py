@@ -41,7 +41,7 @@ METHOD_COLOURS = {"log_log": VERMILLION, "both_axes": BLUE}
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
 METHOD_LINES = {"log_log": (0, (4, 2)), "both_axes": "-"}
 
-_RC: dict[str, Any] = {
+_RC: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 11,
     "axes.titlesize": 11,
@@ -156,11 +156,15 @@ def _at_least_an_octave(low: float, high: float) -> tuple[float, float]:
     return min(low, middle / math.sqrt(2)), max(high, middle * math.sqrt(2))
 
 
-def render(fig: Figure, *, png_dpi: int = 160, tight: bool = False) -> tuple[bytes, bytes]:
-    """Return the figure as PNG (white background) and as SVG (transparent), the same bytes for the same figure."""
-    box = "tight" if tight else None
+def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 150) -> dict[str, bytes]:
+    """Return the figure in each format, the same bytes for the same figure; PNG on white, the others transparent."""
+    dates = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
+    files = {}
     with look():
-        png, svg = io.BytesIO(), io.BytesIO()
-        fig.savefig(png, format="png", dpi=png_dpi, facecolor="white", bbox_inches=box, metadata={"Software": None})
-        fig.savefig(svg, format="svg", bbox_inches=box, metadata={"Date": None, "Creator": None})
-    return png.getvalue(), svg.getvalue()
+        for form in formats:
+            file = io.BytesIO()
+            fig.savefig(
+                file, format=form, dpi=dpi, facecolor="white" if form == "png" else "none", metadata=dates[form]
+            )
+            files[form] = file.getvalue()
+    return files

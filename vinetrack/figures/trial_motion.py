@@ -104,9 +104,14 @@ def _draw_speed(ax: Axes, kinematics: pd.DataFrame, windows: pd.DataFrame, trave
     ax.set_ylim(low, high)
     ax.set_ylabel("leading edge (m/s)")
     if travel_ratio != 1:
-        right = ax.secondary_yaxis(
-            "right", functions=(lambda lead: travel_ratio * lead, lambda tail: tail / travel_ratio)
-        )
+
+        def to_tail(lead_m_s: Any) -> Any:
+            return travel_ratio * lead_m_s
+
+        def to_lead(tail_m_s: Any) -> Any:
+            return tail_m_s / travel_ratio
+
+        right = ax.secondary_yaxis("right", functions=(to_tail, to_lead))
         right.set_ylabel("tail (m/s)")
         right.spines["right"].set_visible(True)
 

@@ -1,0 +1,166 @@
+# From an experiment folder to its report. Rules only: what they need to know is in vinetrack/workflow.py.
+#
+#   snakemake --cores 2                               the shipped demonstration
+#   snakemake --cores 2 --config experiment=PATH      a folder of one's own
+
+from pathlib import Path
+
+from vinetrack.workflow import (
+    CAMPAIGN_FIGURES,
+    code_hash,
+    plan_or_stop,
+    say_where_at_exit,
+    shell_prefix,
+)
+
+
+configfile: Path(workflow.basedir) / "config" / "config.yaml"
+
+
+shell.prefix(shell_prefix())
+plan = plan_or_stop(config, Path(workflow.basedir))
+say_where_at_exit(plan, quiet=workflow.dryrun)
+
+
+rule all:
+    input:
+        plan.result("report.html"),
+        plan.result("provenance.json"),
+
+
+if plan.is_demo:
+
+    rule recordings:
+        """Make what the demonstration's trial sheet names, once, in the virtual laboratory."""
+        input:
+            plan.experiment / "trials.csv",
+        output:
+            plan.recordings,
+        log:
+            plan.result("logs", "recordings.log"),
+        params:
+            code=code_hash("laboratory"),
+            folder=plan.experiment,
+        shell:
+            "python -m vinetrack.laboratory {params.folder:q} 2>&1 | tee {log:q}"
+
+
+rule tracks:
+    """All trials in one job: a process takes longer to start than a track takes to analyse."""
+    input:
+        plan.inputs,
+    output:
+        plan.per_trial("tracks", "", ".csv"),
+        plan.per_trial("kinematics", "", ".csv"),
+        plan.result("trials.csv"),
+        plan.result("steady.csv"),
+        plan.result("damping_points.csv"),
+    log:
+        plan.result("logs", "tracks.log"),
+    threads: workflow.cores
+    params:
+        code=code_hash("tracks"),
+        experiment=plan.experiment,
+        results=plan.results,
+        settings=plan.stage_settings(
+            "steady", "velocity", "final_at_fraction", "efficiency_at_mm"
+        ),
+    shell:
+        "vinetrack tracks {params.experiment:q} {params.results:q} --settings {params.settings:q}"
+        " --threads {threads} --log {log:q}"
+
+
+rule damping:
+    """The damping law, its intervals, and how it grows with size."""
+    input:
+        plan.result("damping_points.csv"),
+    output:
+        plan.result("damping.json"),
+        plan.result("scaling.json"),
+    log:
+        plan.result("logs", "damping.log"),
+    params:
+        code=code_hash("damping"),
+        results=plan.results,
+        settings=plan.stage_settings("damping"),
+    shell:
+        "vinetrack damping {params.results:q} --settings {params.settings:q} --log {log:q}"
+
+
+rule trial_figures:
+    """Position, speed and steady stretches of every trial."""
+    input:
+        plan.per_trial("tracks", "", ".csv"),
+        plan.per_trial("kinematics", "", ".csv"),
+        plan.result("steady.csv"),
+    output:
+        [
+            report(
+                path,
+                caption="vinetrack/report/captions/trial_motion.rst",
+                category="Trials",
+                labels={"trial": trial, "format": form},
+            )
+            for trial, form, path in plan.trial_figures()
+        ],
+    log:
+        plan.result("logs", "trial_figures.log"),
+    threads: workflow.cores
+    params:
+        code=code_hash("figures"),
+        experiment=plan.experiment,
+        results=plan.results,
+        settings=plan.stage_settings("figures"),
+    shell:
+        "vinetrack figures {params.experiment:q} {params.results:q} --of trials --settings {params.settings:q}"
+        " --threads {threads} --log {log:q}"
+
+
+rule campaign_figures:
+    """The damping law, its numbers, its scale, and all trials at a glance."""
+    input:
+        plan.per_trial("kinematics", "", ".csv"),
+        plan.result("trials.csv"),
+        plan.result("damping_points.csv"),
+        plan.result("damping.json"),
+        plan.result("scaling.json"),
+    output:
+        [
+            report(
+                path,
+                caption=f"vinetrack/report/captions/{name}.rst",
+                category="Experiment",
+                labels={"figure": CAMPAIGN_FIGURES[name], "format": form},
+            )
+            for name, form, path in plan.campaign_figures()
+        ],
+    log:
+        plan.result("logs", "campaign_figures.log"),
+    params:
+        code=code_hash("figures"),
+        experiment=plan.experiment,
+        results=plan.results,
+        settings=plan.stage_settings("figures"),
+    shell:
+        "vinetrack figures {params.experiment:q} {params.results:q} --of campaign --settings {params.settings:q}"
+        " --log {log:q}"
+
+
+rule report_page:
+    """Everything a person wants to see, in one file, and what it was made with."""
+    input:
+        plan.inputs,
+        plan.figure_files(),
+        plan.result("steady.csv"),
+    output:
+        plan.result("report.html"),
+        plan.result("provenance.json"),
+    log:
+        plan.result("logs", "report.log"),
+    params:
+        code=code_hash("report"),
+        experiment=plan.experiment,
+        results=plan.results,
+        settings=plan.stage_settings(),
+    shell:
+        "vinetrack report {params.experiment:q} {params.results:q} --settings {params.settings:q} --log {log:q}"

@@ -1,0 +1,214 @@
+"""The command line: thin, quick to start, and without tracebacks.
+
+What is wrong with the input is one sentence a problem; what is wrong with the program is one sentence that names the
+log, where the traceback is.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from vinetrack.experiment import Experiment
+    from vinetrack.settings import RunSettings
+
+app = typer.Typer(
+    name="vinetrack",
+    help="From recordings of everting vine robots to the physics that a model of them lacks.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
+ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
+SettingsText = Annotated[str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")]
+Threads = Annotated[int, typer.Option("--threads", min=1, help="Processes to use.")]
+LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")]
+
+
+def main() -> None:
+    """Entry of the `vinetrack` command."""
+    app()
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        import vinetrack
+
+        typer.echo(f"vinetrack {vinetrack.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """See the commands below."""
+
+
+@app.command()
+def check(experiment: ExperimentPath) -> None:
+    """Check the sheet, settings, tracks and videos, in seconds, before any work."""
+    with _sentences(None):
+        from vinetrack.experiment import check_experiment, format_problems
+        from vinetrack.workflow import find_experiment
+
+        problems = check_experiment(find_experiment(experiment))
+        for line in format_problems(problems):
+            typer.echo(line)
+        if any(problem.severity == "error" for problem in problems):
+            raise typer.Exit(1)
+        if not problems:
+            typer.echo(f"{experiment}: nothing to mend.")
+
+
+@app.command()
+def effects() -> None:
+    """The catalogue of effects, with formulas, parameters and units."""
+    with _sentences(None):
+        from vinetrack.effects import catalogue
+
+        for effect in catalogue().values():
+            typer.echo(f"{effect.name} ({effect.kind}): {effect.summary}")
+            typer.echo(f"    {effect.formula}")
+            for parameter in effect.parameters:
+                low, high = parameter.bounds
+                typer.echo(f"    {parameter.symbol}: {parameter.name}, {parameter.unit or '–'}, {low:g} to {high:g}")
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def tracks(
+    experiment: ExperimentPath,
+    results: ResultsPath,
+    settings: SettingsText = "{}",
+    threads: Threads = 1,
+    log: LogPath = None,
+) -> None:
+    """Positions to tracks, kinematics, steady windows and trials.csv."""
+    with _sentences(log):
+        from vinetrack.stages.tracks import analyse_tracks
+
+        table = analyse_tracks(_read(experiment), results, _run_settings(settings), threads)
+        failed = table[table["status"] == "failed"]
+        typer.echo(f"{len(table)} trials, {len(failed)} failed.")
+        for name, reason in list(zip(failed["trial"], failed["reason"], strict=True))[:10]:
+            typer.echo(f"  {name}: {reason}")
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+    """Steady points to the damping law, damping.json."""
+    with _sentences(log):
+        from vinetrack.report.words import headline
+        from vinetrack.stages.damping import fit_law
+
+        typer.echo(headline(fit_law(results, _run_settings(settings).damping)))
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def figures(
+    experiment: ExperimentPath,
+    results: ResultsPath,
+    of: Annotated[str, typer.Option("--of", help="`trials`, `campaign` or `all`.")] = "all",
+    settings: SettingsText = "{}",
+    threads: Threads = 1,
+    log: LogPath = None,
+) -> None:
+    """Draw the figures of the trials, of the whole experiment, or both."""
+    with _sentences(log):
+        from vinetrack.stages.figures import draw_campaign, draw_trials
+
+        if of not in ("trials", "campaign", "all"):
+            raise typer.BadParameter(f"{of!r} is none of trials, campaign, all", param_hint="--of")
+        chosen = _run_settings(settings).figures
+        read = _read(experiment)
+        if of != "campaign":
+            draw_trials(read, results, chosen, threads)
+        if of != "trials":
+            draw_campaign(read, results, chosen)
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def report(
+    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
+) -> None:
+    """Put everything in report.html, and what it was made with in provenance.json."""
+    with _sentences(log):
+        from vinetrack.stages.report import write_report
+
+        path = write_report(_read(experiment), results, _run_settings(settings).model_dump(mode="json"))
+        typer.echo(f"Report: {path}")
+
+
+def _read(folder: Path) -> Experiment:
+    from vinetrack.experiment import read_experiment
+    from vinetrack.workflow import find_experiment
+
+    return read_experiment(find_experiment(folder))
+
+
+def _run_settings(text: str) -> RunSettings:
+    import json
+
+    from vinetrack.settings import run_settings
+
+    try:
+        values = json.loads(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"is not JSON ({error})", param_hint="--settings") from None
+    if not isinstance(values, dict):
+        raise typer.BadParameter('is not a JSON object such as {"damping": {"seed": 7}}', param_hint="--settings")
+    return run_settings(values)
+
+
+@contextmanager
+def _sentences(log: Path | None) -> Iterator[None]:
+    """Turn every failure into sentences and exit status 1; tracebacks go to the log."""
+    from vinetrack.problems import ExperimentError, format_problems
+
+    _log_to(log)
+    try:
+        yield
+    except (typer.Exit, typer.BadParameter, typer.Abort):
+        raise
+    except ExperimentError as error:
+        _stop("\n".join(format_problems(error.problems)))
+    except KeyboardInterrupt:
+        _stop("Stopped; what was finished is kept.")
+    except Exception as error:
+        logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
+        if type(error).__name__ in ("ResultsError", "EffectError", "TableError"):
+            _stop(str(error))
+        place = f"; the traceback is in {log}" if log else "; run it with --log FILE to have the traceback"
+        _stop(f"A fault of the program, not of your data ({type(error).__name__}: {error}){place}.")
+
+
+def _stop(message: str) -> None:
+    typer.echo(message, err=True)
+    raise typer.Exit(1)
+
+
+def _log_to(path: Path | None) -> None:
+    """Send messages of every module to a file alone; the terminal shows sentences, never logs."""
+    handler: logging.Handler = logging.NullHandler()
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    logging.basicConfig(
+        handlers=[handler], level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

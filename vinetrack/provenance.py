@@ -1,0 +1,77 @@
+"""What a result was made with: version, libraries, settings, and the hashes of everything read."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import vinetrack
+
+PROVENANCE = "provenance.json"
+"""Its presence marks a results folder."""
+
+LIBRARIES = (
+    "numpy",
+    "scipy",
+    "pandas",
+    "numba",
+    "odrpack",
+    "opencv-python-headless",
+    "av",
+    "scikit-image",
+    "matplotlib",
+)
+
+
+def describe_run(
+    experiment: Path, inputs: Iterable[Path], settings: dict[str, Any], model: Iterable[str]
+) -> dict[str, Any]:
+    """Return the content of `provenance.json`.
+
+    Parameters
+    ----------
+    experiment : the experiment's folder.
+    inputs : every file that was read; those in the folder are listed relative to it.
+    settings : those of the run.
+    model : names of the effects in use.
+    """
+    return {
+        "vinetrack": vinetrack.__version__,
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "libraries": {name: found for name in LIBRARIES if (found := _version(name))},
+        "experiment": experiment.absolute().as_posix(),
+        "inputs": {_shown(path, experiment): hash_file(path) for path in inputs},
+        "model": list(model),
+        "settings": settings,
+    }
+
+
+def hash_file(path: Path) -> str:
+    """SHA-256 of a file, or of the names and contents of a folder of frames; "missing" where there is none."""
+    if path.is_dir():
+        files = sorted(file for file in path.rglob("*") if file.is_file())
+        lines = [f"{file.relative_to(path).as_posix()} {hash_file(file)}\n" for file in files]
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
+    if not path.is_file():
+        return "missing"
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _shown(path: Path, folder: Path) -> str:
+    try:
+        return path.relative_to(folder).as_posix()
+    except ValueError:
+        return path.as_posix()
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""

@@ -1,0 +1,135 @@
+"""What an experiment found, in sentences, and how it was found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.figures.numbers import half_width, interval, number, with_error
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STATUSES = ("ok", "warning", "failed", "left_out")
+_STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "left_out": "left out on request"}
+
+PREFERRED = "both_axes"
+"""The fit whose numbers head the report: speed and force both have errors, and ignoring those of speed bends n."""
+
+REFERENCES = (
+    "Alvarez et al., High-Velocity, Pressure-Driven Eversion for Rapid Vine Robots, IEEE Robotics and Automation "
+    "Letters, 2025: the equation of motion, the damping law and the 3 % rule.",
+    "Savitzky and Golay, Smoothing and Differentiation of Data by Simplified Least Squares Procedures, Analytical "
+    "Chemistry 36, 1964: velocity.",
+    "Boggs and Rogers, Orthogonal Distance Regression, Contemporary Mathematics 112, 1990: the fit with errors on both "
+    "axes.",
+    "Efron and Tibshirani, An Introduction to the Bootstrap, 1993: intervals by resampling whole trials.",
+)
+
+
+def headline(damping: Mapping[str, Any]) -> str:
+    """The main result in one sentence."""
+    fit = damping.get(PREFERRED) or {}
+    if fit.get("refused") or fit.get("n") is None or not fit.get("vines"):
+        return f"No damping law: {_sentence(fit.get('refused') or 'no trial gave a steady speed')}"
+    vines = fit["vines"]
+    n_trials = sum(law["n_trials"] for law in vines.values())
+    n = with_error(fit["n"], half_width(fit.get("n_95")))
+    if len(vines) == 1:
+        (law,) = vines.values()
+        B = with_error(law["B"], half_width(law.get("B_95")))
+        return f"Damping exponent n = {n}, with B = {B} N·(s/m)ⁿ (95 %), from {_count(n_trials, 'trial')} of one vine."
+    return (
+        f"One damping exponent fits all vines: n = {n} (95 %), from {_count(n_trials, 'trial')} of {len(vines)} vines."
+    )
+
+
+def tally(trials: pd.DataFrame) -> str:
+    """How many trials there are, and of which status, as a sentence."""
+    counts = trials["status"].value_counts()
+    parts = [f"{counts[status]} {_STATUS_WORDS[status]}" for status in STATUSES if counts.get(status, 0)]
+    return f"{_count(len(trials), 'trial')}: {', '.join(parts)}." if parts else "No trials."
+
+
+def vine_table(damping: Mapping[str, Any], names: Mapping[str, str]) -> list[dict[str, str]]:
+    """One row a vine and method: size, B and its intervals, R² and N, as text."""
+    table = []
+    for method, method_name in names.items():
+        for vine, law in ((damping.get(method) or {}).get("vines") or {}).items():
+            table.append(
+                {
+                    "vine": vine,
+                    "method": method_name,
+                    "size": f"{number(law['diameter_mm'])} mm × {number(law['thickness_um'])} µm",
+                    "B": number(law["B"], 4),
+                    "B_95": interval(law.get("B_95")),
+                    "B_95_total": interval(law.get("B_95_total")),
+                    "R2": number(law.get("R2")),
+                    "n_trials": str(law["n_trials"]),
+                }
+            )
+    return table
+
+
+def exponent_table(damping: Mapping[str, Any], names: Mapping[str, str]) -> list[dict[str, str]]:
+    """One row a method: n and its intervals, or why there is none, as text."""
+    table = []
+    for method, method_name in names.items():
+        fit = damping.get(method) or {}
+        table.append(
+            {
+                "method": method_name,
+                "n": number(fit.get("n"), 4),
+                "n_95": interval(fit.get("n_95")),
+                "n_95_total": interval(fit.get("n_95_total")),
+                "refused": str(fit.get("refused") or ""),
+            }
+        )
+    return table
+
+
+def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How it was done, as (heading, paragraph) pairs; numbers from the settings that were used."""
+    velocity, steady, damping = (settings.get(key) or {} for key in ("velocity", "steady", "damping"))
+    return [
+        (
+            "Speed",
+            f"Positions are smoothed and differentiated by local polynomials of order {velocity.get('order', 3)} "
+            "(Savitzky–Golay). At each point the window is the widest that the noise does not contradict; noise and "
+            "its correlation are estimated from the positions themselves. Speeds in results are those of the tail, "
+            "which moves twice as fast as the leading edge.",
+        ),
+        (
+            "Steady stretch",
+            "The gated rule takes the longest stretch whose change of speed is shown to be below "
+            f"{_percent(steady.get('drift_limit', 0.03))} (an equivalence test, so noise cannot pass for steadiness). "
+            f"The paper's rule takes at least {steady.get('paper_points', 3)} consecutive points whose speeds vary by "
+            f"less than {_percent(steady.get('paper_cv', 0.03))}. A window chosen by hand is used where the sheet "
+            "gives one. All are reported for every trial.",
+        ),
+        (
+            "Force",
+            "F = (P − P_y)·πD²/4 + 2·m·g·cosθ: the pressure in the window where it was measured, else the one of the "
+            "sheet, less the yield pressure; and the mean weight moving there. Only trials without payload, of "
+            "everting bodies, enter the fit.",
+        ),
+        (
+            "Damping law",
+            "F = B·x_ssⁿ with one n for all vines and a B for each: by least squares on logarithms, as in the paper, "
+            f"and with errors on both axes. Intervals hold 95 % and come from {damping.get('resamples', 2000)} resamplings "
+            f"of whole trials (seed {damping.get('seed', 0)}); the wider ones add the stated error of the yield "
+            "pressure, which all trials of a vine share.",
+        ),
+    ]
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:g} %"
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith(".") else text + "."

@@ -1,0 +1,36 @@
+"""From the points of the trials to the damping law and how it grows with size."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.stages.results import Results, read_result
+from vinetrack.tables import write_json
+
+if TYPE_CHECKING:
+    from vinetrack.settings import DampingSettings
+
+log = logging.getLogger(__name__)
+
+
+def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
+    """Fit the damping law to `damping_points.csv` and write `damping.json` and `scaling.json`.
+
+    Returns
+    -------
+    dict
+        `damping.json` as written.
+    """
+    from vinetrack.motion.damping import fit_damping
+    from vinetrack.motion.scaling import fit_scaling
+
+    results = Results(folder)
+    points = read_result(results.points)
+    damping = fit_damping(points[points["used"]], resamples=settings.resamples, seed=settings.seed)
+    write_json(results.scaling, fit_scaling(damping))
+    write_json(results.damping, damping)
+    for method, fit in damping.items():
+        log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))
+    return damping

@@ -1,0 +1,76 @@
+"""The tables and pictures of a results folder put together as one page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.provenance import describe_run
+from vinetrack.stages.results import Results, read_json, read_result
+from vinetrack.tables import write_json, write_text
+
+if TYPE_CHECKING:
+    from vinetrack.experiment import Experiment
+    from vinetrack.report.build import ReportFigure
+
+FIGURES = {
+    "damping_law": ("Steady force and steady speed", "damping_points.csv"),
+    "exponents": ("The exponent and the coefficients, by both methods", "damping.json"),
+    "scaling": ("How damping grows with size", "damping.json"),
+    "overview": ("All trials at a glance", "trials.csv"),
+}
+MAX_TRIAL_PICTURES = 60
+"""With more trials their figures stay files beside the report: at 0.1 MB each the page would not open at once."""
+
+
+def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> Path:
+    """Write `provenance.json` and `report.html`; return the path of the report.
+
+    Raises
+    ------
+    ResultsError
+        If a stage before this one has not run.
+    """
+    from vinetrack.report.build import ReportContent, build_report
+
+    results = Results(folder)
+    inputs = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace) if path]
+    shared = [path for name in ("trials.csv", "experiment.yaml") if (path := experiment.folder / name).exists()]
+    provenance = describe_run(
+        experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model
+    )
+    trials = read_result(results.trials)
+    drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
+    content = ReportContent(
+        name=experiment.name,
+        trials=trials,
+        windows=read_result(results.steady),
+        damping=read_json(results.damping),
+        provenance=provenance,
+        kinematics={name: read_result(results.kinematics(name)) for name in drawn},
+        figures=[figure for name in FIGURES if (figure := _figure(results, name))],
+        trial_figures=_trial_figures(results, drawn) if len(drawn) <= MAX_TRIAL_PICTURES else {},
+    )
+    page = build_report(content)
+    write_json(results.provenance, provenance)
+    write_text(results.report, page)
+    return results.report
+
+
+def _figure(results: Results, name: str) -> ReportFigure | None:
+    from vinetrack.report.build import ReportFigure
+
+    path = results.figure(name, ".svg")
+    if not path.exists():
+        return None
+    title, data_name = FIGURES[name]
+    caption = (files("vinetrack.report") / "captions" / f"{name}.rst").read_text(encoding="utf-8")
+    data = (results.folder / data_name).read_text(encoding="utf-8")
+    return ReportFigure(name, title, " ".join(caption.split()), path.read_text(encoding="utf-8"), data_name, data)
+
+
+def _trial_figures(results: Results, names: list[str]) -> dict[str, str]:
+    paths = {name: results.trial_figure(name, ".svg") for name in names}
+    return {name: path.read_text(encoding="utf-8") for name, path in paths.items() if path.exists()}

@@ -1,0 +1,182 @@
+"""A results folder: what each file in it is called, which columns it has, and reading it back.
+
+Names of trials are text whatever they look like: `007` stays `007`, and a trial may be called `NaN`.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.tables import result_file
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TRACK_COLUMNS = ("frame", "time_s", "edge_px", "lead_position_m", "lead_position_sigma_m", "flag")
+KINEMATICS_COLUMNS = (
+    "time_s",
+    "lead_position_m",
+    "lead_velocity_m_s",
+    "lead_velocity_sigma_m_s",
+    "tail_velocity_m_s",
+    "lead_acceleration_m_s2",
+)
+TRIALS_COLUMNS = (
+    "trial",
+    "vine",
+    "condition",
+    "status",
+    "reason",
+    "n_frames",
+    "mm_per_px",
+    "scale_rel_sigma",
+    "noise_m",
+    "steady_from_s",
+    "steady_to_s",
+    "steady_rule",
+    "x_ss_m_s",
+    "x_ss_sigma_m_s",
+    "x_ss_paper_m_s",
+    "cv",
+    "force_N",
+    "final_lead_velocity_m_s",
+    "efficiency",
+)
+STEADY_COLUMNS = (
+    "trial",
+    "rule",
+    "accepted",
+    "from_s",
+    "to_s",
+    "points",
+    "x_ss_m_s",
+    "x_ss_sigma_m_s",
+    "drift",
+    "drift_95_low",
+    "drift_95_high",
+    "cv",
+    "reason",
+)
+POINT_COLUMNS = (
+    "trial",
+    "vine",
+    "diameter_mm",
+    "thickness_um",
+    "pressure_kPa",
+    "x_ss_m_s",
+    "x_ss_sigma_m_s",
+    "force_N",
+    "force_sigma_N",
+    "yield_force_sigma_N",
+    "used",
+    "reason",
+)
+TEXT_COLUMNS = frozenset({"trial", "vine", "condition", "status", "reason", "steady_rule", "rule", "flag"})
+TRUTH_COLUMNS = frozenset({"accepted", "used"})
+
+
+class ResultsError(Exception):
+    """A results folder that is not one, or lacks what a stage needs: one sentence with a remedy."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """Paths of a results folder."""
+
+    folder: Path
+
+    @property
+    def trials(self) -> Path:
+        """One row a trial of the sheet."""
+        return self.folder / "trials.csv"
+
+    @property
+    def steady(self) -> Path:
+        """One row a trial and rule."""
+        return self.folder / "steady.csv"
+
+    @property
+    def points(self) -> Path:
+        """The points of the damping fit, one row a trial, and why one was not used."""
+        return self.folder / "damping_points.csv"
+
+    @property
+    def damping(self) -> Path:
+        """The damping law by both methods."""
+        return self.folder / "damping.json"
+
+    @property
+    def scaling(self) -> Path:
+        """How B grows with the size of the vine."""
+        return self.folder / "scaling.json"
+
+    @property
+    def provenance(self) -> Path:
+        """What all this was made with."""
+        return self.folder / "provenance.json"
+
+    @property
+    def report(self) -> Path:
+        """The page for people."""
+        return self.folder / "report.html"
+
+    def track(self, trial: str) -> Path:
+        """Where the leading edge was."""
+        return result_file(self.folder / "tracks", trial, ".csv")
+
+    def kinematics(self, trial: str) -> Path:
+        """How the leading edge moved."""
+        return result_file(self.folder / "kinematics", trial, ".csv")
+
+    def figure(self, name: str, suffix: str) -> Path:
+        """A figure of the whole experiment."""
+        return result_file(self.folder / "figures", name, suffix)
+
+    def trial_figure(self, trial: str, suffix: str) -> Path:
+        """The figure of one trial."""
+        return result_file(self.folder / "figures", f"trial_{trial}", suffix)
+
+
+def read_result(path: Path) -> pd.DataFrame:
+    """Read a table that a stage wrote: text stays text, numbers are floats, truth values are bool.
+
+    Raises
+    ------
+    ResultsError
+        If there is no such file or it is no table of ours.
+    """
+    import pandas as pd
+
+    try:
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    except FileNotFoundError:
+        raise ResultsError(f"{path} does not exist: run the stage that makes it, or snakemake for all") from None
+    except (OSError, ValueError) as error:
+        raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
+    for column in table.columns.difference(list(TEXT_COLUMNS)):
+        if column in TRUTH_COLUMNS:
+            table[column] = (table[column] == "True").astype(bool)
+        else:
+            table[column] = pd.to_numeric(table[column].replace("", "NaN")).astype(float)
+    return table
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON file that a stage wrote; see `read_result`."""
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ResultsError(f"{path} does not exist: run the stage that makes it, or snakemake for all") from None
+    except (OSError, ValueError) as error:
+        raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
+    return content
+
+
+def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
+    """A table with its header alone."""
+    import pandas as pd
+
+    return pd.DataFrame({column: pd.Series(dtype=object if column in TEXT_COLUMNS else float) for column in columns})

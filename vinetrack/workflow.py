@@ -1,0 +1,207 @@
+"""What the Snakefile needs to know before anything runs: which experiment, which trials, which files, whose code.
+
+Light on purpose: it is imported every time Snakemake looks at the workflow, before the first job.
+"""
+
+from __future__ import annotations
+
+import atexit
+import difflib
+import hashlib
+import json
+import os
+import shlex
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.problems import ExperimentError, Problem, format_problems
+
+if TYPE_CHECKING:
+    from vinetrack.settings import RunSettings
+
+PACKAGE = Path(__file__).parent
+
+CAMPAIGN_FIGURES = {
+    "damping_law": "Force and steady speed",
+    "exponents": "Exponent and coefficients",
+    "scaling": "Coefficient and size",
+    "overview": "All trials",
+}
+"""Figures of a whole experiment, by file name, with the label Snakemake's own report gives them."""
+
+SHARED_FILES = ("trials.csv", "experiment.yaml")
+
+_INTAKE = ("records.py", "constants.py", "tables.py", "columns.py", "sheet.py", "naming.py", "experiment.py")
+STAGE_CODE = {
+    "tracks": (*_INTAKE, "settings.py", "stages", "video", "motion", "effects", "model"),
+    "damping": ("tables.py", "stages", "motion"),
+    "figures": ("tables.py", "stages", "figures"),
+    "report": ("tables.py", "stages", "provenance.py", "figures", "report"),
+    "laboratory": ("effects", "model", "laboratory"),
+}
+"""Files and folders of the package whose change makes the results of a stage stale."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One run of the workflow.
+
+    `trials` are all that get files (those that failed at the sheet too, with empty ones), `inputs` what they are read
+    from, `is_demo` whether the recordings are made on first use by the virtual laboratory.
+    """
+
+    experiment: Path
+    results: Path
+    trials: tuple[str, ...]
+    inputs: tuple[Path, ...]
+    settings: RunSettings
+    is_demo: bool
+
+    @property
+    def recordings(self) -> list[str]:
+        """What the virtual laboratory makes of the demonstration's sheet."""
+        return [as_pattern(path) for path in self.inputs if path.name not in SHARED_FILES]
+
+    def result(self, *parts: str) -> str:
+        """Path of a result as Snakemake wants it."""
+        return as_pattern(self.results.joinpath(*parts))
+
+    def per_trial(self, folder: str, prefix: str, suffix: str) -> list[str]:
+        """One result a trial."""
+        return [self.result(folder, f"{prefix}{trial}{suffix}") for trial in self.trials]
+
+    def campaign_figures(self) -> list[tuple[str, str, str]]:
+        """Figures of the whole experiment: name, format and path."""
+        return self._figures(CAMPAIGN_FIGURES, "")
+
+    def trial_figures(self) -> list[tuple[str, str, str]]:
+        """Figures of single trials: trial, format and path."""
+        return self._figures(self.trials, "trial_")
+
+    def figure_files(self) -> list[str]:
+        """Paths of all figures."""
+        return [path for _, _, path in (*self.campaign_figures(), *self.trial_figures())]
+
+    def _figures(self, names: Iterable[str], prefix: str) -> list[tuple[str, str, str]]:
+        formats = self.settings.figures.formats
+        return [(name, form, self.result("figures", f"{prefix}{name}.{form}")) for name in names for form in formats]
+
+    def stage_settings(self, *keys: str) -> str:
+        """The settings a stage depends on, or all of them, as JSON: a change of others leaves its results alone."""
+        return json.dumps(self.settings.model_dump(mode="json", include=set(keys) or None), sort_keys=True)
+
+
+def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
+    """Read the settings and the experiment's sheet.
+
+    Parameters
+    ----------
+    config : Snakemake's `config`, the command line included.
+    base : folder of the Snakefile; the shipped demonstration is found from there, wherever Snakemake is run.
+
+    Raises
+    ------
+    ExperimentError
+        With every problem of the settings, or else of the sheet.
+    """
+    from vinetrack.experiment import read_experiment
+    from vinetrack.settings import run_settings
+
+    paths = {key: str(config[key]) for key in ("experiment", "results") if config.get(key) is not None}
+    settings = run_settings({**config, **paths})
+    demo = base / "data" / "demo"
+    folder = Path(settings.experiment)
+    if not folder.exists() and settings.experiment == type(settings)().experiment:
+        folder = demo
+    is_demo = folder.exists() and demo.exists() and folder.samefile(demo)
+    experiment = read_experiment(find_experiment(folder))
+    results = Path(settings.results) if settings.results else Path("results") / experiment.name
+    trials = tuple(name for name in experiment.names if name not in experiment.left_out)
+    files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
+    present = (path for path in files if path is not None and (is_demo or path.exists()))
+    shared = [path for name in SHARED_FILES if (path := folder / name).exists()]
+    return Plan(folder, results, trials, tuple(dict.fromkeys([*shared, *present])), settings, is_demo)
+
+
+def find_experiment(folder: Path) -> Path:
+    """Return `folder` if it exists; else raise an ExperimentError that names the nearest folder that does."""
+    if folder.exists():
+        return folder
+    parent = folder.absolute().parent
+    while not parent.is_dir():
+        parent = parent.parent
+    folders = sorted(path.name for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
+    wanted = folder.absolute().relative_to(parent).parts[0]
+    near = (
+        difflib.get_close_matches(wanted, folders, 1, 0.5)
+        or [name for name in folders if (parent / name / "trials.csv").is_file()][:1]
+    )
+    shown = os.path.relpath(parent / near[0] if near else parent)
+    remedy = f"did you mean {shown}?" if near else f"the nearest that exists is {shown}"
+    raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
+
+
+def plan_or_stop(config: Mapping[str, Any], base: Path) -> Plan:
+    """`make_plan`, but what is wrong is printed in at most 20 lines and the process ends with status 1.
+
+    For the Snakefile: an exception there would be printed with Snakemake's own stack.
+    """
+    try:
+        return make_plan(config, base)
+    except ExperimentError as error:
+        print("\n".join(format_problems(error.problems)), file=sys.stderr)
+        sys.stderr.flush()
+        raise SystemExit(1) from None
+
+
+def say_where_at_exit(plan: Plan, quiet: bool = False) -> None:
+    """Let the last line of this process say where the report is, if it is there and no older than what it is made of.
+
+    Snakemake's own `onsuccess` comes before its closing lines, and not at all where nothing had to be done.
+    """
+    if not quiet:
+        atexit.register(_say_where, plan)
+
+
+def _say_where(plan: Plan) -> None:
+    path = plan.results / "report.html"
+    if not path.exists():
+        return
+    made = path.stat().st_mtime
+    if all(source.stat().st_mtime <= made for source in plan.inputs if source.exists()):
+        print(f"Report: {path}", flush=True)
+
+
+def code_hash(stage: str) -> str:
+    """Hash of the code a stage runs; in `params:` it makes Snakemake rerun what an edit has made stale."""
+    digest = hashlib.sha256()
+    for path in _sources(STAGE_CODE[stage]):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _sources(names: Iterable[str]) -> list[Path]:
+    found: list[Path] = []
+    for name in names:
+        path = PACKAGE / name
+        found += (
+            [file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+            if path.is_dir()
+            else [path]
+        )
+    return sorted(file for file in found if file.exists())
+
+
+def shell_prefix() -> str:
+    """Line before every shell command that puts this Python's programs first: no environment need be activated."""
+    return f'set -euo pipefail; export PATH={shlex.quote(str(Path(sys.executable).parent))}:"$PATH"; '.replace(
+        "{", "{{"
+    ).replace("}", "}}")
+
+
+def as_pattern(path: Path) -> str:
+    """A path in which Snakemake sees no wildcards."""
+    return path.as_posix().replace("{", "{{").replace("}", "}}")
