@@ -1,0 +1,260 @@
+"""The growth axis: a line in the picture, given by the user or found from the motion itself.
+
+Nothing is assumed about where the vine enters, how bright it is, or whether it rests at first: a pixel that a
+growing vine covers changes once, and the moments of change grow along one line. Every line of a coarse fan is asked
+how much change a monotone path along it collects; the best is refined by the pixels that agree with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vinetrack.video.frames import RecordingError
+
+Floats = NDArray[np.float64]
+
+SMALL_PX = 240
+"""Longest side of the pictures in which the axis is sought."""
+MAX_FRAMES = 150
+"""Frames, spread evenly over the changes, in which it is sought."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A line in the picture along which a vine grows: `from_px` and `to_px` are (x, y), pixel centres at integers.
+
+    `width_px` is the width of what moves along it, NaN where unknown.
+    """
+
+    from_px: tuple[float, float]
+    to_px: tuple[float, float]
+    width_px: float = float("nan")
+
+    def __post_init__(self) -> None:
+        if self.length_px < 10:
+            raise RecordingError("the growth axis is shorter than 10 pixels; move from_px and to_px apart")
+
+    @property
+    def length_px(self) -> float:
+        """Distance between its ends."""
+        return float(np.hypot(self.to_px[0] - self.from_px[0], self.to_px[1] - self.from_px[1]))
+
+    @property
+    def direction(self) -> Floats:
+        """Unit vector of growth (x, y), shape (2,)."""
+        return np.subtract(self.to_px, self.from_px) / self.length_px
+
+    @property
+    def normal(self) -> Floats:
+        """Unit vector across, a quarter turn from x towards y, shape (2,)."""
+        along = self.direction
+        return np.array([-along[1], along[0]])
+
+    def points(self, along_px: Floats, across_px: Floats | float = 0.0) -> Floats:
+        """Picture coordinates, shape (..., 2), of points `along_px` from `from_px` and `across_px` beside the axis."""
+        along, across = np.broadcast_arrays(np.asarray(along_px, float), np.asarray(across_px, float))
+        start = np.asarray(self.from_px, dtype=float)
+        return start + along[..., None] * self.direction + across[..., None] * self.normal
+
+    def moved(self, dx_px: float, dy_px: float) -> Axis:
+        """The same axis in a picture whose origin is elsewhere."""
+        a, b = self.from_px, self.to_px
+        return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
+
+
+def find_axis(luma: NDArray[Any]) -> Axis:
+    """Axis of growth from frames of shape (n_frames, height, width).
+
+    Raises
+    ------
+    RecordingError
+        Where nothing moves, or what moves follows no line.
+    """
+    if len(luma) < 3:
+        raise RecordingError("fewer than 3 frames: no motion can be seen")
+    small, factor = _small_frames(luma)
+    picked = _busy_frames(small)
+    when, worth = _changes(small[picked])
+    rows, columns = np.nonzero(worth > 0)
+    if len(rows) < 12:
+        raise RecordingError("nothing moves in the picture")
+    x, y = columns.astype(float), rows.astype(float)
+    time = when[rows, columns].astype(float)
+    # What comes first counts most: a vine that meets a wall bends, sweeps and grows on along another line.
+    weight = worth[rows, columns] * (1 - 0.8 * time / len(picked))
+    diagonal = float(np.hypot(*small.shape[1:]))
+    band = max(3.0, 0.03 * diagonal)
+    angle, middle = _best_line(x, y, time, weight, len(picked), band, diagonal)
+    for _ in range(3):
+        angle, middle, half, ends = _refine(x, y, time, weight, len(picked), angle, middle, band)
+        band = float(np.clip(1.2 * half, 2.0, 0.2 * diagonal))
+    return _to_picture(angle, middle, half, ends, factor, luma.shape[1:])
+
+
+def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
+    """Pictures no longer than SMALL_PX, brightness freed of flicker, and the factor by which they shrank."""
+    import cv2
+
+    n, height, width = luma.shape
+    factor = max(1.0, max(height, width) / SMALL_PX)
+    size = (max(8, round(width / factor)), max(8, round(height / factor)))
+    small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
+    reference = small[n // 2, ::2, ::2] + 1.0
+    gain = np.median((small[:, ::2, ::2] + 1.0) / reference, axis=(1, 2))
+    small /= np.clip(gain, 0.2, 5.0)[:, None, None]
+    return small * np.float32(255.0 / max(float(small.max()), 1.0)), factor
+
+
+def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
+    """At most MAX_FRAMES frames, spread evenly over what changes rather than over time."""
+    n = len(small)
+    if n <= MAX_FRAMES:
+        return np.arange(n)
+    change = np.abs(np.diff(small, axis=0))
+    activity = np.partition(change.reshape(n - 1, -1), -20, axis=1)[:, -200:].mean(axis=1)
+    floor = float(np.quantile(activity, 0.2))
+    busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
+    total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])
+    return np.unique(np.searchsorted(total, np.linspace(0, total[-1], MAX_FRAMES)).clip(0, n - 1))
+
+
+def _changes(frames: NDArray[np.float32]) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
+    """Frame at which each pixel changes most and for good, and what that change is worth; shapes (height, width)."""
+    n = len(frames)
+    window = int(np.clip(n // 6, 2, 8))
+    noise = 1.4826 * float(np.median(np.abs(np.diff(frames[:: max(1, n // 30)], axis=0)))) / np.sqrt(2)
+    sums = np.concatenate([np.zeros((1, *frames.shape[1:]), np.float32), np.cumsum(frames, axis=0)])
+    best = np.zeros(frames.shape[1:], np.float32)
+    when = np.zeros(frames.shape[1:], np.int_)
+    for t in range(1, n):
+        a, b = min(n, t + window), max(0, t - window)
+        step = (sums[a] - sums[t]) / (a - t) - (sums[t] - sums[b]) / (t - b)
+        score = (a - t) * (t - b) / (a - b) * step * step
+        better = score > best
+        best[better], when[better] = score[better], t
+    unit = max(noise, 0.7) ** 2
+    floor = max(30.0 * unit, 0.02 * float(np.quantile(best, 0.995)))
+    return when, np.where(best > floor, np.log(np.maximum(best, unit) / unit), 0.0).astype(np.float32)
+
+
+def _best_line(
+    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, band: float, diagonal: float
+) -> tuple[float, Floats]:
+    """Direction (rad, x towards y) and a point of the line along which most change is collected in order."""
+    middle = np.array([x.mean(), y.mean()])
+    bins = int(np.ceil(2 * diagonal / band)) + 3
+    best, chosen = -1.0, (0.0, middle)
+    for angle in np.radians(np.arange(0, 360, 6.0)):
+        along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
+        across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
+        gathered = _fan(
+            along + diagonal, (across + diagonal) / band, time, weight, bins, int(2 * diagonal) + 2, n_times
+        )
+        i = int(np.argmax(gathered))
+        if gathered[i] > best:
+            offset = (i + 1) * band - diagonal
+            best = float(gathered[i])
+            chosen = (float(angle), middle + offset * np.array([-np.sin(angle), np.cos(angle)]))
+    return chosen
+
+
+@njit(cache=True)
+def _fan(
+    along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
+) -> np.ndarray:
+    """What monotone paths collect in each band of two bins across, shape (bins − 1,)."""
+    table = np.zeros((bins, n_times, length // 4 + 1), np.float32)
+    for i in range(len(along)):
+        b = min(max(int(across[i]), 0), bins - 1)
+        table[b, int(time[i]), min(max(int(along[i] / 4), 0), length // 4)] += weight[i]
+    out = np.zeros(bins - 1)
+    best = np.zeros(length // 4 + 2)
+    for b in range(bins - 1):
+        best[:] = 0.0
+        for t in range(n_times):
+            for s in range(1, len(best)):
+                best[s] = max(best[s], best[s - 1] + table[b, t, s - 1] + table[b + 1, t, s - 1])
+        out[b] = best[-1]
+    return out
+
+
+@njit(cache=True)
+def _ordered_path(table: np.ndarray) -> np.ndarray:
+    """Time at which a monotone path passes each place, for a table (n_times, n_places); NaN beyond its ends."""
+    n, places = table.shape
+    best = np.zeros((n, places + 1))
+    came = np.zeros((n, places + 1), np.uint8)
+    for t in range(n):
+        for s in range(places + 1):
+            best[t, s] = best[t - 1, s] if t > 0 else 0.0
+            if s > 0 and best[t, s - 1] + table[t, s - 1] > best[t, s]:
+                best[t, s] = best[t, s - 1] + table[t, s - 1]
+                came[t, s] = 1
+    passed = np.full(places, np.nan)
+    t, s = n - 1, places
+    while s > 0 and t >= 0:
+        if came[t, s] == 1:
+            passed[s - 1] = t
+            s -= 1
+        elif t > 0:
+            t -= 1
+        else:
+            break
+    return passed
+
+
+def _refine(
+    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
+) -> tuple[float, Floats, float, tuple[float, float]]:
+    """Line through the pixels that change when the path passes them: direction, point, half width, ends along it."""
+    along_unit, across_unit = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    along = (x - middle[0]) * along_unit[0] + (y - middle[1]) * along_unit[1]
+    across = (x - middle[0]) * across_unit[0] + (y - middle[1]) * across_unit[1]
+    low = float(along.min())
+    place = ((along - low) / 2).astype(int)
+    near = np.abs(across) < band
+    table = np.zeros((n_times, int(place.max()) + 1))
+    np.add.at(table, (time[near].astype(int), place[near]), weight[near])
+    passed = _ordered_path(table)
+    agree = near & (np.abs(time - passed[place]) <= max(2.0, 0.03 * n_times))
+    if agree.sum() < 8:
+        raise RecordingError("what moves in the picture follows no line; give the axis in the settings")
+    w = weight[agree]
+    points = np.column_stack([x, y])[agree]
+    centre = np.average(points, axis=0, weights=w)
+    spread = np.cov((points - centre).T, aweights=w)
+    values, vectors = np.linalg.eigh(spread)
+    main = vectors[:, 1] * np.sign(vectors[:, 1] @ along_unit)
+    if values[1] < 2.0 * values[0] or main @ along_unit < 0.8:
+        main = along_unit
+    side = np.array([-main[1], main[0]])
+    lateral = (points - centre) @ side
+    shift = float(np.median(np.repeat(lateral, np.maximum(1, w.astype(int)))))
+    half = float(np.quantile(np.abs(lateral - shift), 0.95)) + 0.5
+    s = (points - centre) @ main
+    ends = float(np.quantile(s, 0.002)), float(np.quantile(s, 0.998))
+    return float(np.arctan2(main[1], main[0])), centre + shift * side, half, ends
+
+
+def _to_picture(
+    angle: float, middle: Floats, half: float, ends: tuple[float, float], factor: float, shape: tuple[int, ...]
+) -> Axis:
+    """Back to full pixels, with room behind and ahead as far as the picture goes."""
+    along = np.array([np.cos(angle), np.sin(angle)])
+    room = 6.0 * half + 12.0
+    centre = (middle + 0.5) * factor - 0.5
+    start, stop = (ends[0] - room) * factor, (ends[1] + room) * factor
+    height, width = shape
+    low, high = -np.inf, np.inf
+    for origin, unit, size in ((centre[0], along[0], width), (centre[1], along[1], height)):
+        if abs(unit) > 1e-6:
+            a, b = sorted([(0.0 - origin) / unit, (size - 1.0 - origin) / unit])
+            low, high = max(low, a), min(high, b)
+    start, stop = max(start, low), min(stop, high)
+    first, last = centre + start * along, centre + stop * along
+    return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * half * factor)
