@@ -106,8 +106,11 @@ def shade_tube(
             v *= girth[min(int(u) + 1, columns - 1)]
             if abs(v) >= reach:
                 continue
-            i = int(v * per_px + half_profile + 0.5)
-            place = (u + setback[i] - tip_px - table_first) / table_step
+            i = int(v * per_px + half_profile)
+            between = np.float32(v * per_px + half_profile - i)
+            back = setback[i] + between * (setback[i + 1] - setback[i])
+            beside = side[i] + between * (side[i + 1] - side[i])
+            place = (u + back - tip_px - table_first) / table_step
             if place >= n - 1:
                 continue
             if place <= 0:
@@ -118,7 +121,7 @@ def shade_tube(
                 row = slope_row[i]
                 cover = table[row, k] + part * (table[row, k + 1] - table[row, k])
                 fold = table[fold_row, k] + part * (table[fold_row, k + 1] - table[fold_row, k])
-            cover *= side[i] * min(max(u + 0.5, 0.0), 1.0)
+            cover *= beside * min(max(u + 0.5, 0.0), 1.0)
             behind = out[y, x]
             if core[i] > 0 and u > tail_end:
                 a, b = (u - tail_to) % period, (u - tail_from) % period

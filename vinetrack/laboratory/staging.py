@@ -58,7 +58,8 @@ class Staging:
         self.release_s = float(grid_s[moving[0]]) if moving.size else math.inf
         self._exit_s, self._exit_px_s = self._find_exit(grid_s, lead_m)
         rng = np.random.default_rng([seed, 1])
-        self._amplitude = rng.normal(size=(2, 6))
+        amplitude = rng.normal(size=(2, 6))
+        self._amplitude = amplitude / np.sqrt((amplitude**2).sum(axis=1, keepdims=True) / 2)
         self._phase = rng.uniform(0, 2 * np.pi, (2, 6))
         self._hertz = rng.uniform(4, 55, 6)
         self._lamp_phase = float(rng.uniform(0, 2 * np.pi))
@@ -109,14 +110,13 @@ class Staging:
         return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * subject.wobble_Hz * since)
 
     def shake_px(self, time_s: float) -> tuple[float, float]:
-        """Displacement of the whole picture (x, y): six slow sinusoids and a kick that rings from release on."""
+        """Displacement of the whole picture (x, y): six sinusoids of rms 1 together, a kick that rings on release."""
         if not self.scene.shake_px:
             return 0.0, 0.0
-        waves = self._amplitude * np.sin(2 * np.pi * self._hertz * time_s + self._phase)
-        sway = waves.sum(axis=1) / math.sqrt(3)
+        sway = (self._amplitude * np.sin(2 * np.pi * self._hertz * time_s + self._phase)).sum(axis=1)
         since = time_s - self.release_s
         if since > 0:
-            sway = sway + 1.5 * self._amplitude[:, 0] * math.exp(-since / 0.04) * math.sin(2 * math.pi * 38 * since)
+            sway = sway + self._amplitude[:, 0] * math.exp(-since / 0.04) * math.sin(2 * math.pi * 38 * since)
         return float(self.scene.shake_px * sway[0]), float(self.scene.shake_px * sway[1])
 
     def lamp(self, frame: int) -> float:
