@@ -12,6 +12,8 @@ import yaml
 from vinetrack.problems import ExperimentError, Problem
 from vinetrack.tables import TableError, read_text
 
+MOST_KEYS = 10_000
+
 
 @dataclass(frozen=True)
 class YamlDocument:
@@ -93,8 +95,9 @@ def _walk(
     node: Any, path: tuple[Any, ...], lines: dict[tuple[Any, ...], int], repeated: list[Problem], file: str
 ) -> None:
     """Note the line of every key below a node, and every key that is written twice."""
-    if len(path) > 20:
-        raise ValueError("nested too deeply")
+    # Aliases of aliases can stand for more keys than memory holds; no settings come near either limit.
+    if len(path) > 20 or len(lines) > MOST_KEYS:
+        raise ValueError("too large")
     if isinstance(node, yaml.MappingNode):
         for key_node, value_node in node.value:
             line = key_node.start_mark.line + 1
