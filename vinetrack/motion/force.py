@@ -1,0 +1,99 @@
+"""The force that drives a vine in its steady window, and whether the trial belongs in a damping fit.
+
+    F = (P_w − P_y) A + r m̄ g cosθ
+
+P_w is the gauge pressure in the window (measured, else that of the model in use) and m̄ the mean moving mass there. The
+rule of the paper, Eq. (3), takes the set pressure and leaves the weight out: then noise-free data made with n = 0.37 give 0.38.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.constants import GRAVITY_M_S2
+from vinetrack.model.model import Model
+from vinetrack.model.simulate import pressure_along
+from vinetrack.motion.release import Release
+from vinetrack.records import Floats, Kinematics, Track, Trial, Window
+
+
+@dataclass(frozen=True)
+class SteadyForce:
+    """Force in a steady window, N; `sigma_N` its random error, `yield_sigma_N` what the vine's yield pressure leaves open.
+
+    The second is the same for all trials of a vine. `paper_N` is the published rule: set pressure, no weight.
+    """
+
+    force_N: float
+    sigma_N: float
+    yield_sigma_N: float
+    paper_N: float
+    window_pressure_Pa: float
+
+
+def steady_force(trial: Trial, track: Track, kinematics: Kinematics, release: Release, window: Window, model: Model) -> SteadyForce:
+    """Force of a trial in one window.
+
+    Raises
+    ------
+    EffectError
+        If an effect of the model needs what the trial lacks.
+    """
+    inside = (kinematics.time_s >= window.from_s) & (kinematics.time_s <= window.to_s)
+    travel_m = np.maximum(kinematics.lead_position_m[inside] - release.lead_position_m, 0.0)
+    pressure_Pa, sigma_Pa = _window_pressure(trial, track, kinematics, release, window, model, inside, travel_m)
+    mass_kg = float(np.mean(trial.moving_mass_kg(travel_m)))
+    weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
+    return SteadyForce(
+        force_N=(pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N,
+        sigma_N=sigma_Pa * trial.area_m2,
+        yield_sigma_N=trial.yield_pressure_sigma_Pa * trial.area_m2,
+        paper_N=(trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2,
+        window_pressure_Pa=pressure_Pa,
+    )
+
+
+def _window_pressure(
+    trial: Trial,
+    track: Track,
+    kinematics: Kinematics,
+    release: Release,
+    window: Window,
+    model: Model,
+    inside: np.ndarray,
+    travel_m: Floats,
+) -> tuple[float, float]:
+    """Mean gauge pressure in the window and its random error, Pa: measured where there is a trace, else the model's."""
+    if track.pressure_Pa is not None:
+        measured = track.pressure_Pa[(track.time_s >= window.from_s) & (track.time_s <= window.to_s)]
+        measured = measured[np.isfinite(measured)]
+        if measured.size:
+            return float(measured.mean()), _mean_error(measured)
+    since_release_s = kinematics.time_s[inside] - (release.time_s if math.isfinite(release.time_s) else kinematics.time_s[0])
+    along = pressure_along(model, trial, since_release_s, travel_m, kinematics.lead_velocity_m_s[inside])
+    return float(np.mean(along)), trial.pressure_sigma_Pa
+
+
+def _mean_error(measured_Pa: Floats) -> float:
+    """Standard error of the mean of a trace, from the scatter about its own straight line: a fall is not an error."""
+    if measured_Pa.size < 4:
+        return 0.0
+    steps = np.arange(measured_Pa.size)
+    residual = measured_Pa - np.polyval(np.polyfit(steps, measured_Pa, 1), steps)
+    return float(np.sqrt(np.sum(residual**2) / (measured_Pa.size - 2) / measured_Pa.size))
+
+
+def why_not_in_fit(trial: Trial, force: SteadyForce | None) -> str:
+    """Why a trial does not enter the damping fit; blank if it does."""
+    if trial.travel_ratio != 2:
+        return "a body that moves as a whole has no eversion damping"
+    if trial.payload_kg > 0:
+        return f"carries a payload of {trial.payload_kg * 1e3:g} g"
+    if force is None:
+        return "no steady window"
+    if not force.force_N > 0:
+        return f"the force in the window is {force.force_N:.3g} N: the pressure there does not exceed the yield pressure"
+    return ""

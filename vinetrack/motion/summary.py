@@ -1,0 +1,173 @@
+"""One trial from its track to a row of results."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+from vinetrack.effects import EffectError
+from vinetrack.model.model import Model
+from vinetrack.motion.efficiency import energy_efficiency, lead_velocity_at
+from vinetrack.motion.force import SteadyForce, steady_force, why_not_in_fit
+from vinetrack.motion.release import Release, find_release, flag_rest
+from vinetrack.motion.steady import gated_window, paper_window, user_window
+from vinetrack.motion.velocity import estimate_kinematics
+from vinetrack.records import Kinematics, Track, Trial, Window
+from vinetrack.settings import RunSettings
+from vinetrack.video.corrections import correct_frames
+
+FEWEST_POINTS = 5
+
+
+class TrialError(ValueError):
+    """A trial cannot be analysed; the message is a sentence for its `reason`."""
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """All that is known of one trial: its corrected track, motion, windows by rule, and its rows of results.
+
+    `row` has the columns of `trials.csv`, `point` those of the damping fit, with `used` and the `reason` if not.
+    """
+
+    track: Track
+    kinematics: Kinematics
+    release: Release
+    windows: Mapping[str, Window]
+    row: Mapping[str, object]
+    point: Mapping[str, object]
+
+
+def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Model) -> TrialResult:
+    """Velocity, steady windows by every rule, force, final speed and efficiency of one trial.
+
+    Parameters
+    ----------
+    model
+        The model in use: it gives the pressure in the window where none was measured.
+
+    Raises
+    ------
+    TrialError
+        If fewer than five points say where the leading edge was, or the model lacks what it needs of the trial.
+    """
+    usable = int(track.usable.sum())
+    if usable < FEWEST_POINTS:
+        raise TrialError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
+    track = correct_frames(track)
+    kinematics = estimate_kinematics(
+        track, travel_ratio=trial.travel_ratio, order=settings.velocity.order, kappa=settings.velocity.kappa
+    )
+    release = find_release(track, kinematics)
+    track = flag_rest(track, release)
+    windows = _windows(trial, track, kinematics, settings)
+    chosen = _chosen(windows)
+    try:
+        force = steady_force(trial, track, kinematics, release, chosen, model) if chosen else None
+    except EffectError as error:
+        raise TrialError(str(error)) from error
+    warnings = _warnings(track, release, windows)
+    notes = [*warnings, *([] if chosen else [f"no steady window: {windows['gated'].reason}"])]
+    row = {
+        "trial": trial.name,
+        "vine": trial.vine,
+        "condition": trial.condition,
+        "status": "warning" if warnings else "ok",
+        "reason": "; ".join(notes),
+        "n_frames": track.time_s.size,
+        "mm_per_px": trial.m_per_px * 1e3,
+        "scale_rel_sigma": math.nan,
+        "noise_m": kinematics.noise_m,
+        **_steady_columns(chosen, windows["paper"], force),
+        **_end_columns(trial, kinematics, release, settings),
+    }
+    return TrialResult(track, kinematics, release, windows, row, _point(trial, chosen, windows["paper"], force))
+
+
+def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSettings) -> dict[str, Window]:
+    steady = settings.steady
+    windows = {
+        "gated": gated_window(
+            track,
+            kinematics,
+            drift_limit=steady.drift_limit,
+            start_fraction=steady.start_fraction,
+            start_sigmas=steady.start_sigmas,
+        ),
+        "paper": paper_window(
+            track, travel_ratio=trial.travel_ratio, cv_limit=steady.paper_cv, min_points=steady.paper_points
+        ),
+    }
+    if trial.steady_window_s is not None:
+        try:
+            windows["user"] = user_window(track, kinematics, trial.steady_window_s)
+        except ValueError as error:
+            windows["user"] = Window("user", False, str(error))
+    return windows
+
+
+def _chosen(windows: Mapping[str, Window]) -> Window | None:
+    """The window whose numbers are reported: the user's own where there is one, else ours where it is accepted."""
+    window = windows.get("user", windows["gated"])
+    return window if window.accepted and window.x_ss_m_s > 0 else None
+
+
+def _warnings(track: Track, release: Release, windows: Mapping[str, Window]) -> list[str]:
+    found = list(track.notes)
+    if release.moving_from_start or not math.isfinite(release.time_s):
+        found.append(release.reason)
+    if "user" in windows and ("warning" in windows["user"].reason or not windows["user"].accepted):
+        found.append(windows["user"].reason)
+    return found
+
+
+def _steady_columns(window: Window | None, paper: Window, force: SteadyForce | None) -> dict[str, object]:
+    return {
+        "steady_from_s": window.from_s if window else math.nan,
+        "steady_to_s": window.to_s if window else math.nan,
+        "steady_rule": window.rule if window else "",
+        "x_ss_m_s": window.x_ss_m_s if window else math.nan,
+        "x_ss_sigma_m_s": window.x_ss_sigma_m_s if window else math.nan,
+        "x_ss_paper_m_s": paper.x_ss_m_s if paper.accepted else math.nan,
+        "cv": window.cv if window else math.nan,
+        "force_N": force.force_N if force else math.nan,
+    }
+
+
+def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, settings: RunSettings) -> dict[str, object]:
+    """Speed at the set fraction of the length, and efficiency at the set travel; NaN where the growth did not get there."""
+    travel_m = kinematics.lead_position_m - release.lead_position_m
+    velocity_m_s = kinematics.lead_velocity_m_s
+    if math.isfinite(trial.length_m):
+        final = lead_velocity_at(travel_m, velocity_m_s, settings.final_at_fraction * trial.length_m)
+    else:
+        final = float(velocity_m_s[-1])
+    at_m = settings.efficiency_at_mm / 1e3
+    efficiency = energy_efficiency(trial, at_m, lead_velocity_at(travel_m, velocity_m_s, at_m))
+    return {"final_lead_velocity_m_s": final, "efficiency": efficiency}
+
+
+def _point(trial: Trial, window: Window | None, paper: Window, force: SteadyForce | None) -> dict[str, object]:
+    reason = why_not_in_fit(trial, force)
+    nan = math.nan
+    return {
+        "trial": trial.name,
+        "vine": trial.vine,
+        "diameter_mm": trial.diameter_m * 1e3,
+        "thickness_um": trial.thickness_m * 1e6,
+        "pressure_kPa": trial.pressure_Pa / 1e3,
+        "window_pressure_kPa": force.window_pressure_Pa / 1e3 if force else nan,
+        "x_ss_m_s": window.x_ss_m_s if window else nan,
+        "x_ss_sigma_m_s": window.x_ss_sigma_m_s if window else nan,
+        "force_N": force.force_N if force else nan,
+        "force_sigma_N": force.sigma_N if force else nan,
+        "yield_force_sigma_N": force.yield_sigma_N if force else nan,
+        "x_ss_paper_m_s": paper.x_ss_m_s if paper.accepted else nan,
+        "force_paper_N": (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2,
+        "used": not reason,
+        "reason": reason,
+    }
+
+
