@@ -1,4 +1,4 @@
-"""How many frames a second does the virtual laboratory write, on one core, and where does the time go?
+"""Frames a second that the virtual laboratory writes on one core, and where the time goes.
 
 Run as `python benchmarks/rendering_speed.py`. Prints one row a preset: frames a second from scene to closed file by
 the processor's own clock (so that other work on the machine does not count), by the wall clock, and without encoding.

@@ -52,7 +52,7 @@ def length_from_area(levels: np.ndarray, rows: slice) -> float:
     return float(((levels[rows].astype(float).mean(axis=0) - BEHIND) / (FILM - BEHIND)).sum())
 
 
-# --- the leading edge ---------------------------------------------------------------------------------------------------
+# --- the leading edge
 
 
 @pytest.mark.parametrize("exposure_s", [1e-6, 2e-4, 5e-4, 9.9e-4])
@@ -165,7 +165,7 @@ def test_tip_outline_is_flat_on_the_axis_and_round_at_its_corners():
     assert side[half + 32 * 16] == pytest.approx(0.5)
 
 
-# --- what moves with what -----------------------------------------------------------------------------------------------
+# --- what moves with what
 
 
 def test_everted_wall_stays_where_it_is():
@@ -283,7 +283,7 @@ def test_contrast_of_the_tube_changes_sign_along_the_way():
     assert change[650:750].mean() < -0.03 * 65535
 
 
-# --- light and sensor ---------------------------------------------------------------------------------------------------
+# --- light and sensor
 
 
 def test_noise_has_the_variance_of_shot_and_read_noise():
@@ -356,7 +356,7 @@ def test_ticks_of_the_ruler_are_a_millimetre_apart():
     assert offset == pytest.approx(60, abs=0.15)
 
 
-# --- frames, faults, refusals -------------------------------------------------------------------------------------------
+# --- frames, faults, refusals
 
 
 def test_same_seed_same_pictures_other_seed_others():

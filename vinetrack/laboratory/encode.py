@@ -23,6 +23,8 @@ STACK_ENDINGS = (".tif", ".tiff")
 PICTURE_FORMATS = ("png", "tiff", "jpg", "dng")
 CODECS = {"h264": "libx264", "ffv1": "ffv1", "mjpeg": "mjpeg", "raw": "rawvideo"}
 GREY_FORMATS = {8: "gray", 10: "gray10le", 12: "gray12le", 16: "gray16le"}
+LIMITED_RANGE, FULL_RANGE = 1, 2
+"""Codes of the H.264 stream for 16…235 and 0…255."""
 HEADER_SHARE = 0.15
 """Share of a file left alone when bytes are damaged: the index at its front is well inside."""
 TINT = (12, -8)
@@ -99,8 +101,7 @@ def _write_video(renderer: FrameRenderer, order: NDArray[np.int_], path: Path) -
         stream.options = _codec_options(encoding)
         if encoding.codec == "h264":
             stream.gop_size = encoding.gop
-        if pixel_format.startswith("yuv"):
-            stream.codec_context.color_range = 1 if _is_limited(scene) else 2
+            stream.codec_context.color_range = LIMITED_RANGE if _is_limited(scene) else FULL_RANGE
         for count, levels_frame in enumerate(_frames(renderer, order, *levels)):
             picture = _picture(levels_frame, pixel_format, chroma)
             picture.pts = count
@@ -121,12 +122,13 @@ def _pixel_format(scene: Scene) -> str:
     encoding, sensor = scene.encoding, scene.sensor
     if encoding.codec not in CODECS:
         raise ValueError(f"Unknown codec {encoding.codec!r}; choose one of {', '.join(CODECS)}.")
+    depths: tuple[int, ...] = (8,)
     if encoding.codec == "h264":
-        pixel_format, depths = "yuv420p", (8,)
+        pixel_format = "yuv420p"
     elif encoding.codec == "mjpeg":
-        pixel_format, depths = "yuvj420p", (8,)
+        pixel_format = "yuvj420p"
     elif encoding.codec == "raw" or sensor.colour:
-        pixel_format, depths = ("yuv420p" if sensor.colour else "gray"), (8,)
+        pixel_format = "yuv420p" if sensor.colour else "gray"
     else:
         pixel_format, depths = GREY_FORMATS.get(sensor.bit_depth, ""), tuple(GREY_FORMATS)
     if sensor.bit_depth not in depths:

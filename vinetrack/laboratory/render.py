@@ -128,9 +128,10 @@ class FrameRenderer:
 
         rng = np.random.default_rng([self.seed, 3])
         sensor, (cx, cy) = self.scene.sensor, self.scene.camera.centre_px
-        yy, xx = np.mgrid[: self._still.shape[0], : self._still.shape[1]]
+        height, width = self.scene.camera.height_px, self.scene.camera.width_px
+        yy, xx = np.mgrid[:height, :width]
         radius2 = ((xx - cx) ** 2 + (yy - cy) ** 2) / (cx**2 + cy**2)
-        spread = rng.standard_normal(xx.shape) + 0.5 * rng.standard_normal((1, xx.shape[1]))
+        spread = rng.standard_normal((height, width)) + 0.5 * rng.standard_normal((1, width))
         falloff = 1 - self.scene.light.vignetting * radius2
         self._gain = (falloff * (1 + sensor.fixed_pattern * spread)).astype(np.float32)
         cells = 1 << shading.NORMAL_BITS
@@ -158,7 +159,7 @@ class FrameRenderer:
         well_e = sensor.full_well_e if sensor.noise else 0.0
         full = float(2**sensor.bit_depth - 1 if span is None else span)
         shading.expose(
-            self.radiance(frame), self._gain, np.float32(self.staging.lamp(frame)), well_e, sensor.read_noise_e,
+            self.radiance(frame), self._gain, self.staging.lamp(frame), well_e, sensor.read_noise_e,
             self.seed, frame, self._normals, self._tone, low, full, out,
         )  # fmt: skip
         return out

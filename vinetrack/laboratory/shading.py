@@ -9,6 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
+Floats = NDArray[np.float64]
+Whole = NDArray[np.int64]
 
 NORMAL_BITS = 12
 """Bits of a random number per normal deviate: 4096 quantiles, in steps too fine to be seen in one grey level."""
@@ -27,7 +29,7 @@ def _ramp(z: float) -> float:
 
 
 @njit(cache=True)
-def coverage_table(path_px, sigmas_px, first_px, step_px, n):
+def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px: float, n: int) -> Image:
     """Share of the exposure for which a point has been passed by a blurred edge, shape (len(sigmas_px), n).
 
     Column i is a point `first_px + i·step_px` ahead of the edge's reference; `path_px` are positions of the edge
@@ -56,7 +58,7 @@ def coverage_table(path_px, sigmas_px, first_px, step_px, n):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def sample_backdrop(canvas, map_x, map_y, shift_x, shift_y, out):
+def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, shift_y: float, out: Image) -> None:
     """Backdrop as the camera sees it when everything is moved by (shift_x, shift_y) px; bilinear, into `out`."""
     rows, columns = canvas.shape
     for y in range(out.shape[0]):
@@ -72,10 +74,12 @@ def sample_backdrop(canvas, map_x, map_y, shift_x, shift_y, out):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def shade_tube(
-    out, along, across, first_x, last_x, shift_along, shift_across, tip_px, sway, sway_length, table, table_first,
-    table_step, fold_row, setback, slope_row, side, core, per_px, transmission, glow, girth, tail, tail_from, tail_to,
-    tail_end, tail_opacity, tail_level, tail_contrast, fold_glow, ghost, ghost_across,
-):  # fmt: skip
+    out: Image, along: Image, across: Image, first_x: Whole, last_x: Whole, shift_along: float, shift_across: float,
+    tip_px: float, sway: float, sway_length: float, table: Image, table_first: float, table_step: float, fold_row: int,
+    setback: Floats, slope_row: Whole, side: Image, core: Image, per_px: int, transmission: Image, glow: Image,
+    girth: Image, tail: Image, tail_from: float, tail_to: float, tail_end: float, tail_opacity: float,
+    tail_level: float, tail_contrast: float, fold_glow: float, ghost: float, ghost_across: float,
+) -> None:  # fmt: skip
     """Lay the tube over `out` (height, width), in place.
 
     `along`, `across` are coordinates (px) of each pixel at rest; `first_x`, `last_x` the columns of each row that the
@@ -147,7 +151,10 @@ def shade_tube(
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def shade_ball(out, along, across, shift_along, shift_across, path_px, radius_px, sigma_px, surface, box, min_along):
+def shade_ball(
+    out: Image, along: Image, across: Image, shift_along: float, shift_across: float, path_px: Floats,
+    radius_px: float, sigma_px: float, surface: Image, box: Whole, min_along: float,
+) -> None:  # fmt: skip
     """Lay a ball over `out` within `box` (x0, y0, x1, y1), averaged over its centres `path_px` along the path."""
     half = (surface.shape[0] - 1) // 2
     for y in range(box[1], box[3]):
@@ -175,7 +182,7 @@ def shade_ball(out, along, across, shift_along, shift_across, path_px, radius_px
 
 
 @njit(cache=True)
-def _mixed(z):
+def _mixed(z: np.uint64) -> np.uint64:
     """Splitmix64's finaliser (Steele et al. 2014): neighbouring seeds give unrelated streams."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -183,7 +190,10 @@ def _mixed(z):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def expose(light, gain, lamp, full_well_e, read_noise_e, seed, frame, normals, tone, low, span, out):
+def expose(
+    light: Image, gain: Image, lamp: float, full_well_e: float, read_noise_e: float, seed: int, frame: int,
+    normals: Image, tone: Image, low: float, span: float, out: NDArray[np.uint8 | np.uint16],
+) -> None:  # fmt: skip
     """Turn radiance into grey levels with shot and read noise, into `out`; returns nothing.
 
     Level = low + span · tone(signal); the noise of a signal s has standard deviation √(s·well + read²)/well. Normal
@@ -196,11 +206,12 @@ def expose(light, gain, lamp, full_well_e, read_noise_e, seed, frame, normals, t
     per_well = np.float32(1.0 / full_well_e) if full_well_e > 0 else np.float32(0.0)
     read2 = np.float32((read_noise_e * per_well) ** 2)
     linear = steps < 2
+    bright = np.float32(lamp)
     for y in range(rows):
         state = _mixed(np.uint64(seed) * np.uint64(0x9E3779B97F4A7C15) + _mixed(np.uint64(frame * 65536 + y + 1)))
         bits = np.uint64(0)
         for x in range(columns):
-            signal = max(light[y, x] * gain[y, x] * lamp, np.float32(0.0))
+            signal = max(light[y, x] * gain[y, x] * bright, np.float32(0.0))
             if full_well_e > 0:
                 if x % 4 == 0:
                     state ^= state << np.uint64(13)

@@ -83,12 +83,15 @@ class TubeLayer:
         path = staging.lead_px(frame / staging.capture_fps + staging.exposure_s * part)
         tip = float(staging.lead_px(middle_s))
         table, first = self._edge_table(path - tip)
+        setback, slope_row, side, core = self._profiles
+        tail_from, tail_to = 2 * float(path[0]), 2 * float(path[-1])
         # Averaged over one pixel at least, so that the tail's texture is as soft at rest as in motion.
-        slack = max(0.0, 1.0 - 2 * float(path[-1] - path[0])) / 2
+        slack = max(0.0, 1.0 - (tail_to - tail_from)) / 2
         shading.shade_tube(
             light, self._maps.along, self._maps.across, self._first_x, self._last_x, *shift, tip,
             staging.sway_px(middle_s), staging.sway_length_px, table, first, TABLE_STEP_PX, len(SLOPES),
-            *self._profiles, PROFILE_PER_PX, *self._wall, self._girth, self._tail, 2 * path[0] - slack, 2 * path[-1] + slack,
+            setback, slope_row, side, core, PROFILE_PER_PX, *self._wall, self._girth, self._tail, tail_from - slack,
+            tail_to + slack,
             float(staging.tail_end_px(middle_s)), tube.tail_opacity, tube.brightness, tube.tail_texture,
             tube.tip_glow, 0.25 * tube.reflection * tube.brightness, self._ghost_across,
         )  # fmt: skip
