@@ -123,7 +123,7 @@ def record(
     end_frames: int = 0,
     capture_fps: float = CAPTURE_FPS,
 ) -> Recording:
-    """Sample a vine with still frames before release, `end_frames` flat ones after it is grown, and an arbitrary origin."""
+    """Sample a vine: still frames before release, `end_frames` flat ones once it is grown, arbitrary zeros."""
     solution, duration_s = motion(vine)
     release_s = (rest_frames + rng.uniform()) / capture_fps
     n = int(np.floor((release_s + duration_s) * capture_fps)) + 1 + end_frames

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,31 +36,31 @@ class WindowMoments:
         """Mean lead speed, relative change of speed across, and standard error of that, for windows [first, last]."""
         s = self.sums[:, last + 1] - self.sums[:, first]
         middle = (self.u[first] + self.u[last]) / 2
-        half = (self.u[last] - self.u[first]) / 2
-        count = s[0]
-        # Shift the moments to the middle of each window, in units of its half-width.
-        s1 = (s[1] - middle * s[0]) / half
-        s2 = (s[2] - 2 * middle * s[1] + middle**2 * s[0]) / half**2
-        s3 = (s[3] - 3 * middle * s[2] + 3 * middle**2 * s[1] - middle**3 * s[0]) / half**3
-        s4 = (
-            s[4] - 4 * middle * s[3] + 6 * middle**2 * s[2] - 4 * middle**3 * s[1] + middle**4 * s[0]
-        ) / half**4
-        y0 = s[5]
-        y1 = (s[6] - middle * s[5]) / half
-        y2 = (s[7] - 2 * middle * s[6] + middle**2 * s[5]) / half**2
+        half = ((self.u[last] - self.u[first]) / 2).astype(float)
+        # Moments about the middle of each window: Σ(u − m)ᵏ by repeated shifts, products only (powers of extended
+        # precision are slow), then in units of the window's half-width.
+        shifted = []
+        for row in (s[:5], s[5:]):
+            terms = list(row)
+            for order in range(1, len(terms)):
+                for k in range(len(terms) - 1, order - 1, -1):
+                    terms[k] = terms[k] - middle * terms[k - 1]
+            shifted.append([term.astype(float) for term in terms])
+        (count, s1, s2, s3, s4), (y0, y1, y2) = shifted
+        s1, s2, s3, s4 = s1 / half, s2 / half**2, s3 / half**3, s4 / half**4
+        y1, y2 = y1 / half, y2 / half**2
         # Normal equations of 1, w, w² with the constant eliminated.
         a11, a12, a22 = s2 - s1 * s1 / count, s3 - s1 * s2 / count, s4 - s2 * s2 / count
         b1, b2 = y1 - s1 * y0 / count, y2 - s2 * y0 / count
         determinant = a11 * a22 - a12**2
         slope = (a22 * b1 - a12 * b2) / determinant
         curve = (a11 * b2 - a12 * b1) / determinant
-        unit = (half * self.unit_s).astype(float)
-        mean = slope.astype(float) / unit
+        mean = slope / (half * self.unit_s)
         with np.errstate(divide="ignore", invalid="ignore"):
             # Speed goes from (slope − 2 curve) to (slope + 2 curve).
-            drift = (4 * curve / slope).astype(float)
-            curve_sigma = self.noise_m * np.sqrt((a11 / determinant).astype(float)) * self.gain(last - first + 1)
-            sigma = 4 * curve_sigma / np.abs(slope.astype(float))
+            drift = 4 * curve / slope
+            curve_sigma = self.noise_m * np.sqrt(a11 / determinant) * self.gain(last - first + 1)
+            sigma = 4 * curve_sigma / np.abs(slope)
         return mean, drift, sigma
 
 
@@ -142,52 +143,138 @@ def _bounds_of(low: RangeExtremes, high: RangeExtremes, span: int) -> Bounds:
     return bounds
 
 
-def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
-    """Speed, error, drift and variation of one window, by least squares on its raw positions.
+@dataclass(frozen=True)
+class LineFit:
+    """Raw positions of one window as Legendre polynomials in time: speed, its change, and what a cubic would add.
 
-    The error of x_ss is that of a straight line's slope under AR(1) noise; where the points scatter about their
-    parabola clearly more than the track's noise says, by that scatter.
+    Speeds in m/s of the lead. `drift` is the relative change of speed across the window; `bend_m_s` the mean speed of
+    the cubic less that of the straight line, `bend_sigma_m_s` its error.
     """
-    t, y = time_s[first : last + 1], position_m[first : last + 1]
-    n = t.size
-    middle, half = (t[0] + t[-1]) / 2, (t[-1] - t[0]) / 2
-    u = (t - middle) / half
-    centred = u - u.mean()
-    slope_weights = centred / np.sum(centred**2)
-    square = u**2 - np.mean(u**2)
-    square = square - centred * (square @ centred) / np.sum(centred**2)
-    curve_weights = square / np.sum(square**2)
-    y = y - y.mean()
-    slope, curve = float(slope_weights @ y), float(curve_weights @ y)
-    rho = kinematics.noise_correlation
-    noise_m = _local_noise(y - slope * centred - curve * square, kinematics.noise_m, rho)
-    lead_speed = slope / half
-    sigma = noise_m * ar1_sd(slope_weights, rho) / half
-    drift, drift_sigma = math.nan, math.nan
-    if slope != 0:
-        drift = 4 * curve / slope
-        drift_sigma = 4 * noise_m * ar1_sd(curve_weights, rho) / abs(slope)
-    velocity = kinematics.lead_velocity_m_s[first : last + 1]
+
+    speed_m_s: float
+    speed_sigma_m_s: float
+    drift: float
+    drift_sigma: float
+    bend_m_s: float
+    bend_sigma_m_s: float
+
+    @property
+    def drift_95(self) -> tuple[float, float]:
+        """95 % interval of the drift."""
+        return self.drift - 1.96 * self.drift_sigma, self.drift + 1.96 * self.drift_sigma
+
+
+def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -> LineFit:
+    """Least squares on the raw positions of one window of at least three points, errors for AR(1) noise.
+
+    Where the points scatter about their cubic clearly more than `noise_m` says, the errors are those of that scatter.
+    """
+    n = time_s.size
+    half = float(time_s[-1] - time_s[0]) / 2
+    u = (time_s - (time_s[0] + time_s[-1]) / 2) / half
+    order = min(3, n - 1)
+    y = position_m - position_m.mean()
+    # Each weight row is that of a fit with no higher term than its own: the line, the parabola, the cubic.
+    rows = [np.linalg.pinv(np.polynomial.legendre.legvander(u, k))[k] for k in range(1, order + 1)]
+    residual = y - np.polynomial.legendre.legval(u, np.polynomial.legendre.legfit(u, y, order))
+    noise_m = _local_noise(residual, noise_m, rho, order + 1)
+    slope, curve = float(rows[0] @ y), float(rows[1] @ y)
+    errors = [noise_m * ar1_sd(row, rho) for row in rows]
+    bend, bend_sigma = (float(rows[2] @ y), errors[2]) if order == 3 else (0.0, 0.0)
+    known = slope != 0
+    return LineFit(
+        speed_m_s=slope / half,
+        speed_sigma_m_s=errors[0] / half,
+        drift=6 * curve / slope if known else math.nan,  # d(c₂P₂)/du runs from −3c₂ to 3c₂
+        drift_sigma=6 * errors[1] / abs(slope) if known else math.nan,
+        bend_m_s=bend / half,
+        bend_sigma_m_s=bend_sigma / half,
+    )
+
+
+def _local_noise(residual: Floats, noise_m: float, rho: float, terms: int) -> float:
+    """The track's noise, or the scatter in this window where that is clearly larger (three standard errors)."""
+    n = residual.size
+    effective = n * (1 - rho**2) / (1 + rho**2) - terms
+    if effective < 2:
+        return noise_m
+    scatter = float(np.sum(residual**2)) / (n - terms)
+    return math.sqrt(scatter) if scatter > noise_m**2 * (1 + 3 * math.sqrt(2 / effective)) else noise_m
+
+
+def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
+    """Speed, error, drift and variation of the window from point `first` to `last`; not yet accepted.
+
+    The error of x_ss holds the noise and, where the speed bends within the window, how far the mean speed of a cubic
+    lies from that of the line.
+    """
+    inside = slice(first, last + 1)
+    t = time_s[inside]
+    fit = fit_window(t, position_m[inside], kinematics.noise_m, kinematics.noise_correlation)
+    bend = math.sqrt(max(fit.bend_m_s**2 - fit.bend_sigma_m_s**2, 0.0))
+    velocity = kinematics.lead_velocity_m_s[inside]
     return Window(
         rule=rule,
         accepted=False,
         reason="",
         from_s=float(t[0]),
         to_s=float(t[-1]),
-        n_points=n,
-        x_ss_m_s=kinematics.travel_ratio * lead_speed,
-        x_ss_sigma_m_s=kinematics.travel_ratio * sigma,
-        drift=drift,
-        drift_95=(drift - 1.96 * drift_sigma, drift + 1.96 * drift_sigma),
+        n_points=t.size,
+        x_ss_m_s=kinematics.travel_ratio * fit.speed_m_s,
+        x_ss_sigma_m_s=kinematics.travel_ratio * math.hypot(fit.speed_sigma_m_s, bend),
+        drift=fit.drift,
+        drift_95=fit.drift_95,
         cv=float(velocity.std(ddof=1) / abs(velocity.mean())) if velocity.mean() != 0 else math.nan,
     )
 
 
-def _local_noise(residual: Floats, noise_m: float, rho: float) -> float:
-    """The track's noise, or the scatter in this window where that is clearly larger (three standard errors)."""
-    n = residual.size
-    effective = n * (1 - rho**2) / (1 + rho**2) - 3
-    if effective < 2:
-        return noise_m
-    scatter = float(np.sum(residual**2)) / (n - 3)
-    return math.sqrt(scatter) if scatter > noise_m**2 * (1 + 3 * math.sqrt(2 / effective)) else noise_m
+def trim(
+    time_s: Floats, position_m: Floats, kinematics: Kinematics, window: tuple[int, int], band: float, drift_limit: float
+) -> tuple[int, int]:
+    """Cut from both ends of a steady window what is not yet, or no longer, on its line of speed.
+
+    The first and last 1, 2, 4 … frames must move within `band` (a fraction of the mean speed) and `TRIM_SIGMAS` of the
+    speed that the window's parabola has there. Cutting stops where the rest would no longer be shown to be steady.
+    """
+    first, last = window
+    while last - first >= 4:
+        move_first, move_last = _untidy_ends(time_s, position_m, kinematics, first, last, band)
+        if not (move_first or move_last):
+            break
+        first_now, last_now = first + move_first, last - move_last
+        if last_now - first_now < 3:
+            break
+        fit = fit_window(
+            time_s[first_now : last_now + 1],
+            position_m[first_now : last_now + 1],
+            kinematics.noise_m,
+            kinematics.noise_correlation,
+        )
+        if max(abs(bound) for bound in fit.drift_95) > drift_limit:
+            break
+        first, last = first_now, last_now
+    return first, last
+
+
+TRIM_SIGMAS = 2.5
+
+
+def _untidy_ends(
+    time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, band: float
+) -> tuple[int, int]:
+    """How many points to cut from the beginning and the end: none where the ends keep to the parabola."""
+    t, y = time_s[first : last + 1], position_m[first : last + 1]
+    noise_m, rho = kinematics.noise_m, kinematics.noise_correlation
+    fit = fit_window(t, y, noise_m, rho)
+    middle, length = (t[0] + t[-1]) / 2, t[-1] - t[0]
+    cuts = [0, 0]
+    span = 1
+    while span <= max(1, (t.size - 1) // 4):
+        for end, (i, j) in enumerate(((0, span), (t.size - 1 - span, t.size - 1))):
+            gap_s = t[j] - t[i]
+            expected = fit.speed_m_s * (1 + fit.drift * ((t[i] + t[j]) / 2 - middle) / length)
+            error = noise_m * math.sqrt(2 * (1 - rho**span)) / gap_s
+            if abs((y[j] - y[i]) / gap_s - expected) > band * abs(fit.speed_m_s) + TRIM_SIGMAS * error:
+                cuts[end] = max(cuts[end], (span + 1) // 2)
+        span *= 2
+    return cuts[0], cuts[1]

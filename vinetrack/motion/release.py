@@ -12,6 +12,7 @@ from vinetrack.records import Floats, Kinematics, Track, join_flags
 
 FEWEST_REST_POINTS = 3
 LIFTED_SIGMAS = 5.0
+CLEAR_SIGMAS = 15.0
 LONGEST_EXTRAPOLATION_FRAMES = 20
 
 
@@ -52,7 +53,7 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
         origin_m, sigma_m = _resting_level(position_m, kinematics)
         return Release(math.nan, origin_m, sigma_m, False, "the leading edge never moves beyond its noise")
     if n_rest < FEWEST_REST_POINTS:
-        return _moving_from_start(time_s, position_m, kinematics)
+        return _moving_from_start(time_s, kinematics)
     origin_m, sigma_m = _resting_level(position_m[: max(n_rest - 2, 1)], kinematics)
     onset_s = _onset(time_s, position_m, n_rest, origin_m, kinematics)
     reason = f"at rest for {n_rest} points, then moving from {onset_s:.5g} s"
@@ -85,7 +86,7 @@ def _resting_level(position_m: Floats, kinematics: Kinematics) -> tuple[float, f
     return float(position_m.mean()), kinematics.noise_m * math.sqrt(variance)
 
 
-def _moving_from_start(time_s: Floats, position_m: Floats, kinematics: Kinematics) -> Release:
+def _moving_from_start(time_s: Floats, kinematics: Kinematics) -> Release:
     """Go back to zero speed at the first acceleration where that is near, else take the first point."""
     velocity, acceleration = kinematics.lead_velocity_m_s[0], kinematics.lead_acceleration_m_s2[0]
     step_s = float(np.median(np.diff(time_s)))
@@ -99,27 +100,32 @@ def _moving_from_start(time_s: Floats, position_m: Floats, kinematics: Kinematic
             f" at {acceleration:.3g} m/s²"
         )
         return Release(float(time_s[0]) - back_s, origin_m, sigma_m, True, reason)
-    reason = f"moving at the first point ({velocity:.3g} m/s) without a trace of the start: zeros set to the first point"
+    reason = (
+        f"moving at the first point ({velocity:.3g} m/s) without a trace of the start: zeros set to the first point"
+    )
     return Release(float(time_s[0]), first_m, kinematics.noise_m, True, reason)
 
 
 def _onset(time_s: Floats, position_m: Floats, n_rest: int, origin_m: float, kinematics: Kinematics) -> float:
-    """Time at which the edge leaves rest: where a line through √(travel) reaches zero.
+    """Time at which the edge leaves rest: the best of y = y₀ + b·(t − t₀)^p, p = 1, 3/2, 2, through the first points.
 
-    Travel grows as ½at² from rest, so its root is a straight line in time, whatever the acceleration. A vine that
-    reaches its speed within a frame gives a time up to a frame early: onset is kept between the last resting point
-    and the first that is clearly off.
+    A vine of little mass is at full speed within a frame (p = 1), a heavy one accelerates evenly (p = 2). The points
+    are those around the corner and on until the edge is clearly off its resting place, three of them at least.
     """
     travel = position_m - origin_m
-    clear = max(LIFTED_SIGMAS * kinematics.noise_m, 1e-9 + 1e-6 * float(np.ptp(position_m)))
+    clear = max(CLEAR_SIGMAS * kinematics.noise_m, 1e-9, 1e-6 * float(np.ptp(position_m)))
     lifted = np.flatnonzero(travel[n_rest - 1 :] > clear)
-    if lifted.size == 0:
-        return float(time_s[n_rest - 1])
-    first = n_rest - 1 + int(lifted[0])
-    earliest, latest = float(time_s[max(n_rest - 3, 0)]), float(time_s[first])
-    take = slice(first, min(first + 3, time_s.size))
-    root = np.sqrt(np.maximum(travel[take], 0.0))
-    if root.size < 2 or root[-1] <= root[0]:
-        return float(np.clip((earliest + latest) / 2, earliest, latest))
-    slope, intercept = np.polyfit(time_s[take] - latest, root, 1)
-    return float(np.clip(latest - intercept / slope, earliest, latest))
+    off = n_rest - 1 + (int(lifted[0]) if lifted.size else 0)
+    take = slice(max(n_rest - 10, 0), min(off + 3, position_m.size))
+    frame_s = float(np.median(np.diff(time_s)))
+    t, y = (time_s[take] - time_s[off]) / frame_s, travel[take]
+    starts = np.arange(t[0] if off - take.start < 60 else -60.0, 0.0, 0.05)
+    best_s, least = 0.0, math.inf
+    for power in (1.0, 1.5, 2.0):
+        shape = np.maximum(t - starts[:, None], 0.0) ** power
+        norm = np.sum(shape**2, axis=1)
+        cost = np.sum(y**2) - (shape @ y) ** 2 / np.maximum(norm, 1e-300)
+        at = int(np.argmin(cost))
+        if cost[at] < least:
+            best_s, least = float(starts[at]), float(cost[at])
+    return float(time_s[off] + best_s * frame_s)

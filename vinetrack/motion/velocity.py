@@ -117,7 +117,9 @@ def smooth(
 Centred = tuple[Indices, Floats, Floats]
 
 
-def _narrowest(fit: WindowFits, centred: Centred, follows: Mask, noise_m: float) -> tuple[Floats, Indices, Floats, Floats]:
+def _narrowest(
+    fit: WindowFits, centred: Centred, follows: Mask, noise_m: float
+) -> tuple[Floats, Indices, Floats, Floats]:
     """Where nothing wider serves: the narrowest window, its error that of the noise or of its misfit if larger."""
     window, velocity, gain = centred
     good = follows[window]

@@ -71,7 +71,7 @@ class WindowFits:
         slope = _rows(np.array([u]), self.coefficients.shape[0])[1][:, 0]
         plain = slice(reach, reach + m)
         velocity[plain] = slope @ self.coefficients / self.half_s
-        gain[plain] = np.sqrt(max(slope @ self.even_covariance @ slope, 0.0)) / self.half_s
+        gain[plain] = max(float(slope @ self.even_covariance @ slope), 0.0) ** 0.5 / self.half_s
         special = np.ones(n, dtype=bool)
         special[plain] = self.odd
         points = np.flatnonzero(special)
@@ -111,16 +111,15 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
         odd_covariance = np.zeros((order + 1, order + 1, m))
         odd_covariance[:, :, odd] = own_covariance.transpose(1, 2, 0)
     misfit = np.sum(results[order + 1 :] ** 2, axis=0)
-    return WindowFits(
-        width, results[: order + 1], middle, half, covariance[0], odd, odd_covariance, misfit, terms
-    )
+    return WindowFits(width, results[: order + 1], middle, half, covariance[0], odd, odd_covariance, misfit, terms)
 
 
 def _rows(u: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
     """Powers of u and their first and second derivatives, each (terms, k)."""
     k = np.arange(terms)[:, None]
     value = u**k
-    slope, curve = np.zeros_like(value), np.zeros_like(value)
+    slope: Floats = np.zeros_like(value)
+    curve: Floats = np.zeros_like(value)
     slope[1:] = k[1:] * value[:-1]
     curve[2:] = k[2:] * (k[2:] - 1) * value[:-2]
     return value, slope, curve
