@@ -102,6 +102,48 @@ def track_edge(
     return _finish(strip, scale, offset, noise, state, fit, known, passed)
 
 
+def outline(
+    strip: NDArray[Any], scale: Floats, offset: Floats, noise: float, parts: int = 8
+) -> tuple[float, float, float]:
+    """Centreline of what the front leaves behind: shift of its begin and slope (px a px) across, and half width, px.
+
+    From the power of the contrast by row in `parts` stretches along the way: a given axis two degrees off would
+    otherwise cut the tube obliquely.
+
+    Raises
+    ------
+    ValueError
+        Where nothing in the strip changes as a passing front does.
+    """
+    from vinetrack.video import kymograph as ky
+
+    path, _ = ky.first_path(strip, scale, offset, noise)
+    passed = _passed_columns(strip, scale, offset, noise, path)
+    state = _first_state(strip, scale, offset, np.clip(path, *passed), 0.25, noise)
+    power = (state.after - state.before).astype(float)[:, passed[0] : passed[1]] ** 2
+    rows = np.arange(len(power)) - (len(power) - 1) / 2
+    pieces = np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12)))
+    middles, weights, places = [], [], []
+    for piece in pieces:
+        profile = np.convolve(
+            np.minimum(power[:, piece], 4 * np.median(power[:, piece]) + 1e3).mean(axis=1), np.ones(3) / 3, "same"
+        )
+        profile = np.clip(profile - max(float(np.quantile(profile, 0.1)), 0.25 * float(profile.max())), 0, None) > 0
+        low, high = np.flatnonzero(profile)[[0, -1]] if profile.any() else (0, len(rows) - 1)
+        middles.append(0.5 * (rows[low] + rows[high]))
+        places.append(passed[0] + float(piece.mean()))
+        weights.append((rows[high] - rows[low]) / 2)
+    slope, begin = _robust_line(np.array(places), np.array(middles))
+    return begin, slope, float(np.median(weights)) + 1.5
+
+
+def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
+    """Slope and value at zero by the median of pairwise slopes (Theil and Sen)."""
+    i, j = np.triu_indices(len(x), 1)
+    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i]))) if len(i) else 0.0
+    return slope, float(np.median(y - slope * x))
+
+
 def _passed_columns(strip: NDArray[Any], scale: Floats, offset: Floats, noise: float, path: Floats) -> tuple[int, int]:
     """First and last column the front passes: where whole runs of columns change along the path."""
     from vinetrack.video import kymograph as ky

@@ -1,0 +1,293 @@
+"""From a recording to a track: decode, find the axis, cut the strip, follow the edge (or the body), judge each point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.records import Track, Trial
+from vinetrack.video.axis import Axis, find_axis
+from vinetrack.video.edge import EdgeFit, outline, track_edge
+from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
+from vinetrack.video.judge import Judgement, calibrated_sigma, judge
+from vinetrack.video.strip import Strip, cut_strip, squared
+
+Floats = NDArray[np.float64]
+
+FEWEST_FRAMES = 5
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """A track and what a figure of it needs.
+
+    `kymograph`, shape (n_frames, n_along), is the strip's mean brightness across in grey levels; column j lies
+    `j` px from `axis.from_px`. `edge_px` of the track counts along the same axis. `pictures` are (frame number,
+    picture) of the first, middle and last moving frame, full region, as the camera wrote them.
+    """
+
+    track: Track
+    axis: Axis
+    kymograph: NDArray[np.float32]
+    pictures: tuple[tuple[int, NDArray[Any]], ...]
+    blur_px: float
+    exposure_frames: float
+    shake_px: Floats
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """Positions along the axis by frame, px, from whichever tracker."""
+
+    edge_px: Floats
+    sigma_px: Floats
+    unsure: NDArray[np.bool_]
+    blur_px: float
+    exposure_frames: float
+
+
+def track_recording(
+    trial: Trial,
+    axis: Axis | None = None,
+    *,
+    m_per_px: float | None = None,
+    position_m: Callable[[Floats], Floats] | None = None,
+) -> Tracking:
+    """Track the leading edge (travel ratio 1: the body) of one recording.
+
+    Parameters
+    ----------
+    trial
+        Its `video`, `capture_fps`, `exposure_s`, `travel_ratio` and, unless given here, `m_per_px` are used.
+    axis
+        Growth axis in the picture; found from the motion where None. It is centred on what moves along it.
+    m_per_px
+        Scale; that of the trial where None. Without any, positions in metres are NaN and pixels remain.
+    position_m
+        Metres along the axis of picture points (x, y), shape (n, 2): a calibration that knows distortion and tilt.
+
+    Raises
+    ------
+    RecordingError
+        In one sentence, where the recording holds no track.
+    """
+    if trial.video is None:
+        raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
+    recording = inspect_recording(trial.video)
+    capture_fps = _capture_fps(trial, recording.capture_fps)
+    frames = read_frames(recording)
+    return track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
+
+
+def track_frames(
+    frames: Frames,
+    trial: Trial,
+    capture_fps: float,
+    axis: Axis | None = None,
+    *,
+    m_per_px: float | None = None,
+    position_m: Callable[[Floats], Floats] | None = None,
+) -> Tracking:
+    """Track frames that are in memory already; see `track_recording`."""
+    name = frames.recording.path.name
+    exposure_s = trial.exposure_s if np.isfinite(trial.exposure_s) else (frames.recording.exposure_s or np.nan)
+    if len(frames) < FEWEST_FRAMES:
+        raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
+    rejected = odd_frames(frames.luma)
+    kept = np.flatnonzero(~rejected)
+    luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
+    try:
+        strip, found = _follow(luma, trial, axis, exposure_s * capture_fps, m_per_px)
+    except RecordingError as error:
+        raise RecordingError(f"{name}: {error}") from error
+    repeated = _repeated(strip, found.edge_px)
+    moving = np.gradient(found.edge_px) > 0.3 if len(kept) > 1 else np.ones(len(kept), bool)
+    sigma = calibrated_sigma(found.edge_px, found.sigma_px, moving & np.isfinite(found.edge_px))
+    reach = 3 * found.blur_px + 1
+    end_px = strip.axis.length_px - reach
+    verdict = judge(
+        found.edge_px, sigma, frames.slot[kept], unsure=found.unsure, damaged=frames.damaged[kept],
+        repeated=repeated, end_px=end_px,
+    )  # fmt: skip
+    if verdict.last_moving < 0:
+        raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
+    notes = [*frames.notes, *verdict.notes, *_ending(luma, verdict, found.edge_px, name)]
+    if rejected.any():
+        notes.append(
+            f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {np.flatnonzero(rejected)[0]}"
+        )
+    track = _assemble(frames, kept, found, sigma, verdict, capture_fps, exposure_s, notes)
+    track = _in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
+    chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
+    pictures = tuple((int(kept[i]), luma[i]) for i in chosen)
+    return Tracking(
+        track, strip.axis, _kymograph(strip), pictures, found.blur_px, found.exposure_frames, strip.shift_px
+    )
+
+
+def _capture_fps(trial: Trial, own: float | None) -> float:
+    """The capture rate: the user's; that of DNG frames where the sheet is blank; refused where the two differ."""
+    if own is not None:
+        if np.isfinite(trial.capture_fps) and abs(trial.capture_fps / own - 1) > 1e-3:
+            raise RecordingError(
+                f"{trial.name}: capture_fps is {trial.capture_fps:g} in the sheet but {own:g} in the frames; correct the sheet"
+            )
+        return own
+    if not np.isfinite(trial.capture_fps):
+        raise RecordingError(f"{trial.name}: capture_fps is missing; the file knows its playback rate only")
+    return trial.capture_fps
+
+
+def _follow(
+    luma: NDArray[Any], trial: Trial, axis: Axis | None, exposure_frames: float, m_per_px: float | None
+) -> tuple[Strip, _Edge]:
+    """Strip and positions; the axis is found or centred on the way."""
+    given = axis is not None
+    axis = axis if axis is not None else find_axis(luma)
+    half = _half_width(axis, trial, m_per_px)
+    if trial.travel_ratio == 1:
+        from vinetrack.video.body import track_body
+
+        strip = cut_strip(luma, axis, 1.5 * half + 8)
+        fit = track_body(strip)
+        return strip, _Edge(fit.position_px, fit.sigma_px, fit.unsure, fit.blur_px, exposure_frames)
+    wide = half * 1.3 + (0.04 * axis.length_px if given else 3.0)
+    strip = cut_strip(luma, squared(axis), wide)
+    try:
+        shift, slope, half = outline(strip.values, strip.scale, strip.offset, strip.noise)
+        strip = _centred(luma, strip, shift, slope, half, given)
+        fit = track_edge(strip.values, strip.scale, strip.offset, strip.noise, exposure_frames)
+    except ValueError as error:
+        raise RecordingError(str(error)) from error
+    return strip, _Edge(fit.edge_px, fit.sigma_px, _unsure(fit), fit.blur_px, fit.exposure_frames)
+
+
+def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
+    """Half the width of the tube, px: the axis's own, or by the sheet's diameter and scale, or a tenth of the axis."""
+    if np.isfinite(axis.width_px):
+        return axis.width_px / 2
+    scale = trial.m_per_px if m_per_px is None else m_per_px
+    if np.isfinite(trial.diameter_m) and np.isfinite(scale):
+        return trial.diameter_m / scale / 2
+    return 0.1 * axis.length_px
+
+
+def _centred(luma: NDArray[Any], strip: Strip, shift: float, slope: float, half: float, given: bool) -> Strip:
+    """The strip about the tube's own centreline; the same one where it is centred already.
+
+    A given axis keeps its ends' places along itself: only what lies across is corrected.
+    """
+    tilt = slope * strip.axis.length_px
+    room = (strip.values.shape[1] - 1) / 2 - half - 3
+    if abs(shift) + abs(tilt) / 2 < 2.0 and 0 <= room < 0.3 * half + 6:
+        return strip
+    start = strip.axis.points(np.array(0.0), shift)
+    stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
+    turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
+    return cut_strip(luma, squared(turned), half * 1.1 + 3)
+
+
+def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
+    """Frames whose neighbourhood does not look like the edge elsewhere."""
+    usual = float(np.nanmedian(fit.misfit))
+    odd = (fit.amplitude < 0.6) | (fit.amplitude > 1.5) | (fit.misfit > 6 * max(usual, 0.3))
+    return np.asarray(odd | (fit.sigma_px > np.maximum(1.0, 5 * np.nanmedian(fit.sigma_px))))
+
+
+def odd_frames(luma: NDArray[Any]) -> NDArray[np.bool_]:
+    """Frames among the first three that resemble none of those after them: cameras are known to write such, shape (n,)."""
+    odd = np.zeros(len(luma), dtype=bool)
+    if len(luma) < 8:
+        return odd
+    small = luma[:8, ::4, ::4].astype(np.float32)
+
+    def apart(a: int, b: int) -> float:
+        return float(np.mean(np.abs(small[a] - small[b])))
+
+    usual = float(np.median([apart(i, i + 1) for i in range(3, 7)]))
+    unit = 1.0 if luma.dtype == np.uint8 else max(float(small.max()), 1.0) / 255
+    for i in range(3):
+        odd[i] = apart(i, 3) > max(8 * usual, 6 * unit) and apart(i, 4) > max(8 * usual, 6 * unit)
+    return odd
+
+
+def _repeated(strip: Strip, edge_px: Floats) -> NDArray[np.bool_]:
+    """Frames whose surroundings of the edge are those of the frame before, shape (n,).
+
+    Compared with the noise of a moving picture: a fresh exposure differs at least by that.
+    """
+    n, _, columns = strip.values.shape
+    change = np.full(n, np.inf)
+    for i in range(1, n):
+        if not np.isfinite(edge_px[i]):
+            continue
+        low, high = int(np.clip(edge_px[i] - 40, 0, columns - 1)), int(np.clip(edge_px[i] + 40, 1, columns))
+        pair = strip.values[i - 1 : i + 1, ::2, low : max(high, low + 1)].astype(np.float32)
+        change[i] = float(np.mean(np.abs(pair[1] - pair[0]))) * float(strip.scale[i])
+    moving = np.zeros(n, dtype=bool)
+    moving[1:] = np.diff(edge_px) > 1.0
+    usual = float(np.median(change[moving])) if moving.any() else np.inf
+    still = np.zeros(n, dtype=bool)
+    still[1:] = np.abs(np.diff(edge_px)) < 0.5
+    return still & (change < 0.15 * usual)
+
+
+def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str) -> list[str]:
+    """What is to be said of an edge that stops before the recording does."""
+    n, last = len(edge_px), verdict.last_moving
+    if last < 0 or last >= n - 4 or "leaves the picture" in " ".join(verdict.notes):
+        return []
+    small = luma[:, ::3, ::3].astype(np.float32)
+    change = np.abs(np.diff(small, axis=0)).mean(axis=(1, 2))
+    before = float(np.median(change[verdict.first_moving : last])) if last > verdict.first_moving else 0.0
+    rest = float(np.min(change)) if len(change) else 0.0
+    later = float(np.median(change[last + 1 :]))
+    where = f"{name}: the leading edge stops at {np.nanmedian(edge_px[last + 1 :]):.0f} px after frame {last}"
+    if later - rest > 0.3 * (before - rest):
+        return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
+    return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
+
+
+def _assemble(
+    frames: Frames, kept: NDArray[np.int_], found: _Edge, sigma: Floats, verdict: Judgement, capture_fps: float,
+    exposure_s: float, notes: list[str],
+) -> Track:  # fmt: skip
+    """A row for every decoded frame; those rejected have no position."""
+    n = len(frames)
+    edge, error = np.full(n, np.nan), np.full(n, np.nan)
+    flag = np.full(n, "rejected", dtype="<U64")
+    slot = frames.slot.astype(float)
+    lost = np.array(["lost" in f.split(";") for f in verdict.flag], dtype=bool)
+    edge[kept] = np.where(lost, np.nan, found.edge_px)
+    error[kept] = np.where(lost, np.nan, sigma)
+    flag[kept] = verdict.flag
+    slot[kept] = verdict.slot
+    time = slot / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)
+    return Track(time, np.full(n, np.nan), error, flag, edge, None, tuple(notes))
+
+
+def _in_metres(track: Track, axis: Axis, m_per_px: float, position_m: Callable[[Floats], Floats] | None) -> Track:
+    """Positions and errors in metres; NaN without a scale."""
+    if position_m is None:
+        return replace(
+            track,
+            lead_position_m=track.edge_px * m_per_px,
+            lead_position_sigma_m=track.lead_position_sigma_m * m_per_px,
+        )
+    finite = np.isfinite(track.edge_px)
+    position = np.full(len(track.edge_px), np.nan)
+    local = np.full(len(track.edge_px), np.nan)
+    if finite.any():
+        along = track.edge_px[finite]
+        position[finite] = position_m(axis.points(along))
+        local[finite] = position_m(axis.points(along + 0.5)) - position_m(axis.points(along - 0.5))
+    return replace(track, lead_position_m=position, lead_position_sigma_m=track.lead_position_sigma_m * np.abs(local))
+
+
+def _kymograph(strip: Strip) -> NDArray[np.float32]:
+    mean = strip.values.mean(axis=1, dtype=np.float32)
+    return (mean * strip.scale[:, None] + strip.offset[:, None]).astype(np.float32)
