@@ -248,6 +248,10 @@ def test_paths_outside_are_refused(relative: str) -> None:
         safe_join(Path("exp"), relative)
 
 
+def test_the_narrow_blank_that_macos_puts_in_names_is_kept() -> None:
+    assert safe_join(Path("exp"), "at 3.04\u202fPM.mov") == Path("exp/at 3.04\u202fPM.mov")
+
+
 def test_a_link_inside_the_folder_may_point_out(tmp_path: Path) -> None:
     (tmp_path / "store").mkdir()
     (tmp_path / "store" / "a.mp4").write_text("frames")

@@ -13,6 +13,7 @@ import io
 import json
 import math
 import re
+import unicodedata
 import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -267,7 +268,8 @@ def safe_join(folder: Path, relative: str) -> Path:
     vinetrack.tables.TableError: leads out of the experiment folder: move the file into it, or put a link there
     """
     text = relative.strip().replace("\\", "/")
-    if not text.isprintable():
+    # Control characters, line and paragraph separators; macOS itself puts unusual blanks in the names of recordings.
+    if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
         raise TableError("contains characters that no path should have: type it anew")
     if text.startswith("/") or re.match(r"[A-Za-z]:", text):
         raise TableError("is an absolute path: write it relative to the experiment folder")

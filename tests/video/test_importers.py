@@ -99,6 +99,7 @@ def test_a_track_that_runs_backwards_is_kept_and_noted(tmp_path: Path) -> None:
         ("time_s,position_m\n1,1\n2,2\n3,3\n4,4\n", "has 4 points"),
         ("time_s,position_mm\n1,1\n", "lacks the column position_m (found: time_s, position_mm)"),
         ("frame,position_m\n1,1\n", "lacks the column time_s"),
+        ("\tt,x\n1,1\n", "has no columns t and x or y"),
         ("time_s,position_m\n0,0\n1,1\n1,2\n2,3\n3,4\n", "line 4, column time_s: time does not increase (1 after 1 s)"),
         ("time_s,position_m\n0,0\n1,x\n2,2\n3,3\n4,4\n", "line 3, column position_m: 'x' is not a number"),
         ("time_s,position_m\n0,0\n1,\n2,2\n3,3\n4,4\n", "line 3, column position_m: '' is blank"),

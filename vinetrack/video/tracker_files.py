@@ -212,6 +212,8 @@ def read_export(table: Table) -> Track:
     for column in table.columns:
         name, unit = _column(column)
         columns.setdefault(name, (column, unit))
+    if "t" not in columns or not {"x", "y"} & columns.keys():
+        raise TrackError("has no columns t and x or y: export them from Tracker with one separator throughout")
     time_s = table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS)
     check_times(time_s, table.lines)
     axes = [
