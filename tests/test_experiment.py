@@ -268,11 +268,15 @@ def test_dng_frames_carry_their_own_rate(folder: Path) -> None:
     assert experiment.problems == ()
 
 
-def test_a_rate_of_playback_is_suspected(folder: Path) -> None:
-    write(folder, GOOD.replace("track", "video"), "capture_fps: 30\n")
-    assert [trial.capture_fps for trial in read_experiment(folder).trials] == [30, 30]
-    row = "a,a.mp4,24,200,280,28,3,,30"
-    (problem,) = read_experiment(write(folder, f"{HEADER},capture_fps\n{row}\n".replace("track", "video"), "")).problems
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_rate_of_playback_is_suspected(folder: Path, shared: bool) -> None:
+    """30 fps is legal, but nobody films a vine at it."""
+    row = "a,a.mp4,24,200,280,28,3,," + ("" if shared else "30")
+    sheet = f"{HEADER.replace('track', 'video')},capture_fps\n{row}\n"
+    experiment = read_experiment(write(folder, sheet, "capture_fps: 30\n" if shared else ""))
+    assert [trial.capture_fps for trial in experiment.trials] == [30]
+    (problem,) = experiment.problems
+    assert (problem.severity, problem.file) == ("warning", "experiment.yaml" if shared else "trials.csv")
     assert "not that of playback" in str(problem)
 
 

@@ -22,6 +22,8 @@ from vinetrack.settings import read_experiment_settings
 from vinetrack.tables import TableError, decode_text, parse_number, parse_table, result_file, safe_join
 from vinetrack.video.importers import TrackError, read_pressure_trace, read_track
 
+REPEATABLE = settings(derandomize=True, deadline=None)
+
 COLUMNS = (
     "trial",
     "track",
@@ -121,7 +123,7 @@ PLAIN = {
 }
 
 
-@settings(max_examples=120, deadline=None)
+@settings(REPEATABLE, max_examples=120)
 @given(rows=SHEET, dialect=DIALECT)
 def test_a_sheet_reads_the_same_in_every_dialect(rows: list[dict[str, Any]], dialect: dict[str, Any]) -> None:
     rows = with_trials(rows)
@@ -158,7 +160,7 @@ BROKEN = {
 }
 
 
-@settings(max_examples=150, deadline=None)
+@settings(REPEATABLE, max_examples=150)
 @given(rows=SHEET, data=st.data())
 def test_a_single_broken_cell_is_one_problem_that_names_it(rows: list[dict[str, Any]], data: st.DataObject) -> None:
     rows = with_trials(rows)
@@ -211,7 +213,7 @@ FRAGMENTS = st.lists(st.sampled_from(PIECES) | st.binary(max_size=8), max_size=3
 BOMB = b"a0: &a0 [1]\n" + b"".join(b"a%d: &a%d [*a%d, *a%d]\n" % (i, i, i - 1, i - 1) for i in range(1, 60))
 
 
-@settings(max_examples=250, deadline=None)
+@settings(REPEATABLE, max_examples=250)
 @given(name=NAMED_FILES, content=st.binary(max_size=300) | FRAGMENTS)
 @example(name="experiment.yaml", content=b"[" * 5000)
 @example(name="experiment.yaml", content=b"a: &a [*a]")
@@ -252,6 +254,7 @@ def raise_if_read(reader: Any, path: Path) -> None:
     raise TrackError("was read")
 
 
+@REPEATABLE
 @given(st.binary(max_size=200))
 def test_any_bytes_are_text_or_refused(data: bytes) -> None:
     try:
@@ -261,6 +264,7 @@ def test_any_bytes_are_text_or_refused(data: bytes) -> None:
     assert "\r" not in text
 
 
+@REPEATABLE
 @given(st.text(max_size=12))
 def test_a_number_is_finite_or_refused(text: str) -> None:
     try:
@@ -272,6 +276,7 @@ def test_a_number_is_finite_or_refused(text: str) -> None:
     assert "_" not in text
 
 
+@REPEATABLE
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_every_float_is_read_back(value: float) -> None:
     text = repr(value)
@@ -279,6 +284,7 @@ def test_every_float_is_read_back(value: float) -> None:
     assert parse_table(f"x;y\n{text.replace('.', ',')};0,5\n").numbers("x")[0] == value
 
 
+@REPEATABLE
 @given(st.text(alphabet=st.sampled_from("ab./\\: C~\x00\n\u2028é"), max_size=14) | st.text(max_size=20))
 def test_no_path_escapes(relative: str) -> None:
     root = Path("/srv/experiment")
@@ -291,6 +297,7 @@ def test_no_path_escapes(relative: str) -> None:
     assert path != root
 
 
+@REPEATABLE
 @given(st.text(max_size=20))
 def test_no_result_escapes(name: str) -> None:
     root = Path("/srv/results/x/tracks")
@@ -303,6 +310,7 @@ def test_no_result_escapes(name: str) -> None:
     assert not path.name.startswith(".")
 
 
+@REPEATABLE
 @given(st.lists(ROW, min_size=2, max_size=6))
 def test_conditions_have_one_name_each_and_it_names_a_file(rows: list[dict[str, Any]]) -> None:
     trials = with_names(
@@ -340,7 +348,7 @@ ROW_PHYSICS = (
 )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(REPEATABLE, max_examples=100)
 @given(st.text(alphabet=st.characters(codec="utf-8", exclude_categories=["Cs"]), max_size=80))
 def test_any_settings_are_read_or_refused_with_a_sentence(text: str) -> None:
     with scratch() as folder:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack.columns import COLUMNS
+from vinetrack.columns import COLUMNS, SHARED, oddity
 from vinetrack.naming import with_names
 from vinetrack.problems import ExperimentError, Problem, format_problems
 from vinetrack.records import Trial
@@ -128,6 +128,11 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
             safe_join(folder, relative)
         except TableError as error:
             problems.append(_from_table_error(error, SETTINGS, column=key, value=relative))
+    for name in SHARED:
+        value = getattr(settings, name)
+        if COLUMNS[name].kind == "number" and value is not None and (hint := oddity(COLUMNS[name], value)):
+            place: dict[str, Any] = {"file": SETTINGS, "column": name, "value": f"{value:g}"}
+            problems.append(Problem(message=f"is unusual: {hint}", severity="warning", **place))
     return settings
 
 
