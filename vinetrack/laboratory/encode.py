@@ -6,17 +6,28 @@ import shutil
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.laboratory.scene import Encoding, Scene
 
-if TYPE_CHECKING:
-    from vinetrack.laboratory.render import FrameRenderer
-
 Frame = NDArray[np.uint8 | np.uint16]
+
+
+class Renderer(Protocol):
+    """What can be written: anything that renders frames by number."""
+
+    scene: Scene
+    seed: int
+    capture_fps: float
+    exposure_s: float
+
+    def frame(self, frame: int, *, low: float = ..., span: float | None = ...) -> Frame:
+        """Grey levels of frame `frame`, black at `low`, full scale `span` above it."""
+        ...
+
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".avi")
 STACK_ENDINGS = (".tif", ".tiff")
@@ -31,7 +42,7 @@ TINT = (12, -8)
 """How far (U, V) of a colour recording lie from grey: a warm wall and bluish film under LED lamps."""
 
 
-def write_recording(renderer: FrameRenderer, order: NDArray[np.int_], path: Path) -> None:
+def write_recording(renderer: Renderer, order: NDArray[np.int_], path: Path) -> None:
     """Write frames `order` of `renderer` to `path`, whole or not at all, then apply the scene's file faults.
 
     A path without ending becomes a folder of `frame_000000.png` and so on; `NAME.dng`, `NAME.jpg`, `NAME.tiff` and
@@ -66,7 +77,7 @@ def write_recording(renderer: FrameRenderer, order: NDArray[np.int_], path: Path
 
 
 def _frames(
-    renderer: FrameRenderer, order: NDArray[np.int_], low: float = 0.0, span: float | None = None
+    renderer: Renderer, order: NDArray[np.int_], low: float = 0.0, span: float | None = None
 ) -> Iterator[Frame]:
     """Grey frames in the order of the file; rubbish for −1."""
     camera, sensor = renderer.scene.camera, renderer.scene.sensor
@@ -86,7 +97,7 @@ def _rubbish(height: int, width: int, bit_depth: int, seed: int) -> Frame:
     return (bands * noise).astype(np.uint8 if bit_depth <= 8 else np.uint16)
 
 
-def _write_video(renderer: FrameRenderer, order: NDArray[np.int_], path: Path) -> None:
+def _write_video(renderer: Renderer, order: NDArray[np.int_], path: Path) -> None:
     import av
 
     scene, encoding = renderer.scene, renderer.scene.encoding
@@ -198,7 +209,7 @@ def _spread(levels: Frame, bit_depth: int) -> Frame:
     return levels if bit_depth <= 8 else levels.astype(np.uint16)
 
 
-def _write_pictures(frames: Iterator[Frame], folder: Path, scene: Scene, renderer: FrameRenderer) -> None:
+def _write_pictures(frames: Iterator[Frame], folder: Path, scene: Scene, renderer: Renderer) -> None:
     """Numbered pictures in the format of the scene's `encoding.codec`: png, tiff, jpg or dng; png for any other."""
     import cv2
 

@@ -24,6 +24,7 @@ from vinetrack.laboratory import shading, textures
 from vinetrack.laboratory.scene import Scene, Tube
 from vinetrack.laboratory.staging import Motion, Staging
 from vinetrack.laboratory.subjects import BallLayer, DoorLayer, PathMaps, TubeLayer
+from vinetrack.laboratory.targets import lay_target, plane_seen
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -119,8 +120,15 @@ class FrameRenderer:
         rng = np.random.default_rng([self.seed, 0])
         self._canvas = textures.backdrop_canvas(self.scene, rng, (y1 - y0 + 1, x1 - x0 + 1), (x0, y0))
         self._canvas_x, self._canvas_y = maps.plane_x - np.float32(x0), maps.plane_y - np.float32(y0)
+        target, psf_px = self.scene.target, self.scene.psf_px
+        if target is not None and self.scene.shake_px:
+            across, down = np.meshgrid(np.arange(x0, x1 + 1), np.arange(y0, y1 + 1))
+            offset_px = np.stack([across, down], axis=-1) - np.array(self.scene.camera.centre_px)
+            self._canvas = lay_target(self._canvas, target, offset_px * self.scene.camera.m_per_px, psf_px)
         self._still = np.empty(maps.plane_x.shape, dtype=np.float32)
         shading.sample_backdrop(self._canvas, self._canvas_x, self._canvas_y, 0.0, 0.0, self._still)
+        if target is not None and not self.scene.shake_px:
+            self._still = lay_target(self._still, target, plane_seen(self.scene.camera), psf_px)
 
     def _prepare_sensor(self) -> None:
         """Gain of every pixel (vignetting, fixed pattern), normal deviates and the table of the gamma."""
@@ -152,15 +160,25 @@ class FrameRenderer:
         self._subject.lay(light, frame, (shake[0] * ux + shake[1] * uy, shake[1] * ux - shake[0] * uy))
         return light
 
+    def backdrop(self) -> Image:
+        """Light of everything that does not move, shape (height, width)."""
+        return self._still.copy()
+
     def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
         """Grey levels of frame `frame`, shape (height, width): black at `low`, full scale `span` above it."""
+        return self.expose(self.radiance(frame), frame, low=low, span=span)
+
+    def expose(
+        self, light: Image, frame: int, *, low: float = 0.0, span: float | None = None
+    ) -> NDArray[np.uint8 | np.uint16]:
+        """Grey levels of `light` with the lamps, gain and noise of frame `frame`; see `frame`."""
         sensor = self.scene.sensor
-        out = np.empty(self._still.shape, dtype=np.uint8 if sensor.bit_depth <= 8 else np.uint16)
+        out = np.empty(light.shape, dtype=np.uint8 if sensor.bit_depth <= 8 else np.uint16)
         well_e = sensor.full_well_e if sensor.noise else 0.0
         full = float(2**sensor.bit_depth - 1 if span is None else span)
         shading.expose(
-            self.radiance(frame), self._gain, self.staging.lamp(frame), well_e, sensor.read_noise_e,
-            self.seed, frame, self._normals, self._tone, low, full, out,
+            light, self._gain, self.staging.lamp(frame), well_e, sensor.read_noise_e, self.seed, frame,
+            self._normals, self._tone, low, full, out,
         )  # fmt: skip
         return out
 

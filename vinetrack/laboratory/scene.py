@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 from vinetrack.laboratory.camera import Camera
+from vinetrack.laboratory.targets import Target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,12 +141,13 @@ class Scene:
     `growth_angle_deg` is the direction of growth in the picture, from +x (right) towards +y (down). The path starts at
     `origin_px` (plane pixels; where it is None, at the border that lets the path run through the middle of the
     picture) and the tip rests `start_m` after it. `psf_px` is the standard deviation of the optics and pixel together;
-    `shake_px` of the camera's movement; `exposure_fraction` the exposure over the time between frames.
+    `shake_px` of the camera's movement; a `target` hangs behind the tube, in the plane of growth; `exposure_fraction` the exposure over the time between frames.
     """
 
     camera: Camera = field(default_factory=Camera)
     subject: Tube | Ball = field(default_factory=Tube)
     door: Door | None = field(default_factory=Door)
+    target: Target | None = None
     backdrop: Backdrop = field(default_factory=Backdrop)
     light: Light = field(default_factory=Light)
     sensor: Sensor = field(default_factory=Sensor)
