@@ -154,6 +154,8 @@ def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
         ("ambient_pressure_kPa: 101325", "less than or equal to 1000"),
         ("ambient_pressure_kPa: yes", "yes or no where a number belongs"),
         ("strict: 3", "boolean"),
+        ("model: gravity", "should be a list"),
+        ("axis: 3", "should be a group of keys"),
         ("axis: {from_px: [1, 1], to_px: [1, 1]}", "same point"),
         ("calibration: {kind: mm_per_px, mm_per_px: 0}", "greater than 0"),
         (

@@ -7,6 +7,7 @@ in step. An unknown key, a key written twice and a value that is not allowed are
 from __future__ import annotations
 
 import difflib
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -267,7 +268,9 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
         return Problem(message="is missing", file=file, line=line, column=key, remedy="add it")
     message, _, remedy = detail["msg"].removeprefix("Value error, ").partition(": ")
     if not detail["msg"].startswith("Value error, "):
-        message, remedy = f"is not allowed: {detail['msg'][:1].lower()}{detail['msg'][1:]}", ""
+        words = re.sub(r"a valid (tuple|list)", "a list", detail["msg"])
+        words = re.sub(r"a valid dictionary.*", "a group of keys", words)
+        message, remedy = f"is not allowed: {words[:1].lower()}{words[1:]}", ""
     return Problem(message=message, file=file, line=line, column=key, value=shown, remedy=remedy)
 
 

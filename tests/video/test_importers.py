@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vinetrack.records import Track, Trial
+from vinetrack.records import FLAGS, Track, Trial
 from vinetrack.video.importers import TrackError, attach_pressure, load_track, read_pressure_trace, read_track
 
 TIMES = np.arange(8) / 100
@@ -49,8 +49,12 @@ def test_flags_can_be_written_into_an_imported_track(tmp_path: Path) -> None:
     """The text type must hold the longest join of flags, not just the blanks it starts with."""
     track = read_track(write(tmp_path, "time_s,position_m\n" + rows(TIMES, POSITIONS)))
     flag = track.flag.copy()
-    flag[0] = "before_release;doubtful"
-    assert flag[0] == "before_release;doubtful"
+    flag[0] = ";".join(FLAGS)
+    assert flag[0] == ";".join(FLAGS)
+
+
+def test_a_packed_project_is_to_be_unpacked(tmp_path: Path) -> None:
+    assert "unpack it" in refused(write(tmp_path, "PK", "tip.trz"))
 
 
 def test_sigma_and_pressure_come_along(tmp_path: Path) -> None:

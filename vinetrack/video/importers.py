@@ -54,6 +54,8 @@ def read_track(path: Path) -> Track:
         One sentence with a remedy: not readable, fewer than 5 points, time that does not increase, a cell that is not
         a number, pressure out of range.
     """
+    if path.suffix.lower() == ".trz":
+        raise TrackError("is a packed Tracker project: unpack it and name the .trk inside")
     try:
         text = read_text(path)
         if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):

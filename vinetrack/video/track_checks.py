@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from vinetrack.records import Floats, Track
+from vinetrack.records import FLAGS, Floats, Track
 
 FEWEST_POINTS = 5
 LARGEST_PRESSURE_KPA = 1000.0
@@ -74,7 +74,7 @@ def new_track(
         time_s=time_s,
         lead_position_m=lead_position_m,
         lead_position_sigma_m=unknown if sigma_m is None else sigma_m,
-        flag=np.full(len(time_s), "", dtype="<U32"),
+        flag=np.full(len(time_s), "", dtype=f"<U{len(';'.join(FLAGS))}"),
         edge_px=unknown.copy() if edge_px is None else edge_px,
         pressure_Pa=pressure_Pa,
         notes=(*notes, *backwards),
