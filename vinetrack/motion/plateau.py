@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.motion.windows import correlated
 from vinetrack.records import Floats, Kinematics, Window
 
 Indices = NDArray[np.int_]
@@ -83,13 +84,8 @@ class _GainTable:
 
 
 def ar1_sd(weights: Floats, rho: float) -> float:
-    """Standard deviation of Σ w_i e_i for AR(1) noise e of unit variance: Σw² + 2 Σ_i w_i Σ_{j<i} ρ^{i−j} w_j."""
-    from scipy.signal import lfilter
-
-    if rho == 0:
-        return float(np.sqrt(np.sum(weights**2)))
-    before = lfilter([0.0, rho], [1.0, -rho], weights)
-    return math.sqrt(max(float(np.sum(weights**2) + 2 * np.sum(weights * before)), 0.0))
+    """Standard deviation of Σ w_i e_i for AR(1) noise e of unit variance."""
+    return math.sqrt(max(float(weights @ correlated(weights, rho)), 0.0))
 
 
 class RangeExtremes:

@@ -51,7 +51,7 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
     n_rest = rest_points(position_m)
     if n_rest == position_m.size or not _ever_moves(kinematics):
         origin_m, sigma_m = _resting_level(position_m, kinematics)
-        return Release(math.nan, origin_m, sigma_m, False, "the leading edge never moves beyond its noise")
+        return Release(math.nan, origin_m, sigma_m, False, "the leading edge never moves forward beyond its noise")
     if n_rest < FEWEST_REST_POINTS:
         return _moving_from_start(time_s, kinematics)
     origin_m, sigma_m = _resting_level(position_m[: max(n_rest - 2, 1)], kinematics)
@@ -92,8 +92,9 @@ def _moving_from_start(time_s: Floats, kinematics: Kinematics) -> Release:
     step_s = float(np.median(np.diff(time_s)))
     first_m = float(kinematics.lead_position_m[0])
     back_s = velocity / acceleration if acceleration > 0 else math.inf
-    if 0 <= back_s <= LONGEST_EXTRAPOLATION_FRAMES * step_s:
-        origin_m = first_m - 0.5 * velocity * back_s
+    if -step_s / 2 <= back_s <= LONGEST_EXTRAPOLATION_FRAMES * step_s:
+        back_s = max(back_s, 0.0)
+        origin_m = float(first_m - 0.5 * velocity * back_s)
         sigma_m = math.hypot(kinematics.noise_m, 0.5 * velocity * back_s)
         reason = (
             f"moving at the first point ({velocity:.3g} m/s); release extrapolated {back_s * 1e3:.3g} ms back"

@@ -7,18 +7,30 @@ speed is shown to be small (equivalence) rather than merely not shown to be larg
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.motion.paper_rule import paper_window
 from vinetrack.motion.plateau import RangeExtremes, WindowMoments, chord_bounds, judge, trim
 from vinetrack.records import Floats, Kinematics, Track, Window
+
+__all__ = ["gated_window", "paper_window", "user_window"]
 
 STEPS = 56
 """Starts and ends tried in the first pass; the best is then moved point by point."""
 
 BAND = 0.5
 """Half-width of the band that holds every velocity, in drift limits: a drift of the limit is half that each side."""
+
+SHORTEST_SHARE = 0.1
+"""Least part of the motion that counts as steady. What speeds up evenly changes by 3 % within 3–4 % of its run: short
+enough a piece of anything looks steady."""
+
+SHORTEST_FALL, FALLING = 0.02, 1 / 3
+"""Least part where the speed falls by more than a third of the limit: a vine slowing down with its supply or weight is
+in balance all the while, one that speeds up is not."""
 
 TRIM_BAND = 1 / 6
 """The ends of a window keep to its line of speed within this many drift limits: a start-up of 1.5 % that decays over a
@@ -64,8 +76,10 @@ def gated_window(
     whole = (first + found[0], first + found[1])
     kept = trim(time_s, position_m, kinematics, whole, TRIM_BAND * drift_limit, drift_limit)
     window = judge(time_s, position_m, kinematics, *kept, "gated")
+    moving = last - first + 1
     reason = (
-        f"steady over {window.n_points} points: speed changes by {_percent(window)}, inside ±{100 * drift_limit:g} %"
+        f"steady over {window.n_points} of {moving} moving points: speed changes by {_percent(window)},"
+        f" inside ±{100 * drift_limit:g} %"
     )
     return _with(window, True, reason)
 
@@ -91,40 +105,6 @@ def user_window(track: Track, kinematics: Kinematics, window_s: tuple[float, flo
     steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= 0.03
     verdict = "chosen by hand" if steady else "chosen by hand; warning: not shown to be steady"
     return _with(window, True, f"{verdict}: speed changes by {_percent(window)} over {window.n_points} points")
-
-
-def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, min_points: int = 3) -> Window:
-    """The published rule to the letter: the longest run whose velocities vary by less than 3 %, wherever it is.
-
-    Velocities are central differences of the raw positions, as Physics Tracker computes them; the run holds at
-    least `min_points` consecutive velocities with (sample standard deviation)/(mean) below `cv_limit`; x_ss is
-    their mean, and its error s/√n, which is what the rule implies and not what the data allow.
-    """
-    usable = track.usable
-    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
-    if time_s.size < min_points + 2:
-        return Window("paper", False, f"{time_s.size} points are too few for {min_points} central differences")
-    velocity = (position_m[2:] - position_m[:-2]) / (time_s[2:] - time_s[:-2])
-    run = _longest_run(velocity, cv_limit, min_points)
-    if run is None:
-        return Window("paper", False, f"no {min_points} consecutive velocities vary by less than {cv_limit:.0%}")
-    start, stop = run
-    chosen = velocity[start : stop + 1] * travel_ratio
-    mean, sd = float(chosen.mean()), float(chosen.std(ddof=1))
-    drift = float(np.polyfit(np.linspace(-0.5, 0.5, chosen.size), chosen, 1)[0]) / mean
-    cv = sd / abs(mean)
-    return Window(
-        rule="paper",
-        accepted=True,
-        reason=f"longest run with a coefficient of variation below {cv_limit:.0%}: {chosen.size} velocities, {cv:.2%}",
-        from_s=float(time_s[start + 1]),
-        to_s=float(time_s[stop + 1]),
-        n_points=chosen.size,
-        x_ss_m_s=mean,
-        x_ss_sigma_m_s=sd / math.sqrt(chosen.size),
-        drift=drift,
-        cv=cv,
-    )
 
 
 def _points(track: Track, kinematics: Kinematics) -> tuple[Floats, Floats]:
@@ -198,7 +178,8 @@ class _Search:
             return None, "fewer points move than one smoothing window holds"
         mean, drift, drift_sigma = self.moments.drift(first, last)
         worst = np.abs(drift) + 1.96 * drift_sigma
-        steady = (mean > 0) & (worst <= self.limit)
+        share = np.where(drift < -FALLING * self.limit, SHORTEST_FALL, SHORTEST_SHARE)
+        steady = (mean > 0) & (worst <= self.limit) & (points >= share * self.n)
         for bounds in (self._smooth, *self.chords):
             index = np.flatnonzero(steady)
             if index.size == 0:
@@ -221,58 +202,15 @@ class _Search:
         worst = np.where(mean > 0, np.abs(drift) + 1.96 * sigma, np.inf)
         near = int(np.argmin(worst))
         count, change, error = last[near] - first[near] + 1, 100 * drift[near], 196 * sigma[near]
-        return (
-            f"no window is shown to be steady within ±{100 * self.limit:g} %: the nearest, {count} points,"
-            f" changes by {change:.2g} ± {error:.2g} % across it"
+        why = (
+            "too short a part of the motion, or not smooth"
+            if worst[near] <= self.limit
+            else f"changes by {change:.2g} ± {error:.2g} % across it"
         )
-
-
-def _longest_run(velocity: Floats, cv_limit: float, min_points: int) -> tuple[int, int] | None:
-    """First and last index of the longest run with coefficient of variation below the limit; the steadiest of ties.
-
-    Lengths are tried from the longest down, octave by octave: a run of 2b to 4b values holds an aligned block of b
-    whose own scatter cannot be larger than the whole run's, so that only runs around quiet blocks are looked at.
-    """
-    n = velocity.size
-    level = float(np.median(velocity))
-    total = np.concatenate([[0.0], np.cumsum(velocity - level)])
-    square = np.concatenate([[0.0], np.cumsum((velocity - level) ** 2)])
-    longest = n
-    while longest >= min_points:
-        block = max(1, 2 ** (int(math.log2(longest)) - 1))
-        shortest = max(min_points, 2 * block if block > 1 else 1)
-        starts = _near_quiet_blocks(velocity, block, cv_limit)
-        for length in range(longest, shortest - 1, -1):
-            first = starts[starts + length <= n]
-            if first.size == 0:
-                continue
-            sums = total[first + length] - total[first]
-            spread = np.maximum(square[first + length] - square[first] - sums**2 / length, 0.0) / (length - 1)
-            mean = sums / length + level
-            good = np.flatnonzero((spread < (cv_limit * mean) ** 2) & (mean != 0))
-            if good.size:
-                start = int(first[good[np.argmin(spread[good] / mean[good] ** 2)]])
-                return start, start + length - 1
-        longest = shortest - 1
-    return None
-
-
-def _near_quiet_blocks(velocity: Floats, block: int, cv_limit: float) -> NDArray[np.int_]:
-    """Starts from which a run of 2 to 4 blocks can reach over a block that is quiet enough for the run.
-
-    The run's mean m lies within 2·cv·|m| of the block's, and the block's squares sum to no more than 4·block·(cv·m)².
-    """
-    n = velocity.size
-    if 2 * cv_limit >= 1 or block < 2:
-        return np.arange(n)
-    rows = velocity[: n // block * block].reshape(-1, block)
-    mean = rows.mean(axis=1)
-    squares = np.sum((rows - mean[:, None]) ** 2, axis=1)
-    quiet = np.flatnonzero(squares <= 4 * block * (cv_limit * mean / (1 - 2 * cv_limit)) ** 2) * block
-    edge = np.zeros(n + 1, dtype=int)
-    np.add.at(edge, np.maximum(quiet - 3 * block, 0), 1)
-    np.add.at(edge, quiet + 1, -1)
-    return np.flatnonzero(np.cumsum(edge[:n]) > 0)
+        return (
+            f"no window is shown to be steady within ±{100 * self.limit:g} %: the nearest,"
+            f" {count} of {self.n} moving points, {why}"
+        )
 
 
 def _percent(window: Window) -> str:
@@ -281,6 +219,4 @@ def _percent(window: Window) -> str:
 
 
 def _with(window: Window, accepted: bool, reason: str) -> Window:
-    from dataclasses import replace
-
     return replace(window, accepted=accepted, reason=reason)

@@ -100,13 +100,14 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     m = time_s.size - width + 1
     last = np.arange(m) + width - 1
     middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
-    weights, covariance, terms = _design(np.linspace(-1, 1, width)[None, :], order, rho)
+    weights, covariance, terms = _scaled(*_even_design(width, order), order, rho)
     results = np.array([np.convolve(position_m, row[::-1], mode="valid") for row in weights[0]])
     odd = _uneven_windows(time_s, width)
     odd_covariance = None
     if odd.any():
         take = np.flatnonzero(odd)[:, None] + np.arange(width)
-        own, own_covariance, _ = _design((time_s[take] - middle[odd, None]) / half[odd, None], order, rho)
+        u = (time_s[take] - middle[odd, None]) / half[odd, None]
+        own, own_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
         results[:, odd] = np.einsum("mkw,mw->km", own, position_m[take])
         odd_covariance = np.zeros((order + 1, order + 1, m))
         odd_covariance[:, :, odd] = own_covariance.transpose(1, 2, 0)
@@ -133,28 +134,36 @@ def _uneven_windows(time_s: Floats, width: int) -> Mask:
     return crossed[width - 1 :] > crossed[: crossed.size - width + 1]
 
 
-def _design(u: Floats, order: int, rho: float) -> tuple[Floats, Floats, int]:
-    """Weights that turn positions into coefficients and scaled misfits, for windows with points at u, shape (s, w).
-
-    Returns weights (s, order + 1 + terms, w), the covariance of the coefficients under AR(1) noise of unit standard
-    deviation (s, order + 1, order + 1), and the number of misfit terms.
-    """
-    width = u.shape[1]
-    terms = min(MISFIT_TERMS, width - order - 1)
-    legendre = np.polynomial.legendre.legvander(u, order + terms)
-    q, _ = np.linalg.qr(legendre)
-    basis = u[:, :, None] ** np.arange(order + 1)
-    inside = q[:, :, : order + 1].transpose(0, 2, 1)
-    pinv = np.linalg.solve(inside @ basis, inside)
-    correlation = _correlation(width, round(rho, 9))
-    covariance = pinv @ correlation @ pinv.transpose(0, 2, 1)
-    extra = q[:, :, order + 1 :].transpose(0, 2, 1)
-    spread = np.sqrt(np.sum((extra @ correlation) * extra, axis=2, keepdims=True))
-    return np.concatenate([pinv, extra / np.maximum(spread, 1e-12)], axis=1), covariance, terms
+def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:
+    """Weights with the misfits scaled to unit variance, and the covariance of the coefficients, under AR(1) noise."""
+    coefficients, extra = weights[:, : order + 1], weights[:, order + 1 :]
+    covariance = correlated(coefficients, rho) @ coefficients.transpose(0, 2, 1)
+    spread = np.sqrt(np.sum(correlated(extra, rho) * extra, axis=2, keepdims=True))
+    return np.concatenate([coefficients, extra / np.maximum(spread, 1e-12)], axis=1), covariance, terms
 
 
-@lru_cache(maxsize=32)
-def _correlation(width: int, rho: float) -> Floats:
-    """ρ^|i − j|, shape (width, width)."""
-    lag = np.abs(np.subtract.outer(np.arange(width), np.arange(width)))
-    return np.where(lag == 0, 1.0, float(rho) ** np.maximum(lag, 1))
+@lru_cache(maxsize=64)
+def _even_design(width: int, order: int) -> tuple[Floats, int]:
+    """The one design of all evenly spaced windows of a width."""
+    return _solve_design(np.linspace(-1, 1, width)[None, :], order)
+
+
+def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
+    """Weights of the coefficients and of the next orthonormal polynomials, (s, order + 1 + terms, w), and terms."""
+    terms = min(MISFIT_TERMS, u.shape[1] - order - 1)
+    q, _ = np.linalg.qr(np.polynomial.legendre.legvander(u, order + terms))
+    q = q.transpose(0, 2, 1)
+    inside = q[:, : order + 1]
+    coefficients = np.linalg.solve(inside @ (u[:, :, None] ** np.arange(order + 1)), inside)
+    return np.concatenate([coefficients, q[:, order + 1 :]], axis=1), terms
+
+
+def correlated(weights: Floats, rho: float) -> Floats:
+    """R·w for AR(1) noise, R_ij = ρ^|i − j|, along the last axis: w·(R·w) is the variance of Σ w_i e_i."""
+    from scipy.signal import lfilter
+
+    if rho == 0 or weights.size == 0:
+        return weights
+    before = lfilter([1.0], [1.0, -rho], weights, axis=-1)
+    after = lfilter([1.0], [1.0, -rho], weights[..., ::-1], axis=-1)[..., ::-1]
+    return before + after - weights

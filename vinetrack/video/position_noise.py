@@ -21,6 +21,7 @@ REST_STRETCH, REST_ORDER = 32, 1
 MOVING_STRETCH, MOVING_ORDER = 12, 3
 RHO_GRID = np.linspace(0.0, 0.95, 20)
 PRIOR_RHO_SD = 0.35
+SHORTEST_MOTION = 12
 
 
 def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
@@ -52,9 +53,10 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
         groups.append(_stretches(time_s[n_rest:], position_m[n_rest:], length, MOVING_ORDER))
     noise_m, correlation = _restricted_likelihood(groups)
     floor_m = quantum(position_m) / math.sqrt(12)
-    if noise_m < floor_m:
-        return floor_m, 0.0
-    return noise_m, correlation
+    moving = position_m[n_rest:]
+    # Exact positions at one speed are multiples of their step too, but then the moving ones show no rounding.
+    rounded = moving.size < SHORTEST_MOTION or rough_noise(moving) > 0.3 * floor_m
+    return (floor_m, 0.0) if rounded and noise_m < floor_m else (noise_m, correlation)
 
 
 def quantum(position_m: Floats) -> float:
