@@ -150,6 +150,12 @@ def test_exports_of_a_straight_motion(tmp_path: Path, header: str, separator: st
     assert "principal axis" in " ".join(track.notes)
 
 
+@pytest.mark.parametrize(("across", "up"), [(0.6, 0.8), (-0.6, -0.8), (0.6, -0.8), (-1.0, 0.0), (0.0, -1.0)])
+def test_position_grows_whichever_way_the_motion_goes(tmp_path: Path, across: float, up: float) -> None:
+    text = export("t,x,y\n", TIMES, across * POSITIONS, up * POSITIONS, separator=",")
+    np.testing.assert_allclose(read_track(write(tmp_path, text)).lead_position_m, POSITIONS, atol=2e-9)
+
+
 def test_an_export_of_one_coordinate_keeps_its_zero(tmp_path: Path) -> None:
     track = read_track(write(tmp_path, export("mass A\nt\tx\n", TIMES, 0.2 + POSITIONS)))
     np.testing.assert_allclose(track.lead_position_m, 0.2 + POSITIONS, atol=1e-9)
@@ -248,14 +254,14 @@ def test_a_project_with_frames_left_out(tmp_path: Path) -> None:
     np.testing.assert_allclose(track.lead_position_m, TRAVEL, atol=1e-12)
     np.testing.assert_allclose(track.edge_px, SCALE * TRAVEL, atol=1e-9)
     assert any("2 frames between the first and the last point have none" in note for note in track.notes)
-    assert any("36.9° from x" in note for note in track.notes)
+    assert any("(36.9° from x)" in note for note in track.notes)
 
 
 def test_a_rotated_origin_changes_nothing_but_the_angle(tmp_path: Path) -> None:
     axes = system(0, origin=(7.0, 11.0), angle_deg=30.0)
     track = read_track(write(tmp_path, project(MARKS, axes=axes), "tip.trk"))
     np.testing.assert_allclose(track.lead_position_m, TRAVEL, atol=1e-12)
-    assert any("6.9° from x" in note for note in track.notes)
+    assert any("(6.9° from x)" in note for note in track.notes)
 
 
 def test_a_project_in_centimetres(tmp_path: Path) -> None:
