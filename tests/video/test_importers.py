@@ -156,6 +156,13 @@ def test_position_grows_whichever_way_the_motion_goes(tmp_path: Path, across: fl
     np.testing.assert_allclose(read_track(write(tmp_path, text)).lead_position_m, POSITIONS, atol=2e-9)
 
 
+def test_the_net_displacement_decides_the_sign_not_the_way_between(tmp_path: Path) -> None:
+    """Out to +1 m and back to 0.2 m on the other side: the end counts as forwards."""
+    there = np.array([0.0, 0.5, 0.9, 1.0, 0.9, 0.5, 0.1, -0.2])
+    text = export("t,x,y\n", TIMES, 0.6 * there, 0.8 * there, separator=",")
+    np.testing.assert_allclose(read_track(write(tmp_path, text)).lead_position_m, -there, atol=2e-9)
+
+
 def test_an_export_of_one_coordinate_keeps_its_zero(tmp_path: Path) -> None:
     track = read_track(write(tmp_path, export("mass A\nt\tx\n", TIMES, 0.2 + POSITIONS)))
     np.testing.assert_allclose(track.lead_position_m, 0.2 + POSITIONS, atol=1e-9)
