@@ -12,7 +12,7 @@ help:  ## this list
 venv: $(STAMP)  ## .venv with the locked version of everything, extras included
 
 demo: $(STAMP)  ## the shipped demonstration, from trial sheet to results/demo/report.html
-	@$(BIN)/snakemake --cores $(CORES) --quiet rules host
+	@$(BIN)/snakemake --cores $(CORES)
 
 test: $(STAMP)  ## all tests
 	$(BIN)/python -m pytest

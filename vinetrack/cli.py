@@ -7,7 +7,6 @@ log, where the traceback is.
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -84,7 +83,7 @@ def effects() -> None:
             typer.echo(f"    {effect.formula}")
             for parameter in effect.parameters:
                 low, high = parameter.bounds
-                typer.echo(f"    {parameter.symbol}: {parameter.name}, {parameter.unit or '–'}, {low:g} to {high:g}")
+                typer.echo(f"    {parameter.symbol} ({parameter.unit}): {parameter.meaning}, {low:g} to {high:g}")
 
 
 @app.command(rich_help_panel="Stages of the workflow")
@@ -211,4 +210,4 @@ def _log_to(path: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -135,13 +135,19 @@ def find_experiment(folder: Path) -> Path:
         parent = parent.parent
     folders = sorted(path.name for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
     wanted = folder.absolute().relative_to(parent).parts[0]
-    near = (
-        difflib.get_close_matches(wanted, folders, 1, 0.5)
-        or [name for name in folders if (parent / name / "trials.csv").is_file()][:1]
-    )
-    shown = os.path.relpath(parent / near[0] if near else parent)
-    remedy = f"did you mean {shown}?" if near else f"the nearest that exists is {shown}"
+    near = difflib.get_close_matches(wanted, folders, 1, 0.5)
+    sheets = [name for name in folders if (parent / name / "trials.csv").is_file()][:3]
+    if near:
+        remedy = f"did you mean {_shown(parent / near[0])}?"
+    elif sheets:
+        remedy = f"there is {', '.join(_shown(parent / name) for name in sheets)}"
+    else:
+        remedy = f"the nearest that exists is {_shown(parent)}"
     raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
+
+
+def _shown(path: Path) -> str:
+    return os.path.relpath(path)
 
 
 def plan_or_stop(config: Mapping[str, Any], base: Path) -> Plan:

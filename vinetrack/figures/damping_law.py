@@ -109,9 +109,9 @@ def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.
     """Standard error of ln F = ln B + n ln x_ss along the law of one vine, from the fit's covariance; None without."""
     covariance = fit.get("covariance") or {}
     names, matrix = covariance.get("parameters"), covariance.get("matrix")
-    if not names or matrix is None or f"ln_B:{vine}" not in names:
+    if not names or matrix is None or f"ln B {vine}" not in names:
         return None
-    i, j = names.index("n"), names.index(f"ln_B:{vine}")
+    i, j = names.index("n"), names.index(f"ln B {vine}")
     cov = np.asarray(matrix, dtype=float)
     slope = np.log(x_ss_m_s)
     variance = cov[j, j] + 2 * slope * cov[i, j] + slope**2 * cov[i, i]
@@ -148,4 +148,4 @@ def _legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styles: 
     for method, name in METHOD_NAMES.items():
         if (damping.get(method) or {}).get("vines"):
             handles.append(Line2D([], [], color=INK, ls=METHOD_LINES[method], label=f"{name}\nand its 95 % band"))
-    fig.legend(handles=handles, loc="outside right upper", fontsize=9, labelspacing=0.8, borderaxespad=1.2)
+    fig.legend(handles=handles, loc="outside right upper", fontsize=9, labelspacing=0.8, borderaxespad=0.8)

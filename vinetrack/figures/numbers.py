@@ -28,7 +28,7 @@ def with_error(value: float | None, sigma: float | None) -> str:
         return "–"
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return number(value)
-    places = 1 - math.floor(math.log10(sigma))
+    places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 is written 0.010, and counts as that
     if places > 6:
         return f"{value:.3e} ± {sigma:.1e}"
     return f"{value:.{max(places, 0)}f} ± {sigma:.{max(places, 0)}f}"

@@ -117,6 +117,16 @@ def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure
     return fig
 
 
+def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) -> float:
+    """Font size at which `text` fits a width, at most `largest`: names come as long as people make them."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
+    font = FontProperties(family="DejaVu Sans", weight="bold" if bold else "normal")
+    taken_pt = TextPath((0, 0), text.replace("$", "S"), size=largest, prop=font).get_extents().width
+    return largest * min(1.0, width_pt / max(taken_pt, 1e-9))
+
+
 def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
     """Put the legend over the axes, where no datum can lie under it."""
     handles, labels = ax.get_legend_handles_labels()

@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.figures.numbers import with_error
-from vinetrack.figures.style import GRID, INK, MUTED, RULE_COLOURS, RULE_NAMES, VERMILLION, blank, look, rows
+from vinetrack.figures.style import (
+    GRID,
+    INK,
+    MUTED,
+    RULE_COLOURS,
+    RULE_NAMES,
+    VERMILLION,
+    blank,
+    fitting_size,
+    look,
+    rows,
+)
 from vinetrack.records import UNUSABLE_FLAGS
 
 if TYPE_CHECKING:
@@ -42,7 +53,8 @@ def draw_trial_motion(
 
     if kinematics.empty:
         return blank(f"{title}: no positions to draw.", _WIDTH_IN)
-    notes = [line for row in rows(windows) for line in _verdict(row)]
+    unusable = _unusable(track)
+    notes = [_counts(len(kinematics), int(unusable.sum())), *(line for row in rows(windows) for line in _verdict(row))]
     with look():
         text_in = _LINE_IN * len(notes) + 0.1
         strip_in = 0.24 * max(len(windows), 1)
@@ -50,8 +62,8 @@ def draw_trial_motion(
         height_in = sum(heights_in.values()) + 1.2
         fig = Figure(figsize=(_WIDTH_IN, height_in))
         lead, speed, strip = _three_rows(fig, heights_in, height_in)
-        _draw_position(lead, track, kinematics)
-        lead.set_title(textwrap.shorten(title, 78, placeholder=" …"), pad=8)
+        _draw_position(lead, track, kinematics, unusable)
+        lead.set_title(title, pad=8, fontsize=fitting_size(title, 0.8 * 72 * _WIDTH_IN, 11))
         _draw_speed(speed, kinematics, windows, travel_ratio)
         _draw_strip(strip, windows)
         for i, (colour, line) in enumerate(notes):
@@ -73,19 +85,24 @@ def _three_rows(fig: Figure, heights_in: dict[str, float], height_in: float) -> 
     return lead, speed, strip
 
 
-def _draw_position(ax: Axes, track: pd.DataFrame, kinematics: pd.DataFrame) -> None:
+def _unusable(track: pd.DataFrame) -> np.ndarray:
+    """Mask of the rows that say nothing about where the leading edge was."""
     flags = track["flag"].fillna("").astype(str)
-    doubtful = flags.map(lambda flag: bool(UNUSABLE_FLAGS.intersection(flag.split(";")))).to_numpy(dtype=bool)
-    position_m = track["lead_position_m"].to_numpy(dtype=float)
+    return flags.map(lambda flag: bool(UNUSABLE_FLAGS.intersection(flag.split(";")))).to_numpy(dtype=bool)
+
+
+def _counts(n_used: int, n_left: int) -> tuple[str, str]:
+    return MUTED, f"{n_used} points" + (f", {n_left} left out (×)" if n_left else "")
+
+
+def _draw_position(ax: Axes, track: pd.DataFrame, kinematics: pd.DataFrame, unusable: np.ndarray) -> None:
+    position_mm = 1e3 * track["lead_position_m"].to_numpy(dtype=float)
     time_s = track["time_s"].to_numpy(dtype=float)
     step = max(len(track) // _MAX_DOTS, 1)
-    ax.plot(time_s[~doubtful][::step], 1e3 * position_m[~doubtful][::step], ".", color=MUTED, ms=3.5, mew=0)
-    if (doubtful & np.isfinite(position_m)).any():
-        ax.plot(time_s[doubtful], 1e3 * position_m[doubtful], "x", color=VERMILLION, ms=4, mew=1)
+    ax.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=MUTED, ms=3.5, mew=0)
+    if (unusable & np.isfinite(position_mm)).any():
+        ax.plot(time_s[unusable], position_mm[unusable], "x", color=VERMILLION, ms=4, mew=1)
     ax.plot(kinematics["time_s"], 1e3 * kinematics["lead_position_m"], "-", color=INK, lw=1.1)
-    n_used, n_left = len(kinematics), int(doubtful.sum())
-    counts = f"{n_used} points" + (f", {n_left} left out (×)" if n_left else "")
-    ax.text(1.0, 1.03, counts, transform=ax.transAxes, ha="right", va="bottom", fontsize=9, color=MUTED)
     ax.set_ylabel("leading edge (mm)")
 
 

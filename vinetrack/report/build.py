@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.figures.numbers import number, with_error
 from vinetrack.figures.style import METHOD_NAMES, RULE_NAMES, rows
 from vinetrack.report.svg import inline_svg, speed_sparkline
-from vinetrack.report.words import REFERENCES, exponent_table, headline, methods, tally, vine_table
+from vinetrack.report.words import REFERENCES, exponent_table, headline, methods, tally, vine_table, without_law
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,6 +67,7 @@ def build_report(content: ReportContent) -> str:
         headline=headline(content.damping),
         tally=tally(content.trials),
         exponents=exponent_table(content.damping, METHOD_NAMES),
+        without_law=without_law(content.damping),
         vines=vine_table(content.damping, METHOD_NAMES),
         figures=[_figure(figure) for figure in content.figures if len(figure.svg) <= MAX_INLINE_SVG_BYTES],
         trials=[_trial(row, content) for row in rows(content.trials)],

@@ -8,9 +8,17 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.figures.style import GRID, INK, MUTED, PAPER
+from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, VERMILLION
 
-_THEMED = {INK: "currentColor", GRID: "var(--grid)", MUTED: "var(--muted)", PAPER: "var(--paper)"}
+_THEMED = {
+    INK: "currentColor",
+    GRID: "var(--grid)",
+    MUTED: "var(--muted)",
+    PAPER: "var(--paper)",
+    BLUE: "var(--blue)",
+    VERMILLION: "var(--vermillion)",
+    GREEN: "var(--green)",
+}
 _REFERENCE = re.compile(r"""(\bid="|url\(#|href="#)""")
 
 

@@ -21,8 +21,8 @@ REFERENCES = (
     "Letters, 2025: the equation of motion, the damping law and the 3 % rule.",
     "Savitzky and Golay, Smoothing and Differentiation of Data by Simplified Least Squares Procedures, Analytical "
     "Chemistry 36, 1964: velocity.",
-    "Boggs and Rogers, Orthogonal Distance Regression, Contemporary Mathematics 112, 1990: the fit with errors on both "
-    "axes.",
+    "York, Evensen, Martínez and De Basabe Delgado, Unified equations for the slope, intercept, and standard errors of "
+    "the best straight line, American Journal of Physics 72, 2004: the fit with errors on both axes.",
     "Efron and Tibshirani, An Introduction to the Bootstrap, 1993: intervals by resampling whole trials.",
 )
 
@@ -88,6 +88,12 @@ def exponent_table(damping: Mapping[str, Any], names: Mapping[str, str]) -> list
     return table
 
 
+def without_law(damping: Mapping[str, Any]) -> list[str]:
+    """Vines that the fit left out, each with the reason."""
+    left_out = (damping.get(PREFERRED) or {}).get("left_out") or {}
+    return [f"{vine}: {reason}" for vine, reason in left_out.items()]
+
+
 def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
     """How it was done, as (heading, paragraph) pairs; numbers from the settings that were used."""
     velocity, steady, damping = (settings.get(key) or {} for key in ("velocity", "steady", "damping"))
@@ -109,16 +115,17 @@ def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
         ),
         (
             "Force",
-            "F = (P − P_y)·πD²/4 + 2·m·g·cosθ: the pressure in the window where it was measured, else the one of the "
-            "sheet, less the yield pressure; and the mean weight moving there. Only trials without payload, of "
-            "everting bodies, enter the fit.",
+            "F = (P − P_y)·πD²/4 + 2·m·g·cosθ: the pressure in the window where it was measured, else the one that "
+            "the model in use gives there, less the yield pressure; and the mean weight moving there. Only trials "
+            "without payload, of everting bodies, enter the fit.",
         ),
         (
             "Damping law",
             "F = B·x_ssⁿ with one n for all vines and a B for each: by least squares on logarithms, as in the paper, "
-            f"and with errors on both axes. Intervals hold 95 % and come from {damping.get('resamples', 2000)} resamplings "
-            f"of whole trials (seed {damping.get('seed', 0)}); the wider ones add the stated error of the yield "
-            "pressure, which all trials of a vine share.",
+            "and with errors on both axes (York), where the vines' own scatter stands with the measured errors. "
+            f"Intervals hold 95 % and come from {damping.get('resamples', 2000)} resamplings of whole trials (seed "
+            f"{damping.get('seed', 0)}), or from Student's t where there are too few trials to resample; the wider "
+            "ones add the stated error of the yield pressure, which all trials of a vine share.",
         ),
     ]
 

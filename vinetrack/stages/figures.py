@@ -76,10 +76,12 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
         name: read_result(results.kinematics(name))
         for name in described.loc[described["status"] != "left_out", "trial"]
     }
+    in_fit = [vine for fit in damping.values() for vine in fit["vines"]]
+    points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
     drawings: dict[str, Figure] = {
         "damping_law": draw_damping_law(points, damping),
         "exponents": draw_exponents(damping),
-        "scaling": draw_scaling(damping, read_json(results.scaling)),
+        "scaling": draw_scaling(damping),
         "overview": draw_overview(described, moved),
     }
     for name, figure in drawings.items():

@@ -66,11 +66,14 @@ POINT_COLUMNS = (
     "diameter_mm",
     "thickness_um",
     "pressure_kPa",
+    "window_pressure_kPa",
     "x_ss_m_s",
     "x_ss_sigma_m_s",
     "force_N",
     "force_sigma_N",
     "yield_force_sigma_N",
+    "x_ss_paper_m_s",
+    "force_paper_N",
     "used",
     "reason",
 )
@@ -151,16 +154,21 @@ def read_result(path: Path) -> pd.DataFrame:
     import pandas as pd
 
     try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        with path.open(encoding="utf-8") as file:
+            columns = file.readline().strip().split(",")
+        numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS]
+        table = pd.read_csv(
+            path,
+            dtype={column: float if column in numbers else str for column in columns},
+            keep_default_na=False,
+            na_values={column: ["", "NaN"] for column in numbers},
+        )
     except FileNotFoundError:
         raise ResultsError(f"{path} does not exist: run the stage that makes it, or snakemake for all") from None
     except (OSError, ValueError) as error:
         raise ResultsError(f"{path} cannot be read ({error}): delete it and run snakemake again") from None
-    for column in table.columns.difference(list(TEXT_COLUMNS)):
-        if column in TRUTH_COLUMNS:
-            table[column] = (table[column] == "True").astype(bool)
-        else:
-            table[column] = pd.to_numeric(table[column].replace("", "NaN")).astype(float)
+    for column in TRUTH_COLUMNS.intersection(columns):
+        table[column] = (table[column] == "True").astype(bool)
     return table
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import traceback
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.experiment import Experiment
+    from vinetrack.model.model import Model
     from vinetrack.settings import RunSettings
 
 log = logging.getLogger(__name__)
@@ -62,7 +63,9 @@ def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, 
     results = Results(folder)
     for name in experiment.failed:
         _write_empty(results, name)
-    work = partial(_analyse_trial, results=results, settings=settings, experiment=experiment)
+    effects = experiment.settings.model, tuple(experiment.folder / path for path in experiment.settings.effects)
+    _model(*effects)
+    work = partial(_analyse_trial, results=results, settings=settings, effects=effects)
     analysed = {found.row["trial"]: found for found in map_trials(work, experiment.trials, n_workers, "tracks")}
     for name, found in analysed.items():
         if found.fault:
@@ -81,23 +84,36 @@ def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, 
     return table
 
 
-def _analyse_trial(trial: Trial, results: Results, settings: RunSettings, experiment: Experiment) -> _Analysed:
+@lru_cache(maxsize=1)
+def _model(names: tuple[str, ...], own: tuple[Path, ...]) -> Model:
+    """The model in use; every process makes its own, since a user's effects cannot travel between processes."""
+    from vinetrack.effects import load_effect
+    from vinetrack.model.model import make_model
+
+    return make_model(names, {effect.name: effect for effect in map(load_effect, own)})
+
+
+def _analyse_trial(
+    trial: Trial, results: Results, settings: RunSettings, effects: tuple[tuple[str, ...], tuple[Path, ...]]
+) -> _Analysed:
     """One trial from its file to its rows; its own files are written here, in the worker."""
-    from vinetrack.motion.summary import summarise_trial
+    from vinetrack.motion.summary import TrialError, summarise_trial
     from vinetrack.video.importers import TrackError, load_track
 
     try:
         if trial.track is None:
             raise TrackError(NO_RECORDINGS_YET)
-        summary = summarise_trial(trial, load_track(trial), settings, experiment.settings.model)
+        summary = summarise_trial(trial, load_track(trial), settings, _model(*effects))
     except TrackError as error:
         return _failed(results, trial, f"{trial.track.name + ' ' if trial.track else ''}{error}")
+    except TrialError as error:
+        return _failed(results, trial, str(error))
     except Exception:
         return _failed(results, trial, INTERNAL_FAULT, traceback.format_exc())
     write_csv(results.track(trial.name), track_table(summary.track))
     write_csv(results.kinematics(trial.name), kinematics_table(summary.kinematics))
     windows = [_window_row(trial.name, window) for window in summary.windows.values()]
-    return _Analysed(summary.row, windows, summary.point)
+    return _Analysed(dict(summary.row), windows, dict(summary.point))
 
 
 def _failed(results: Results, trial: Trial, reason: str, fault: str = "") -> _Analysed:

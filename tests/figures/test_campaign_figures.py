@@ -1,0 +1,248 @@
+"""Figures of a whole experiment, from tables written by hand: what is drawn and said, and that nothing overlaps."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from vinetrack.figures.damping_law import draw_damping_law, log_force_sigma
+from vinetrack.figures.exponents import draw_exponents
+from vinetrack.figures.overview import MAX_CONDITION_PANELS, draw_overview
+from vinetrack.figures.scaling import abscissa, draw_scaling
+from vinetrack.figures.style import look, render, vine_styles
+
+N = 0.4
+
+
+def law(B: float, diameter_mm: float, n_trials: int = 5) -> dict:
+    total = [0.9 * B, 1.1 * B]
+    size = {"diameter_mm": diameter_mm, "thickness_um": 8 * diameter_mm}
+    return {"B": B, "B_95": [0.95 * B, 1.05 * B], "B_95_total": total, "R2": 0.98, "n_trials": n_trials, **size}
+
+
+def fit(vines: dict[str, dict]) -> dict:
+    names = ["n", *(f"ln B {vine}" for vine in vines)]
+    return {
+        "n": N,
+        "n_95": [0.39, 0.41],
+        "n_95_total": [0.38, 0.42],
+        "vines": vines,
+        "covariance": {"parameters": names, "matrix": (1e-4 * np.eye(len(names))).tolist()},
+        "refused": None,
+    }
+
+
+def damping(n_vines: int = 2) -> dict:
+    vines = {f"vine{i}": law(1.0 + i, 6.0 * (i + 1)) for i in range(n_vines)}
+    return {"log_log": fit(vines), "both_axes": fit(vines)}
+
+
+REFUSED = {m: {"n": None, "n_95": [None, None], "vines": {}, "refused": "too few"} for m in ("log_log", "both_axes")}
+
+
+def points(n_vines: int = 2) -> pd.DataFrame:
+    rows = [
+        {
+            "trial": f"v{i}_{k}",
+            "vine": f"vine{i}",
+            "x_ss_m_s": 2.0**k,
+            "x_ss_sigma_m_s": 0.02 * 2.0**k,
+            "force_N": (1.0 + i) * 2.0 ** (N * k),
+            "force_sigma_N": 0.01,
+            "used": k < 4,
+        }
+        for i in range(n_vines)
+        for k in range(5)
+    ]
+    return pd.DataFrame(rows)
+
+
+def words(figure: Figure) -> str:
+    return "\n".join(text.get_text() for text in figure.findobj(Text))
+
+
+def test_log_axes_and_units_on_the_damping_law() -> None:
+    ax = draw_damping_law(points(), damping()).axes[0]
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert "(m/s)" in ax.get_xlabel()
+    assert "(N)" in ax.get_ylabel()
+
+
+def test_trials_outside_the_fit_are_hollow_and_counted() -> None:
+    figure = draw_damping_law(points(), damping())
+    markers = [line for line in figure.axes[0].lines if line.get_marker() in ("o", "s")]
+    hollow = [line for line in markers if line.get_markerfacecolor() != line.get_markeredgecolor()]
+    assert sorted(len(line.get_xdata()) for line in hollow) == [1, 1]
+    assert "not in the fit, N = 2" in words(figure)
+
+
+def test_both_fits_are_lines_of_slope_n() -> None:
+    lines = [line for line in draw_damping_law(points(1), damping(1)).axes[0].lines if line.get_marker() == "None"]
+    curves = [line for line in lines if len(line.get_xdata()) == 60]
+    assert len(curves) == 2
+    for line in curves:
+        x, force_N = np.log(line.get_xdata()), np.log(line.get_ydata())
+        assert np.polyfit(x, force_N, 1)[0] == pytest.approx(N, abs=1e-9)
+
+
+def test_the_band_is_that_of_the_covariance() -> None:
+    x_ss_m_s = np.array([0.5, 1.0, 4.0])
+    # Var(ln F) = Var(ln B) + ln²x·Var(n), the two being independent here.
+    expected = np.sqrt(1e-4 + np.log(x_ss_m_s) ** 2 * 1e-4)
+    assert log_force_sigma(fit({"v": law(1.0, 6.0)}), "v", x_ss_m_s) == pytest.approx(expected)
+
+
+def test_without_a_fit_the_points_are_still_drawn() -> None:
+    figure = draw_damping_law(points(), REFUSED)
+    assert "no fit" in words(figure)
+    assert sum(len(line.get_xdata()) for line in figure.axes[0].lines if line.get_marker() in ("o", "s")) == 10
+
+
+def test_without_points_the_figure_says_so() -> None:
+    assert "no damping law to draw" in words(draw_damping_law(points().iloc[:0], REFUSED)).replace("\n", " ")
+
+
+def test_n_and_b_are_shown_with_both_methods_and_both_intervals() -> None:
+    figure = draw_exponents(damping())
+    left, right = figure.axes
+    widths = [line.get_linewidth() for line in left.lines if len(line.get_xdata()) == 2]
+    assert len(widths) == 4
+    assert len(set(widths)) == 2
+    assert len([line for line in right.lines if len(line.get_xdata()) == 2]) == 8
+    assert "N = 5" in words(figure)
+
+
+def test_published_values_are_drawn_only_where_given() -> None:
+    published = {"n": 0.37, "B": {"vine0": 0.57}, "source": "someone 2025"}
+    assert "someone 2025" in words(draw_exponents(damping(), published))
+    assert "someone 2025" in words(draw_scaling(damping(), published))
+    assert "someone" not in words(draw_exponents(damping())) + words(draw_scaling(damping()))
+
+
+def test_b_is_drawn_against_the_size_that_differs_most() -> None:
+    assert abscissa({"a": law(1, 6), "b": law(2, 24)}) == "diameter_mm"
+    same = {"a": law(1, 6) | {"thickness_um": 50}, "b": law(2, 6) | {"thickness_um": 80}}
+    assert abscissa(same) == "thickness_um"
+    assert abscissa({"a": law(1, 6), "b": law(2, 6)}) is None
+
+
+def test_the_slope_of_b_against_size_is_stated() -> None:
+    vines = {f"v{d}": law(0.1 * d**1.5, d) for d in (6.0, 12.0, 24.0)}
+    assert "diameter to the 1.50" in words(draw_scaling({"both_axes": fit(vines)}))
+
+
+def test_one_vine_has_no_scale() -> None:
+    assert "at least two vines" in words(draw_scaling(damping(1))).replace("\n", " ")
+
+
+def campaign(n_conditions: int, replicates: int) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
+    rows, curves = [], {}
+    time_s = np.linspace(0, 0.1, 40)
+    for i in range(n_conditions):
+        for k in range(replicates):
+            name = f"c{i}_{k}"
+            speed_m_s = (1 + i) * (1 - np.exp(-time_s / 0.01))
+            position_m = (1 + i) * time_s
+            curves[name] = pd.DataFrame(
+                {"time_s": time_s, "lead_position_m": position_m, "lead_velocity_m_s": speed_m_s}
+            )
+            row = {"trial": name, "vine": "v", "condition": f"c{i}", "condition_label": f"12 mm, {i} kPa"}
+            rows.append({**row, "pressure_kPa": i, "status": "ok", "steady_from_s": 0.05, "steady_to_s": 0.08})
+    return pd.DataFrame(rows), curves
+
+
+@pytest.mark.parametrize(("n_conditions", "replicates", "n_panels"), [(1, 1, 1), (12, 2, 12), (40, 4, 40), (500, 1, 1)])
+def test_all_trials_have_a_panel_for_each_condition_or_for_each_vine(
+    n_conditions: int, replicates: int, n_panels: int
+) -> None:
+    figure = draw_overview(*campaign(n_conditions, replicates))
+    panels = [ax for ax in figure.axes if ax.get_visible() and ax.get_title(loc="left")]
+    assert len(panels) == n_panels
+    thin = [line for ax in panels for line in ax.lines if line.get_linewidth() < 1]
+    assert len(thin) == n_conditions * replicates
+    if n_conditions > MAX_CONDITION_PANELS:
+        assert "pressure (kPa)" in words(figure)
+
+
+def test_a_steady_stretch_is_thick() -> None:
+    figure = draw_overview(*campaign(1, 1))
+    thick = [line for line in figure.axes[0].lines if line.get_linewidth() > 2]
+    assert len(thick) == 1
+    # 0.05 to 0.08 s at 1 m/s.
+    assert min(thick[0].get_xdata()) == pytest.approx(50, abs=3)
+    assert max(thick[0].get_xdata()) == pytest.approx(80, abs=3)
+
+
+def test_a_failed_trial_is_counted_in_its_panel() -> None:
+    trials, curves = campaign(2, 2)
+    trials.loc[1, "status"] = "failed"
+    del curves["c0_1"]
+    assert "1 failed" in words(draw_overview(trials, curves))
+
+
+def test_the_overview_of_nothing_says_so() -> None:
+    assert "No trial has positions" in words(draw_overview(campaign(1, 1)[0], {}))
+
+
+def every_figure() -> list[tuple[str, Figure]]:
+    return [
+        ("law", draw_damping_law(points(4), damping(4))),
+        ("law of 20 vines", draw_damping_law(points(20), damping(20))),
+        ("exponents", draw_exponents(damping(4), {"n": 0.37, "B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"})),
+        ("scaling", draw_scaling(damping(4), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"})),
+        ("overview", draw_overview(*campaign(40, 1))),
+    ]
+
+
+@pytest.mark.parametrize(("name", "figure"), every_figure(), ids=lambda value: value if isinstance(value, str) else "")
+def test_no_text_is_cut_off_and_no_legend_covers_the_axes(name: str, figure: Figure) -> None:
+    with look():
+        figure.draw_without_rendering()
+        drawn, edge = figure.get_tightbbox(), figure.bbox_inches.padded(0.02)
+        assert edge.x0 <= drawn.x0, name
+        assert drawn.x1 <= edge.x1, name
+        assert edge.y0 <= drawn.y0, name
+        assert drawn.y1 <= edge.y1, name
+        legends = [*figure.legends, *(ax.get_legend() for ax in figure.axes if ax.get_legend())]
+        for legend in legends:
+            for ax in figure.axes:
+                assert not legend.get_window_extent().padded(-1).overlaps(ax.get_window_extent().padded(-1)), name
+
+
+def test_the_same_figure_gives_the_same_bytes() -> None:
+    first, second = (render(draw_damping_law(points(), damping())) for _ in range(2))
+    assert first == second
+
+
+def test_a_png_is_white_and_an_svg_transparent() -> None:
+    from io import BytesIO
+
+    from matplotlib.image import imread
+
+    files = render(draw_scaling(damping()), ("png", "svg"))
+    assert imread(BytesIO(files["png"]))[0, 0] == pytest.approx([1, 1, 1, 1])
+    assert b"fill: #ffffff" not in files["svg"].split(b"axes_1")[0]
+
+
+def test_drawing_leaves_no_state_in_matplotlib() -> None:
+    import matplotlib as mpl
+
+    before = dict(mpl.rcParams)
+    render(draw_scaling(damping()), ("png",))
+    assert dict(mpl.rcParams) == before
+
+
+def test_42_vines_all_look_different() -> None:
+    styles = vine_styles(f"v{i}" for i in range(42))
+    assert len({(style.colour, style.marker) for style in styles.values()}) == 42
+
+
+def test_a_band_needs_a_covariance() -> None:
+    assert log_force_sigma({"covariance": None}, "v", np.array([1.0])) is None
+    assert log_force_sigma(fit({"v": law(1, 6)}), "another", np.array([1.0])) is None
+    assert math.isclose(float(log_force_sigma(fit({"v": law(1, 6)}), "v", np.array([1.0]))[0]), 1e-2)

@@ -1,0 +1,57 @@
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from vinetrack.figures.numbers import half_width, interval, number, with_error
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.37, "0.370"),
+        (1069.0, "1069"),
+        (0.0, "0"),
+        (-2.345, "-2.35"),
+        (1.5e-7, "1.50e-07"),
+        (math.nan, "–"),
+        (None, "–"),
+    ],
+)
+def test_a_number_has_three_digits_and_an_exponent_only_where_needed(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text"),
+    [
+        (0.36981, 0.0123, "0.370 ± 0.012"),
+        (0.3712, 0.00999999, "0.371 ± 0.010"),
+        (152.7, 31.0, "153 ± 31"),
+        (2.5, 0.0, "2.50"),
+        (2.5, math.nan, "2.50"),
+    ],
+)
+def test_a_value_ends_where_its_error_does(value: float, sigma: float, text: str) -> None:
+    assert with_error(value, sigma) == text
+
+
+def test_an_unknown_value_is_a_dash_whatever_its_error() -> None:
+    assert with_error(math.nan, 0.1) == "–"
+
+
+def test_an_interval_shows_both_ends_to_the_same_digit() -> None:
+    assert interval([0.36512, 0.37449]) == "0.3651 to 0.3745"
+
+
+@pytest.mark.parametrize("bounds", [None, [None, None], [math.nan, 1.0]])
+def test_an_unknown_interval_is_a_dash(bounds: list | None) -> None:
+    assert interval(bounds) == "–"
+
+
+def test_half_an_interval() -> None:
+    assert half_width([1.0, 4.0]) == 1.5
+    assert math.isnan(half_width([None, None]))

@@ -1,0 +1,233 @@
+"""The page, from tables written by hand: what its first screen says, that it is one file, and that nothing gets out."""
+
+from __future__ import annotations
+
+import base64
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vinetrack.report.build import ReportContent, ReportFigure, build_report
+from vinetrack.report.svg import inline_svg, speed_sparkline
+from vinetrack.report.words import headline, tally, without_law
+
+EVIL = "<script>alert('x')</script>&\"'"
+SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"/></defs><g id="g1" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></svg>'  # noqa: E501
+
+
+def law(n_trials: int = 4, B: float = 2.0) -> dict:
+    size = {"diameter_mm": 12.0, "thickness_um": 100.0}
+    return {"B": B, "B_95": [1.9, 2.1], "B_95_total": [1.8, 2.2], "R2": 0.98, "n_trials": n_trials, **size}
+
+
+def damping(*vines: str, refused: str | None = None) -> dict:
+    fit = {
+        "n": None if refused else 0.3712,
+        "n_95": [None, None] if refused else [0.3612, 0.3812],
+        "n_95_total": [None, None] if refused else [0.35, 0.39],
+        "vines": {} if refused else {vine: law() for vine in vines},
+        "refused": refused,
+        "left_out": {},
+    }
+    return {"log_log": fit, "both_axes": fit}
+
+
+def trials(*names: str, status: str = "ok", reason: str = "") -> pd.DataFrame:
+    columns = "x_ss_m_s x_ss_sigma_m_s x_ss_paper_m_s force_N final_lead_velocity_m_s efficiency"
+    numbers = dict.fromkeys([*columns.split(), "steady_from_s", "steady_to_s"], 0.5)
+    rows = [{"trial": n, "vine": "v", "condition": "c", "status": status, "reason": reason, **numbers} for n in names]
+    return pd.DataFrame(rows)
+
+
+def windows(*names: str) -> pd.DataFrame:
+    row = {"rule": "gated", "accepted": True, "from_s": 0.1, "to_s": 0.2, "points": 50.0, "x_ss_m_s": 2.0}
+    row |= {"x_ss_sigma_m_s": 0.1, "drift": 0.01, "cv": 0.02, "reason": "steady enough"}
+    return pd.DataFrame([{"trial": name, **row} for name in names], columns=["trial", *row])
+
+
+def curves(*names: str, n: int = 300) -> dict[str, pd.DataFrame]:
+    time_s = np.linspace(0, 0.3, n)
+    return {name: pd.DataFrame({"time_s": time_s, "lead_velocity_m_s": 1 - np.exp(-time_s / 0.02)}) for name in names}
+
+
+def page(**changes: object) -> str:
+    content = {
+        "name": "vines",
+        "trials": trials("a"),
+        "windows": windows("a"),
+        "damping": damping("v"),
+        "provenance": {
+            "vinetrack": "1.2.3",
+            "python": "3.11",
+            "platform": "Linux",
+            "model": ["gravity"],
+            "libraries": {"numpy": "2"},
+            "inputs": {"trials.csv": "abc"},
+            "settings": {"damping": {"resamples": 777, "seed": 1}},
+        },
+        "kinematics": curves("a"),
+    }
+    return build_report(ReportContent(**{**content, **changes}))  # type: ignore[arg-type]
+
+
+class Tags(HTMLParser):
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in ("meta", "br", "link", "img", "hr"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+
+def test_the_first_screen_says_n_with_its_error_and_how_many_trials() -> None:
+    html = page(damping=damping("v", "w"), trials=trials("a", "b"))
+    heading = re.search(r"<h1>(.*?)</h1>", html)
+    assert heading is not None
+    assert heading[1] == "One damping exponent fits all vines: n = 0.371 ± 0.010 (95 %), from 8 trials of 2 vines."
+    assert "2 trials: 2 ok." in html
+
+
+def test_one_vine_has_b_in_the_headline() -> None:
+    assert "B = 2.00 ± 0.10 N·(s/m)ⁿ" in headline(damping("v"))
+
+
+def test_a_refusal_is_the_headline() -> None:
+    assert headline(damping(refused="no vine has enough trials")) == "No damping law: no vine has enough trials."
+
+
+def test_every_status_is_counted() -> None:
+    mixed = pd.concat([trials("a"), trials("b", "c", status="failed"), trials("d", status="left_out")])
+    assert tally(mixed) == "4 trials: 1 ok, 2 failed, 1 left out on request."
+
+
+def test_vines_that_the_fit_left_out_are_named() -> None:
+    fit = damping("v")
+    fit["both_axes"] = {**fit["both_axes"], "left_out": {"w": "2 steady trials"}}
+    assert without_law(fit) == ["w: 2 steady trials"]
+    assert "No B for w: 2 steady trials." in page(damping=fit)
+
+
+def test_every_trial_stands_with_status_and_reason() -> None:
+    html = page(trials=trials("a", "b", status="failed", reason="fewer than 5 points"), windows=windows())
+    assert html.count('class="status status-failed"') == 2
+    assert html.count("fewer than 5 points") == 2
+
+
+def test_settings_provenance_and_methods_are_on_the_page() -> None:
+    html = page()
+    for said in ("damping.resamples", "777 resamplings", "vinetrack", "1.2.3", "numpy 2", "abc", "Savitzky"):
+        assert said in html
+
+
+@pytest.mark.parametrize("place", ["name", "trial", "reason", "vine", "refused", "left_out", "rule", "input", "figure"])
+def test_whatever_a_user_wrote_is_escaped(place: str) -> None:
+    fit = damping(EVIL if place == "vine" else "v", refused=EVIL if place == "refused" else None)
+    if place == "left_out":
+        fit["both_axes"] = {**fit["both_axes"], "left_out": {EVIL: EVIL}}
+    table = trials(EVIL if place == "trial" else "a", reason=EVIL if place == "reason" else "")
+    rules = windows("a").assign(rule=EVIL, reason=EVIL) if place == "rule" else windows("a")
+    provenance = {
+        "vinetrack": EVIL,
+        "python": "",
+        "platform": "",
+        "model": [EVIL],
+        "libraries": {},
+        "settings": {EVIL: EVIL},
+    }
+    provenance["inputs"] = {EVIL if place == "input" else "trials.csv": "abc"}
+    figures = [ReportFigure("f", EVIL, EVIL, SVG, EVIL, EVIL)] if place == "figure" else []
+    html = page(
+        name=EVIL if place == "name" else "vines",
+        damping=fit,
+        trials=table,
+        windows=rules,
+        provenance=provenance,
+        figures=figures,
+    )
+    assert "<script" not in html
+    assert not [tag for tag, _ in Tags(html).tags if tag == "script"]
+
+
+def test_the_page_is_one_file_that_asks_for_nothing_from_elsewhere() -> None:
+    html = page(figures=[ReportFigure("law", "Law", "caption", SVG, "p.csv", "a,b\n1,2\n")])
+    for _, attributes in Tags(html).tags:
+        for name in ("src", "href", "xlink:href"):
+            target = attributes.get(name) or ""
+            assert target.startswith(("#", "data:")) or not target
+    assert "@import" not in html
+    assert "url(http" not in html
+
+
+def test_tags_are_closed_in_order() -> None:
+    html = page(
+        trials=trials("a", "b"),
+        windows=windows("a"),
+        figures=[ReportFigure("law", "Law", "caption", SVG)],
+        trial_figures={"b": SVG},
+    )
+    tags = Tags(html)
+    assert tags.wrong == []
+    assert tags.open == []
+
+
+def test_identifiers_are_unique_though_pictures_share_them() -> None:
+    figures = [ReportFigure(key, "t", "c", SVG) for key in ("one", "two")]
+    ids = [attributes["id"] for _, attributes in Tags(page(figures=figures)).tags if attributes.get("id")]
+    assert len(ids) == len(set(ids))
+
+
+def test_the_numbers_of_a_figure_are_one_click_away() -> None:
+    html = page(figures=[ReportFigure("law", "Law", "c", SVG, "points.csv", "µ,b\n1,2\n")])
+    link = next(a for tag, a in Tags(html).tags if tag == "a" and a.get("download") == "points.csv")
+    assert base64.b64decode((link["href"] or "").split("base64,")[1]).decode() == "µ,b\n1,2\n"
+
+
+def test_an_inlined_picture_follows_the_page_and_keeps_its_proportions() -> None:
+    svg = inline_svg(SVG, "law", 'a "law"')
+    assert svg.startswith("<svg")
+    assert "currentColor" in svg
+    assert "var(--blue)" in svg
+    assert 'viewBox="0 0 504 360"' in svg
+    assert 'id="law-g1"' in svg
+    assert "url(#law-p1)" in svg
+    assert 'aria-label="a &quot;law&quot;"' in svg
+    for gone in ("<?xml", "<!--", "<metadata", "<style", 'height="360pt"'):
+        assert gone not in svg
+
+
+def test_a_small_curve_marks_the_steady_stretch() -> None:
+    time_s = np.linspace(0, 1, 50)
+    svg = speed_sparkline(time_s, np.ones(50), (0.5, 1.0))
+    steady = re.search(r'class="steady" points="([^"]+)"', svg)
+    assert steady is not None
+    x = [float(pair.split(",")[0]) for pair in steady[1].split()]
+    # Half of the 130 px between the margins.
+    assert min(x) == pytest.approx(1 + 130 / 2, abs=3)
+    assert max(x) == pytest.approx(131, abs=0.1)
+
+
+@pytest.mark.parametrize("speed", [np.full(50, np.nan), np.array([1.0])])
+def test_a_small_curve_of_nothing_is_blank(speed: np.ndarray) -> None:
+    assert speed_sparkline(np.linspace(0, 1, speed.size), speed, (np.nan, np.nan)) == ""
+
+
+def test_500_trials_stay_below_two_megabytes() -> None:
+    names = [f"trial_{i}" for i in range(500)]
+    html = page(trials=trials(*names), windows=windows(*names), kinematics=curves(*names))
+    assert html.count('class="spark"') == 500
+    assert len(html.encode()) < 2e6

@@ -1,0 +1,308 @@
+"""A whole experiment from a sheet and tracks written by hand to the report, through Snakemake and stage by stage.
+
+The truth is analytic. A horizontal vine weighs nothing along its path, so its steady tail speed is
+x_ss = (F/B)^(1/n) with F = (P − P_y)·πD²/4; the tracks approach it exponentially: y = ½x_ss (t − τ(1 − e^(−t/τ))).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from vinetrack.cli import app
+
+ROOT = Path(__file__).parents[1]
+N = 0.4
+B = {12: 2.0, 24: 6.0}
+PRESSURES_KPA = (15.0, 20.0, 26.0, 33.0)
+YIELD_KPA = 3.0
+LAG_S = 0.004
+NOISE_M = 3e-5
+
+TRIALS_HEADER = (
+    "trial,vine,condition,status,reason,n_frames,mm_per_px,scale_rel_sigma,noise_m,steady_from_s,steady_to_s,"
+    "steady_rule,x_ss_m_s,x_ss_sigma_m_s,x_ss_paper_m_s,cv,force_N,final_lead_velocity_m_s,efficiency"
+)
+TRACK_HEADER = "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag"
+KINEMATICS_HEADER = (
+    "time_s,lead_position_m,lead_velocity_m_s,lead_velocity_sigma_m_s,tail_velocity_m_s,lead_acceleration_m_s2"
+)
+
+
+def steady_tail_speed(diameter_mm: float, pressure_kPa: float) -> float:
+    force_N = (pressure_kPa - YIELD_KPA) * 1e3 * np.pi * (diameter_mm * 1e-3) ** 2 / 4
+    return float((force_N / B[int(diameter_mm)]) ** (1 / N))
+
+
+def positions(diameter_mm: float, pressure_kPa: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ten still frames, then growth up to 250 mm, at 1000 frames a second with white noise."""
+    speed_m_s = steady_tail_speed(diameter_mm, pressure_kPa) / 2
+    time_s = np.arange(0, 0.25 / speed_m_s + LAG_S, 1e-3)
+    grown_m = speed_m_s * (time_s - LAG_S * (1 - np.exp(-time_s / LAG_S)))
+    grown_m = np.concatenate([np.zeros(10), grown_m])
+    noise_m = NOISE_M * np.random.default_rng(seed).standard_normal(grown_m.size)
+    return np.arange(grown_m.size) * 1e-3, 0.05 + grown_m + noise_m
+
+
+def write_track(path: Path, diameter_mm: float, pressure_kPa: float, seed: int, excel: bool = False) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = ["time_s,position_m"]
+    lines += [f"{t:.4f},{y:.7f}" for t, y in zip(*positions(diameter_mm, pressure_kPa, seed), strict=True)]
+    text = "\n".join(lines) + "\n"
+    if excel:
+        text = text.replace(",", ";").replace(".", ",").replace("\n", "\r\n")
+    path.write_bytes((b"\xef\xbb\xbf" if excel else b"") + text.encode())
+
+
+def write_campaign(folder: Path) -> None:
+    """As Excel saves it in half of Europe: semicolons, decimal commas, BOM, CRLF. One broken trial, one left out."""
+    rows = ["trial;track;diameter_mm;thickness_um;length_mm;pressure_kPa;yield_pressure_kPa;growth_angle_deg;use"]
+    for diameter_mm in B:
+        for i, pressure_kPa in enumerate(PRESSURES_KPA):
+            name = f"d{diameter_mm}_{i}"
+            write_track(folder / "tracks" / f"{name}.csv", diameter_mm, pressure_kPa, 10 * diameter_mm + i, i % 2 == 0)
+            pressure = f"{pressure_kPa:.1f}".replace(".", ",")
+            rows.append(f"{name};tracks/{name}.csv;{diameter_mm};{100 * diameter_mm // 12};300;{pressure};3,0;90;")
+    (folder / "tracks" / "torn.csv").write_text("time_s,position_m\n0,0\n0.001,zero\n")
+    rows.append("torn;tracks/torn.csv;12;100;300;20,0;3,0;90;")
+    rows.append("aside;tracks/d12_0.csv;12;100;300;15,0;3,0;90;no")
+    (folder / "trials.csv").write_bytes(b"\xef\xbb\xbf" + "\r\n".join([*rows, ""]).encode())
+
+
+def snakemake(workdir: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Snakemake from a shell in which nothing is activated."""
+    command = [str(Path(sys.executable).parent / "snakemake"), "--snakefile", str(ROOT / "Snakefile"), *arguments]
+    environment = {**os.environ, "PATH": os.defpath}
+    return subprocess.run(
+        command, cwd=workdir, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def read_rows(path: Path) -> dict[str, dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return {row["trial"]: row for row in csv.DictReader(file)}
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """The results folder of a run over an experiment whose path has blanks, and what Snakemake printed."""
+    workdir = tmp_path_factory.mktemp("a folder")
+    write_campaign(workdir / "my vines {1}")
+    done = snakemake(workdir, "--cores", "2", "--config", "experiment=my vines {1}/")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return workdir / "results" / "my vines {1}", done
+
+
+@pytest.mark.pipeline
+def test_last_line_says_where_the_report_is(campaign: tuple) -> None:
+    results, done = campaign
+    assert done.stdout.strip().splitlines()[-1] == f"Report: results/{results.name}/report.html"
+    assert (results / "report.html").is_file()
+
+
+@pytest.mark.pipeline
+def test_headers_are_exactly_those_people_rely_on(campaign: tuple) -> None:
+    results, _ = campaign
+    assert (results / "trials.csv").read_text().splitlines()[0] == TRIALS_HEADER
+    assert (results / "tracks" / "d12_0.csv").read_text().splitlines()[0] == TRACK_HEADER
+    assert (results / "kinematics" / "d12_0.csv").read_text().splitlines()[0] == KINEMATICS_HEADER
+
+
+@pytest.mark.pipeline
+def test_every_trial_of_the_sheet_is_listed_in_its_order_with_its_status(campaign: tuple) -> None:
+    rows = read_rows(campaign[0] / "trials.csv")
+    good = [f"d{diameter}_{i}" for diameter in B for i in range(len(PRESSURES_KPA))]
+    assert list(rows) == [*good, "torn", "aside"]
+    assert {rows[name]["status"] for name in good} == {"ok"}
+    assert (rows["torn"]["status"], rows["aside"]["status"]) == ("failed", "left_out")
+    assert "'zero' is not a number" in rows["torn"]["reason"]
+
+
+@pytest.mark.pipeline
+def test_a_failed_trial_has_files_with_a_header_alone_and_one_left_out_has_none(campaign: tuple) -> None:
+    results, _ = campaign
+    assert (results / "tracks" / "torn.csv").read_text() == TRACK_HEADER + "\n"
+    assert (results / "kinematics" / "torn.csv").read_text() == KINEMATICS_HEADER + "\n"
+    assert not (results / "tracks" / "aside.csv").exists()
+
+
+@pytest.mark.pipeline
+def test_a_track_has_a_row_for_every_frame(campaign: tuple) -> None:
+    lines = (campaign[0] / "tracks" / "d24_1.csv").read_text().splitlines()[1:]
+    time_s, _ = positions(24, PRESSURES_KPA[1], 241)
+    assert [int(line.split(",")[0]) for line in lines] == list(range(time_s.size))
+
+
+@pytest.mark.pipeline
+def test_steady_speeds_are_those_the_tracks_were_written_with(campaign: tuple) -> None:
+    rows = read_rows(campaign[0] / "trials.csv")
+    for diameter_mm in B:
+        for i, pressure_kPa in enumerate(PRESSURES_KPA):
+            truth = steady_tail_speed(diameter_mm, pressure_kPa)
+            assert float(rows[f"d{diameter_mm}_{i}"]["x_ss_m_s"]) == pytest.approx(truth, rel=0.02)
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize("method", ["log_log", "both_axes"])
+def test_the_damping_law_is_the_one_the_tracks_were_written_with(campaign: tuple, method: str) -> None:
+    fit = json.loads((campaign[0] / "damping.json").read_text())[method]
+    assert fit["refused"] is None
+    assert fit["n"] == pytest.approx(N, abs=0.01)
+    found = {law["diameter_mm"]: law["B"] for law in fit["vines"].values()}
+    assert found == pytest.approx(B, rel=0.02)
+    low, high = fit["n_95"]
+    assert low < fit["n"] < high
+
+
+@pytest.mark.pipeline
+def test_both_rules_are_reported_for_every_trial(campaign: tuple) -> None:
+    with (campaign[0] / "steady.csv").open() as file:
+        rules = {(row["trial"], row["rule"]) for row in csv.DictReader(file)}
+    assert {("d12_0", "gated"), ("d12_0", "paper"), ("d24_3", "gated"), ("d24_3", "paper")} <= rules
+
+
+@pytest.mark.pipeline
+def test_every_figure_is_there_as_png_and_svg(campaign: tuple) -> None:
+    figures = campaign[0] / "figures"
+    names = ["damping_law", "exponents", "scaling", "overview", "trial_d12_0", "trial_torn"]
+    for name in names:
+        assert (figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert "<svg" in (figures / f"{name}.svg").read_text(encoding="utf-8")
+
+
+@pytest.mark.pipeline
+def test_provenance_names_version_settings_and_the_hash_of_every_input(campaign: tuple) -> None:
+    import hashlib
+
+    import vinetrack
+
+    results, _ = campaign
+    provenance = json.loads((results / "provenance.json").read_text())
+    sheet = results.parents[1] / "my vines {1}" / "trials.csv"
+    assert provenance["vinetrack"] == vinetrack.__version__
+    assert provenance["settings"]["damping"]["resamples"] == 2000
+    assert provenance["inputs"]["trials.csv"] == hashlib.sha256(sheet.read_bytes()).hexdigest()
+    assert set(provenance["inputs"]) >= {"tracks/d12_0.csv", "tracks/d24_3.csv", "tracks/torn.csv"}
+
+
+@pytest.mark.pipeline
+def test_nothing_is_left_to_do_afterwards_and_the_last_line_still_says_where(campaign: tuple) -> None:
+    results, _ = campaign
+    again = snakemake(results.parents[1], "--cores", "1", "--config", "experiment=my vines {1}")
+    assert again.returncode == 0
+    assert "Nothing to be done" in again.stderr
+    assert again.stdout.strip().splitlines()[-1] == f"Report: results/{results.name}/report.html"
+
+
+@pytest.mark.pipeline
+def test_a_setting_reruns_only_what_depends_on_it(campaign: tuple) -> None:
+    results, _ = campaign
+    arguments = ("--cores", "1", "-n", "--config", "experiment=my vines {1}", "damping={resamples: 500}")
+    planned = snakemake(results.parents[1], *arguments)
+    assert planned.returncode == 0, planned.stderr
+    listed = {line.split()[0] for line in planned.stdout.splitlines() + planned.stderr.splitlines() if line.split()}
+    assert "damping" in listed
+    assert "tracks" not in listed
+
+
+@pytest.mark.parametrize(
+    ("folder", "said"),
+    [
+        ("vinse", "did you mean vines?"),
+        ("empty", "expected a folder with trials.csv"),
+        ("torn", "thickness_um is missing: add the column thickness_um"),
+    ],
+)
+def test_snakemake_stops_with_a_sentence_where_there_is_no_readable_sheet(
+    tmp_path: Path, folder: str, said: str
+) -> None:
+    write_track(tmp_path / "vines" / "a.csv", 12, 20, 1)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "torn").mkdir()
+    (tmp_path / "torn" / "trials.csv").write_text("trial,track,diameter_mm\na,a.csv,12\n")
+    done = snakemake(tmp_path, "--cores", "1", "--config", f"experiment={folder}")
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr + done.stdout
+    assert not (tmp_path / "results").exists()
+
+
+def stages(experiment: Path, results: Path) -> dict[str, dict[str, str]]:
+    """All stages by their own commands, in this process; the rows of trials.csv."""
+    runner = CliRunner()
+    for arguments in (
+        ["tracks", str(experiment), str(results)],
+        ["damping", str(results), "--settings", '{"damping": {"resamples": 200}}'],
+        ["figures", str(experiment), str(results), "--settings", '{"figures": {"dpi": 50}}'],
+        ["report", str(experiment), str(results)],
+    ):
+        done = runner.invoke(app, arguments, catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    return read_rows(results / "trials.csv")
+
+
+def test_one_trial_gives_everything_but_a_law_and_says_why(tmp_path: Path) -> None:
+    folder = tmp_path / "one"
+    write_track(folder / "a.csv", 12, 20, 7)
+    (folder / "trials.csv").write_text(
+        "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
+        "007,a.csv,12,100,300,20,3,90\n"
+    )
+    rows = stages(folder, tmp_path / "results")
+    assert float(rows["007"]["x_ss_m_s"]) == pytest.approx(steady_tail_speed(12, 20), rel=0.02)
+    law = json.loads((tmp_path / "results" / "damping.json").read_text())["both_axes"]
+    assert law["n"] is None
+    assert law["refused"] in (tmp_path / "results" / "report.html").read_text().replace("&#39;", "'")
+
+
+def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reasons(tmp_path: Path) -> None:
+    folder = tmp_path / "all broken"
+    folder.mkdir()
+    (folder / "a.csv").write_text("time_s,position_m\n1,1\n")
+    (folder / "trials.csv").write_text(
+        "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
+        "a,a.csv,12,100,300,20,3\nb,b.csv,12,100,300,20,3\nc,a.csv,12,100,300,9999,3\n"
+    )
+    rows = stages(folder, tmp_path / "results")
+    assert {row["status"] for row in rows.values()} == {"failed"}
+    page = (tmp_path / "results" / "report.html").read_text()
+    assert "3 trials: 3 failed." in page
+    assert all(row["reason"] for row in rows.values())
+
+
+def test_the_same_experiment_gives_the_same_bytes(tmp_path: Path) -> None:
+    folder = tmp_path / "same"
+    write_track(folder / "a.csv", 24, 26, 3)
+    (folder / "trials.csv").write_text(
+        "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
+        "a,a.csv,24,200,300,26,3,90\n"
+    )
+    stages(folder, tmp_path / "first")
+    stages(folder, tmp_path / "second")
+    files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*") if path.is_file())
+    assert len(files) > 12
+    for file in files:
+        assert (tmp_path / "first" / file).read_bytes() == (tmp_path / "second" / file).read_bytes(), file
+
+
+@pytest.mark.pipeline
+def test_the_workflow_has_no_lints_but_the_one_about_conda() -> None:
+    done = snakemake(ROOT, "--lint", "--config", "experiment=data/demo")
+    lints = [line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip().startswith("* ")]
+    assert set(lints) <= {"* Specify a conda environment or container for each rule.:"}
+
+
+@pytest.mark.skipif(shutil.which("snakefmt", path=str(Path(sys.executable).parent)) is None, reason="needs snakefmt")
+def test_the_snakefile_is_formatted() -> None:
+    command = [str(Path(sys.executable).parent / "snakefmt"), "--check", str(ROOT / "Snakefile")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,146 @@
+"""What the Snakefile is told before anything runs."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+
+import pytest
+
+from vinetrack import workflow
+from vinetrack.problems import ExperimentError
+from vinetrack.workflow import as_pattern, code_hash, find_experiment, make_plan, shell_prefix
+
+SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
+
+
+def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3,\nb,a.csv,12,100,300,20,3,no\n") -> Path:
+    folder.mkdir(parents=True)
+    (folder / "trials.csv").write_text(SHEET + rows)
+    (folder / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))
+    return folder
+
+
+@pytest.mark.parametrize("shown", ["{}", "{}/", "{}/."])
+def test_results_are_named_after_the_last_part_of_the_path(tmp_path: Path, shown: str) -> None:
+    folder = experiment(tmp_path / "week 3" / "vines")
+    plan = make_plan({"experiment": shown.format(folder)}, tmp_path)
+    assert plan.results == Path("results/vines")
+
+
+def test_results_go_where_the_command_line_says(tmp_path: Path) -> None:
+    plan = make_plan({"experiment": str(experiment(tmp_path / "v")), "results": "else/where"}, tmp_path)
+    assert plan.results == Path("else/where")
+
+
+def test_a_folder_whose_name_is_a_number_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    experiment(tmp_path / "2024")
+    monkeypatch.chdir(tmp_path)
+    assert make_plan({"experiment": 2024}, tmp_path).results == Path("results/2024")
+
+
+def test_trials_left_out_get_no_files_and_failed_ones_do(tmp_path: Path) -> None:
+    rows = "a,a.csv,12,100,300,20,3,\nb,a.csv,12,100,300,20,3,no\nc,a.csv,12,100,300,9999,3,\n"
+    plan = make_plan({"experiment": str(experiment(tmp_path / "v", rows))}, tmp_path)
+    assert plan.trials == ("a", "c")
+
+
+def test_inputs_are_the_sheet_and_every_track_there_is(tmp_path: Path) -> None:
+    rows = "a,a.csv,12,100,300,20,3,\nb,gone.csv,12,100,300,20,3,\n"
+    folder = experiment(tmp_path / "v", rows)
+    assert make_plan({"experiment": str(folder)}, tmp_path).inputs == (folder / "trials.csv", folder / "a.csv")
+
+
+def test_the_shipped_demonstration_is_found_wherever_snakemake_is_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment(tmp_path / "house" / "data" / "demo")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    plan = make_plan({"experiment": "data/demo"}, tmp_path / "house")
+    assert plan.is_demo
+    assert plan.results == Path("results/demo")
+    assert plan.recordings == [str(tmp_path / "house" / "data" / "demo" / "a.csv")]
+
+
+def test_another_experiment_is_no_demonstration(tmp_path: Path) -> None:
+    experiment(tmp_path / "data" / "demo")
+    assert not make_plan({"experiment": str(experiment(tmp_path / "v"))}, tmp_path).is_demo
+
+
+def test_a_missing_folder_names_the_one_that_was_probably_meant(tmp_path: Path) -> None:
+    (tmp_path / "spring_campaign").mkdir()
+    with pytest.raises(ExperimentError, match=r"did you mean .*spring_campaign\?"):
+        find_experiment(tmp_path / "sprin_campaign")
+
+
+def test_a_missing_folder_without_a_likeness_names_the_experiments_there_are(tmp_path: Path) -> None:
+    experiment(tmp_path / "vines")
+    with pytest.raises(ExperimentError, match=r"there is .*vines"):
+        find_experiment(tmp_path / "zzz" / "deep")
+
+
+def test_an_unknown_setting_is_refused_with_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match=r"dampng is no setting.*damping"):
+        make_plan({"experiment": str(experiment(tmp_path / "v")), "dampng": {}}, tmp_path)
+
+
+def test_what_is_wrong_is_printed_and_the_process_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        workflow.plan_or_stop({"experiment": str(tmp_path / "gone")}, tmp_path)
+    assert stopped.value.code == 1
+    assert "gone: does not exist" in capsys.readouterr().err
+
+
+def test_a_stage_depends_on_its_own_settings_alone(tmp_path: Path) -> None:
+    folder = str(experiment(tmp_path / "v"))
+    before = make_plan({"experiment": folder}, tmp_path)
+    after = make_plan({"experiment": folder, "damping": {"seed": 99}}, tmp_path)
+    assert before.stage_settings("steady") == after.stage_settings("steady")
+    assert before.stage_settings("damping") != after.stage_settings("damping")
+
+
+def test_an_edit_of_a_stage_changes_its_hash_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "motion").mkdir()
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "motion" / "a.py").write_text("x = 1\n")
+    (tmp_path / "figures" / "b.py").write_text("y = 1\n")
+    monkeypatch.setattr(workflow, "PACKAGE", tmp_path)
+    motion, figures = code_hash("damping"), code_hash("figures")
+    (tmp_path / "motion" / "a.py").write_text("x = 2\n")
+    assert code_hash("damping") != motion
+    assert code_hash("figures") == figures
+
+
+def test_every_part_of_a_stages_code_exists() -> None:
+    missing = {
+        name for parts in workflow.STAGE_CODE.values() for name in parts if not (workflow.PACKAGE / name).exists()
+    }
+    assert not missing
+
+
+def test_braces_in_a_path_are_no_wildcards() -> None:
+    assert as_pattern(Path("a {b}/c")) == "a {{b}}/c"
+
+
+def test_programs_of_this_python_come_first_without_an_environment_activated() -> None:
+    import sys
+
+    path = shell_prefix().split("PATH=", 1)[1].split(":", 1)[0]
+    assert shlex.split(path) == [str(Path(sys.executable).parent)]
+
+
+def test_the_last_line_is_silent_about_a_report_older_than_its_sheet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = experiment(tmp_path / "v")
+    plan = make_plan({"experiment": str(folder), "results": str(tmp_path / "r")}, tmp_path)
+    plan.results.mkdir()
+    report = plan.results / "report.html"
+    report.write_text("")
+    workflow._say_where(plan)
+    assert capsys.readouterr().out == f"Report: {report}\n"
+    os.utime(folder / "trials.csv", (report.stat().st_mtime + 5,) * 2)
+    workflow._say_where(plan)
+    assert capsys.readouterr().out == ""
