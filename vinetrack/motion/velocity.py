@@ -103,7 +103,7 @@ def smooth(
             error = noise_m * gain
             slack = kappa * error
             agrees = follows[k][window] & (velocity >= low - slack) & (velocity <= high + slack)
-            better = agrees & wider_agrees & (error < best)
+            better = agrees & wider_agrees & (error < (1 - 1e-6) * best)  # rounding must not decide between two sides
             wider_agrees = agrees
             fit_used[better], window_used[better] = k, window[better]
             sigma[better] = best[better] = error[better]

@@ -22,6 +22,8 @@ MOVING_STRETCH, MOVING_ORDER = 12, 3
 RHO_GRID = np.linspace(0.0, 0.95, 20)
 PRIOR_RHO_SD = 0.35
 SHORTEST_MOTION = 12
+SUSPECT_RHO, SHORTEST_STRETCH = 0.85, 7
+"""Noise that remembers itself so well may be motion that a cubic does not follow: shorter stretches then decide."""
 
 
 def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
@@ -52,11 +54,23 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
         length = MOVING_STRETCH if n_moving < LONG_TRACK else 2 * MOVING_STRETCH
         groups.append(_stretches(time_s[n_rest:], position_m[n_rest:], length, MOVING_ORDER))
     noise_m, correlation = _restricted_likelihood(groups)
+    if correlation > SUSPECT_RHO:
+        short = [_stretches(time_s, position_m, SHORTEST_STRETCH, MOVING_ORDER)]
+        noise_m, correlation = min((noise_m, correlation), _restricted_likelihood(short))
     floor_m = quantum(position_m) / math.sqrt(12)
-    moving = position_m[n_rest:]
-    # Exact positions at one speed are multiples of their step too, but then the moving ones show no rounding.
-    rounded = moving.size < SHORTEST_MOTION or rough_noise(moving) > 0.3 * floor_m
-    return (floor_m, 0.0) if rounded and noise_m < floor_m else (noise_m, correlation)
+    return (floor_m, 0.0) if noise_m < floor_m and _jagged(position_m[n_rest:], floor_m) else (noise_m, correlation)
+
+
+def _jagged(position_m: Floats, floor_m: float) -> bool:
+    """Whether positions that are all multiples of a step are so from rounding.
+
+    Exact positions at one speed are multiples of their step too, but smooth: their third differences are zero but for
+    a few at a corner.
+    """
+    if position_m.size < SHORTEST_MOTION:
+        return True
+    uneven = np.count_nonzero(np.abs(np.diff(position_m, 3)) > floor_m)
+    return bool(uneven > max(5, 0.05 * position_m.size))
 
 
 def quantum(position_m: Floats) -> float:
@@ -65,18 +79,21 @@ def quantum(position_m: Floats) -> float:
     Rounding to a step q adds an error of standard deviation q/√12, which frames at rest cannot show.
     """
     values = np.unique(position_m)
-    if values.size < 2:
+    if values.size < 3:
         return 0.0
     steps = np.diff(values)
-    step = float(np.min(steps))
     span = float(values[-1] - values[0])
     resolution = np.finfo(float).eps * float(np.max(np.abs(values)))
-    # A chance fit is impossible only where the multiples are coarse beside float resolution and fine beside the span.
-    if step < 1e4 * resolution or span < 3 * step or span / step > 1e7:
-        return 0.0
-    multiples = steps / step
-    tolerance = 1e-3 + 8 * resolution / step * np.abs(multiples)
-    return step if bool(np.all(np.abs(multiples - np.rint(multiples)) < tolerance)) else 0.0
+    # Fast motion may skip single steps: the smallest difference is then two or more of them.
+    for count in range(1, 7):
+        step = float(np.min(steps)) / count
+        # A fit is no chance only where the step is coarse beside float resolution, and the span holds several.
+        if step < 1e4 * resolution or span < 3 * step or span / step > 1e7:
+            return 0.0
+        multiples = steps / step
+        if np.all(np.abs(multiples - np.rint(multiples)) < 1e-3 + 8 * resolution / step * multiples):
+            return step
+    return 0.0
 
 
 def rough_noise(position_m: Floats) -> float:
