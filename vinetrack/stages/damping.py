@@ -23,11 +23,12 @@ def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
     dict
         `damping.json` as written.
     """
+    results = Results(folder)
+    points = read_result(results.points)
+
     from vinetrack.motion.damping import fit_damping
     from vinetrack.motion.scaling import fit_scaling
 
-    results = Results(folder)
-    points = read_result(results.points)
     damping = fit_damping(points[points["used"]], resamples=settings.resamples, seed=settings.seed)
     write_json(results.scaling, fit_scaling(damping))
     write_json(results.damping, damping)
