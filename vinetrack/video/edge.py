@@ -8,25 +8,37 @@ from a step blurred by optics and by its own motion. Tip shape, optical blur and
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.video import edge_kernels as kernels
+from vinetrack.video import kymograph as ky
+from vinetrack.video.strip import Strip
+
 Floats = NDArray[np.float64]
 
-SPAN_FRAMES = 25
-"""Frames on each side of its passing that speak for a column: long enough to average noise, short enough for sway."""
+MEMORY_FRAMES = 6.0
+"""What a pixel showed this long before and after its passing counts 1/e: enough frames to average noise, few enough
+that a door that has swung away, or a tube that sways, is forgotten."""
 RIDGE = 0.05
-"""Weight, in frames, of a pixel's neighbours where it was never seen itself: (noise / texture)² of 2 / 9 grey levels."""
+"""Weight, in frames, of a pixel's neighbours where it was seen itself: (noise / texture)² of 2 / 9 grey levels."""
 MEMORY = 0.93
 """Neighbours' weights fall to 1/e over 14 px, a few times the grain of film and background."""
+TEXTURE = 12.0
+"""Standard deviation, grey levels, of a pixel about its neighbours, where it was never seen itself."""
 PRIOR_SD = 0.15
 """Relative scatter allowed to amplitude and level of the contrast from frame to frame."""
 MARGIN_PX = 6.0
 """Pixels beyond the blurred edge that take part: they hold amplitude and level."""
 FLOOR_PX = 0.02
 """No edge in compressed video was ever better than this."""
+ASSUMED_EXPOSURE = 0.25
+"""Exposure over frame period until it is estimated."""
+CLEAR_PX = 20.0
+"""Growth after which the surroundings of the start are free of what held the tip there."""
+EVIDENCE_CLIP = 2.5
+"""Widths beyond which a pixel is as unlike film (or background) as can be."""
 
 
 @dataclass(frozen=True)
@@ -34,15 +46,15 @@ class EdgeFit:
     """Leading edge in strip pixels, all arrays of shape (n_frames,).
 
     `edge_px` at mid-exposure, `sigma_px` its random error, `misfit` the mean squared residual in units of the noise
-    (1 is perfect), `level` how far the neighbourhood's contrast strays; `cover` is the kymograph (n_frames, n_along),
-    `contrast` the mean signed contrast by column (n_along,), NaN where unknown.
+    (1 is perfect), `amplitude` its contrast relative to that of the pixels it passes; `contrast` is their mean signed
+    contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far each row of the tip lags behind
+    its foremost point; `passed` the first and last column passed.
     """
 
     edge_px: Floats
     sigma_px: Floats
     misfit: Floats
     amplitude: Floats
-    cover: NDArray[np.float32]
     contrast: Floats
     blur_px: float
     exposure_frames: float
@@ -51,29 +63,26 @@ class EdgeFit:
 
 
 @dataclass(frozen=True)
-class _State:
-    """What alternates: edge and its blur, and the two pictures."""
+class State:
+    """What alternates: the edge (n_frames,) and its blur lengths, the tip's lag by row and optical blur, and the
+    pictures (4, n_across, n_along): brightness after and before the edge and the variance about each.
+
+    `inflation` multiplies those variances by distance ahead of the edge, 1 px a bin about its middle.
+    """
 
     edge: Floats
     lengths: Floats
     lag: Floats
     blur: float
-    after: NDArray[np.float32]
-    before: NDArray[np.float32]
-    spread: Floats
+    pictures: NDArray[np.float32]
+    inflation: Floats
 
 
-def track_edge(
-    strip: NDArray[Any], scale: Floats, offset: Floats, noise: float, exposure_frames: float = np.nan, rounds: int = 4
-) -> EdgeFit:
-    """Track the leading edge through a strip, shape (n_frames, n_across, n_along), growing towards higher columns.
+def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -> EdgeFit:
+    """Track the leading edge through a strip, growing towards higher columns.
 
     Parameters
     ----------
-    scale, offset
-        Shape (n_frames,): `scale * value + offset` is a frame freed of flicker.
-    noise
-        Standard deviation of one pixel, grey levels.
     exposure_frames
         Exposure over frame period; NaN to estimate it from the blur.
 
@@ -82,59 +91,49 @@ def track_edge(
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    from vinetrack.video import kymograph as ky
+    from vinetrack.video.tip_shape import find_exposure, find_shape
 
-    path, _ = ky.first_path(strip, scale, offset, noise)
-    passed = _passed_columns(strip, scale, offset, noise, path)
-    path = np.clip(path, *passed)
-    known = float(exposure_frames) if np.isfinite(exposure_frames) else 0.25
-    state = _first_state(strip, scale, offset, path, known, noise)
-    path = _second_path(strip, scale, offset, noise, state, passed)
-    state = _repicture(strip, scale, offset, replace(state, edge=path, lengths=_lengths(path, known)), 0.0)
-    fit = _fit(strip, scale, offset, state)
+    path, passed = _first_path(strip)
+    exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
+    state = _first_state(strip, path, exposure)
+    for _ in range(3):
+        path = _second_path(strip, state, passed)
+        state = repicture(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
+    fit = mend_jumps(strip, state, fit_edges(strip, state))
     for turn in range(rounds):
-        state = _restate(strip, scale, offset, noise, state, fit, known)
+        state = _restate(strip, state, fit, exposure)
         if turn == 1 and not np.isfinite(exposure_frames):
-            known = _find_exposure(strip, scale, offset, state, fit)
+            exposure = find_exposure(strip, state, fit)
         if turn < 3:
-            state = _find_shape(strip, scale, offset, state, fit, turn)
-        fit = _fit(strip, scale, offset, state)
-    return _finish(strip, scale, offset, noise, state, fit, known, passed)
+            state = find_shape(strip, state, fit, turn == 0)
+        fit = mend_jumps(strip, state, fit_edges(strip, state))
+    return _finish(state, fit, exposure, passed)
 
 
-def outline(
-    strip: NDArray[Any], scale: Floats, offset: Floats, noise: float, parts: int = 8
-) -> tuple[float, float, float]:
+def outline(strip: Strip, parts: int = 8) -> tuple[float, float, float]:
     """Centreline of what the front leaves behind: shift of its begin and slope (px a px) across, and half width, px.
 
-    From the power of the contrast by row in `parts` stretches along the way: a given axis two degrees off would
-    otherwise cut the tube obliquely.
+    From the contrast by row in `parts` stretches along the way: a given axis two degrees off would otherwise cut the
+    tube obliquely.
 
     Raises
     ------
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    from vinetrack.video import kymograph as ky
-
-    path, _ = ky.first_path(strip, scale, offset, noise)
-    passed = _passed_columns(strip, scale, offset, noise, path)
-    state = _first_state(strip, scale, offset, np.clip(path, *passed), 0.25, noise)
-    power = (state.after - state.before).astype(float)[:, passed[0] : passed[1]] ** 2
+    path, passed = _first_path(strip)
+    pictures = _first_state(strip, path, ASSUMED_EXPOSURE).pictures
+    power = (pictures[0] - pictures[1]).astype(float)[:, passed[0] : passed[1]] ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
-    pieces = np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12)))
-    middles, weights, places = [], [], []
-    for piece in pieces:
-        profile = np.convolve(
-            np.minimum(power[:, piece], 4 * np.median(power[:, piece]) + 1e3).mean(axis=1), np.ones(3) / 3, "same"
-        )
-        profile = np.clip(profile - max(float(np.quantile(profile, 0.1)), 0.25 * float(profile.max())), 0, None) > 0
-        low, high = np.flatnonzero(profile)[[0, -1]] if profile.any() else (0, len(rows) - 1)
-        middles.append(0.5 * (rows[low] + rows[high]))
+    middles, halves, places = [], [], []
+    for piece in np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12))):
+        profile = np.sqrt(np.minimum(power[:, piece], 9 * np.median(power[:, piece]) + 1e3).mean(axis=1))
+        inside = np.flatnonzero(profile > max(0.35 * float(np.quantile(profile, 0.75)), 0.25 * float(profile.max())))
+        middles.append(0.5 * (rows[inside[0]] + rows[inside[-1]]))
+        halves.append(0.5 * (rows[inside[-1]] - rows[inside[0]]))
         places.append(passed[0] + float(piece.mean()))
-        weights.append((rows[high] - rows[low]) / 2)
     slope, begin = _robust_line(np.array(places), np.array(middles))
-    return begin, slope, float(np.median(weights)) + 1.5
+    return begin, slope, float(np.median(halves)) + 1.5
 
 
 def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
@@ -144,13 +143,10 @@ def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
     return slope, float(np.median(y - slope * x))
 
 
-def _passed_columns(strip: NDArray[Any], scale: Floats, offset: Floats, noise: float, path: Floats) -> tuple[int, int]:
-    """First and last column the front passes: where whole runs of columns change along the path."""
-    from vinetrack.video import kymograph as ky
-
-    bunch = int(np.clip(strip.shape[1] // 12, 1, 4))
-    score = ky.change_score(strip, scale, offset, 10, bunch, noise)
-    columns = np.arange(strip.shape[2])
+def _first_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
+    """Front by frame from changes alone, and first and last column where whole runs of columns change along it."""
+    path, score = ky.first_path(strip.values, strip.scale, strip.offset, strip.noise)
+    columns = np.arange(strip.values.shape[2])
     when = np.clip(np.searchsorted(path, columns + 0.5), 0, len(path) - 1)
     got = np.max([score[np.clip(when + d, 0, len(path) - 1), columns] for d in (-1, 0, 1)], axis=0)
     # Half the usual contrast (0.3 in power): rather begin late (the neighbours then stand in for the background) than
@@ -160,7 +156,8 @@ def _passed_columns(strip: NDArray[Any], scale: Floats, offset: Floats, noise: f
     if run.sum() < 9:
         raise ValueError("nothing moves along the axis")
     where = np.flatnonzero(run & strong)
-    return max(int(where[0]), _after_jump(path)), int(where[-1]) + 1
+    passed = max(int(where[0]), _after_jump(path)), int(where[-1]) + 1
+    return np.clip(path, *passed), passed
 
 
 def _after_jump(path: Floats) -> int:
@@ -180,8 +177,8 @@ def _after_jump(path: Floats) -> int:
     return begin
 
 
-def _lengths(edge: Floats, exposure_frames: float) -> Floats:
-    """Length of the motion blur in every frame: speed times exposure, px."""
+def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
+    """Length of the motion blur in every frame, shape (n_frames,): speed times exposure, px."""
     if len(edge) < 3:
         return np.zeros(len(edge))
     speed = np.gradient(edge)
@@ -189,179 +186,162 @@ def _lengths(edge: Floats, exposure_frames: float) -> Floats:
     return np.clip(smooth, 0, None) * exposure_frames
 
 
-def _first_state(
-    strip: NDArray[Any], scale: Floats, offset: Floats, path: Floats, exposure: float, noise: float
-) -> _State:
-    rows, columns = strip.shape[1:]
-    blank = np.zeros((rows, columns), np.float32)
-    spread = np.full(3, noise**2)
-    state = _State(path, _lengths(path, exposure), np.zeros(rows), 3.0, blank, blank, spread)
-    return _repicture(strip, scale, offset, state, 0.0)
-
-
-def _repicture(strip: NDArray[Any], scale: Floats, offset: Floats, state: _State, clip: float) -> _State:
-    """Solve every pixel's brightness before and after, given the edge."""
-    from vinetrack.video import edge_kernels as kernels
-
-    args = (state.edge, state.lengths, state.lag, state.blur, SPAN_FRAMES, state.after, state.before, clip)
-    sums = kernels.gather(strip, scale, offset, *args)
-    middle = float(np.median(strip[len(strip) // 2])) * float(np.median(scale)) + float(np.median(offset))
-    after, before = kernels.solve(sums, RIDGE, MEMORY, middle)
-    return replace(state, after=after, before=before)
-
-
-def _second_path(
-    strip: NDArray[Any], scale: Floats, offset: Floats, noise: float, state: _State, passed: tuple[int, int]
-) -> Floats:
-    """Front by signed contrast over all columns, with clipped residuals."""
-    from vinetrack.video import edge_kernels as kernels
-    from vinetrack.video import kymograph as ky
-
-    cover, weight = kernels.kymograph(strip, scale, offset, state.after, state.before, noise)
-    # Capped: a few columns of strong contrast must not outvote the rest; what strays 0.6 is neither free nor film.
-    weight = np.minimum(weight, 4 * np.median(weight[passed[0] : passed[1]]))
-    weight[: max(passed[0] - kernels.BEHIND, 0)] = 0.0
-    path = ky.covered_path(cover, weight, 0.6, 2)
-    return np.clip(path - 0.5, passed[0] - 30, passed[1] + 2)
-
-
-def _fit(strip: NDArray[Any], scale: Floats, offset: Floats, state: _State) -> Floats:
-    from vinetrack.video import edge_kernels as kernels
-
-    return kernels.fit_edges(
-        strip, scale, offset, state.edge, state.lengths, state.lag, state.blur, state.after, state.before,
-        state.spread, PRIOR_SD, MARGIN_PX, 12,
-    )  # fmt: skip
-
-
-def _restate(
-    strip: NDArray[Any], scale: Floats, offset: Floats, noise: float, state: _State, fit: Floats, exposure: float
-) -> _State:
-    """Take over the fitted edges and renew blur lengths, pictures and the noise about the edge."""
-    from vinetrack.video import edge_kernels as kernels
-
-    edge = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
-    state = replace(state, edge=edge, lengths=_lengths(edge, exposure))
-    state = _repicture(strip, scale, offset, state, 4 * noise + 4)
-    by_distance, _, _ = kernels.residual_sums(
-        strip, scale, offset, _with_edge(fit, edge), state.lengths, state.lag, state.blur, state.after, state.before,
-        MARGIN_PX, _moving(edge),
-    )  # fmt: skip
-    seen = by_distance[:, 1] > 4
-    variance = np.where(seen, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), noise**2)
-    smooth = np.convolve(np.pad(variance, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    return replace(state, spread=np.maximum(smooth, (0.5 * noise) ** 2))
-
-
-def _with_edge(fit: Floats, edge: Floats) -> Floats:
-    filled = np.nan_to_num(fit)
-    filled[:, 0] = edge
-    return filled
-
-
-def _moving(edge: Floats) -> NDArray[np.bool_]:
-    """Frames in which the edge is on its way; all of them where hardly any is."""
+def moving_frames(edge: Floats) -> NDArray[np.bool_]:
+    """Frames in which the edge is on its way, shape (n_frames,); all of them where hardly any is."""
     speed = np.abs(np.gradient(edge)) if len(edge) > 1 else np.zeros(len(edge))
     moving = speed > max(0.2, 0.1 * float(np.quantile(speed, 0.95)))
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
 
 
-def _find_shape(strip: NDArray[Any], scale: Floats, offset: Floats, state: _State, fit: Floats, turn: int) -> _State:
-    """Estimate the optical blur, then how far each row of the tip lags behind its foremost point."""
-    from vinetrack.video import edge_kernels as kernels
-
-    moving = _moving(state.edge)
-    slow = moving & (state.lengths <= max(2.0, float(np.quantile(state.lengths[moving], 0.3))))
-
-    def leftover(blur: float, lag: Floats) -> tuple[Floats, float]:
-        _, by_row, misfit = kernels.residual_sums(
-            strip, scale, offset, _with_edge(fit, state.edge), state.lengths, lag, blur, state.after, state.before,
-            MARGIN_PX, slow,
-        )  # fmt: skip
-        return by_row, misfit
-
-    lag = state.lag
-    for _ in range(3):
-        by_row, _ = leftover(state.blur, lag)
-        step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
-        lag = _smooth_lag(lag + np.clip(step, -4, 4), by_row[:, 1])
-    candidates = (
-        np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8, 3.6])
-        if turn == 0
-        else state.blur * np.array([0.7, 0.85, 1, 1.2, 1.4])
-    )
-    misfits = [leftover(blur, lag)[1] for blur in candidates]
-    return replace(state, lag=lag, blur=max(0.4, _least(candidates, np.array(misfits))))
+def _first_state(strip: Strip, path: Floats, exposure: float) -> State:
+    rows, columns = strip.values.shape[1:]
+    blank = np.zeros((4, rows, columns), np.float32)
+    state = State(path, blur_lengths(path, exposure), np.zeros(rows), 3.0, blank, np.ones(3))
+    return repicture(strip, state, 0.0)
 
 
-def _smooth_lag(lag: Floats, weight: Floats) -> Floats:
-    """Smooth slightly along the rows, by weight, and set zero at the foremost point of the tip.
+def repicture(strip: Strip, state: State, clip: float) -> State:
+    """Solve every pixel's brightness before and after, given the edge; `clip` > 0 weighs strays down."""
+    when, dwell = _passing(state, strip.values.shape[2])
+    sums = kernels.gather(
+        strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, when, dwell,
+        MEMORY_FRAMES, state.pictures, clip,
+    )  # fmt: skip
+    half = len(strip.values) // 2
+    middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
+    pictures = kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
+    return replace(state, pictures=pictures)
 
-    That point is the vertex of a parabola through the foremost third of the rows that show an edge at all: the least
-    of them would follow their noise.
+
+def _passing(state: State, columns: int) -> tuple[Floats, Floats]:
+    """Frame at which the edge passes each column, and for how many frames about it the column is half covered.
+
+    Columns that stood covered from the start count as passed when the edge has left them by CLEAR_PX.
     """
-    kernel = np.exp(-0.5 * (np.arange(-3, 4) / 0.8) ** 2)
-    weight = weight + 1e-6 * float(weight.max() + 1e-12)
-    top = np.convolve(np.pad(lag * weight, 3, mode="edge"), kernel, mode="valid")
-    smooth = top / np.convolve(np.pad(weight, 3, mode="edge"), kernel, mode="valid")
-    seen = np.flatnonzero(weight > 0.1 * float(np.median(weight[weight >= np.median(weight)])))
-    front = seen[np.argsort(smooth[seen])[: max(len(seen) // 3, 3)]]
-    lead = float(np.average(smooth[front], weights=weight[front]))
-    if len(front) >= 6:
-        middle = float(front.mean())
-        curve = np.polyfit(front - middle, smooth[front], 2, w=np.sqrt(weight[front]))
-        vertex = -curve[1] / (2 * curve[0]) if curve[0] > 1e-6 else np.inf
-        if front.min() <= vertex + middle <= front.max():
-            lead = float(np.polyval(curve, vertex))
-    return np.clip(smooth - lead, -3.0, 60.0)
+    rising = np.maximum.accumulate(state.edge) + 1e-6 * np.arange(len(state.edge))
+    frames = np.arange(len(rising), dtype=float)
+    moving = np.flatnonzero(moving_frames(state.edge))
+    places = np.arange(columns, dtype=float)
+    reach = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
+    begin, end = frames[moving[0]], frames[moving[-1]]
+    early = np.clip(np.interp(places - reach, rising, frames), begin, end)
+    behind = np.maximum(places + reach + float(state.lag.max()), rising[0] + CLEAR_PX)
+    late = np.clip(np.interp(behind, rising, frames), begin, end)
+    return 0.5 * (early + late), 0.5 * (late - early) + 1.0
 
 
-def _least(candidates: Floats, misfits: Floats) -> float:
-    """Least misfit, refined by a parabola through its neighbours (in the logarithm of the candidate)."""
-    i = int(np.argmin(misfits))
-    if i in (0, len(candidates) - 1):
-        return float(candidates[i])
-    x, y = np.log(candidates[i - 1 : i + 2]), misfits[i - 1 : i + 2]
-    curve = np.polyfit(x - x[1], y, 2)
-    return (
-        float(np.exp(x[1] + np.clip(-curve[1] / (2 * curve[0]), x[0] - x[1], x[2] - x[1])))
-        if curve[0] > 0
-        else float(candidates[i])
-    )
+def _second_path(strip: Strip, state: State, passed: tuple[int, int]) -> Floats:
+    """Front by what every pixel resembles, film or background."""
+    contrast = np.abs(state.pictures[0] - state.pictures[1])[:, passed[0] : passed[1]]
+    width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
+    evidence = kernels.film_evidence(
+        strip.values, strip.scale, strip.offset, state.pictures, width, EVIDENCE_CLIP
+    )  # fmt: skip
+    evidence[:, : max(passed[0] - kernels.BEHIND, 0)] = 0.0
+    path = ky.evident_path(evidence * _novelty(strip, state.edge)[:, None])
+    return np.clip(path - 0.5, passed[0] - kernels.BEHIND, passed[1] + 2)
 
 
-def _find_exposure(strip: NDArray[Any], scale: Floats, offset: Floats, state: _State, fit: Floats) -> float:
-    """Exposure in frame periods that explains the blur of the faster frames best; 0 where none moves 2 px a frame."""
-    from vinetrack.video import edge_kernels as kernels
+def _novelty(strip: Strip, edge: Floats) -> NDArray[np.float32]:
+    """How much each frame has to say that the one before it had not, 0.05 to 1, shape (n_frames,).
 
-    moving = _moving(state.edge)
-    speed = _lengths(state.edge, 1.0)
-    fast = moving & (speed >= np.quantile(speed[moving], 0.5)) & (speed > 2)
-    if not fast.any():
-        return 0.25
-    candidates = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
-    misfits = [
-        kernels.residual_sums(
-            strip, scale, offset, _with_edge(fit, state.edge), speed * tau, state.lag, state.blur, state.after,
-            state.before, MARGIN_PX + float(speed.max()) / 2 * (1 - tau), fast,
-        )[2]
-        for tau in candidates
-    ]  # fmt: skip
-    return _least(candidates, np.array(misfits))
+    While the tip rests behind a closed door that looks like film, a hundred frames are no better than one.
+    """
+    change = np.zeros(len(edge))
+    for t in range(1, len(edge)):
+        pair = strip.values[t - 1 : t + 1, ::2, ::2].astype(np.float32)
+        change[t] = float(np.mean(np.abs(pair[1] - pair[0])))
+    change[0] = change[1] if len(change) > 1 else 1.0
+    usual = float(np.median(change[moving_frames(edge)]))
+    floor = float(np.quantile(change, 0.05))
+    return np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
 
 
-def _finish(
-    strip: NDArray[Any], scale: Floats, offset: Floats, noise: float, state: _State, fit: Floats, exposure: float,
-    passed: tuple[int, int],
-) -> EdgeFit:  # fmt: skip
-    from vinetrack.video import edge_kernels as kernels
+def fit_edges(strip: Strip, state: State) -> Floats:
+    """Most likely edge of every frame, shape (n_frames, 6); see `edge_kernels.fit_edges`."""
+    return kernels.fit_edges(
+        strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, state.pictures,
+        state.inflation, PRIOR_SD, MARGIN_PX, 12,
+    )  # fmt: skip
 
+
+def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
+    """Fits with those that break the motion sought again where it leads, shape (n_frames, 6).
+
+    From the middle of the motion backwards and forwards: the edge never retreats, and a step is at most 1.3 times (or
+    1.5 px more than) its neighbour. Where a fit breaks that (it caught the far side of a door, a payload) and another
+    start inside leads to a fit not much worse, that one is taken. A frame that is missing breaks it too: no fit
+    inside then comes near, and the first one stands.
+    """
+    moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
+    if len(moving) < 5:
+        return fit
+    out = fit.copy()
+    anchor = int(moving[np.argmin(np.abs(moving - 0.5 * (moving[0] + moving[-1])) + 100 * _rough(fit[moving, 0]))])
+    for sense in (-1, 1):
+        end = -1 if sense < 0 else len(fit)
+        for t in range(anchor + sense, end, sense):
+            near, next_one = out[t - sense, 0], out[min(max(t - 2 * sense, 0), len(fit) - 1), 0]
+            step = abs(near - next_one) if np.isfinite(next_one) else 0.0
+            far = max(1.3 * step, step + 1.5)
+            low, high = (near - far, near + 0.8) if sense < 0 else (near - 0.8, near + far)
+            if low <= out[t, 0] <= high or not np.isfinite(near):
+                continue
+            better = _best_between(strip, state, t, low, high)
+            if better is not None and not better[2] > 1.5 * out[t, 2]:
+                out[t] = better
+    return out
+
+
+def _rough(edge: Floats) -> NDArray[np.bool_]:
+    """Points that stray from the mean of their neighbours by more than a pixel and a tenth of the step, (n,)."""
+    rough = np.ones(len(edge), dtype=bool)
+    step = np.abs(edge[2:] - edge[:-2]) / 2
+    rough[1:-1] = np.abs(edge[1:-1] - 0.5 * (edge[2:] + edge[:-2])) > 1.0 + 0.15 * step
+    return rough
+
+
+def _best_between(strip: Strip, state: State, t: int, low: float, high: float) -> Floats | None:
+    """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
+    best = None
+    for start in np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9))):
+        edge = np.full(len(state.edge), np.nan)
+        edge[t] = start
+        found = fit_edges(strip, replace(state, edge=edge))[t]
+        inside = low - 0.5 <= found[0] <= high + 0.5
+        if inside and np.isfinite(found[2]) and (best is None or found[2] < best[2]):
+            best = found
+    return best
+
+
+def residuals(strip: Strip, state: State, fit: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
+    """What the fit leaves in the frames of `use`; see `edge_kernels.residual_sums`."""
+    filled = np.nan_to_num(fit)
+    filled[:, 0] = state.edge
+    return kernels.residual_sums(
+        strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.pictures,
+        MARGIN_PX, use,
+    )  # fmt: skip
+
+
+def _restate(strip: Strip, state: State, fit: Floats, exposure: float) -> State:
+    """Take over the fitted edges and renew blur lengths, pictures and how far noise adds up about the edge."""
+    edge = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
+    state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
+    state = repicture(strip, state, 4 * strip.noise + 4)
+    by_distance, _, _ = residuals(strip, state, fit, moving_frames(edge))
+    seen = by_distance[:, 1] > 4
+    ratio = np.where(seen, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
+    smooth = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    return replace(state, inflation=np.clip(smooth, 0.3, 50.0))
+
+
+def _finish(state: State, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
     edge, sigma = fit[:, 0].copy(), np.hypot(fit[:, 1], FLOOR_PX)
     # A box of uniform dwell stands for the exposure: its middle is the mean position, ahead of mid-exposure by aτ²/24.
     bend = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
     edge = edge - np.clip(bend, -50, 50) * exposure**2 / 24
-    cover, _ = kernels.kymograph(strip, scale, offset, state.after, state.before, noise)
-    contrast = (state.after - state.before).mean(axis=0).astype(float)
+    contrast = (state.pictures[0] - state.pictures[1]).mean(axis=0).astype(float)
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
-    return EdgeFit(edge, sigma, fit[:, 2], 1 + fit[:, 3], cover, contrast, state.blur, exposure, state.lag, passed)
+    return EdgeFit(edge, sigma, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)

@@ -15,7 +15,9 @@ from numba import njit
 STEP = 0.05
 """Spacing of the table of covers, px: linear interpolation then errs by under 4e-4."""
 BEHIND = 25
-"""Columns behind the edge whose film is looked at: neighbours that stand in where film is never seen."""
+"""Columns behind the first passed one whose film is looked at: neighbours that stand in where it is never seen."""
+FORGOTTEN = 4.0
+"""Frames further off than this many memories, e⁻⁴ = 2 %, are not read."""
 BLOCK = 1
 """Columns in a block whose sum tells how far noise adds up: about one grain of film."""
 
@@ -63,42 +65,46 @@ def gather(
     lengths: np.ndarray,
     lag: np.ndarray,
     blur: float,
-    span: int,
-    after: np.ndarray,
-    before: np.ndarray,
+    when: np.ndarray,
+    dwell: np.ndarray,
+    memory_frames: float,
+    pictures: np.ndarray,
     clip: float,
 ) -> np.ndarray:
-    """Sums for the least squares of (before, after) at every pixel; shape (9, n_across, n_along).
+    """Sums for the least squares of (before, after) at every pixel; shape (11, n_across, n_along).
 
-    Frame t speaks of the columns that the edge passes within `span` frames of it. Rows of the answer: Σwq², Σwqp,
-    Σwp², ΣwqV, ΣwpV (q = 1 − p), then count and sum of V where only background, and where only film, is seen.
+    Frame t speaks of column s by a weight that falls as exp(−d / memory_frames), d the frames between t and the
+    passing of the edge, `when[s]` give or take `dwell[s]`: what was seen last before and first after counts most.
+    Rows of the answer: Σwq², Σwqp, Σwp², ΣwqV, ΣwpV (q = 1 − p), then weight, sum and sum of squares of V where only
+    background, and where only film, is seen.
     With `clip` > 0 a value that strays from the last solution is weighed down by 1/(1 + (r/clip)²).
     """
     n, rows, columns = strip.shape
-    sums = np.zeros((9, rows, columns), np.float32)
+    sums = np.zeros((11, rows, columns), np.float32)
+    share = np.zeros(columns)
     for t in range(n):
         if not math.isfinite(edge[t]):
             continue
         reach = 0.5 * lengths[t] + 4 * blur + 0.5
         table = cover_table(lengths[t], blur, reach)
-        low = edge[t] - reach - 2
-        high = edge[t] + reach + 2
-        for k in range(max(0, t - span), min(n, t + span + 1)):
-            if math.isfinite(edge[k]):
-                low = min(low, edge[k] - reach - 2)
-                high = max(high, edge[k] + reach + 2)
-        first = max(0, int(low - lag.max()) - BEHIND)
-        last = min(columns, int(high) + 2)
+        first, last = columns, 0
+        for s in range(columns):
+            d = max(0.0, abs(t - when[s]) - dwell[s]) / memory_frames
+            share[s] = math.exp(-d) if d < FORGOTTEN else 0.0
+            if share[s] > 0:
+                first, last = min(first, s), s + 1
         for u in range(rows):
             at = edge[t] - lag[u]
             for s in range(first, last):
                 p, _ = _look_up(table, reach, at - s)
                 q = 1 - p
                 value = strip[t, u, s] * scale[t] + offset[t]
-                w = 1.0
+                w = share[s]
+                if p > 0.98 and t < when[s] - dwell[s]:
+                    continue
                 if clip > 0:
-                    r = (value - before[u, s] * q - after[u, s] * p) / clip
-                    w = 1 / (1 + r * r)
+                    r = value - pictures[1, u, s] * q - pictures[0, u, s] * p
+                    w /= 1 + r * r / (clip * clip)
                 sums[0, u, s] += w * q * q
                 sums[1, u, s] += w * q * p
                 sums[2, u, s] += w * p * p
@@ -107,22 +113,23 @@ def gather(
                 if q > 0.98:
                     sums[5, u, s] += w
                     sums[6, u, s] += w * value
+                    sums[7, u, s] += w * value * value
                 elif p > 0.98:
-                    sums[7, u, s] += w
-                    sums[8, u, s] += w * value
+                    sums[8, u, s] += w
+                    sums[9, u, s] += w * value
+                    sums[10, u, s] += w * value * value
     return sums
 
 
 @njit(cache=True)
-def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float) -> tuple[np.ndarray, np.ndarray]:
-    """Brightness after and before the edge at every pixel, each of shape (n_across, n_along).
+def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise: float, texture: float) -> np.ndarray:
+    """Brightness after and before the edge at every pixel, and the variance about each; shape (4, n_across, n_along).
 
     A pixel that never shows one of the two takes it, by `ridge`, from its row: film from the columns behind it,
-    background from those ahead, with weights falling as `memory`^distance.
+    background from those ahead, with weights falling as `memory`^distance; its variance is then `texture`².
     """
     _, rows, columns = sums.shape
-    after = np.empty((rows, columns), np.float32)
-    before = np.empty((rows, columns), np.float32)
+    out = np.empty((4, rows, columns), np.float32)
     guess = np.empty(columns)
     for u in range(rows):
         total, count, level = 0.0, 0.0, fallback
@@ -140,44 +147,51 @@ def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float) -> tup
         for s in range(columns):
             if count > 1e-3:
                 level = total / count
-            elif sums[7, u, s] > 0:
-                level = sums[8, u, s] / sums[7, u, s]
-            total = total * memory + sums[8, u, s]
-            count = count * memory + sums[7, u, s]
+            elif sums[8, u, s] > 0:
+                level = sums[9, u, s] / sums[8, u, s]
+            total = total * memory + sums[9, u, s]
+            count = count * memory + sums[8, u, s]
             # Never seen bare: what a half-covered pixel seems to show would follow any error of the edge.
-            rq = ridge if sums[5, u, s] > 0.3 else 50 * (1 + sums[0, u, s])
-            rp = ridge if sums[7, u, s] > 0.3 else 50 * (1 + sums[2, u, s])
+            bare, film = sums[5, u, s] > 0.1, sums[8, u, s] > 0.1
+            rq = ridge if bare else 50 * (1 + sums[0, u, s])
+            rp = ridge if film else 50 * (1 + sums[2, u, s])
             qq, qp, pp = sums[0, u, s] + rq, sums[1, u, s], sums[2, u, s] + rp
             vq, vp = sums[3, u, s] + rq * guess[s], sums[4, u, s] + rp * level
             det = qq * pp - qp * qp
-            before[u, s] = (vq * pp - vp * qp) / det
-            after[u, s] = (vp * qq - vq * qp) / det
-    return after, before
+            out[0, u, s] = (vp * qq - vq * qp) / det
+            out[1, u, s] = (vq * pp - vp * qp) / det
+            out[2, u, s] = _variance(sums[8, u, s], sums[9, u, s], sums[10, u, s], noise) if film else texture**2
+            out[3, u, s] = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise) if bare else texture**2
+    return out
 
 
 @njit(cache=True)
-def kymograph(
-    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, after: np.ndarray, before: np.ndarray, noise: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Cover by signed contrast, shape (n_frames, n_along), and the weight of each column, shape (n_along,).
+def _variance(weight: float, total: float, squares: float, noise: float) -> float:
+    """Variance of what a pixel showed, never below that of the noise, drawn towards it where few frames speak."""
+    own = max(squares / weight - (total / weight) ** 2, 0.0)
+    return max((weight * own + 2 * noise**2) / (weight + 2), noise**2)
 
-    cover = Σ C (V − before) / Σ C² with C = after − before, summed across: the least-squares amplitude.
+
+@njit(cache=True)
+def film_evidence(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, pictures: np.ndarray, width: float, clip: float
+) -> np.ndarray:
+    """How much less like film than like background each column looks in each frame; shape (n_frames, n_along).
+
+    The sum over rows of min(a², clip²) − min(b², clip²), a and b the distances from film and background in units of
+    `width` and their own variances. A pixel like neither (door, payload, glint) is silent.
     """
     n, rows, columns = strip.shape
-    cover = np.zeros((n, columns), np.float32)
-    weight = np.zeros(columns, np.float64)
-    contrast = after - before
-    for u in range(rows):
-        for s in range(columns):
-            weight[s] += contrast[u, s] ** 2
+    out = np.zeros((n, columns), np.float32)
+    top = clip * clip
     for t in range(n):
         for u in range(rows):
             for s in range(columns):
                 value = strip[t, u, s] * scale[t] + offset[t]
-                cover[t, s] += contrast[u, s] * (value - before[u, s])
-        for s in range(columns):
-            cover[t, s] /= weight[s] + 1e-6
-    return cover, weight / noise**2
+                a = (value - pictures[0, u, s]) ** 2 / (pictures[2, u, s] + width * width)
+                b = (value - pictures[1, u, s]) ** 2 / (pictures[3, u, s] + width * width)
+                out[t, s] += min(a, top) - min(b, top)
+    return out
 
 
 @njit(cache=True)
@@ -189,9 +203,8 @@ def fit_edges(
     lengths: np.ndarray,
     lag: np.ndarray,
     blur: float,
-    after: np.ndarray,
-    before: np.ndarray,
-    spread: np.ndarray,
+    pictures: np.ndarray,
+    inflation: np.ndarray,
     prior_sd: float,
     margin: float,
     rounds: int,
@@ -199,11 +212,12 @@ def fit_edges(
     """Most likely edge in every frame by Gauss-Newton; shape (n_frames, 6).
 
     Columns: edge, its Fisher sigma, mean squared weighted residual, amplitude − 1, level, pixels used. Amplitude and
-    level of the contrast are free within `prior_sd`. `spread[i]` is the noise variance i − len/2 px ahead of the edge.
+    level of the contrast are free within `prior_sd`. `inflation[i]` multiplies the variance of pixels i − len/2 px
+    ahead of the edge: how far their noise adds up.
     """
     n, rows, columns = strip.shape
     out = np.full((n, 6), np.nan)
-    middle = len(spread) // 2
+    middle = len(inflation) // 2
     deepest = lag.max()
     for t in range(n):
         y = start[t]
@@ -226,11 +240,12 @@ def fit_edges(
                     if x > half or x < -half:
                         continue
                     p, slope = _look_up(table, reach, x)
-                    contrast = after[u, s] - before[u, s]
+                    contrast = pictures[0, u, s] - pictures[1, u, s]
                     value = strip[t, u, s] * scale[t] + offset[t]
-                    r = value - before[u, s] - contrast * ((1 + gain) * p + level)
-                    i = int(middle - x)
-                    variance = spread[min(max(i, 0), len(spread) - 1)]
+                    r = value - pictures[1, u, s] - contrast * ((1 + gain) * p + level)
+                    i = min(max(int(middle - x), 0), len(inflation) - 1)
+                    variance = p * p * pictures[2, u, s] + (1 - p) * (1 - p) * pictures[3, u, s]
+                    variance *= inflation[i]
                     w = 1 / (variance * (1 + r * r / (9 * variance)))
                     dy = contrast * (1 + gain) * slope
                     dg = contrast * p
@@ -275,18 +290,16 @@ def residual_sums(
     lengths: np.ndarray,
     lag: np.ndarray,
     blur: float,
-    after: np.ndarray,
-    before: np.ndarray,
+    pictures: np.ndarray,
     margin: float,
     use: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """What the fit leaves: by distance ahead of the edge, by row, and in all.
 
-    First answer: shape (n, 2), bins of 1 px about the middle: Σ (ΣCr)²/ΣC² over blocks of BLOCK columns and all
-    rows, and the count of blocks: a variance per pixel that contains how far noise adds up across neighbours (grain
-    of the film, its tail moving inside), equal to the plain variance for white noise. Second: shape (n_across, 2),
-    Σ g r and Σ g² with g the slope of the model in the row's own lag. Third: the mean of log(1 + r²/25), a robust
-    misfit for comparing blurs.
+    First answer: shape (n, 2), bins of 1 px about the middle: the sum over frames of z² / var z, with z = Σ C r / v over
+    blocks of BLOCK columns and all rows, and the count: 1 on average for white noise, more where noise adds up across
+    neighbours (grain of the film, its tail moving inside). Second: shape (n_across, 2), Σ g r and Σ g² with g the
+    slope of the model in the row's own lag. Third: the mean of log(1 + r²/9v), a robust misfit for comparing blurs.
     """
     n, rows, columns = strip.shape
     widest = 0.0
@@ -315,17 +328,18 @@ def residual_sums(
                 if x > half or x < -half:
                     continue
                 p, slope = _look_up(table, reach, x)
-                contrast = after[u, s] - before[u, s]
+                contrast = pictures[0, u, s] - pictures[1, u, s]
                 value = strip[t, u, s] * scale[t] + offset[t]
-                r = value - before[u, s] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
+                r = value - pictures[1, u, s] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
                 i = min(max(int(middle - x), 0), bins - 1)
-                column[i, 0] += contrast * r
-                column[i, 1] += contrast * contrast
+                v = p * p * pictures[2, u, s] + (1 - p) * (1 - p) * pictures[3, u, s]
+                w = 1 / (v * (1 + r * r / (9 * v)))
+                column[i, 0] += w * contrast * r
+                column[i, 1] += w * contrast * contrast
                 g = -contrast * slope
-                w = 1 / (1 + r * r / 225)
                 by_row[u, 0] += w * g * r
                 by_row[u, 1] += w * g * g
-                misfit += math.log(1 + r * r / 25)
+                misfit += math.log(1 + r * r / (9 * v))
                 count += 1
         for i in range(BLOCK // 2, bins - BLOCK // 2):
             a, b = 0.0, 0.0

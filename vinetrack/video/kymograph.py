@@ -1,8 +1,8 @@
 """The front as a monotone path through space and time, by dynamic programming.
 
 Two passes. The first knows nothing of film or background: a column changes once, when the front passes it, and the
-path collects the change of every column. The second knows both, and asks of every column in every frame whether it
-is covered, with clipped residuals, so that a door, a payload flying ahead or a reflection cannot steal the path.
+path collects the change of every column. The second knows both, and asks of every pixel in every frame which of the
+two it resembles, with clipped distances, so that a door, a payload flying ahead or a reflection cannot steal the path.
 """
 
 from __future__ import annotations
@@ -80,35 +80,25 @@ def collect_path(score: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def covered_path(cover: np.ndarray, weight: np.ndarray, clip: float, back: int) -> np.ndarray:
-    """Edge by frame, shape (n_frames,), that best divides covered from free columns.
+def evident_path(evidence: np.ndarray) -> np.ndarray:
+    """Edge by frame, shape (n_frames,), never retreating, that best divides film from background.
 
-    `cover` (n_frames, n_along) is near 1 behind the front and near 0 ahead. The cost of a column is its squared
-    residual, clipped at `clip`² and weighed; from frame to frame the edge retreats by `back` px at most.
+    `evidence` (n_frames, n_along) is negative where a column looks like film; its sum behind the edge is made least.
     """
-    n, columns = cover.shape
+    n, columns = evidence.shape
     best = np.zeros((n, columns + 1), np.float64)
     came = np.zeros((n, columns + 1), np.int32)
-    cost = np.zeros(columns + 1)
     for t in range(n):
-        cost[0] = 0.0
-        for s in range(columns):
-            free = min(cover[t, s] ** 2, clip * clip)
-            film = min((1 - cover[t, s]) ** 2, clip * clip)
-            cost[s + 1] = cost[s] + weight[s] * (film - free)
-        if t == 0:
-            best[0] = cost
-            continue
-        running, where = np.inf, 0
+        cost, running, where = 0.0, np.inf, 0
         for s in range(columns + 1):
-            reach = min(s + back, columns)
-            if s == 0:
-                for k in range(reach + 1):
-                    if best[t - 1, k] < running:
-                        running, where = best[t - 1, k], k
-            elif best[t - 1, reach] < running:
-                running, where = best[t - 1, reach], reach
-            best[t, s] = running + cost[s]
+            if s > 0:
+                cost += evidence[t, s - 1]
+            if t == 0:
+                best[t, s] = cost
+                continue
+            if best[t - 1, s] < running:
+                running, where = best[t - 1, s], s
+            best[t, s] = running + cost
             came[t, s] = where
     path = np.zeros(n)
     s = int(np.argmin(best[n - 1]))

@@ -158,9 +158,9 @@ def _follow(
     wide = half * 1.3 + (0.04 * axis.length_px if given else 3.0)
     strip = cut_strip(luma, squared(axis), wide)
     try:
-        shift, slope, half = outline(strip.values, strip.scale, strip.offset, strip.noise)
+        shift, slope, half = outline(strip)
         strip = _centred(luma, strip, shift, slope, half, given)
-        fit = track_edge(strip.values, strip.scale, strip.offset, strip.noise, exposure_frames)
+        fit = track_edge(strip, exposure_frames)
     except ValueError as error:
         raise RecordingError(str(error)) from error
     return strip, _Edge(fit.edge_px, fit.sigma_px, _unsure(fit), fit.blur_px, fit.exposure_frames)

@@ -1,0 +1,209 @@
+"""How far tracked positions are from the truth, recording by recording.
+
+    python benchmarks/tracking_accuracy.py [--set demo|hard|plain|all] [--seeds score|tune] [--keep DIR]
+
+Sets: `demo` like the shipped demonstration, `hard` one recording of each harder preset of the virtual laboratory at a
+camera's bit rate, `plain` drawn by other code (tests/video/plain_scene.py). Constants of the tracker were tuned on
+seeds 1-9; the tables that count are of seeds 101 and up, which no constant has seen.
+
+SD: of tracked minus true position over moving frames, bias its mean (an origin is free in every analysis; the shape
+of the tip decides it); stated: root mean square of the stated errors; pull: SD over stated. Lost: moving frames
+without a usable position.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vinetrack.laboratory.render import Truth, render_recording
+from vinetrack.laboratory.scene import Scene, Tube, preset
+from vinetrack.records import Trial
+from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
+from vinetrack.video.track import Tracking, track_frames
+
+CAPTURE_FPS = 1069.0
+HARD = (
+    "door", "wobble", "flicker", "low_contrast", "dark_tube", "half_frame_exposure", "contrast_reversal", "shake",
+    "reflections", "noisy", "strong_tail", "diagonal", "downward", "payload", "light_stream", "twelve_bit", "colour",
+)  # fmt: skip
+BODIES = ("falling_ball", "dark_ball")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One recording's numbers, px."""
+
+    name: str
+    n_moving: int
+    lost: int
+    sd: float
+    bias: float
+    stated: float
+    ms_per_frame: float
+    note: str = ""
+
+    @property
+    def pull(self) -> float:
+        """SD over the stated error."""
+        return self.sd / self.stated
+
+
+def approach(speed_m_s: float, rise_s: float, release_s: float, length_m: float):
+    """Exponential approach to a steady speed, a dead stop at `length_m`."""
+
+    def position_m(time_s: np.ndarray) -> np.ndarray:
+        t = np.clip(np.asarray(time_s, float) - release_s, 0, None)
+        return np.minimum(speed_m_s * (t - rise_s * (1 - np.exp(-t / rise_s))), length_m)
+
+    return position_m
+
+
+def free_fall(release_s: float):
+    """Falling from rest."""
+    return lambda time_s: 0.5 * 9.81 * np.clip(np.asarray(time_s, float) - release_s, 0, None) ** 2
+
+
+def film(scene: Scene, name: str, seed: int, folder: Path, speed_m_s: float) -> tuple[Path, Truth]:
+    """Render one recording into `folder`, or find it there."""
+    rng = np.random.default_rng([seed, 77])
+    release = (rng.integers(12, 30) + rng.uniform()) / CAPTURE_FPS
+    if name in BODIES:
+        motion, n_frames = free_fall(release), 250
+    else:
+        subject = scene.subject
+        assert isinstance(subject, Tube)
+        motion = approach(speed_m_s, 0.008, release, subject.length_m)
+        n_frames = int((release + subject.length_m / speed_m_s + 0.02) * CAPTURE_FPS) + 4
+    path = folder / f"{name}_{seed}.{'mkv' if scene.encoding.codec == 'ffv1' else 'mp4'}"
+    truth_path = folder / "truth" / f"{path.stem}.npz"
+    if path.exists() and truth_path.exists():
+        return path, _stored(truth_path)
+    truth = render_recording(
+        scene, motion, n_frames=n_frames, capture_fps=CAPTURE_FPS, out_path=path, seed=seed,
+    )  # fmt: skip
+    truth_path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(truth_path, **vars(truth))
+    return path, truth
+
+
+def _stored(path: Path) -> Truth:
+    with np.load(path) as data:
+        return Truth(**{key: (data[key] if data[key].ndim else data[key].item()) for key in data.files})
+
+
+def measure(name: str, path: Path, truth: Truth, travel_ratio: float) -> tuple[Row, Tracking | None]:
+    """Track and compare."""
+    trial = Trial(
+        name=name, video=path, capture_fps=CAPTURE_FPS, exposure_s=truth.exposure_s, m_per_px=1.0,
+        travel_ratio=travel_ratio,
+    )  # fmt: skip
+    moving = np.diff(truth.lead_px, append=truth.lead_px[-1]) > 0.05
+    moving &= truth.in_frame & np.isfinite(truth.lead_px)
+    start = time.perf_counter()
+    try:
+        frames = read_frames(inspect_recording(path))
+        decoded = time.perf_counter()
+        tracking = track_frames(frames, trial, CAPTURE_FPS)
+    except RecordingError as error:
+        return Row(name, int(moving.sum()), int(moving.sum()), np.nan, np.nan, np.nan, np.nan, str(error)), None
+    spent = (time.perf_counter() - decoded) / len(frames) * 1e3
+    del start
+    tips = np.column_stack([truth.tip_x_px, truth.tip_y_px])
+    along = (tips - tracking.axis.from_px) @ tracking.axis.direction
+    return compare(name, tracking, along, moving, spent), tracking
+
+
+def compare(name: str, tracking: Tracking, along_px: np.ndarray, moving: np.ndarray, spent: float) -> Row:
+    """Numbers of one track against the true edge along its axis."""
+    track = tracking.track
+    used = moving & track.usable
+    error = track.edge_px[used] - along_px[used]
+    stated = float(np.sqrt(np.nanmean(track.lead_position_sigma_m[used] ** 2)))
+    lost = int((moving & ~track.usable).sum())
+    return Row(name, int(moving.sum()), lost, float(error.std()), float(error.mean()), stated, spent)
+
+
+def show(rows: list[Row]) -> None:
+    """Print the table and its medians."""
+    print(f"{'recording':28s} {'moving':>6s} {'lost':>4s} {'SD':>7s} {'bias':>7s} {'stated':>7s} {'pull':>5s} {'ms/frame':>8s}")
+    for r in rows:
+        print(f"{r.name:28s} {r.n_moving:6d} {r.lost:4d} {r.sd:7.3f} {r.bias:+7.3f} {r.stated:7.3f} {r.pull:5.2f} {r.ms_per_frame:8.2f} {r.note}")
+    sd = np.array([r.sd for r in rows])
+    within = np.mean([1 / 1.5 <= r.pull <= 1.5 for r in rows])
+    print(f"median SD {np.nanmedian(sd):.3f} px, worst {np.nanmax(sd):.3f}; lost {sum(r.lost for r in rows)} of {sum(r.n_moving for r in rows)}; pulls within a factor 1.5: {within:.0%}\n")
+
+
+def demo_rows(seeds: list[int], folder: Path) -> list[Row]:
+    """Recordings like the demonstration's: two diameters, several speeds."""
+    rows = []
+    for i, seed in enumerate(seeds):
+        diameter, length = ((0.012, 0.14), (0.024, 0.20))[i % 2]
+        scene = preset("demo")
+        scene = replace(scene, subject=replace(scene.subject, diameter_m=diameter, length_m=length))
+        speed = (3.0, 5.0, 8.0, 12.0)[(i // 2) % 4]
+        name = f"demo_{diameter * 1e3:.0f}mm_{speed:.0f}m_s"
+        rows.append(measure(f"{name}_{seed}", *film(scene, name, seed, folder, speed), 2.0)[0])
+    return rows
+
+
+def hard_rows(seeds: list[int], folder: Path, names: tuple[str, ...] = HARD + BODIES) -> list[Row]:
+    """One recording of every harder preset and seed."""
+    rows = []
+    for name in names:
+        for seed in seeds:
+            path, truth = film(preset(name), name, seed, folder, 6.0)
+            rows.append(measure(f"{name}_{seed}", path, truth, 1.0 if name in BODIES else 2.0)[0])
+    return rows
+
+
+def plain_rows(seeds: list[int], folder: Path) -> list[Row]:
+    """Recordings drawn by other code, H.264 at a camera's rate."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "video"))
+    from plain_scene import HARDER, Plan, plain_scene, write_video
+
+    rows = []
+    for name, changes in HARDER.items():
+        for seed in seeds:
+            plan = replace(Plan(seed=seed), **changes)
+            scene = plain_scene(plan)
+            path = write_video(folder / f"plain_{name}_{seed}.mp4", scene.frames, bit_rate=15_000_000)
+            direction = np.array([np.cos(np.radians(plan.angle_deg)), np.sin(np.radians(plan.angle_deg))])
+            tips = np.asarray(plan.from_px) + scene.edge_px[:, None] * direction
+            n = len(scene.frames)
+            truth = Truth(
+                np.arange(n), np.arange(n) / CAPTURE_FPS, scene.edge_px, scene.edge_px, tips[:, 0], tips[:, 1],
+                np.ones(n, bool), 1.0, 0.0, CAPTURE_FPS, plan.exposure / CAPTURE_FPS,
+            )  # fmt: skip
+            rows.append(measure(f"plain_{name}_{seed}", path, truth, 2.0)[0])
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--set", default="all", choices=["demo", "hard", "plain", "all"])
+    parser.add_argument("--seeds", default="score", choices=["score", "tune"])
+    parser.add_argument("--only", default="", help="comma-separated presets of the set `hard`")
+    parser.add_argument("--keep", type=Path, help="folder for the rendered recordings, to use them again")
+    chosen = parser.parse_args()
+    first = 101 if chosen.seeds == "score" else 1
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = chosen.keep or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        if chosen.set in ("demo", "all"):
+            show(demo_rows(list(range(first, first + 8)), folder))
+        if chosen.set in ("hard", "all"):
+            names = tuple(chosen.only.split(",")) if chosen.only else HARD + BODIES
+            show(hard_rows([first, first + 1], folder, names))
+        if chosen.set in ("plain", "all"):
+            show(plain_rows([first, first + 1], folder))
+
+
+if __name__ == "__main__":
+    main()
