@@ -16,11 +16,11 @@ from vinetrack.records import Floats
 
 ENOUGH_REST_FRAMES = 60
 REST_MARGIN = 3  # the corner between rest and motion is found to within about two frames
-LONG_TRACK = 240
+LONG_TRACK = 90
 REST_STRETCH, REST_ORDER = 32, 1
 MOVING_STRETCH, MOVING_ORDER = 12, 3
 RHO_GRID = np.linspace(0.0, 0.95, 20)
-PRIOR_RHO_SD = 0.35
+PRIOR_RHO_SD = 0.5
 SHORTEST_MOTION = 12
 SUSPECT_RHO, SHORTEST_STRETCH = 0.85, 7
 """Noise that remembers itself so well may be motion that a cubic does not follow: shorter stretches then decide."""
@@ -58,7 +58,8 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
         short = [_stretches(time_s, position_m, SHORTEST_STRETCH, MOVING_ORDER)]
         noise_m, correlation = min((noise_m, correlation), _restricted_likelihood(short))
     floor_m = quantum(position_m) / math.sqrt(12)
-    return (floor_m, 0.0) if noise_m < floor_m and _jagged(position_m[n_rest:], floor_m) else (noise_m, correlation)
+    moving_m = position_m[n_rest:] if n_moving >= SHORTEST_MOTION else position_m
+    return (floor_m, 0.0) if noise_m < floor_m and _jagged(moving_m, floor_m) else (noise_m, correlation)
 
 
 def _jagged(position_m: Floats, floor_m: float) -> bool:
@@ -67,10 +68,9 @@ def _jagged(position_m: Floats, floor_m: float) -> bool:
     Exact positions at one speed are multiples of their step too, but smooth: their third differences are zero but for
     a few at a corner.
     """
-    if position_m.size < SHORTEST_MOTION:
-        return True
     uneven = np.count_nonzero(np.abs(np.diff(position_m, 3)) > floor_m)
-    return bool(uneven > max(5, 0.05 * position_m.size))
+    few = 5 if position_m.size >= SHORTEST_MOTION else 0
+    return bool(uneven > max(few, 0.05 * position_m.size))
 
 
 def quantum(position_m: Floats) -> float:
