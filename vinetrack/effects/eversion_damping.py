@@ -13,7 +13,16 @@ from vinetrack.effects import Parameter, Worked
 KIND = "base"
 EASILY_TAKEN_FOR = ("linear_damping", "pressure_damping")
 PARAMETERS = (
-    Parameter("B", "B", "N·(s/m)ⁿ", 3.0, bounds=(0.0, 1e3), shared="vine", plausible=(0.1, 20.0), meaning="damping coefficient"),
+    Parameter(
+        "B",
+        "B",
+        "N·(s/m)ⁿ",
+        3.0,
+        bounds=(0.0, 1e3),
+        shared="vine",
+        plausible=(0.1, 20.0),
+        meaning="damping coefficient",
+    ),
     Parameter("n", "n", "1", 0.37, bounds=(0.0, 2.0), zero=0.37, plausible=(0.2, 0.6), meaning="damping exponent"),
 )
 

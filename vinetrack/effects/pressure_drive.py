@@ -18,5 +18,7 @@ def tip_force(s, rig):  # noqa: ARG001, D103
 
 
 WORKED = (
-    Worked("tip_force", 12.667, "28 kPa × π(24 mm)²/4 = 28000 × 4.5239e-4", state={"pressure": 28e3, "area": 4.5239e-4}),
+    Worked(
+        "tip_force", 12.667, "28 kPa × π(24 mm)²/4 = 28000 × 4.5239e-4", state={"pressure": 28e3, "area": 4.5239e-4}
+    ),
 )

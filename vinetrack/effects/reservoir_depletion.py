@@ -3,8 +3,9 @@
     P → (P₀ + P_atm) (V₀ / (V₀ + A y))^γ − P_atm
 
 V₀ is the chamber's volume and A·y what the vine has swept. Boyle's law needs absolute pressure: a volume change of a
-few per cent takes tens of per cent off a small gauge pressure. With 3.7 L and a vine of 24 mm × 280 mm, 28 kPa falls by 15 %
-(γ = 1, slow enough to stay at room temperature) to 21 % (γ = 1.4, too fast to exchange heat); 7 kPa by 51 to 71 %.
+few per cent takes tens of per cent off a small gauge pressure. With 3.7 L and a vine of 24 mm × 280 mm, 28 kPa falls
+by 15 % (γ = 1, slow enough to stay at room temperature) to 21 % (γ = 1.4, too fast to exchange heat); 7 kPa by 51 to
+71 %.
 
 Matters wherever A·L is more than a thousandth of V₀, most at low gauge pressure and late in growth. Reduce it on the
 rig with a larger chamber beside the inlet, or measure the pressure during growth. A regulator that refills the chamber

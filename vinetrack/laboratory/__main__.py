@@ -2,8 +2,8 @@
 
     python -m vinetrack.laboratory data/demo [--nature FILE] [--truth FILE]
 
-The sheet says what is to be grown; `--nature` what is true and hidden (default: that of the demonstration). The truth is written
-only where `--truth` says, never inside the experiment.
+The sheet says what is to be grown; `--nature` what is true and hidden (default: that of the demonstration). The truth
+is written only where `--truth` says, never inside the experiment.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Campaigns: which vines are grown at which pressures with which payloads, how often.
 
 `paper_damping` and `paper_payload` are the published protocol: four isometric vines, about ten pressures each, four
-trials a pressure without payload; and the 24 mm vine with 35.6 g. Where the paper gives no number (lengths other than 280 mm,
-the pressures themselves) ours are stated here.
+trials a pressure without payload; and the 24 mm vine with 35.6 g. Where the paper gives no number (lengths other than
+280 mm, the pressures themselves) ours are stated here.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ def isometric_vine(scale: int) -> Vine:
     return Vine(6.0 * scale, 50.0 * scale, 70.0 * scale)
 
 
-def campaign(vine: Vine, pressures_kPa: Iterable[float], replicates: int, payload_g: float = 0.0, prefix: str = "") -> list[Trial]:
+def campaign(
+    vine: Vine, pressures_kPa: Iterable[float], replicates: int, payload_g: float = 0.0, prefix: str = ""
+) -> list[Trial]:
     """Every pressure `replicates` times with one vine and payload."""
     return [
         vine.trial(f"{prefix}{pressure_kPa:g}kPa_{k + 1}".replace(".", "p"), pressure_kPa, payload_g)
@@ -60,13 +62,12 @@ def campaign(vine: Vine, pressures_kPa: Iterable[float], replicates: int, payloa
     ]
 
 
-
-
 def damping_pressures_kPa(scale: int, count: int = 10) -> np.ndarray:
     """Pressures of the damping protocol for one scale, kPa, shape (count,), rounded to 0.1.
 
-    The paper raises the pressure until speeds are still steady within the length of the vine. Lowest: 0.25 m/s of the tail, where a
-    trial lasts a second; highest: 3.2 relaxation times (mass over slope of the damping) within the growth.
+    The paper raises the pressure until speeds are still steady within the length of the vine. Lowest: 0.25 m/s of the
+    tail, where a trial lasts a second; highest: 3.2 relaxation times (mass over slope of the damping) within the
+    growth.
     """
     vine, B = isometric_vine(scale).trial("", 1.0), PAPER_B[scale]
     film_kg = vine.linear_density_kg_m * vine.length_m
@@ -82,7 +83,9 @@ def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
     trials = [
         trial
         for scale in PAPER_B
-        for trial in campaign(isometric_vine(scale), damping_pressures_kPa(scale, count), replicates, prefix=f"R{scale}_")
+        for trial in campaign(
+            isometric_vine(scale), damping_pressures_kPa(scale, count), replicates, prefix=f"R{scale}_"
+        )
     ]
     return list(with_names(trials))
 
@@ -92,7 +95,9 @@ def paper_payload(replicates: int = 4) -> list[Trial]:
     trials = campaign(isometric_vine(4), (7, 14, 28), replicates, payload_g=35.6, prefix="fig4_")
     thinner = replace(isometric_vine(4), thickness_um=150.0)
     for payload_g in (10.0, 20.0, 35.6, 50.0):
-        trials += campaign(thinner, (14, 28, 41), replicates, payload_g=payload_g, prefix=f"fig5_{payload_g:g}g_".replace(".", "p"))
+        trials += campaign(
+            thinner, (14, 28, 41), replicates, payload_g=payload_g, prefix=f"fig5_{payload_g:g}g_".replace(".", "p")
+        )
     return list(with_names(trials))
 
 

@@ -19,10 +19,10 @@ class Nature:
     """The truth behind a campaign.
 
     `effects` and `values` are the physics. Scatter is a standard deviation from trial to trial, relative to B and to P;
-    `yield_error_kPa` that of the yield pressure stated for each vine. `release_frames` bounds the rest frames before release, whose
-    instant is uniform between two frames; `origin_m` bounds the unknown zero of position. Noise is AR(1) with standard
-    deviation `noise_m` and lag-one correlation `noise_correlation`. `dropped` and `repeated` are probabilities per moving
-    frame. `trace_sigma_kPa` is the noise of a recorded pressure (None: none is recorded).
+    `yield_error_kPa` that of the yield pressure stated for each vine. `release_frames` bounds the rest frames before
+    release, whose instant is uniform between two frames; `origin_m` bounds the unknown zero of position. Noise is
+    AR(1) with standard deviation `noise_m` and lag-one correlation `noise_correlation`. `dropped` and `repeated` are
+    probabilities per moving frame. `trace_sigma_kPa` is the noise of a recorded pressure (None: none is recorded).
     """
 
     effects: tuple[str, ...] = BASE

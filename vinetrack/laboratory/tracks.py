@@ -23,8 +23,8 @@ from vinetrack.tables import write_csv, write_json, write_text
 class VirtualTrial:
     """One trial as it was grown and as it was measured.
 
-    `stated` is the trial as the sheet states it, `true` as it was. `track` is what the analysis gets; its zeros are arbitrary.
-    The rest is the truth at the track's rows: SI, the release at `release_s` on the track's clock.
+    `stated` is the trial as the sheet states it, `true` as it was. `track` is what the analysis gets; its zeros are
+    arbitrary. The rest is the truth at the track's rows: SI, the release at `release_s` on the track's clock.
     """
 
     stated: Trial
@@ -51,11 +51,15 @@ def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
     for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
         pressure_Pa = trial.pressure_Pa * (1 + nature.pressure_scatter * draw.standard_normal())
         factor = 1 + nature.damping_scatter * draw.standard_normal()
-        true.append(replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=trial.yield_pressure_Pa + errors[trial.vine]))
+        true.append(
+            replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=trial.yield_pressure_Pa + errors[trial.vine])
+        )
         if column is not None:
             theta[i, column] *= factor
         damping.append(float(theta[i, column]) if column is not None else math.nan)
-    times, release = zip(*(_frame_times(trial, nature, draw) for trial, draw in zip(trials, draws, strict=True)), strict=True)
+    times, release = zip(
+        *(_frame_times(trial, nature, draw) for trial, draw in zip(trials, draws, strict=True)), strict=True
+    )
     moved = simulate_many(model, true, [t - t0 for t, t0 in zip(times, release, strict=True)], parameters=theta)
     grown = []
     for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
@@ -143,8 +147,8 @@ def _faults(
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, ...], tuple[int, ...]]:
     """Which true frame each row shows, and which instant its index claims.
 
-    A dropped frame is missing and nobody knows: the rows after it claim one frame too early. A repeated frame shows its predecessor once
-    more in place of itself.
+    A dropped frame is missing and nobody knows: the rows after it claim one frame too early. A repeated frame shows
+    its predecessor once more in place of itself.
     """
     moving = velocity_m_s > 0
     lost = moving & (draw.uniform(size=velocity_m_s.size) < nature.dropped)
@@ -168,7 +172,17 @@ def write_tracks(grown: Sequence[VirtualTrial], folder: Path) -> None:
         write_csv(folder / f"{trial.stated.name}.csv", pd.DataFrame(columns))
 
 
-SHEET_COLUMNS = ("trial", "track", "capture_fps", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa", "payload_g")
+SHEET_COLUMNS = (
+    "trial",
+    "track",
+    "capture_fps",
+    "diameter_mm",
+    "thickness_um",
+    "length_mm",
+    "pressure_kPa",
+    "yield_pressure_kPa",
+    "payload_g",
+)
 
 
 def sheet(trials: Sequence[Trial]) -> pd.DataFrame:

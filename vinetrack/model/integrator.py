@@ -3,10 +3,11 @@
 The equation is hard in four places. At rest the slope of v^0.37 is infinite, so any method of fixed step falls to order
 1.4; near the yield pressure the speed relaxes in microseconds while growth takes minutes (a stiffness of 10⁸); towards
 the end of a bare vine the mass goes to nothing; and a vine may stall, after which it stays at rest until the drive
-exceeds what holds it. An implicit method that is stable at any step, with the step chosen from its own error, does all four.
+exceeds what holds it. An implicit method that is stable at any step, with the step chosen from its own error, does
+all four.
 
-This file is the text of a compiled kernel: `vinetrack.model.kernel` sets what follows the marked line behind the `rates`
-of one model, so that the compiler sees both. Only numbers and arrays, nothing of Python's.
+This file is the text of a compiled kernel: `vinetrack.model.kernel` sets what follows the marked line behind the
+`rates` of one model, so that the compiler sees both. Only numbers and arrays, nothing of Python's.
 
 Source of the method: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.5 and IV.8.
 """
@@ -196,8 +197,9 @@ def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pr
 def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rtol, out):
     """Follow one trajectory from rest at time 0; fill `out` (n_times, 3) with x, v, a of the tail at `times`.
 
-    `kink` is where along x the film's mass reaches its floor: a step ends there, for none is good across it. `times` must increase; before 0 the vine is at rest, after the end of growth (x = `stop`; infinite for a body that
-    moves as a whole) it stays there with its last speed and acceleration given as 0.
+    `kink` is where along x the film's mass reaches its floor: a step ends there, for none is good across it. `times`
+    must increase; before 0 the vine is at rest, after the end of growth (x = `stop`; infinite for a body that moves
+    as a whole) it stays there with its last speed and acceleration given as 0.
 
     Returns
     -------
@@ -323,7 +325,9 @@ def carry_on(s, z1, z2, z3):
 
 
 @njit(nogil=True)
-def integrate_many(starts, times, on, rigs, thetas, trace_starts, trace_time, trace_pressure, kinks, stops, rtol, out, ends):
+def integrate_many(
+    starts, times, on, rigs, thetas, trace_starts, trace_time, trace_pressure, kinks, stops, rtol, out, ends
+):
     """`integrate` for many trials: trial i has times[starts[i]:starts[i+1]], rigs[i], thetas[i] and its own trace.
 
     Fills `out` (n_times, 3) and `ends` (n_trials, 4) with status, end time, end speed, number of steps.
@@ -332,7 +336,16 @@ def integrate_many(starts, times, on, rigs, thetas, trace_starts, trace_time, tr
         low, high = starts[i], starts[i + 1]
         trace = slice(trace_starts[i], trace_starts[i + 1])
         status, end_time, end_speed, n_steps = integrate(
-            times[low:high], on, rigs[i], thetas[i], trace_time[trace], trace_pressure[trace], kinks[i], stops[i], rtol, out[low:high]
+            times[low:high],
+            on,
+            rigs[i],
+            thetas[i],
+            trace_time[trace],
+            trace_pressure[trace],
+            kinks[i],
+            stops[i],
+            rtol,
+            out[low:high],
         )
         ends[i, 0] = status
         ends[i, 1] = end_time

@@ -1,8 +1,8 @@
 """The sum of effects as one compiled function.
 
-The effects of a model are plain Python functions in separate files. Here a small module is written out that calls them in
-the order of the physics, sets the integrator behind them, and is compiled once; the compiled form is kept in the user's
-cache under a name made of everything it depends on, so that it is found again by the next process.
+The effects of a model are plain Python functions in separate files. Here a small module is written out that calls
+them in the order of the physics, sets the integrator behind them, and is compiled once; the compiled form is kept in
+the user's cache under a name made of everything it depends on, so that it is found again by the next process.
 """
 
 from __future__ import annotations
@@ -112,7 +112,12 @@ def _module_source(effects: Sequence[Effect]) -> str:
 
 
 def _cache_folder() -> Path:
-    for base in (os.environ.get("VINETRACK_CACHE"), os.environ.get("XDG_CACHE_HOME"), "~/.cache", tempfile.gettempdir()):
+    for base in (
+        os.environ.get("VINETRACK_CACHE"),
+        os.environ.get("XDG_CACHE_HOME"),
+        "~/.cache",
+        tempfile.gettempdir(),
+    ):
         if not base:
             continue
         folder = Path(base).expanduser() / "vinetrack" / "kernels"

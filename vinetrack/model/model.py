@@ -107,7 +107,9 @@ class Model:
                 value = self.values.get(f"{effect.name}.{parameter.name}", parameter.default)
                 unit = "" if parameter.unit == "1" else f" {parameter.unit}"
                 pairs = sorted(value.items()) if isinstance(value, Mapping) else [("", value)]
-                lines += [f"  {parameter.symbol}{f' ({vine})' if vine else ''} = {number:.6g}{unit}" for vine, number in pairs]
+                lines += [
+                    f"  {parameter.symbol}{f' ({vine})' if vine else ''} = {number:.6g}{unit}" for vine, number in pairs
+                ]
         return "\n".join(lines)
 
 

@@ -28,8 +28,8 @@ Trace = tuple[Floats, Floats]
 class Trajectory:
     """Motion of one trial since release; arrays have shape (n_times,), SI.
 
-    `status` is `ended` where all film was everted before the last time asked for, `stalled` where it stopped for good before,
-    else `running`. `end_time_s` is when growth ended (or last stalled), NaN if it did not.
+    `status` is `ended` where all film was everted before the last time asked for, `stalled` where it stopped for good
+    before, else `running`. `end_time_s` is when growth ended (or last stalled), NaN if it did not.
     """
 
     time_s: Floats
@@ -136,8 +136,8 @@ def simulate_many(
 ) -> list[Trajectory]:
     """`simulate` for many trials in one call of the compiled kernel.
 
-    `parameters`, shape (n_trials, n_parameters) in the order of `model.parameter_names`, gives every trial values of its
-    own in place of the model's.
+    `parameters`, shape (n_trials, n_parameters) in the order of `model.parameter_names`, gives every trial values of
+    its own in place of the model's.
     """
     traces = traces or [None] * len(trials)
     for trial in trials:
@@ -156,9 +156,23 @@ def simulate_many(
     out, ends = np.empty((times.size, 3)), np.empty((len(trials), 4))
     on = np.ones(len(model.effects), dtype=bool)
     kernel(model.effects).integrate_many(
-        starts, times, on, rigs, thetas, trace_starts, trace_time, trace_pressure, *limits.T.copy(), relative_tolerance, out, ends
+        starts,
+        times,
+        on,
+        rigs,
+        thetas,
+        trace_starts,
+        trace_time,
+        trace_pressure,
+        *limits.T.copy(),
+        relative_tolerance,
+        out,
+        ends,
     )
-    return [_trajectory(trials[i], times[a:b], out[a:b], ends[i]) for i, (a, b) in enumerate(zip(starts, starts[1:], strict=False))]
+    return [
+        _trajectory(trials[i], times[a:b], out[a:b], ends[i])
+        for i, (a, b) in enumerate(zip(starts, starts[1:], strict=False))
+    ]
 
 
 def _limits(rig: Rig) -> tuple[float, float]:
@@ -186,10 +200,13 @@ def _trajectory(trial: Trial, times_s: Floats, out: Floats, end: Floats) -> Traj
     )
 
 
-def pressure_along(model: Model, trial: Trial, time_s: Floats, lead_position_m: Floats, lead_velocity_m_s: Floats) -> Floats:
+def pressure_along(
+    model: Model, trial: Trial, time_s: Floats, lead_position_m: Floats, lead_velocity_m_s: Floats
+) -> Floats:
     """Gauge pressure that a model says drove a motion that was measured, Pa, shape as given.
 
-    Time and position run from release. Nothing is integrated: the effects on the pressure are asked one after the other.
+    Time and position run from release. Nothing is integrated: the effects on the pressure are asked one after the
+    other.
 
     Raises
     ------
@@ -204,7 +221,9 @@ def pressure_along(model: Model, trial: Trial, time_s: Floats, lead_position_m: 
         function = effect.functions.get("pressure")
         if function is not None:
             arguments = [theta[f"{effect.name}.{parameter.name}"] for parameter in effect.parameters]
-            pressure = function(_state(trial, rig, time_s, lead_position_m, lead_velocity_m_s, pressure), rig, *arguments)
+            pressure = function(
+                _state(trial, rig, time_s, lead_position_m, lead_velocity_m_s, pressure), rig, *arguments
+            )
     return np.asarray(pressure, dtype=float)
 
 
@@ -222,4 +241,13 @@ def _state(trial: Trial, rig: Rig, time_s: Floats, position: Floats, velocity: F
     )
 
 
-__all__ = ["Effect", "SimulationError", "Trajectory", "check_needs", "pressure_along", "rig_of", "simulate", "simulate_many"]
+__all__ = [
+    "Effect",
+    "SimulationError",
+    "Trajectory",
+    "check_needs",
+    "pressure_along",
+    "rig_of",
+    "simulate",
+    "simulate_many",
+]

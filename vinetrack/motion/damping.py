@@ -1,13 +1,16 @@
 """The damping law F = B·x_ssⁿ: one exponent n for all vines, one coefficient B for each.
 
-Two fits of ln F = ln B_v + n ln x_ss. `log_log` is that of the paper: least squares of the force residuals. But the experimenter sets the
-force and the vine answers with a speed: a vine that damps 3 % more goes 8 % slower, and scatter on the abscissa flattens such a
-fit, by σ_B²/var(ln F) of n. `both_axes` puts every error where it arises: the measured force's on F, the measured speed's and the
-vines' scatter on x_ss, with York's estimator (D. York et al., Am. J. Phys. 72, 367, 2004). The scatter is whatever the stated
-errors leave unexplained.
+Two fits of ln F = ln B_v + n ln x_ss. `log_log` is that of the paper: least squares of the force residuals. But the
+experimenter sets the force and the vine answers with a speed: a vine that damps 3 % more goes 8 % slower, and scatter
+on the abscissa flattens such a fit, by σ_B²/var(ln F) of n. `both_axes` puts every error where it arises: that of a
+measured pressure on F; on x_ss that of the measured speed, the vines' scatter, and the scatter of a pressure that was
+set, for there the true force strays about the stated one and takes the speed along (Berkson). York's estimator then
+gives n (D. York et al., Am. J. Phys. 72, 367, 2004). The scatter is whatever the stated errors leave unexplained.
 
-Intervals resample whole trials within each vine, so that nothing is assumed about the scatter. What resampling cannot see is an error that all trials of a
-vine share: the `…_total` intervals add that of the yield pressure.
+Intervals resample whole trials within each vine, so that nothing is assumed about the scatter. Resampling cannot see
+two things. One is the flattening of `log_log`: its intervals are moved by what its own scatter implies (its estimates
+are not: they are the published method). The other is an error that all trials of a vine share: the `…_total`
+intervals add that of the yield pressure.
 """
 
 from __future__ import annotations
@@ -39,6 +42,7 @@ class Points:
     log_force: Floats
     speed_error: Floats
     force_error: Floats
+    set_error: Floats
     yield_error: Floats
     force: Floats
     vine: np.ndarray
@@ -57,21 +61,24 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
     ----------
     points
         A row a trial: `trial, vine, diameter_mm, thickness_um, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N,
-        yield_force_sigma_N`. Vines with fewer than three trials, or a span of forces below 1.2, are left out and named.
+        yield_force_sigma_N` and, optional, `pressure_source` (`trace` where the force was measured, else `set`).
+        Vines with fewer than three trials, or a span of forces below 1.2, are left out and named.
     resamples, seed
         Number of resamples, and the seed that makes them repeatable.
 
     Returns
     -------
     dict
-        `log_log` and `both_axes`, each with `n`, `n_95` (from resampling whole trials), `n_95_total` (with the stated error of
-        the yield pressures too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number of trials), `covariance` of
-        n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (how it was found), `left_out`, and
-        `refused`: None, or why there is no fit.
+        `log_log` and `both_axes`, each with `n`, `n_95` (from resampling whole trials), `n_95_total` (with the stated
+        error of the yield pressures too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number of
+        trials), `covariance` of n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (how it
+        was found), `left_out`, and `refused`: None, or why there is no fit.
     """
     kept, left_out = _admit(points)
     if kept.empty:
-        reason = "; ".join(f"{vine}: {why}" for vine, why in left_out.items()) or "there is no trial with a steady window"
+        reason = (
+            "; ".join(f"{vine}: {why}" for vine, why in left_out.items()) or "there is no trial with a steady window"
+        )
         refused = f"no vine has enough steady trials for a slope ({reason})"
         return {method: _refusal(refused, left_out) for method in ("log_log", "both_axes")}
     data = _logarithms(kept)
@@ -92,7 +99,9 @@ def _admit(points: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
             left_out[str(vine)] = f"{len(force)} steady trials, at least {FEWEST_PER_VINE} are needed"
         elif force.max() < LEAST_FORCE_RATIO * force.min():
             ratio = force.max() / force.min()
-            left_out[str(vine)] = f"forces span a factor {ratio:.3g}, at least {LEAST_FORCE_RATIO:g} is needed: vary the pressure"
+            left_out[str(vine)] = (
+                f"forces span a factor {ratio:.3g}, at least {LEAST_FORCE_RATIO:g} is needed: vary the pressure"
+            )
     return usable[~usable["vine"].isin(list(left_out))].sort_values("vine", kind="stable"), left_out
 
 
@@ -119,11 +128,16 @@ def _logarithms(points: pd.DataFrame) -> Points:
     def relative(column: str, to: Floats) -> Floats:
         return np.nan_to_num(points[column].to_numpy(float)) / to
 
+    measured = (
+        points["pressure_source"].to_numpy() == "trace" if "pressure_source" in points else np.zeros(len(points), bool)
+    )
+    force_error = relative("force_sigma_N", force)
     return Points(
         log_speed=np.log(speed),
         log_force=np.log(force),
         speed_error=relative("x_ss_sigma_m_s", speed),
-        force_error=relative("force_sigma_N", force),
+        force_error=np.where(measured, force_error, 0.0),
+        set_error=np.where(measured, 0.0, force_error),
         yield_error=np.nan_to_num(points["yield_force_sigma_N"].to_numpy(float)),
         force=force,
         vine=np.array([index[name] for name in points["vine"].astype(str)]),
@@ -131,14 +145,17 @@ def _logarithms(points: pd.DataFrame) -> Points:
     )
 
 
-def slope(log_force: Floats, counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats) -> tuple[Floats, Floats]:
+def slope(
+    log_force: Floats, counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats
+) -> tuple[Floats, Floats]:
     """York's slope with one intercept a vine, for many resamples at once.
 
     Parameters
     ----------
     log_force : array, shape (n_resamples, n_points) or (1, n_points)
     counts : array, shape (n_resamples, n_points), how often each point is drawn
-    speed_variance, force_variance : arrays, shape (n_points,), of the logarithms; where the first is 0 this is least squares in F
+    speed_variance, force_variance : arrays, shape (n_points,), of the logarithms; where the first is 0 this is least
+    squares in F
 
     Returns
     -------
@@ -191,6 +208,10 @@ def _fit(
         reach = _student(dof) * np.sqrt(np.diag(covariance))
         low, high = estimate - reach, estimate + reach
     low_total, high_total = _percentiles(estimate, total, spread)
+    if not both_axes:
+        shift = _flattening(data, estimate)
+        low, high = np.minimum(low + shift, estimate), np.maximum(high + shift, estimate)
+        low_total, high_total = low_total + shift, high_total + shift
     low_total, high_total = np.minimum(low, low_total), np.maximum(high, high_total)
     return {
         "n": n,
@@ -211,10 +232,19 @@ def _fit(
         "covariance": {"parameters": ["n", *(f"ln B {name}" for name in data.names)], "matrix": covariance.tolist()},
         "scatter": scatter,
         "n_trials": n_points,
-        "interval": "resampling whole trials" if by_resampling else "least squares and Student's t: too few trials to resample",
+        "interval": "resampling whole trials"
+        if by_resampling
+        else "least squares and Student's t: too few trials to resample",
         "left_out": left_out,
         "refused": None,
     }
+
+
+def _flattening(data: Points, estimate: Floats) -> Floats:
+    """How far least squares in F falls short of a fit with all scatter on the speed, shape (1 + n_vines,): n, ln B."""
+    same = np.ones_like(data.log_force)
+    n, log_B = slope(data.log_force[None], same[None], data, same, 1e-14 * same)
+    return np.concatenate([n, log_B[0]]) - estimate
 
 
 def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]:
@@ -222,19 +252,32 @@ def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]
     if not both_axes:
         return np.zeros_like(data.log_force), np.ones_like(data.log_force)
     ones = np.ones((1, data.log_force.size))
-    force_variance, measured = data.force_error**2, data.speed_error**2
-    scatter = 1e-4
-    for _ in range(40):
-        n, log_B = slope(data.log_force[None], ones, data, measured + scatter, force_variance)
+    force_variance = data.force_error**2
+    scatter, n = 1e-3, np.array([0.4])
+    for _ in range(60):
+        speed_variance = data.speed_error**2 + (data.set_error**2 + scatter) / n[0] ** 2
+        n, log_B = slope(data.log_force[None], ones, data, speed_variance, force_variance)
+        if not (math.isfinite(n[0]) and n[0] > 0):
+            break
         residual = data.log_force - log_B[0][data.vine] - n[0] * data.log_speed
-        # The scatter that makes χ² equal its degrees of freedom.
-        chi2 = float(np.sum(residual**2 / (force_variance + n[0] ** 2 * (measured + scatter)))) / max(dof, 1)
-        if not math.isfinite(chi2):
+        # The scatter of ln F, beyond the stated errors, that makes χ² equal its degrees of freedom.
+        known = force_variance + n[0] ** 2 * data.speed_error**2 + data.set_error**2
+        before, scatter = scatter, _unexplained(residual, known, dof)
+        if abs(scatter - before) <= 1e-6 * (scatter + 1e-12):
             break
-        before, scatter = scatter, max(scatter * chi2, 1e-10)
-        if abs(scatter - before) < 1e-6 * scatter:
-            break
-    return measured + scatter, force_variance
+    return speed_variance, np.maximum(force_variance, 1e-14)
+
+
+def _unexplained(residual: Floats, known: Floats, dof: int) -> float:
+    """Variance s with Σ residual²/(known + s) = dof, or 0 where the known variances are enough."""
+    from scipy.optimize import brentq
+
+    def excess(s: float) -> float:
+        return float(np.sum(residual**2 / (known + s))) - max(dof, 1)
+
+    largest = float(residual @ residual) / max(dof, 1) + 1e-12
+    floor = 1e-12
+    return float(brentq(excess, floor, largest)) if excess(floor) > 0 > excess(largest) else floor
 
 
 def _covariance(
@@ -267,8 +310,8 @@ def _resample(
 def _widening(data: Points, dof: int) -> Floats:
     """How much wider than their percentiles intervals must be, shape (1 + n_vines,).
 
-    Resampling N points about p fitted parameters shrinks their variance by (N − p)/N, and a spread that is itself estimated
-    calls for Student's t in place of the normal.
+    Resampling N points about p fitted parameters shrinks their variance by (N − p)/N, and a spread that is itself
+    estimated calls for Student's t in place of the normal.
     """
     n_points = data.log_force.size
     sizes = np.array([n_points / (1 + len(data.names)), *np.bincount(data.vine)])

@@ -12,7 +12,8 @@ from vinetrack.records import Floats, Trial
 def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_m: float) -> float:
     """Velocity where the leading edge first passes `target_m`, m/s; NaN where it never gets there.
 
-    Both arrays have shape (n,), travel counted from rest; between points the velocity is interpolated linearly in position.
+    Both arrays have shape (n,), travel counted from rest; between points the velocity is interpolated linearly in
+    position.
     """
     beyond = np.flatnonzero(lead_position_m >= target_m)
     if beyond.size == 0 or beyond[0] == 0:
@@ -26,8 +27,8 @@ def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_
 def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: float) -> float:
     """Kinetic energy over the work of the gas, ½ m(x) ẋ² / (P₀ A y), at one point of the growth; NaN where undefined.
 
-    m(x) is the moving mass, tail and payload, ẋ = r·ẏ. Source: Alvarez et al. (2025), section IV-D, with the moving mass of
-    their Eq. (1).
+    m(x) is the moving mass, tail and payload, ẋ = r·ẏ. Source: Alvarez et al. (2025), section IV-D, with the moving
+    mass of their Eq. (1).
     """
     work_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m
     if not work_J > 0:

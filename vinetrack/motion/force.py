@@ -3,7 +3,8 @@
     F = (P_w − P_y) A + r m̄ g cosθ
 
 P_w is the gauge pressure in the window (measured, else that of the model in use) and m̄ the mean moving mass there. The
-rule of the paper, Eq. (3), takes the set pressure and leaves the weight out: then noise-free data made with n = 0.37 give 0.38.
+rule of the paper, Eq. (3), takes the set pressure and leaves the weight out: then noise-free data made with n = 0.37
+give 0.38.
 """
 
 from __future__ import annotations
@@ -32,9 +33,12 @@ class SteadyForce:
     yield_sigma_N: float
     paper_N: float
     window_pressure_Pa: float
+    pressure_source: str  #: `trace` where it was measured in the window, else `set`
 
 
-def steady_force(trial: Trial, track: Track, kinematics: Kinematics, release: Release, window: Window, model: Model) -> SteadyForce:
+def steady_force(
+    trial: Trial, track: Track, kinematics: Kinematics, release: Release, window: Window, model: Model
+) -> SteadyForce:
     """Force of a trial in one window.
 
     Raises
@@ -44,7 +48,7 @@ def steady_force(trial: Trial, track: Track, kinematics: Kinematics, release: Re
     """
     inside = (kinematics.time_s >= window.from_s) & (kinematics.time_s <= window.to_s)
     travel_m = np.maximum(kinematics.lead_position_m[inside] - release.lead_position_m, 0.0)
-    pressure_Pa, sigma_Pa = _window_pressure(trial, track, kinematics, release, window, model, inside, travel_m)
+    pressure_Pa, sigma_Pa, source = _window_pressure(trial, track, kinematics, release, window, model, inside, travel_m)
     mass_kg = float(np.mean(trial.moving_mass_kg(travel_m)))
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
     return SteadyForce(
@@ -53,6 +57,7 @@ def steady_force(trial: Trial, track: Track, kinematics: Kinematics, release: Re
         yield_sigma_N=trial.yield_pressure_sigma_Pa * trial.area_m2,
         paper_N=(trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2,
         window_pressure_Pa=pressure_Pa,
+        pressure_source=source,
     )
 
 
@@ -65,16 +70,18 @@ def _window_pressure(
     model: Model,
     inside: np.ndarray,
     travel_m: Floats,
-) -> tuple[float, float]:
-    """Mean gauge pressure in the window and its random error, Pa: measured where there is a trace, else the model's."""
+) -> tuple[float, float, str]:
+    """Mean gauge pressure in the window, its random error, Pa, and whether it comes from a `trace` or was `set`."""
     if track.pressure_Pa is not None:
         measured = track.pressure_Pa[(track.time_s >= window.from_s) & (track.time_s <= window.to_s)]
         measured = measured[np.isfinite(measured)]
         if measured.size:
-            return float(measured.mean()), _mean_error(measured)
-    since_release_s = kinematics.time_s[inside] - (release.time_s if math.isfinite(release.time_s) else kinematics.time_s[0])
+            return float(measured.mean()), _mean_error(measured), "trace"
+    since_release_s = kinematics.time_s[inside] - (
+        release.time_s if math.isfinite(release.time_s) else kinematics.time_s[0]
+    )
     along = pressure_along(model, trial, since_release_s, travel_m, kinematics.lead_velocity_m_s[inside])
-    return float(np.mean(along)), trial.pressure_sigma_Pa
+    return float(np.mean(along)), trial.pressure_sigma_Pa, "set"
 
 
 def _mean_error(measured_Pa: Floats) -> float:
@@ -95,5 +102,7 @@ def why_not_in_fit(trial: Trial, force: SteadyForce | None) -> str:
     if force is None:
         return "no steady window"
     if not force.force_N > 0:
-        return f"the force in the window is {force.force_N:.3g} N: the pressure there does not exceed the yield pressure"
+        return (
+            f"the force in the window is {force.force_N:.3g} N: the pressure there does not exceed the yield pressure"
+        )
     return ""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-
 from vinetrack.effects import EffectError
 from vinetrack.model.model import Model
 from vinetrack.motion.efficiency import energy_efficiency, lead_velocity_at
@@ -164,10 +163,9 @@ def _point(trial: Trial, window: Window | None, paper: Window, force: SteadyForc
         "force_N": force.force_N if force else nan,
         "force_sigma_N": force.sigma_N if force else nan,
         "yield_force_sigma_N": force.yield_sigma_N if force else nan,
+        "pressure_source": force.pressure_source if force else "",
         "x_ss_paper_m_s": paper.x_ss_m_s if paper.accepted else nan,
         "force_paper_N": (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2,
         "used": not reason,
         "reason": reason,
     }
-
-
