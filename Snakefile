@@ -60,6 +60,7 @@ rule tracks:
     threads: workflow.cores
     params:
         code=code_hash("tracks"),
+        unwatched=plan.unwatched,
         experiment=plan.experiment,
         results=plan.results,
         settings=plan.stage_settings(

@@ -96,10 +96,10 @@ def read_rows(path: Path) -> dict[str, dict[str, str]]:
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
     """The results folder of a run over an experiment whose path has blanks, and what Snakemake printed."""
     workdir = tmp_path_factory.mktemp("a folder")
-    write_campaign(workdir / "my vines {1}")
-    done = snakemake(workdir, "--cores", "2", "--config", "experiment=my vines {1}/")
+    write_campaign(workdir / "my vines (1)")
+    done = snakemake(workdir, "--cores", "2", "--config", "experiment=my vines (1)/")
     assert done.returncode == 0, done.stdout + done.stderr
-    return workdir / "results" / "my vines {1}", done
+    return workdir / "results" / "my vines (1)", done
 
 
 @pytest.mark.pipeline
@@ -187,7 +187,7 @@ def test_provenance_names_version_settings_and_the_hash_of_every_input(campaign:
 
     results, _ = campaign
     provenance = json.loads((results / "provenance.json").read_text())
-    sheet = results.parents[1] / "my vines {1}" / "trials.csv"
+    sheet = results.parents[1] / "my vines (1)" / "trials.csv"
     assert provenance["vinetrack"] == vinetrack.__version__
     assert provenance["settings"]["damping"]["resamples"] == 2000
     assert provenance["inputs"]["trials.csv"] == hashlib.sha256(sheet.read_bytes()).hexdigest()
@@ -197,7 +197,7 @@ def test_provenance_names_version_settings_and_the_hash_of_every_input(campaign:
 @pytest.mark.pipeline
 def test_nothing_is_left_to_do_afterwards_and_the_last_line_still_says_where(campaign: tuple) -> None:
     results, _ = campaign
-    again = snakemake(results.parents[1], "--cores", "1", "--config", "experiment=my vines {1}")
+    again = snakemake(results.parents[1], "--cores", "1", "--config", "experiment=my vines (1)")
     assert again.returncode == 0
     assert "Nothing to be done" in again.stderr
     assert again.stdout.strip().splitlines()[-1] == f"Report: results/{results.name}/report.html"
@@ -206,7 +206,7 @@ def test_nothing_is_left_to_do_afterwards_and_the_last_line_still_says_where(cam
 @pytest.mark.pipeline
 def test_a_setting_reruns_only_what_depends_on_it(campaign: tuple) -> None:
     results, _ = campaign
-    arguments = ("--cores", "1", "-n", "--config", "experiment=my vines {1}", "damping={resamples: 500}")
+    arguments = ("--cores", "1", "-n", "--config", "experiment=my vines (1)", "damping={resamples: 500}")
     planned = snakemake(results.parents[1], *arguments)
     assert planned.returncode == 0, planned.stderr
     listed = {line.split()[0] for line in planned.stdout.splitlines() + planned.stderr.splitlines() if line.split()}

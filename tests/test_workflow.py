@@ -10,7 +10,7 @@ import pytest
 
 from vinetrack import workflow
 from vinetrack.problems import ExperimentError
-from vinetrack.workflow import as_pattern, code_hash, find_experiment, make_plan, shell_prefix
+from vinetrack.workflow import code_hash, find_experiment, make_plan, shell_prefix
 
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
 
@@ -120,8 +120,19 @@ def test_every_part_of_a_stages_code_exists() -> None:
     assert not missing
 
 
-def test_braces_in_a_path_are_no_wildcards() -> None:
-    assert as_pattern(Path("a {b}/c")) == "a {{b}}/c"
+def test_a_folder_that_snakemake_would_take_for_a_wildcard_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError, match=r"has a brace in its path.*rename the folder"):
+        make_plan({"experiment": str(experiment(tmp_path / "v{1}"))}, tmp_path)
+
+
+def test_a_track_with_a_brace_in_its_name_is_analysed_and_watched_by_its_time(tmp_path: Path) -> None:
+    folder = experiment(tmp_path / "v", "a,a{1}.csv,12,100,300,20,3,\n")
+    (folder / "a.csv").rename(folder / "a{1}.csv")
+    before = make_plan({"experiment": str(folder)}, tmp_path)
+    assert before.trials == ("a",)
+    assert before.inputs == (folder / "trials.csv",)
+    os.utime(folder / "a{1}.csv", (1, 1))
+    assert make_plan({"experiment": str(folder)}, tmp_path).unwatched != before.unwatched
 
 
 def test_programs_of_this_python_come_first_without_an_environment_activated() -> None:

@@ -50,24 +50,26 @@ class Plan:
     """One run of the workflow.
 
     `trials` are all that get files (those that failed at the sheet too, with empty ones), `inputs` what they are read
-    from, `is_demo` whether the recordings are made on first use by the virtual laboratory.
+    from, `unwatched` a fingerprint of inputs that cannot stand in a rule, `is_demo` whether the recordings are made on
+    first use by the virtual laboratory.
     """
 
     experiment: Path
     results: Path
     trials: tuple[str, ...]
     inputs: tuple[Path, ...]
+    unwatched: str
     settings: RunSettings
     is_demo: bool
 
     @property
     def recordings(self) -> list[str]:
         """What the virtual laboratory makes of the demonstration's sheet."""
-        return [as_pattern(path) for path in self.inputs if path.name not in SHARED_FILES]
+        return [path.as_posix() for path in self.inputs if path.name not in SHARED_FILES]
 
     def result(self, *parts: str) -> str:
-        """Path of a result as Snakemake wants it."""
-        return as_pattern(self.results.joinpath(*parts))
+        """Path of a result."""
+        return self.results.joinpath(*parts).as_posix()
 
     def per_trial(self, folder: str, prefix: str, suffix: str) -> list[str]:
         """One result a trial."""
@@ -119,11 +121,33 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
     is_demo = folder.exists() and demo.exists() and folder.samefile(demo)
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
+    _refuse_braces(folder, results)
     trials = tuple(name for name in experiment.names if name not in experiment.left_out)
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
     present = (path for path in files if path is not None and (is_demo or path.exists()))
     shared = [path for name in SHARED_FILES if (path := folder / name).exists()]
-    return Plan(folder, results, trials, tuple(dict.fromkeys([*shared, *present])), settings, is_demo)
+    inputs = dict.fromkeys([*shared, *present])
+    watched = tuple(path for path in inputs if not _has_brace(path))
+    return Plan(folder, results, trials, watched, _fingerprint(inputs), settings, is_demo)
+
+
+def _has_brace(path: Path) -> bool:
+    """Whether Snakemake would take part of the path for a wildcard; it knows no way to write a brace."""
+    return "{" in str(path) or "}" in str(path)
+
+
+def _refuse_braces(*folders: Path) -> None:
+    for folder in folders:
+        if _has_brace(folder):
+            remedy = "rename the folder, or run the stages one by one with vinetrack"
+            message = "has a brace in its path, which Snakemake cannot read"
+            raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
+
+
+def _fingerprint(inputs: Iterable[Path]) -> str:
+    """Size and time of the inputs that Snakemake cannot watch, so that a change of them is seen all the same."""
+    stats = [(path.name, path.stat()) for path in inputs if _has_brace(path) and path.exists()]
+    return ";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats)
 
 
 def find_experiment(folder: Path) -> Path:
@@ -206,8 +230,3 @@ def shell_prefix() -> str:
     return f'set -euo pipefail; export PATH={shlex.quote(str(Path(sys.executable).parent))}:"$PATH"; '.replace(
         "{", "{{"
     ).replace("}", "}}")
-
-
-def as_pattern(path: Path) -> str:
-    """A path in which Snakemake sees no wildcards."""
-    return path.as_posix().replace("{", "{{").replace("}", "}}")
