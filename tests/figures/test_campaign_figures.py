@@ -13,7 +13,7 @@ from matplotlib.text import Text
 from vinetrack.figures.damping_law import draw_damping_law, log_force_sigma
 from vinetrack.figures.exponents import draw_exponents
 from vinetrack.figures.overview import MAX_CONDITION_PANELS, draw_overview
-from vinetrack.figures.scaling import abscissa, draw_scaling
+from vinetrack.figures.scaling import draw_scaling
 from vinetrack.figures.style import look, render, vine_styles
 
 N = 0.4
@@ -120,24 +120,51 @@ def test_n_and_b_are_shown_with_both_methods_and_both_intervals() -> None:
 def test_published_values_are_drawn_only_where_given() -> None:
     published = {"n": 0.37, "B": {"vine0": 0.57}, "source": "someone 2025"}
     assert "someone 2025" in words(draw_exponents(damping(), published))
-    assert "someone 2025" in words(draw_scaling(damping(), published))
-    assert "someone" not in words(draw_exponents(damping())) + words(draw_scaling(damping()))
+    assert "someone 2025" in words(draw_scaling(scaling(), published))
+    assert "someone" not in words(draw_exponents(damping())) + words(draw_scaling(scaling()))
 
 
-def test_b_is_drawn_against_the_size_that_differs_most() -> None:
-    assert abscissa({"a": law(1, 6), "b": law(2, 24)}) == "diameter_mm"
-    same = {"a": law(1, 6) | {"thickness_um": 50}, "b": law(2, 6) | {"thickness_um": 80}}
-    assert abscissa(same) == "thickness_um"
-    assert abscissa({"a": law(1, 6), "b": law(2, 6)}) is None
+def family(along: str, sizes: list[float], B: list[float], **changes: object) -> dict:
+    bounds = [[0.9 * b, 1.1 * b] for b in B]
+    statistics = {"slope": 1.8, "slope_95": [1.2, 2.4], "intercept": -3.0, "intercept_95": [-4.0, -2.0], "R2": 0.98}
+    found = {"along": along, "vines": [f"vine{i}" for i in range(len(B))], "sizes": sizes, "B": B, "B_95": bounds}
+    return {**found, "power": statistics, "line": statistics | {"slope": 0.3}, "refused": None, **changes}
 
 
-def test_the_slope_of_b_against_size_is_stated() -> None:
-    vines = {f"v{d}": law(0.1 * d**1.5, d) for d in (6.0, 12.0, 24.0)}
-    assert "diameter to the 1.50" in words(draw_scaling({"both_axes": fit(vines)}))
+def scaling(n_vines: int = 4) -> dict:
+    sizes = [6.0 * (i + 1) for i in range(n_vines)]
+    isometric = family("diameter_mm", sizes, [float(np.exp(-3.0) * size**1.8) for size in sizes])
+    return {"method": "both_axes", "isometric": [isometric], "thickness": [], "reason": None}
 
 
-def test_one_vine_has_no_scale() -> None:
-    assert "at least two vines" in words(draw_scaling(damping(1))).replace("\n", " ")
+def test_the_power_law_and_the_straight_line_are_drawn_as_fitted() -> None:
+    ax = draw_scaling(scaling()).axes[0]
+    power, line = (
+        next(line for line in ax.lines if line.get_label().startswith(name)) for name in ("power", "straight")
+    )
+    x, B = power.get_data()
+    assert pytest.approx(np.exp(-3.0) * np.asarray(x) ** 1.8) == B
+    x, B = line.get_data()
+    assert pytest.approx(-3.0 + 0.3 * np.asarray(x)) == B
+    assert "slope 1.80 (1.2 to 2.4)" in power.get_label()
+
+
+def test_scaled_copies_and_walls_of_one_diameter_have_a_panel_each() -> None:
+    walls = family("thickness_um", [50.0, 100.0, 200.0], [1.0, 2.0, 4.0])
+    labels = [ax.get_xlabel() for ax in draw_scaling(scaling() | {"thickness": [walls]}).axes]
+    assert labels == ["diameter (mm)", "wall thickness (µm)"]
+
+
+def test_two_vines_have_points_and_no_lines() -> None:
+    pair = family("diameter_mm", [6.0, 12.0], [1.0, 3.0], power=None, line=None, refused="2 vines")
+    figure = draw_scaling(scaling() | {"isometric": [pair]})
+    assert "power law" not in words(figure)
+    assert "N = 2 vines" in words(figure)
+
+
+def test_without_families_the_figure_gives_the_reason() -> None:
+    nothing = {"isometric": [], "thickness": [], "reason": "1 vines with a damping coefficient"}
+    assert "1 vines with a damping coefficient" in words(draw_scaling(nothing))
 
 
 def campaign(n_conditions: int, replicates: int) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
@@ -194,7 +221,7 @@ def every_figure() -> list[tuple[str, Figure]]:
         ("law", draw_damping_law(points(4), damping(4))),
         ("law of 20 vines", draw_damping_law(points(20), damping(20))),
         ("exponents", draw_exponents(damping(4), {"n": 0.37, "B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"})),
-        ("scaling", draw_scaling(damping(4), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"})),
+        ("scaling", draw_scaling(scaling(), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"})),
         ("overview", draw_overview(*campaign(40, 1))),
     ]
 
@@ -224,7 +251,7 @@ def test_a_png_is_white_and_an_svg_transparent() -> None:
 
     from matplotlib.image import imread
 
-    files = render(draw_scaling(damping()), ("png", "svg"))
+    files = render(draw_scaling(scaling()), ("png", "svg"))
     assert imread(BytesIO(files["png"]))[0, 0] == pytest.approx([1, 1, 1, 1])
     assert b"fill: #ffffff" not in files["svg"].split(b"axes_1")[0]
 
@@ -233,7 +260,7 @@ def test_drawing_leaves_no_state_in_matplotlib() -> None:
     import matplotlib as mpl
 
     before = dict(mpl.rcParams)
-    render(draw_scaling(damping()), ("png",))
+    render(draw_scaling(scaling()), ("png",))
     assert dict(mpl.rcParams) == before
 
 

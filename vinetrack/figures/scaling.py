@@ -1,6 +1,7 @@
-"""How B grows with the size of the vine: on log axes, with the power law through it.
+"""How B grows with the size of the vine: against diameter for scaled copies, against thickness for one diameter.
 
-The abscissa is whatever differs most between the vines: the diameter, or the thickness where all have one diameter.
+Two descriptions are drawn because neither is known to be right: a power law, straight on these log axes, and a
+straight line, which bends on them.
 """
 
 from __future__ import annotations
@@ -9,77 +10,80 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.style import METHOD_COLOURS, METHOD_NAMES, MUTED, blank, legend_above, look, plain_log_ticks
+from vinetrack.figures.numbers import interval, number
+from vinetrack.figures.style import MUTED, VINE_COLOURS, VINE_MARKERS, blank, legend_above, look, plain_log_ticks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _LABELS = {"diameter_mm": "diameter (mm)", "thickness_um": "wall thickness (µm)"}
+_TITLES = {"isometric": "Scaled copies (one t/D)", "thickness": "One diameter"}
+MAX_FAMILIES = 4
 
 
-def draw_scaling(damping: dict[str, Any], published: dict[str, Any] | None = None) -> Figure:
-    """Draw B of every vine against its size.
+def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = None) -> Figure:
+    """Draw B against size, one panel for vines that are scaled copies and one for vines of one diameter.
 
     Parameters
     ----------
-    damping : as in `damping.json`.
+    scaling : as in `scaling.json`.
     published : `{"B": {vine: …}, "source": …}` to set beside it; None where there is nothing to set.
     """
     from matplotlib.figure import Figure
 
-    fits = {name: fit for name in METHOD_NAMES if (fit := damping.get(name) or {}).get("vines")}
-    if not fits:
-        return blank("No damping law could be fitted, so there is no B to compare between vines.")
-    vines = next(iter(fits.values()))["vines"]
-    if len(vines) < 2:
-        return blank("B against size needs at least two vines; this experiment has one with a damping law.")
-    size = abscissa(vines)
-    if size is None:
-        return blank("All vines have the same diameter and wall thickness, so there is no scale to plot B against.")
+    kinds = [kind for kind in _TITLES if scaling.get(kind)]
+    if not kinds:
+        return blank(f"Nothing to draw B against: {scaling.get('reason') or 'no vine has a damping coefficient'}.")
     with look():
-        fig = Figure(figsize=(6.4, 5.0), layout="constrained")
-        ax = fig.add_subplot()
-        ax.set(xscale="log", yscale="log", xlabel=_LABELS[size], ylabel="B (N·(s/m)ⁿ)")
-        for method, fit in fits.items():
-            _draw_fit(ax, method, fit["vines"], size)
-        _draw_published(ax, vines, size, published)
-        sizes = [law[size] for law in vines.values()]
-        ax.set_xlim(min(sizes) / 1.3, max(sizes) * 1.3)
-        plain_log_ticks(ax)
-        if len(set(sizes)) <= 8:
-            ax.set_xticks(sorted(set(sizes)))
-        legend_above(ax, n_columns=1)
+        fig = Figure(figsize=(6.6 if len(kinds) == 1 else 11.0, 5.2), layout="constrained")
+        for ax, kind in zip(fig.subplots(1, len(kinds), squeeze=False)[0], kinds, strict=True):
+            families = scaling[kind][:MAX_FAMILIES]
+            ax.set(xscale="log", yscale="log", xlabel=_LABELS[families[0]["along"]], ylabel="B (N·(s/m)ⁿ)")
+            for i, family in enumerate(families):
+                _draw_family(ax, family, i)
+            _draw_published(ax, families, published)
+            _finish(ax, families)
+            left_out = len(scaling[kind]) - len(families)
+            title = _TITLES[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
+            legend_above(ax, n_columns=1, title=title, alignment="left")
     return fig
 
 
-def abscissa(vines: dict[str, dict[str, Any]]) -> str | None:
-    """The size to plot B against, `diameter_mm` or `thickness_um`; None where vines differ in neither."""
-    spread = {
-        size: max(law[size] for law in vines.values()) / min(law[size] for law in vines.values()) for size in _LABELS
-    }
-    best = max(spread, key=lambda size: spread[size])
-    return best if spread[best] > 1 else None
-
-
-def _draw_fit(ax: Axes, method: str, vines: dict[str, dict[str, Any]], size: str) -> None:
-    x = np.array([law[size] for law in vines.values()], dtype=float)
-    B = np.array([law["B"] for law in vines.values()], dtype=float)
-    bounds = [law.get("B_95_total") or law.get("B_95") or (law["B"], law["B"]) for law in vines.values()]
-    low, high = np.array([(b if b is not None else np.nan) for pair in bounds for b in pair], float).reshape(-1, 2).T
+def _draw_family(ax: Axes, family: dict[str, Any], index: int) -> None:
+    colour, marker = VINE_COLOURS[index], VINE_MARKERS[index]
+    sizes, B = np.array(family["sizes"], dtype=float), np.array(family["B"], dtype=float)
+    low, high = np.array(family["B_95"], dtype=float).T
     errors = np.nan_to_num(np.vstack([B - low, high - B])).clip(min=0)
-    slope, log_B = np.polyfit(np.log(x), np.log(B), 1)
-    label = f"{METHOD_NAMES[method]}: B ∝ {_LABELS[size].split(' (')[0]} to the {slope:.2f}, N = {len(B)} vines"
-    shift = 0.985 if method == "log_log" else 1.015
-    marker = "s" if method == "log_log" else "o"
-    colour = METHOD_COLOURS[method]
-    ax.errorbar(shift * x, B, yerr=errors, fmt=marker, color=colour, ms=6, capsize=2.5, elinewidth=1.2, label=label)
-    span = np.geomspace(x.min() / 1.15, x.max() * 1.15, 50)
-    ax.plot(span, np.exp(log_B) * span**slope, color=colour, lw=1.2, alpha=0.8)
+    label = f"B with 95 % interval, N = {B.size} vines"
+    ax.errorbar(sizes, B, yerr=errors, fmt=marker, color=colour, ms=6, capsize=3, elinewidth=1.3, label=label, zorder=3)
+    span = np.geomspace(sizes.min() / 1.15, sizes.max() * 1.15, 100)
+    if power := family["power"]:
+        label = f"power law, slope {number(power['slope'])} ({interval(power['slope_95'])}), R² {number(power['R2'])}"
+        ax.plot(span, np.exp(power["intercept"]) * span ** power["slope"], color=colour, lw=1.5, label=label)
+    if line := family["line"]:
+        straight = line["intercept"] + line["slope"] * span
+        drawn = straight > 0.5 * B.min()
+        label = f"straight line, intercept {number(line['intercept'])}, R² {number(line['R2'])}"
+        ax.plot(span[drawn], straight[drawn], color=colour, lw=1.3, ls=(0, (4, 2)), label=label)
 
 
-def _draw_published(ax: Axes, vines: dict[str, dict[str, Any]], size: str, published: dict[str, Any] | None) -> None:
-    pairs = [(law[size], published["B"][vine]) for vine, law in vines.items() if published and vine in published["B"]]
+def _draw_published(ax: Axes, families: list[dict[str, Any]], published: dict[str, Any] | None) -> None:
+    given = (published or {}).get("B", {})
+    pairs = [
+        (size, given[vine])
+        for family in families
+        for vine, size in zip(family["vines"], family["sizes"], strict=True)
+        if vine in given
+    ]
     if published and pairs:
         x, B = zip(*pairs, strict=True)
-        ax.plot(x, B, "D", mfc="none", mec=MUTED, ms=10, mew=1.3, label=published["source"])
+        ax.plot(x, B, "D", mfc="none", mec=MUTED, ms=11, mew=1.3, label=published["source"])
+
+
+def _finish(ax: Axes, families: list[dict[str, Any]]) -> None:
+    sizes = sorted({size for family in families for size in family["sizes"]})
+    ax.set_xlim(sizes[0] / 1.3, sizes[-1] * 1.3)
+    plain_log_ticks(ax)
+    if len(sizes) <= 8:
+        ax.set_xticks(sizes)

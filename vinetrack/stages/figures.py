@@ -81,7 +81,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     drawings: dict[str, Figure] = {
         "damping_law": draw_damping_law(points, damping),
         "exponents": draw_exponents(damping),
-        "scaling": draw_scaling(damping),
+        "scaling": draw_scaling(read_json(results.scaling)),
         "overview": draw_overview(described, moved),
     }
     for name, figure in drawings.items():

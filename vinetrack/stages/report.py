@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 FIGURES = {
     "damping_law": ("Steady force and steady speed", "damping_points.csv"),
     "exponents": ("The exponent and the coefficients, by both methods", "damping.json"),
-    "scaling": ("How damping grows with size", "damping.json"),
+    "scaling": ("How damping grows with size", "scaling.json"),
     "overview": ("All trials at a glance", "trials.csv"),
 }
 MAX_TRIAL_PICTURES = 60

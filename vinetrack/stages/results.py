@@ -72,12 +72,15 @@ POINT_COLUMNS = (
     "force_N",
     "force_sigma_N",
     "yield_force_sigma_N",
+    "pressure_source",
     "x_ss_paper_m_s",
     "force_paper_N",
     "used",
     "reason",
 )
-TEXT_COLUMNS = frozenset({"trial", "vine", "condition", "status", "reason", "steady_rule", "rule", "flag"})
+TEXT_COLUMNS = frozenset(
+    {"trial", "vine", "condition", "status", "reason", "steady_rule", "rule", "flag", "pressure_source"}
+)
 TRUTH_COLUMNS = frozenset({"accepted", "used"})
 
 
