@@ -70,6 +70,7 @@ class Trial:
     ambient_pressure_Pa: float = AMBIENT_PRESSURE_PA
     mass_loss: str = "geometric"
     tail_slack: str = "taut"
+    tail_store: str = "body"
 
     @property
     def area_m2(self) -> float:

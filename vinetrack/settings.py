@@ -135,6 +135,7 @@ class ExperimentSettings(_Strict):
     use: bool | None = None
     ambient_pressure_kPa: Annotated[Number, Field(gt=0, le=1000)] = 101.325
     tail_slack: Literal["taut", "free"] = "taut"
+    tail_store: Literal["body", "reel"] = "body"
     mass_loss: Literal["geometric", "as_printed"] = "geometric"
     model: tuple[str, ...] = BASE_EFFECTS
     candidates: tuple[str, ...] | None = None

@@ -219,6 +219,7 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
         ambient_pressure_Pa=settings.ambient_pressure_kPa * 1000,
         mass_loss=settings.mass_loss,
         tail_slack=settings.tail_slack,
+        tail_store=settings.tail_store,
     )
     if "film_density_kg_m3" in values:
         trial = replace(trial, film_density_kg_m3=number("film_density_kg_m3"))

@@ -15,7 +15,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-HOOKS = ("pressure", "damping_gain", "tip_force", "tail_force", "added_mass")
+HOOKS = (
+    "true_time",
+    "film_gain",
+    "gauge",
+    "yield_gauge",
+    "area",
+    "chamber_rate",
+    "pressure",
+    "damping_gain",
+    "added_mass",
+    "tip_force",
+    "tail_force",
+    "rest_force",
+    "observed_position",
+)
 """What an effect may change, in the order in which the model asks: see `Effect`."""
 
 KINDS = ("base", "physical", "measurement")
@@ -29,10 +43,16 @@ class State(NamedTuple):
     lead_velocity: float  #: ẏ, m/s
     tail_position: float  #: x = r·y, m
     tail_velocity: float  #: ẋ, m/s
-    pressure: float  #: gauge, Pa, as changed by the effects asked before
+    set_pressure: float  #: gauge pressure at release, Pa, as the gauge should have read it
+    pressure: float  #: gauge pressure now, Pa, as changed by the effects asked before
+    yield_pressure: float  #: Pa, as the gauge should have read it
     area: float  #: A, m²
+    linear_density: float  #: λ, kg/m
     moving_mass: float  #: m(x), kg
     damping_gain: float  #: factor on B, 1 unless an effect changes it
+    bend_angle: float  #: angle of the bends that the tip has passed, rad
+    tail_tension: float  #: T₁, what the tip's forces leave for the tail, N (asked for by `observed_position` only)
+    observed: float  #: position that the camera would report, m, as changed by the effects asked before
 
 
 class Rig(NamedTuple):
@@ -53,6 +73,8 @@ class Rig(NamedTuple):
     chamber_volume: float
     inlet_area: float
     least_mass: float  #: floor of the moving mass: fold and gas, kg
+    has_bends: float  #: 1 where the sheet has bends
+    tail_on_reel: float  #: 1 where the tail comes off a reel instead of lying in the body
 
 
 @dataclass(frozen=True)
@@ -96,11 +118,19 @@ class Effect:
 
     Its functions take `(s: State, rig: Rig, *parameters)` and return, by hook:
 
-    pressure        the gauge pressure it leaves, Pa
-    damping_gain    the factor it leaves on B
-    tip_force       force at the tip, N, positive along growth
-    tail_force      force on tail and payload, N, positive along growth
-    added_mass      mass moving with the tail that it adds, kg
+    true_time           time since release at which what the camera stamps `s.time` really happened, s
+    film_gain           factor on the film's mass per metre
+    gauge               the set or traced gauge pressure that was truly there, Pa
+    yield_gauge         the yield pressure that was truly there, Pa
+    area                the cross-section it leaves, m²
+    chamber_rate        rate of change of the chamber's pressure, Pa/s (the chamber then follows its own equation)
+    pressure            the gauge pressure it leaves, Pa
+    damping_gain        the factor it leaves on B
+    added_mass          mass moving with the tail that it adds, kg
+    tip_force           force at the tip, N, positive along growth
+    tail_force          force on tail and payload, N, positive along growth
+    rest_force          force at the tip that holds a vine at rest and is gone once it moves, N, negative
+    observed_position   position of the leading edge that the camera reports, m
     """
 
     name: str
@@ -114,6 +144,7 @@ class Effect:
     worked: tuple[Worked, ...]
     path: Path
     in_trace: bool = False  #: a pressure measured during growth already holds it
+    replaces: tuple[str, ...] = ()  #: effects that it contains and that rest while it is in the model
 
     @property
     def formula(self) -> str:

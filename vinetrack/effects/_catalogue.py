@@ -76,6 +76,7 @@ def load_effect(path: Path | str) -> Effect:
         worked=tuple(getattr(module, "WORKED", ())),
         path=path.resolve(),
         in_trace=bool(getattr(module, "IN_TRACE", False)),
+        replaces=tuple(getattr(module, "REPLACES", ())),
     )
     faults = list(_faults(effect))
     if faults:

@@ -14,8 +14,8 @@ KIND = "base"
 NEEDS = ("yield_pressure_kPa",)
 
 
-def tip_force(s, rig):  # noqa: D103
-    return -rig.yield_pressure * s.area
+def tip_force(s, rig):  # noqa: ARG001, D103
+    return -s.yield_pressure * s.area
 
 
-WORKED = (Worked("tip_force", -1.3572, "3 kPa × 4.5239e-4 m²", state={"area": 4.5239e-4}, rig={"yield_pressure": 3e3}),)
+WORKED = (Worked("tip_force", -1.3572, "3 kPa × 4.5239e-4 m²", state={"area": 4.5239e-4, "yield_pressure": 3e3}),)

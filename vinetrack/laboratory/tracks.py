@@ -14,7 +14,8 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.laboratory.nature import Nature
-from vinetrack.model.simulate import Trajectory, pressure_along, simulate_many
+from vinetrack.model.simulate import Trajectory, simulate_many
+from vinetrack.model.terms import pressure_along
 from vinetrack.records import Floats, Track, Trial
 from vinetrack.tables import write_csv, write_json, write_text
 
@@ -104,7 +105,7 @@ def _measure(
     origin_m = draw.uniform(*nature.origin_m)
     noise = _ar1(stop, nature.noise_m, nature.noise_correlation, draw)
     shown, index, dropped, repeated = _faults(moved.lead_velocity_m_s[:stop], nature, draw)
-    measured = (origin_m + moved.lead_position_m[:stop] + noise)[shown]
+    measured = (origin_m + moved.observed_position_m[:stop] + noise)[shown]
     gauge = None
     if nature.trace_sigma_kPa is not None:
         gauge = pressure_Pa[shown] + 1e3 * nature.trace_sigma_kPa * draw.standard_normal(shown.size)

@@ -16,8 +16,26 @@ from numba import njit
 
 
 @njit(nogil=True)
-def rates(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure):
+def rates(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends):
     """Acceleration of the tail and rate of change of the chamber's pressure: here stand those of one model."""
+    raise NotImplementedError
+
+
+@njit(nogil=True)
+def rest_acceleration(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends):
+    """Acceleration with which a vine at rest would set off, what holds it at rest included."""
+    raise NotImplementedError
+
+
+@njit(nogil=True)
+def observed(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends):
+    """Position of the leading edge that the camera reports."""
+    raise NotImplementedError
+
+
+@njit(nogil=True)
+def first_chamber(on, rig, theta):
+    """Pressure of the chamber at release."""
     raise NotImplementedError
 
 
@@ -41,12 +59,12 @@ MOST_NEWTON = 9
 
 
 @njit(nogil=True)
-def typical_speed(time, x, chamber, on, rig, theta, trace_time, trace_pressure, start_acceleration, room):
+def typical_speed(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends, start_acceleration, room):
     """Speed that the motion will reach, within a factor of two: ballistic over `room`, or where the forces balance."""
     ballistic = (2 * start_acceleration * room) ** 0.5
     speed = ballistic
     for _ in range(60):
-        acceleration, _rate = rates(time, x, speed, chamber, on, rig, theta, trace_time, trace_pressure)
+        acceleration, _rate = rates(time, x, speed, chamber, on, rig, theta, trace_time, trace_pressure, bends)
         if acceleration > 0:
             return min(2 * speed, ballistic)
         speed *= 0.5
@@ -67,15 +85,17 @@ def solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
 
 
 @njit(nogil=True)
-def slope_in_speed(time, x, v, chamber, acceleration, scale, on, rig, theta, trace_time, trace_pressure):
+def slope_in_speed(time, x, v, chamber, acceleration, scale, on, rig, theta, trace_time, trace_pressure, bends):
     """∂a/∂v by a one-sided difference, upwards: below rest the law is another."""
     delta = 1e-6 * max(abs(v), 1e-4 * scale)
-    other, _rate = rates(time, x, v + delta, chamber, on, rig, theta, trace_time, trace_pressure)
+    other, _rate = rates(time, x, v + delta, chamber, on, rig, theta, trace_time, trace_pressure, bends)
     return (other - acceleration) / delta
 
 
 @njit(nogil=True)
-def radau_step(time, x, v, chamber, slope, h, z1, z2, z3, scale, rtol, on, rig, theta, trace_time, trace_pressure):
+def radau_step(
+    time, x, v, chamber, slope, h, z1, z2, z3, scale, rtol, on, rig, theta, trace_time, trace_pressure, bends
+):
     """One step of size h from (x, v, chamber); z1…z3 are first guesses of the speeds gained at the stages.
 
     Returns
@@ -98,13 +118,13 @@ def radau_step(time, x, v, chamber, slope, h, z1, z2, z3, scale, rtol, on, rig, 
         q2 = chamber + h * (A21 * g1 + A22 * g2 + A23 * g3)
         q3 = chamber + h * (A31 * g1 + A32 * g2 + A33 * g3)
         t1, t2, t3 = time + C1 * h, time + C2 * h, time + h
-        f1, g1 = rates(t1, x1, v1, q1, on, rig, theta, trace_time, trace_pressure)
-        f2, g2 = rates(t2, x2, v2, q2, on, rig, theta, trace_time, trace_pressure)
-        f3, g3 = rates(t3, x3, v3, q3, on, rig, theta, trace_time, trace_pressure)
+        f1, g1 = rates(t1, x1, v1, q1, on, rig, theta, trace_time, trace_pressure, bends)
+        f2, g2 = rates(t2, x2, v2, q2, on, rig, theta, trace_time, trace_pressure, bends)
+        f3, g3 = rates(t3, x3, v3, q3, on, rig, theta, trace_time, trace_pressure, bends)
         if not fresh:
-            j1 = slope_in_speed(t1, x1, v1, q1, f1, scale, on, rig, theta, trace_time, trace_pressure)
-            j2 = slope_in_speed(t2, x2, v2, q2, f2, scale, on, rig, theta, trace_time, trace_pressure)
-            j3 = slope_in_speed(t3, x3, v3, q3, f3, scale, on, rig, theta, trace_time, trace_pressure)
+            j1 = slope_in_speed(t1, x1, v1, q1, f1, scale, on, rig, theta, trace_time, trace_pressure, bends)
+            j2 = slope_in_speed(t2, x2, v2, q2, f2, scale, on, rig, theta, trace_time, trace_pressure, bends)
+            j3 = slope_in_speed(t3, x3, v3, q3, f3, scale, on, rig, theta, trace_time, trace_pressure, bends)
             fresh = True
         d1, d2, d3 = solve3(
             1 - h * A11 * j1, -h * A12 * j2, -h * A13 * j3,
@@ -168,34 +188,38 @@ def time_of_end(stop, h, x0, v0, a0, x1, v1, a1):
 
 
 @njit(nogil=True)
-def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pressure):
-    """First instant after `time` at which the drive moves a vine at rest, or a number past `until` where none does."""
-    if trace_time.size < 2 and theta.size >= 0:
-        steps = 64
-    else:
-        steps = max(64, 2 * trace_time.size)
+def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pressure, bends):
+    """First instant after `time` at which the drive moves a vine at rest, and the chamber's pressure then.
+
+    The instant is past `until` where none does. The chamber goes on filling meanwhile.
+    """
+    steps = max(256, 2 * trace_time.size)
     step = (until - time) / steps
-    before = time
     for k in range(1, steps + 1):
-        now = time + k * step
-        acceleration, _rate = rates(now, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure)
-        if acceleration > 0:
-            low, high = before, now
+        _a, rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
+        _a, rate = rates(time, x, 0.0, chamber + 0.5 * step * rate, on, rig, theta, trace_time, trace_pressure, bends)
+        if (
+            rest_acceleration(time + step, x, chamber + step * rate, on, rig, theta, trace_time, trace_pressure, bends)
+            > 0
+        ):
+            low, high = 0.0, step
             for _ in range(40):
                 middle = 0.5 * (low + high)
-                acceleration, _rate = rates(middle, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure)
-                if acceleration > 0:
+                pressure = chamber + middle * rate
+                if rest_acceleration(time + middle, x, pressure, on, rig, theta, trace_time, trace_pressure, bends) > 0:
                     high = middle
                 else:
                     low = middle
-            return high
-        before = now
-    return until + 1.0
+            return time + high, chamber + high * rate
+        time += step
+        chamber += step * rate
+    return until + 1.0, chamber
 
 
 @njit(nogil=True)
-def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rtol, out):
-    """Follow one trajectory from rest at time 0; fill `out` (n_times, 3) with x, v, a of the tail at `times`.
+def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, stop, rtol, out):
+    """Follow one trajectory from rest at time 0; fill `out` (n_times, 4) with x, v, a of the tail and the
+    position of the leading edge that the camera reports, at `times`.
 
     `kink` is where along x the film's mass reaches its floor: a step ends there, for none is good across it. `times`
     must increase; before 0 the vine is at rest, after the end of growth (x = `stop`; infinite for a body that moves
@@ -208,7 +232,9 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rto
     """
     count = times.size
     k = 0
+    chamber = first_chamber(on, rig, theta)
     while k < count and times[k] <= 0:
+        out[k, 3] = observed(0.0, 0.0, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
         out[k, 0] = 0.0
         out[k, 1] = 0.0
         out[k, 2] = 0.0
@@ -217,11 +243,9 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rto
         return RUNNING, float("nan"), 0.0, 0
     until = times[count - 1]
     time, x, v = 0.0, 0.0, 0.0
-    chamber = rig[0]
     n_steps = 0
     end_time = float("nan")
     at_rest = True
-    stalled = False
     h = 0.0
     slope = 0.0
     scale = 0.0
@@ -230,11 +254,12 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rto
     h_before = 1.0
     while True:
         if at_rest:
-            slope, _rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure)
-            if slope <= 0:
-                stalled = True
-                start = wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pressure)
+            if rest_acceleration(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends) <= 0:
+                start, chamber = wait_for_drive(
+                    time, until, x, chamber, on, rig, theta, trace_time, trace_pressure, bends
+                )
                 while k < count and times[k] <= start:
+                    out[k, 3] = observed(times[k], x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
                     out[k, 0] = x
                     out[k, 1] = 0.0
                     out[k, 2] = 0.0
@@ -242,11 +267,10 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rto
                 if k == count:
                     return STALLED, time, 0.0, n_steps
                 time = start
-                slope, _rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure)
-            stalled = False
+            slope, _rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
             at_rest = False
             room = min(stop - x, 0.5 * slope * (until - time) ** 2 + 1e-9)
-            scale = typical_speed(time, x, chamber, on, rig, theta, trace_time, trace_pressure, slope, room)
+            scale = typical_speed(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends, slope, room)
             h = 1e-3 * scale / slope
             v = 0.0
             have_guess = False
@@ -263,7 +287,7 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rto
             w1, w2, w3 = C1 * h * slope, C2 * h * slope, h * slope
             w1, w2, w3 = max(w1, -0.9 * v), max(w2, -0.9 * v), max(w3, -0.9 * v)
         ok, error, x_end, v_end, slope_end, chamber_end, w1, w2, w3 = radau_step(
-            time, x, v, chamber, slope, h, w1, w2, w3, scale, rtol, on, rig, theta, trace_time, trace_pressure
+            time, x, v, chamber, slope, h, w1, w2, w3, scale, rtol, on, rig, theta, trace_time, trace_pressure, bends
         )
         n_steps += 1
         if n_steps > MOST_STEPS:
@@ -295,12 +319,21 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, kink, stop, rto
         ended = x_end >= stop
         fraction = time_of_end(stop, h, x, v, slope, x_end, v_end, slope_end) if ended else 1.0
         while k < count and times[k] <= time + fraction * h:
-            out[k, 0], out[k, 1], out[k, 2] = quintic((times[k] - time) / h, h, x, v, slope, x_end, v_end, slope_end)
+            part = (times[k] - time) / h
+            now_x, now_v, now_a = quintic(part, h, x, v, slope, x_end, v_end, slope_end)
+            now_chamber = chamber + part * (chamber_end - chamber)
+            out[k, 0] = now_x
+            out[k, 1] = now_v
+            out[k, 2] = now_a
+            out[k, 3] = observed(times[k], now_x, now_v, now_chamber, on, rig, theta, trace_time, trace_pressure, bends)
             k += 1
         if ended:
             end_time = time + fraction * h
             _x, end_speed, _a = quintic(fraction, h, x, v, slope, x_end, v_end, slope_end)
             while k < count:
+                out[k, 3] = observed(
+                    times[k], stop, 0.0, chamber_end, on, rig, theta, trace_time, trace_pressure, bends
+                )
                 out[k, 0] = stop
                 out[k, 1] = 0.0
                 out[k, 2] = 0.0
@@ -326,11 +359,26 @@ def carry_on(s, z1, z2, z3):
 
 @njit(nogil=True)
 def integrate_many(
-    starts, times, on, rigs, thetas, trace_starts, trace_time, trace_pressure, kinks, stops, rtol, out, ends
+    starts,
+    times,
+    on,
+    rigs,
+    thetas,
+    trace_starts,
+    trace_time,
+    trace_pressure,
+    bend_starts,
+    bends,
+    kinks,
+    stops,
+    rtol,
+    out,
+    ends,
 ):
-    """`integrate` for many trials: trial i has times[starts[i]:starts[i+1]], rigs[i], thetas[i] and its own trace.
+    """`integrate` for many trials.
 
-    Fills `out` (n_times, 3) and `ends` (n_trials, 4) with status, end time, end speed, number of steps.
+    Trial i has times[starts[i]:starts[i+1]], rigs[i], thetas[i], the trace and the bends between its own starts. Fills
+    `out` (n_times, 4) and `ends` (n_trials, 4): status, end time, end speed, number of steps.
     """
     for i in range(starts.size - 1):
         low, high = starts[i], starts[i + 1]
@@ -342,6 +390,7 @@ def integrate_many(
             thetas[i],
             trace_time[trace],
             trace_pressure[trace],
+            bends[bend_starts[i] : bend_starts[i + 1]],
             kinks[i],
             stops[i],
             rtol,

@@ -16,7 +16,7 @@ import numpy as np
 
 from vinetrack.constants import GRAVITY_M_S2
 from vinetrack.model.model import Model
-from vinetrack.model.simulate import pressure_along
+from vinetrack.model.terms import pressure_along
 from vinetrack.motion.release import Release
 from vinetrack.records import Floats, Kinematics, Track, Trial, Window
 

@@ -1,0 +1,60 @@
+"""A trial as the effects see it: SI numbers that stay the same while it grows."""
+
+from __future__ import annotations
+
+import math
+
+from vinetrack.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
+from vinetrack.effects import EffectError, Rig
+from vinetrack.model.model import Model
+from vinetrack.records import Trial
+
+
+def rig_of(trial: Trial) -> Rig:
+    """What the effects see of a trial, in SI."""
+    whole_body = trial.travel_ratio == 1
+    length = trial.length_m if math.isfinite(trial.length_m) else 0.0
+    area = trial.area_m2 if math.isfinite(trial.diameter_m) else 0.0
+    linear_density = trial.linear_density_kg_m
+    pressure = 0.0 if whole_body and not math.isfinite(trial.pressure_Pa) else trial.pressure_Pa
+    yield_pressure = 0.0 if whole_body and not math.isfinite(trial.yield_pressure_Pa) else trial.yield_pressure_Pa
+    gas_density = (pressure + trial.ambient_pressure_Pa) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
+    fold = 0.0 if linear_density == 0 else linear_density * math.pi * trial.thickness_m
+    return Rig(
+        set_pressure=pressure,
+        yield_pressure=yield_pressure,
+        diameter=trial.diameter_m,
+        thickness=trial.thickness_m,
+        length=length,
+        area=area,
+        linear_density=linear_density,
+        mass_loss=trial.mass_loss_kg_m if linear_density else 0.0,
+        payload_mass=trial.payload_kg,
+        cos_angle=math.cos(trial.growth_angle_rad),
+        travel_ratio=trial.travel_ratio,
+        ambient_pressure=trial.ambient_pressure_Pa,
+        chamber_volume=trial.chamber_m3,
+        inlet_area=math.pi * trial.inlet_m**2 / 4,
+        least_mass=fold + gas_density * area * length / trial.travel_ratio**2,
+        has_bends=float(bool(trial.bends)),
+        tail_on_reel=float(trial.tail_store == "reel"),
+    )
+
+
+_COLUMN_OF_FIELD = {"chamber_l": "chamber_m3", "yield_pressure_kPa": "yield_pressure_Pa", "inlet_mm": "inlet_m"}
+
+
+def check_needs(model: Model, trial: Trial) -> None:
+    """Refuse a trial that lacks what an effect of the model needs.
+
+    Raises
+    ------
+    EffectError
+        Naming the effect, the column and the trial.
+    """
+    for effect in model.effects:
+        for column in effect.needs:
+            attribute = _COLUMN_OF_FIELD.get(column, column)
+            value = getattr(trial, attribute, math.nan)
+            if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
+                raise EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")
