@@ -29,8 +29,11 @@ DROP_RATIO = 1.6
 JUMP_SIGMAS = 5.5
 """Least significance of a jump: 4e-8 by chance, 1e-4 over a long campaign's frames."""
 
+STILL, STILL_SIGMAS = 0.25, 5.0
+"""A copy stands still to within this part of a step, which must be this significant; a copy is nearly exact."""
+
 COPY_SIGMAS = 3.5
-"""Least significance of a step back after a frame that stands still, which by itself is rare enough."""
+"""Least significance of the step back after an inserted copy."""
 
 SIDE_POINTS = (8, 5, 3)
 """Points taken on either side, fewer where release or the end of growth is near."""
@@ -176,11 +179,12 @@ def _judge_repeat(
         return None
     size, sigma, step = jump
     step_sigma = noise_m * math.sqrt(2 * (1 - rho))
-    if abs(y[i + 1] - y[i]) > min(0.4 * step, 4 * step_sigma + 0.02 * step):
+    still = y[i + 1] - y[i]
+    if abs(still) > min(STILL * step, 4 * step_sigma + 0.02 * step) or step - still < STILL_SIGMAS * step_sigma:
         return None
-    behind = step - (y[i + 1] - y[i])
-    if behind < JUMP_SIGMAS * step_sigma * 0.8 or i + 2 >= y.size:
-        return None
+    if 0 < i < y.size - 3 and 2 * step_sigma < sigma:
+        # Where the motion bends, what the two steps bring against their two neighbours is the better measure.
+        size, sigma = float(y[i + 2] - y[i] - (y[i] - y[i - 1]) - (y[i + 3] - y[i + 2])), 2 * step_sigma
     if abs(size) <= max(3 * sigma, 0.3 * step) and abs(size) < 0.5 * step:
         return _Event("stale", int(rows[i + 1]))
     if abs(size + step) <= max(3 * sigma, 0.3 * step) and -size > COPY_SIGMAS * sigma:
