@@ -82,7 +82,8 @@ class Parameter:
     """A number of an effect that can be fitted.
 
     `zero` is the value at which the effect vanishes; `shared` says over what one value holds: `all` trials or one
-    `vine`. `bounds` are what physics allows, `plausible` what an experimenter would believe.
+    `vine`. `bounds` are what physics allows, `plausible` what an experimenter would believe. One that is `held` is known
+    beforehand: a fit leaves it at its value unless told to find it.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Parameter:
     shared: str = "all"
     plausible: tuple[float, float] | None = None
     meaning: str = ""
+    held: bool = False
 
 
 @dataclass(frozen=True)

@@ -6,22 +6,47 @@
 It acts on the tail itself and so counts whole. On a bare vine it is a few per cent of the drive, and leaves with the
 mass: a steady speed sags by 1–4 % for that alone.
 
+g is known and held; a falling body is the experiment that measures it, and then it is fitted.
+
 Source: Alvarez et al. (2025), Eq. (1).
 """
 
-from vinetrack.effects import Worked
+from vinetrack.effects import Parameter, Worked
 
 KIND = "base"
-STANDARD_GRAVITY = 9.81  # m/s²
+PARAMETERS = (
+    Parameter(
+        "g",
+        "g",
+        "m/s²",
+        9.81,
+        bounds=(0.0, 30.0),
+        plausible=(9.76, 9.84),
+        held=True,
+        meaning="acceleration of free fall",
+    ),
+)
 
 
-def tail_force(s, rig):  # noqa: D103
-    return s.moving_mass * STANDARD_GRAVITY * rig.cos_angle
+def tail_force(s, rig, g):  # noqa: D103
+    return s.moving_mass * g * rig.cos_angle
 
 
 WORKED = (
     Worked(
-        "tail_force", 0.34924, "35.6 g × 9.81, straight down", state={"moving_mass": 35.6e-3}, rig={"cos_angle": 1.0}
+        "tail_force",
+        0.34924,
+        "35.6 g × 9.81, straight down",
+        state={"moving_mass": 35.6e-3},
+        rig={"cos_angle": 1.0},
+        parameters={"g": 9.81},
     ),
-    Worked("tail_force", -0.34924, "the same, upwards", state={"moving_mass": 35.6e-3}, rig={"cos_angle": -1.0}),
+    Worked(
+        "tail_force",
+        -0.34924,
+        "the same, upwards",
+        state={"moving_mass": 35.6e-3},
+        rig={"cos_angle": -1.0},
+        parameters={"g": 9.81},
+    ),
 )

@@ -31,6 +31,7 @@ class Model:
              tip force −B ẋⁿ, on the tail −½B ẋⁿ
              tip force −P_y A, on the tail −½P_y A
              P → (P₀ + P_atm) (V₀ / (V₀ + A y))^γ − P_atm
+      g = 9.81 m/s²
       B = 3 N·(s/m)ⁿ
       n = 0.37
       γ = 1.4
