@@ -111,6 +111,21 @@ def test_free_fall_is_never_steady():
     assert "no window is shown to be steady" in window.reason
 
 
+def test_a_speed_that_goes_up_and_down_is_rejected_for_it():
+    time_s = np.arange(300) / 1000
+    y = 0.5 * time_s + 5e-4 * np.sin(150 * time_s) + ar1(300, 2e-5, 0.0, np.random.default_rng(1000))
+    window = gated(make_track(time_s, y))
+    assert not window.accepted
+    assert "holds speeds from" in window.reason
+
+
+def test_an_exact_acceleration_is_rejected_as_too_short_a_part():
+    time_s = np.arange(600) / 1000
+    window = gated(make_track(time_s, 0.5 * 9.81 * time_s**2))
+    assert not window.accepted
+    assert "is less than 10 % of the motion" in window.reason
+
+
 def test_a_plateau_declining_by_two_per_cent_is_accepted_and_its_drift_reported():
     window = gated(ramp(0.02, 3e-5))
     assert window.accepted

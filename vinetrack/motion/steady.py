@@ -146,7 +146,8 @@ class _Search:
         self.limit = drift_limit
         self.moments = WindowMoments(time_s, position_m, kinematics.noise_m, kinematics.noise_correlation)
         self.width = kinematics.window_points[inside]
-        velocity, sigma = kinematics.lead_velocity_m_s[inside], kinematics.lead_velocity_sigma_m_s[inside]
+        self.velocity, sigma = kinematics.lead_velocity_m_s[inside], kinematics.lead_velocity_sigma_m_s[inside]
+        velocity = self.velocity
         self.smooth_low = RangeExtremes(velocity - BAND_SIGMAS * sigma)
         self.smooth_high = RangeExtremes(-(velocity + BAND_SIGMAS * sigma))
         self.chords = chord_bounds(time_s, position_m, kinematics.noise_m, kinematics.noise_correlation, BAND_SIGMAS)
@@ -202,11 +203,13 @@ class _Search:
         worst = np.where(mean > 0, np.abs(drift) + 1.96 * sigma, np.inf)
         near = int(np.argmin(worst))
         count, change, error = last[near] - first[near] + 1, 100 * drift[near], 196 * sigma[near]
-        why = (
-            "too short a part of the motion, or not smooth"
-            if worst[near] <= self.limit
-            else f"changes by {change:.2g} ± {error:.2g} % across it"
-        )
+        if worst[near] > self.limit:
+            why = f"changes by {change:.2g} ± {error:.2g} % across it"
+        elif count < SHORTEST_SHARE * self.n:
+            why = f"is less than {100 * SHORTEST_SHARE:g} % of the motion"
+        else:
+            band = self.velocity[first[near] : last[near] + 1] / mean[near]
+            why = f"holds speeds from {100 * band.min():.0f} to {100 * band.max():.0f} % of its mean"
         return (
             f"no window is shown to be steady within ±{100 * self.limit:g} %: the nearest,"
             f" {count} of {self.n} moving points, {why}"
