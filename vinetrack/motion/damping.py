@@ -31,7 +31,7 @@ LEAST_FORCE_RATIO = 1.2
 """Largest over smallest force that a vine must span for its slope to mean anything: below, 1 % of P is 0.1 of n."""
 
 FEWEST_FOR_RESAMPLING = 10
-"""Below, resamples repeat so few points that their spread says little: intervals come from least squares and Student's t."""
+"""Below, resamples repeat so few points that their spread says little: intervals come from Student's t."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,27 @@ class Points:
     def member(self) -> Floats:
         """Shape (n_points, n_vines): 1 where a point belongs to a vine."""
         return np.eye(len(self.names))[self.vine]
+
+
+def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
+    """The law from our windows in both ways, and what the published rule gives, to the letter.
+
+    Parameters
+    ----------
+    points
+        A row a trial, as `vinetrack.motion.summary` makes them: those with `used` enter `log_log` and `both_axes`; every
+        trial that could, by its payload and travel ratio, and has a window by the published rule enters `paper` with set
+        pressure, without weight and fitted as published.
+
+    Returns
+    -------
+    dict
+        `log_log`, `both_axes`, `paper`, each as `fit_damping` describes.
+    """
+    fits = fit_damping(points[points["used"]], resamples=resamples, seed=seed)
+    literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
+    literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
+    return fits | {"paper": fit_damping(literal, resamples=resamples, seed=seed)["log_log"]}
 
 
 def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from vinetrack.effects import EffectError
 from vinetrack.model.model import Model
 from vinetrack.motion.efficiency import energy_efficiency, lead_velocity_at
-from vinetrack.motion.force import SteadyForce, steady_force, why_not_in_fit
+from vinetrack.motion.force import SteadyForce, known_pressure, steady_force, why_not_force, why_not_in_fit
+from vinetrack.motion.quasi_steady import quasi_steady_window
 from vinetrack.motion.release import Release, find_release, flag_rest
 from vinetrack.motion.steady import gated_window, paper_window, user_window
 from vinetrack.motion.velocity import estimate_kinematics
@@ -64,6 +65,11 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
     windows = _windows(trial, track, kinematics, settings)
     chosen = _chosen(windows)
     try:
+        if chosen is None and "user" not in windows and why_not_in_fit(trial) == "":
+            pressure_Pa = known_pressure(trial, track, kinematics, release, model)
+            if pressure_Pa is not None:
+                windows["quasi_steady"] = quasi_steady_window(trial, track, kinematics, release, pressure_Pa)
+                chosen = _chosen(windows)
         force = steady_force(trial, track, kinematics, release, chosen, model) if chosen else None
     except EffectError as error:
         raise TrialError(str(error)) from error
@@ -108,9 +114,12 @@ def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSe
 
 
 def _chosen(windows: Mapping[str, Window]) -> Window | None:
-    """The window whose numbers are reported: the user's own where there is one, else ours where it is accepted."""
-    window = windows.get("user", windows["gated"])
-    return window if window.accepted and window.x_ss_m_s > 0 else None
+    """The window whose numbers are reported: the user's own where there is one, else the first of ours accepted."""
+    for rule in ("user", "gated", "quasi_steady"):
+        window = windows.get(rule)
+        if window is not None and (window.accepted or rule == "user"):
+            return window if window.accepted and window.x_ss_m_s > 0 else None
+    return None
 
 
 def _warnings(track: Track, release: Release, windows: Mapping[str, Window]) -> list[str]:
@@ -136,7 +145,7 @@ def _steady_columns(window: Window | None, paper: Window, force: SteadyForce | N
 
 
 def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, settings: RunSettings) -> dict[str, object]:
-    """Speed at the set fraction of the length, and efficiency at the set travel; NaN where the growth did not get there."""
+    """Speed at the set fraction of the length, efficiency at the set travel; NaN where growth did not get there."""
     travel_m = kinematics.lead_position_m - release.lead_position_m
     velocity_m_s = kinematics.lead_velocity_m_s
     if math.isfinite(trial.length_m):
@@ -149,7 +158,7 @@ def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, setting
 
 
 def _point(trial: Trial, window: Window | None, paper: Window, force: SteadyForce | None) -> dict[str, object]:
-    reason = why_not_in_fit(trial, force)
+    reason = why_not_in_fit(trial) or why_not_force(force)
     nan = math.nan
     return {
         "trial": trial.name,
@@ -166,6 +175,7 @@ def _point(trial: Trial, window: Window | None, paper: Window, force: SteadyForc
         "pressure_source": force.pressure_source if force else "",
         "x_ss_paper_m_s": paper.x_ss_m_s if paper.accepted else nan,
         "force_paper_N": (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2,
+        "eligible": not why_not_in_fit(trial),
         "used": not reason,
         "reason": reason,
     }

@@ -26,10 +26,10 @@ def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
     results = Results(folder)
     points = read_result(results.points)
 
-    from vinetrack.motion.damping import fit_damping
+    from vinetrack.motion.damping import fit_laws
     from vinetrack.motion.scaling import fit_scaling
 
-    damping = fit_damping(points[points["used"]], resamples=settings.resamples, seed=settings.seed)
+    damping = fit_laws(points, resamples=settings.resamples, seed=settings.seed)
     write_json(results.scaling, fit_scaling(damping))
     write_json(results.damping, damping)
     for method, fit in damping.items():

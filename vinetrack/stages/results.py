@@ -67,21 +67,22 @@ POINT_COLUMNS = (
     "thickness_um",
     "pressure_kPa",
     "window_pressure_kPa",
+    "pressure_source",
     "x_ss_m_s",
     "x_ss_sigma_m_s",
     "force_N",
     "force_sigma_N",
     "yield_force_sigma_N",
-    "pressure_source",
     "x_ss_paper_m_s",
     "force_paper_N",
+    "eligible",
     "used",
     "reason",
 )
 TEXT_COLUMNS = frozenset(
     {"trial", "vine", "condition", "status", "reason", "steady_rule", "rule", "flag", "pressure_source"}
 )
-TRUTH_COLUMNS = frozenset({"accepted", "used"})
+TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used"})
 
 
 class ResultsError(Exception):
