@@ -35,6 +35,10 @@ FLOOR_PX = 0.02
 """No edge in compressed video was ever better than this."""
 ASSUMED_EXPOSURE = 0.25
 """Exposure over frame period until it is estimated."""
+FAINTEST = 0.5
+"""An edge of less than this much of its contrast is another thing's."""
+LONG_REST = 8
+"""Frames of rest, counted from the motion, in which a bad fit is still sought again from many starts."""
 CLEAR_PX = 20.0
 """Growth after which the surroundings of the start are free of what held the tip there."""
 EVIDENCE_CLIP = 2.5
@@ -99,7 +103,7 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     for _ in range(3):
         path = _second_path(strip, state, passed)
         state = repicture(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
-    fit = mend_jumps(strip, state, fit_edges(strip, state))
+    fit = fit_edges(strip, state)
     for turn in range(rounds):
         state = _restate(strip, state, fit, exposure)
         if turn == 1 and not np.isfinite(exposure_frames):
@@ -157,7 +161,26 @@ def _first_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
         raise ValueError("nothing moves along the axis")
     where = np.flatnonzero(run & strong)
     passed = max(int(where[0]), _after_jump(path)), int(where[-1]) + 1
-    return np.clip(path, *passed), passed
+    return _run_up(np.clip(path, *passed)), passed
+
+
+def _run_up(path: Floats) -> Floats:
+    """The path with its beginning replaced by a run-up of falling steps, as from rest.
+
+    Where growth is first seen something else may have stood before (a door), and the tip have come from further back.
+    If it did not, the columns between turn out to be film from the start, and the second path takes that back.
+    """
+    steps = np.diff(path)
+    onset = int(np.argmax(steps > 0)) if np.any(steps > 0) else 0
+    later = path[onset + 1 :]
+    if onset < 2 or len(later) < 5:
+        return path
+    fall = max(float(np.median(np.diff(later[:5], 2))), 0.1 * float(later[1] - later[0]), 0.2)
+    out, step = path.copy(), float(np.median(np.diff(later[:4])))
+    for t in range(onset, -1, -1):
+        step = max(step - fall, 0.0)
+        out[t] = max(out[t + 1] - step, 0.0)
+    return out
 
 
 def _after_jump(path: Floats) -> int:
@@ -196,7 +219,7 @@ def moving_frames(edge: Floats) -> NDArray[np.bool_]:
 def _first_state(strip: Strip, path: Floats, exposure: float) -> State:
     rows, columns = strip.values.shape[1:]
     blank = np.zeros((4, rows, columns), np.float32)
-    state = State(path, blur_lengths(path, exposure), np.zeros(rows), 3.0, blank, np.ones(3))
+    state = State(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank, np.ones(3))
     return repicture(strip, state, 0.0)
 
 
@@ -266,29 +289,33 @@ def fit_edges(strip: Strip, state: State) -> Floats:
 
 
 def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
-    """Fits with those that break the motion sought again where it leads, shape (n_frames, 6).
+    """Fits that break the motion, or hardly fit, sought again where the motion leads, shape (n_frames, 6).
 
     From the middle of the motion backwards and forwards: the edge never retreats, and a step is at most 1.3 times (or
-    1.5 px more than) its neighbour. Where a fit breaks that (it caught the far side of a door, a payload) and another
-    start inside leads to a fit not much worse, that one is taken. A frame that is missing breaks it too: no fit
-    inside then comes near, and the first one stands.
+    1.5 px more than) its neighbour. Where a fit breaks that, or is half again as bad as most (it caught the far side
+    of a door, a payload), the best fit inside is taken if it is better, or breaks the motion less and is not much
+    worse. A frame that is missing breaks it too: no fit inside then comes near, and the first one stands.
     """
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
         return fit
     out = fit.copy()
-    anchor = int(moving[np.argmin(np.abs(moving - 0.5 * (moving[0] + moving[-1])) + 100 * _rough(fit[moving, 0]))])
+    bad = 1.5 * float(np.nanmedian(fit[moving, 2]))
+    central = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
+    anchor = int(moving[np.argmin(central + _rough(fit[moving, 0]) + (fit[moving, 2] > bad))])
     for sense in (-1, 1):
-        end = -1 if sense < 0 else len(fit)
-        for t in range(anchor + sense, end, sense):
-            near, next_one = out[t - sense, 0], out[min(max(t - 2 * sense, 0), len(fit) - 1), 0]
-            step = abs(near - next_one) if np.isfinite(next_one) else 0.0
+        resting = 0
+        for t in range(anchor + sense, -1 if sense < 0 else len(fit), sense):
+            near, beyond = out[t - sense, 0], out[min(max(t - 2 * sense, 0), len(fit) - 1), 0]
+            step = abs(near - beyond) if np.isfinite(beyond) else 0.0
+            resting = resting + 1 if step < 0.3 else 0
             far = max(1.3 * step, step + 1.5)
             low, high = (near - far, near + 0.8) if sense < 0 else (near - 0.8, near + far)
-            if low <= out[t, 0] <= high or not np.isfinite(near):
+            inside = low <= out[t, 0] <= high
+            if not np.isfinite(near) or (inside and (out[t, 2] <= bad or resting > LONG_REST)):
                 continue
-            better = _best_between(strip, state, t, low, high)
-            if better is not None and not better[2] > 1.5 * out[t, 2]:
+            better = _best_between(strip, state, t, low, high, 1 if resting > LONG_REST else 9)
+            if better is not None and better[2] < (1.0 if inside else 1.5) * np.nan_to_num(out[t, 2], nan=np.inf):
                 out[t] = better
     return out
 
@@ -301,14 +328,14 @@ def _rough(edge: Floats) -> NDArray[np.bool_]:
     return rough
 
 
-def _best_between(strip: Strip, state: State, t: int, low: float, high: float) -> Floats | None:
+def _best_between(strip: Strip, state: State, t: int, low: float, high: float, starts: int) -> Floats | None:
     """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
     best = None
-    for start in np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9))):
+    for start in np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]:
         edge = np.full(len(state.edge), np.nan)
         edge[t] = start
         found = fit_edges(strip, replace(state, edge=edge))[t]
-        inside = low - 0.5 <= found[0] <= high + 0.5
+        inside = low - 0.5 <= found[0] <= high + 0.5 and found[3] > FAINTEST - 1
         if inside and np.isfinite(found[2]) and (best is None or found[2] < best[2]):
             best = found
     return best

@@ -18,6 +18,12 @@ BEHIND = 25
 """Columns behind the first passed one whose film is looked at: neighbours that stand in where it is never seen."""
 FORGOTTEN = 4.0
 """Frames further off than this many memories, e⁻⁴ = 2 %, are not read."""
+PARTIAL = 0.05
+"""Weight of a half-covered pixel: what it says of film and background depends on where the edge was thought to be."""
+FOREIGN = 1.7
+"""How much farther than background film is from what resembles neither."""
+DOUBT = 0.1
+"""By how much a pixel that could be either is called film: one that never changed was film from the start."""
 BLOCK = 1
 """Columns in a block whose sum tells how far noise adds up: about one grain of film."""
 
@@ -99,8 +105,8 @@ def gather(
                 p, _ = _look_up(table, reach, at - s)
                 q = 1 - p
                 value = strip[t, u, s] * scale[t] + offset[t]
-                w = share[s]
-                if p > 0.98 and t < when[s] - dwell[s]:
+                w = share[s] if p < 0.02 or p > 0.98 else PARTIAL * share[s]
+                if p > 0.02 and t < when[s] - dwell[s]:
                     continue
                 if clip > 0:
                     r = value - pictures[1, u, s] * q - pictures[0, u, s] * p
@@ -178,8 +184,9 @@ def film_evidence(
 ) -> np.ndarray:
     """How much less like film than like background each column looks in each frame; shape (n_frames, n_along).
 
-    The sum over rows of min(a², clip²) − min(b², clip²), a and b the distances from film and background in units of
-    `width` and their own variances. A pixel like neither (door, payload, glint) is silent.
+    The sum over rows of min(a², FOREIGN clip²) − min(b², clip²), a and b the distances from film and background in
+    units of `width` and their own variances. A pixel like neither (door, payload) rather hides background: what film
+    looks like is known from the frames after, what may come before the background is not.
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
@@ -190,7 +197,7 @@ def film_evidence(
                 value = strip[t, u, s] * scale[t] + offset[t]
                 a = (value - pictures[0, u, s]) ** 2 / (pictures[2, u, s] + width * width)
                 b = (value - pictures[1, u, s]) ** 2 / (pictures[3, u, s] + width * width)
-                out[t, s] += min(a, top) - min(b, top)
+                out[t, s] += min(a, FOREIGN * top) - min(b, top) - DOUBT
     return out
 
 
@@ -299,7 +306,8 @@ def residual_sums(
     First answer: shape (n, 2), bins of 1 px about the middle: the sum over frames of z² / var z, with z = Σ C r / v over
     blocks of BLOCK columns and all rows, and the count: 1 on average for white noise, more where noise adds up across
     neighbours (grain of the film, its tail moving inside). Second: shape (n_across, 2), Σ g r and Σ g² with g the
-    slope of the model in the row's own lag. Third: the mean of log(1 + r²/9v), a robust misfit for comparing blurs.
+    slope of the model in the row's own lag. Third: the mean of log(1 + r²/9v̄), v̄ the mean
+    of the two variances: a robust misfit for comparing blurs.
     """
     n, rows, columns = strip.shape
     widest = 0.0
@@ -339,7 +347,8 @@ def residual_sums(
                 g = -contrast * slope
                 by_row[u, 0] += w * g * r
                 by_row[u, 1] += w * g * g
-                misfit += math.log(1 + r * r / (9 * v))
+                # A variance that knows nothing of the blur: else the widest blur would be its own excuse.
+                misfit += math.log(1 + r * r / (4.5 * (pictures[2, u, s] + pictures[3, u, s])))
                 count += 1
         for i in range(BLOCK // 2, bins - BLOCK // 2):
             a, b = 0.0, 0.0

@@ -33,7 +33,8 @@ def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
         _, by_row, _ = residuals(strip, state, fit, slow)
         step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
         step = np.clip(step, -FASTEST_LAG_STEP_PX, FASTEST_LAG_STEP_PX)
-        state = replace(state, lag=_smooth_lag(state.lag + step, by_row[:, 1]))
+        lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
+        state = replace(state, lag=lag, edge=state.edge - lead)
     candidates = BLURS_PX if anew else state.blur * np.array([0.7, 0.85, 1, 1.2, 1.4])
     misfits = [residuals(strip, replace(state, blur=float(blur)), fit, slow)[2] for blur in candidates]
     return replace(state, blur=float(np.clip(_least(candidates, np.array(misfits)), 0.4, 5.0)))
@@ -50,8 +51,8 @@ def find_exposure(strip: Strip, state: State, fit: Floats) -> float:
     return _least(EXPOSURES, np.array(misfits))
 
 
-def _smooth_lag(lag: Floats, weight: Floats) -> Floats:
-    """Smooth slightly along the rows, by weight, and set zero at the foremost point of the tip.
+def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
+    """Smooth slightly along the rows, by weight, and set zero at the foremost point of the tip; what was taken off.
 
     That point is the vertex of a parabola through the foremost third of the rows that show an edge at all: the least
     of them would follow their noise.
@@ -69,7 +70,7 @@ def _smooth_lag(lag: Floats, weight: Floats) -> Floats:
         vertex = -curve[1] / (2 * curve[0]) if curve[0] > 1e-6 else np.inf
         if front.min() <= vertex + middle <= front.max():
             lead = float(np.polyval(curve, vertex))
-    return np.clip(smooth - lead, -3.0, DEEPEST_LAG_PX)
+    return np.clip(smooth - lead, -3.0, DEEPEST_LAG_PX), lead
 
 
 def _least(candidates: Floats, misfits: Floats) -> float:
