@@ -41,7 +41,7 @@ SIDE_POINTS = (8, 5, 3)
 SLOWEST_SIDE = 0.75
 """Each side alone moves at least this part of a clear step."""
 
-SIMILAR_SIDES = 1.5
+SIMILAR_SIDES = 1.8
 """Largest ratio of the speeds just before and just after: beyond it a long step may be the motion itself."""
 
 LARGEST_MISFIT = 0.1
@@ -163,7 +163,12 @@ def _judge_drop(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, ro
         return None
     size, sigma, step = jump
     missing = round(size / step)
-    if missing < 1 or y[i + 1] - y[i] <= DROP_RATIO * step or size < JUMP_SIGMAS * sigma:
+    long = y[i + 1] - y[i]
+    if missing < 1 or long <= DROP_RATIO * step or size < JUMP_SIGMAS * sigma:
+        return None
+    # Both single neighbours count too, to within a standard error: speeding up, the one after is nearly as long.
+    nearest = max((y[i] - y[i - 1]) / (frame[i] - frame[i - 1]), (y[i + 2] - y[i + 1]) / (frame[i + 2] - frame[i + 1]))
+    if long <= DROP_RATIO * nearest - noise_m * math.sqrt(2 * (1 - rho)):
         return None
     if abs(size - missing * step) > max(4 * sigma, 0.3 * step):
         return None
