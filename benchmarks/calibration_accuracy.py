@@ -2,8 +2,9 @@
 
 Run as `python benchmarks/calibration_accuracy.py [first_seed] [poses]`. Boards are rendered in random poses (tilt to
 12° each way, turned, shifted) through random lenses (barrel and pincushion), with noise; the scale is that along
-random axes on the target, and anywhere in the picture, where lens and tilt are extrapolated. Seeds below 1000 tuned the method; those from 1000 on only score it. The goals: error
-below 0.1 %, and stated errors that cover it (|z| < 2 in about 95 %).
+random axes on the target, and anywhere in the picture, where lens and tilt are extrapolated. Seeds below 1000 tuned
+the method; those from 1000 on only score it. The goals: error below 0.1 % on the target, and stated errors that cover
+it (|z| < 2 in about 95 %).
 """
 
 from __future__ import annotations

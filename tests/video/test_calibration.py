@@ -59,7 +59,7 @@ def scale_error(found, camera: Camera = CAMERA, ends=AXIS) -> tuple[float, float
 # --- targets in any pose
 
 
-@pytest.mark.parametrize("seed", range(2000, 2012))
+@pytest.mark.parametrize("seed", range(2000, 2008))
 @pytest.mark.parametrize("kind", ["charuco", "checkerboard"])
 def test_scale_of_a_random_pose_is_within_a_thousandth_and_its_stated_error(kind, seed):
     rng = np.random.default_rng(seed)
@@ -345,7 +345,9 @@ def test_bent_board_is_refused(board_picture):
 
 def test_picture_of_another_size_than_the_recordings(tmp_path):
     cv2.imwrite(str(tmp_path / "board.png"), picture())
-    with pytest.raises(CalibrationError, match=r"board\.png is 960 × 320 pixels but the recordings are 1280 × 720; film"):
+    with pytest.raises(
+        CalibrationError, match=r"board\.png is 960 × 320 pixels but the recordings are 1280 × 720; film"
+    ):
         calibrate(charuco(), tmp_path, 1280, 720)
 
 

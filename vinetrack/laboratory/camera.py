@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 UNDISTORT_STEPS = 10
-"""Newton steps of the inverse of the distortion; it is exact to rounding after about six, for any lens worth filming with."""
+"""Newton steps of the inverse of the distortion; exact to rounding after about six for lenses such as cameras have."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -141,7 +141,8 @@ class Scene:
     `growth_angle_deg` is the direction of growth in the picture, from +x (right) towards +y (down). The path starts at
     `origin_px` (plane pixels; where it is None, at the border that lets the path run through the middle of the
     picture) and the tip rests `start_m` after it. `psf_px` is the standard deviation of the optics and pixel together;
-    `shake_px` of the camera's movement; a `target` hangs behind the tube, in the plane of growth; `exposure_fraction` the exposure over the time between frames.
+    `shake_px` of the camera's movement; `exposure_fraction` is the exposure over the time between frames. A `target`
+    hangs behind the tube, in the plane of growth.
     """
 
     camera: Camera = field(default_factory=Camera)

@@ -1,6 +1,6 @@
 """Calibration targets in the plane of growth: pictures and clips of a ChArUco board or a checkerboard, seen truly.
 
-Every picture pixel is divided into SUBPIXELS² points; each is traced through lens and tilt to the plane and finds its
+Every picture pixel holds POINTS points; each is traced through lens and tilt to the plane and finds its
 own black or white there, so that corners lie where geometry puts them, without interpolation of any picture.
 """
 
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-SUBPIXELS = 6
+POINTS, LATTICE = 89, 55
+"""Points in a pixel, on a Fibonacci lattice: no two share a column or a row, so that edges along either, too, are met
+to 1/89 px; a square grid of as many would round them to 1/9."""
 PATTERN_PX = 120
 """Side of a square in the stored pattern of a ChArUco board; squares are met exactly, marker bits to 1/240 square."""
 
@@ -91,22 +93,21 @@ def _paint_board(
     for y in range(board.shape[0]):
         for x in range(board.shape[1]):
             seen, on = 0.0, 0
-            for i in range(SUBPIXELS):
-                dy = (i + 0.5) / SUBPIXELS - 0.5
-                for j in range(SUBPIXELS):
-                    dx = (j + 0.5) / SUBPIXELS - 0.5
-                    bx = board[y, x, 0] + dx * step_x[y, x, 0] + dy * step_y[y, x, 0]
-                    by = board[y, x, 1] + dx * step_x[y, x, 1] + dy * step_y[y, x, 1]
-                    if bx < -margin or by < -margin or bx >= across + margin or by >= down + margin:
-                        continue
-                    on += 1
-                    inside = 0 <= bx < across and 0 <= by < down
-                    if inside and pattern[int(by * per_square), int(bx * per_square)] == 0:
-                        seen += black
-                    else:
-                        seen += white
-            light[y, x] = seen / SUBPIXELS**2
-            share[y, x] = on / SUBPIXELS**2
+            for i in range(POINTS):
+                dx = (i + 0.5) / POINTS - 0.5
+                dy = ((i * LATTICE) % POINTS + 0.5) / POINTS - 0.5
+                bx = board[y, x, 0] + dx * step_x[y, x, 0] + dy * step_y[y, x, 0]
+                by = board[y, x, 1] + dx * step_x[y, x, 1] + dy * step_y[y, x, 1]
+                if bx < -margin or by < -margin or bx >= across + margin or by >= down + margin:
+                    continue
+                on += 1
+                inside = 0 <= bx < across and 0 <= by < down
+                if inside and pattern[int(by * per_square), int(bx * per_square)] == 0:
+                    seen += black
+                else:
+                    seen += white
+            light[y, x] = seen / POINTS
+            share[y, x] = on / POINTS
 
 
 def plane_seen(camera: Camera) -> Floats:
@@ -121,7 +122,7 @@ def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> 
 
     painted, share = np.zeros(light.shape, np.float32), np.zeros(light.shape, np.float32)
     board = target.board_squares(plane_m)
-    step_y, step_x = np.gradient(board, axis=(0, 1))
+    step_y, step_x = np.gradient(board, axis=0), np.gradient(board, axis=1)
     per_square = PATTERN_PX if target.kind == "charuco" else 1
     _paint_board(
         board, step_x, step_y, target.pattern(), per_square, target.margin, target.black, target.white, painted, share
@@ -184,7 +185,13 @@ def render_target(target: Target, scene: Scene, *, seed: int = 0, **settings: An
 
 
 def render_calibration_clip(
-    target: Target, scene: Scene, n_frames: int, out_path: Path, *, seed: int = 0, moves: tuple[dict[str, Any], ...] = ()
+    target: Target,
+    scene: Scene,
+    n_frames: int,
+    out_path: Path,
+    *,
+    seed: int = 0,
+    moves: tuple[dict[str, Any], ...] = (),
 ) -> None:
     """Write a clip (or, by the path's ending, a folder of pictures) of `target`; see `TargetRenderer` for `moves`."""
     from vinetrack.laboratory.encode import write_recording

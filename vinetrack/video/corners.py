@@ -1,7 +1,6 @@
 """Corners of calibration targets in a picture, to a few hundredths of a pixel; what is wrong where there are none.
 
-OpenCV finds the board; every corner is then moved to where the picture is point-symmetric (`cornerSubPix`) in a window
-as wide as the pattern around it allows: wide windows halve the error on a checkerboard, but must not reach a marker.
+OpenCV finds the board; every corner is then fitted to the picture around it (`saddle`), markers left out.
 """
 
 from __future__ import annotations
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vinetrack.video.saddle import refine_saddles
 
 if TYPE_CHECKING:
     from vinetrack.settings import Charuco, Checkerboard
@@ -54,7 +55,7 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     grey = eight_bits(picture)
     words = _words(board.dictionary)
     corners, ids = _markers(grey, words)
-    if len(ids) < board.squares[0] * board.squares[1] // 4:
+    if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
         corners, ids = max((corners, ids), _markers(grey, words, enlarge=2), key=lambda one: len(one[1]))
     if not len(ids):
         raise CornersError(_no_markers(grey, board.dictionary))
@@ -79,9 +80,8 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     if n < FEWEST_CORNERS:
         raise CornersError(_too_few(n, f"{len(ids)} markers are seen"))
     grid_m = np.array(layout.getChessboardCorners())[found_ids.ravel(), :2].astype(float)
-    square_px = _square_px(found_px.reshape(-1, 2), grid_m, board.square_mm / 1000)
-    gap_px = square_px * (1 - board.marker_mm / board.square_mm) / 2
-    return _spread_out(_refined(grey, found_px.reshape(-1, 2), 0.75 * gap_px), grid_m)
+    gap_share = (1 - board.marker_mm / board.square_mm) / 2
+    return _refined(grey, found_px.reshape(-1, 2).astype(float), grid_m, board.square_mm / 1000, gap_share)
 
 
 def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Floats, Floats]:
@@ -100,9 +100,8 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
             if found_px is None:
                 continue
             grid = np.stack(np.meshgrid(np.arange(columns - 1), np.arange(rows - 1)), axis=-1).reshape(-1, 2)
-            grid_m = grid * board.square_mm / 1000
-            square_px = _square_px(found_px, grid_m, board.square_mm / 1000)
-            return _refined(grey, found_px, 0.22 * square_px), grid_m
+            square_m = board.square_mm / 1000
+            return _refined(grey, found_px, grid.astype(float) * square_m, square_m, 0.5)
     raise CornersError(_no_checkerboard(grey, across, down))
 
 
@@ -187,22 +186,29 @@ def _sector_corners(grey: Grey, columns: int, rows: int, enlarge: int = 1) -> Fl
     return _reduced(corners.reshape(-1, 2), enlarge) if seen else None
 
 
-def _square_px(corners_px: Floats, grid_m: Floats, square_m: float) -> float:
-    """Smallest distance between corners that are one square apart, px."""
-    apart = np.linalg.norm(grid_m[:, None] - grid_m[None], axis=2) / square_m
-    pairs = np.abs(apart - 1) < 0.01
-    distance = np.linalg.norm(corners_px[:, None] - corners_px[None], axis=2)
-    return float(distance[pairs].min()) if pairs.any() else 20.0
+def _refined(
+    grey: Grey, corners_px: Floats, grid_m: Floats, square_m: float, free_share: float
+) -> tuple[Floats, Floats]:
+    """Corners refined and their places on the board, without those that could not be, both of shape (n, 2)."""
+    refined_px, held = refine_saddles(grey, corners_px, _steps_px(corners_px, grid_m, square_m), free_share)
+    places_m = grid_m[held]
+    if held.sum() < FEWEST_CORNERS:
+        raise CornersError(_too_few(int(held.sum()), f"{len(held)} are detected"))
+    if min(len(np.unique(places_m[:, k].round(6))) for k in (0, 1)) < 2:
+        raise CornersError(_too_few(len(places_m), "they lie on one line"))
+    return refined_px[held], places_m
 
 
-def _refined(grey: Grey, corners_px: NDArray[Any], half_window_px: float) -> Floats:
-    """Corners moved to the point of symmetry within ± `half_window_px`, at least 2 px."""
+def _steps_px(corners_px: Floats, grid_m: Floats, square_m: float) -> Floats:
+    """Steps in the picture to the next corner along the board's two directions, at each corner, shape (n, 2, 2)."""
     import cv2
 
-    half = int(np.clip(half_window_px, 2, 25))
-    start = np.ascontiguousarray(corners_px, dtype=np.float32).reshape(-1, 1, 2)
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
-    return np.asarray(cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), stop)).reshape(-1, 2).astype(float)
+    plane, _ = cv2.findHomography(grid_m, corners_px)
+    steps = []
+    for direction in np.eye(2) * square_m:
+        ends = [cv2.perspectiveTransform((grid_m + sign * direction / 2)[:, None], plane)[:, 0] for sign in (-1, 1)]
+        steps.append(ends[1] - ends[0])
+    return np.stack(steps, axis=1)
 
 
 def _is_a_grid(corners_px: NDArray[Any]) -> bool:
@@ -210,13 +216,6 @@ def _is_a_grid(corners_px: NDArray[Any]) -> bool:
     steps = np.linalg.norm(np.diff(corners_px, axis=1), axis=2)
     bends = [np.linalg.norm(np.diff(corners_px, 2, axis=axis), axis=2).max() for axis in (0, 1)]
     return bool(max(bends) < 0.1 * np.median(steps))
-
-
-def _spread_out(corners_px: Floats, grid_m: Floats) -> tuple[Floats, Floats]:
-    """The corners, unless they all lie on one line of the board, which fixes no plane."""
-    if min(len(np.unique(grid_m[:, k].round(6))) for k in (0, 1)) < 2:
-        raise CornersError(_too_few(len(grid_m), "they lie on one line"))
-    return corners_px, grid_m
 
 
 def _too_few(n: int, why: str) -> str:

@@ -66,16 +66,14 @@ class PlaneMap:
         """Relative standard error of that distance, from the covariance of the fit."""
         ends = np.array([from_px, to_px], dtype=float)
         gradient = np.zeros(self.parameters.size)
-        steps = np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9)
+        steps = np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9).tolist()
         for k, step in enumerate(steps):
-            lengths = []
-            for sign in (-1, 1):
-                changed = self.parameters.copy()
-                changed[k] += sign * step
-                a, b = self._plane_m(changed, ends)
-                lengths.append(np.linalg.norm(b - a))
-            gradient[k] = (lengths[1] - lengths[0]) / (2 * step)
-        return float(np.sqrt(max(gradient @ self.covariance @ gradient, 0.0))) / self.length_m(from_px, to_px)
+            change = np.zeros(self.parameters.size)
+            change[k] = step
+            (a, b), (c, d) = (self._plane_m(self.parameters + sign * change, ends) for sign in (-1, 1))
+            gradient[k] = (np.linalg.norm(d - c) - np.linalg.norm(b - a)) / (2 * step)
+        variance = float(gradient @ self.covariance @ gradient)
+        return float(np.sqrt(max(variance, 0.0))) / self.length_m(from_px, to_px)
 
     def _plane_m(self, parameters: Floats, picture_px: Floats) -> Floats:
         size = (self.width_px, self.height_px)
@@ -173,11 +171,11 @@ def _distorted(ideal: Floats, lens: Floats) -> Floats:
 
 def _first_homography(picture: Floats, board: Floats) -> Floats:
     """Homography from half-diagonals to the board, by the direct linear transform; first eight entries, shape (8,)."""
-    rows = []
-    for (x, y), (u, v) in zip(picture, board, strict=True):
-        rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y, -u], [0, 0, 0, x, y, 1, -v * x, -v * y, -v]]
-    _, _, directions = np.linalg.svd(np.array(rows))
-    homography = directions[-1]
+    there = np.column_stack([picture, np.ones(len(picture))])
+    nothing = np.zeros_like(there)
+    system = np.block([[there, nothing, -board[:, :1] * there], [nothing, there, -board[:, 1:] * there]])
+    _, directions = np.linalg.eigh(system.T @ system)
+    homography = directions[:, 0]
     return np.asarray(homography[:8] / homography[8])
 
 
