@@ -75,6 +75,10 @@ class Rig(NamedTuple):
     least_mass: float  #: floor of the moving mass: fold and gas, kg
     has_bends: float  #: 1 where the sheet has bends
     tail_on_reel: float  #: 1 where the tail comes off a reel instead of lying in the body
+    bend_count: float  #: number of bends in the sheet
+    bend_total: float  #: their angles added up, rad
+    as_printed: float  #: 1 where the paper's terms are taken literally
+    tail_free: float  #: 1 where a tail that would have to push goes slack
 
 
 @dataclass(frozen=True)
@@ -82,8 +86,8 @@ class Parameter:
     """A number of an effect that can be fitted.
 
     `zero` is the value at which the effect vanishes; `shared` says over what one value holds: `all` trials or one
-    `vine`. `bounds` are what physics allows, `plausible` what an experimenter would believe. One that is `held` is known
-    beforehand: a fit leaves it at its value unless told to find it.
+    `vine`. `bounds` are what physics allows, `plausible` what an experimenter would believe. One that is `held` is
+    known beforehand: a fit leaves it at its value unless told to find it.
     """
 
     name: str
@@ -96,6 +100,12 @@ class Parameter:
     plausible: tuple[float, float] | None = None
     meaning: str = ""
     held: bool = False
+
+    @property
+    def sign(self) -> int:
+        """1 or −1 where physics lets it lie on one side of `zero` only, else 0."""
+        low, high = self.bounds
+        return (1 if low >= self.zero else 0) - (1 if high <= self.zero else 0)
 
 
 @dataclass(frozen=True)
@@ -122,7 +132,7 @@ class Effect:
 
     true_time           time since release at which what the camera stamps `s.time` really happened, s
     film_gain           factor on the film's mass per metre
-    gauge               the set or traced gauge pressure that was truly there, Pa
+    gauge               the gauge pressure that was truly there where the gauge read `s.pressure`, Pa
     yield_gauge         the yield pressure that was truly there, Pa
     area                the cross-section it leaves, m²
     chamber_rate        rate of change of the chamber's pressure, Pa/s (the chamber then follows its own equation)
@@ -133,6 +143,10 @@ class Effect:
     tail_force          force on tail and payload, N, positive along growth
     rest_force          force at the tip that holds a vine at rest and is gone once it moves, N, negative
     observed_position   position of the leading edge that the camera reports, m
+
+    Effects of one hook are asked by rising `order`, then as they stand in the model, and each sees what the ones before
+    left. In the chain of pressures 1 is the chamber, 2 a leak, 3 losses on the way (as everywhere if not said); what
+    the camera makes of the position comes after what the vine does, at 4 and 5.
     """
 
     name: str
@@ -147,12 +161,18 @@ class Effect:
     path: Path
     in_trace: bool = False  #: a pressure measured during growth already holds it
     replaces: tuple[str, ...] = ()  #: effects that it contains and that rest while it is in the model
+    order: int = 3  #: place among the effects of one hook
 
     @property
     def formula(self) -> str:
         """The formula: the indented lines of the docstring, stripped."""
         lines = [line.strip() for line in self.text.splitlines() if line.startswith("    ")]
         return "; ".join(line for line in lines if line)
+
+    @property
+    def zero(self) -> tuple[float, ...]:
+        """Values of the parameters at which it changes nothing, in their order."""
+        return tuple(parameter.zero for parameter in self.parameters)
 
     def __hash__(self) -> int:
         return hash((self.name, self.path))

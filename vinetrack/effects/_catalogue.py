@@ -77,6 +77,7 @@ def load_effect(path: Path | str) -> Effect:
         path=path.resolve(),
         in_trace=bool(getattr(module, "IN_TRACE", False)),
         replaces=tuple(getattr(module, "REPLACES", ())),
+        order=int(getattr(module, "ORDER", 3)),
     )
     faults = list(_faults(effect))
     if faults:

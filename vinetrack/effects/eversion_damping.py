@@ -1,9 +1,15 @@
 """Eversion damping: turning the film inside out costs more the faster it is done.
 
-    tip force −B ẋⁿ, on the tail −½B ẋⁿ
+Matters always: it sets the steady speed of a fast vine.
+
+    tip force −B ẋⁿ, on the tail −½B ẋⁿ, by ½ = 1/r
 
 A power law of the tail speed, with n near 0.37 for thermoplastic polyurethane and B growing with scale and thickness:
 buckling, wrinkling and the film's nonlinear viscoelasticity together. B belongs to one vine, n to the material.
+
+Easily taken for `linear_damping` (n near 1) or `pressure_damping` (a B that drifts with pressure).
+
+Reduce it with thinner or softer film, and powder or oil on the fold.
 
 Source: Alvarez et al. (2025), third term of Eq. (1) (printed there as Bxⁿ; it is a power of the speed).
 """

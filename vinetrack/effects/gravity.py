@@ -1,10 +1,16 @@
 """Gravity: the weight of tail and payload, along the direction of growth.
 
+Matters with a payload, and on a bare vine as a few per cent of the drive that leave with the mass: a steady speed sags
+by 1–4 % for that alone.
+
     tail force +m(x) g cosθ
 
 θ is the growth angle from straight down (0 down, 90° horizontal, 180° up) and m(x) what still moves: tail and payload.
-It acts on the tail itself and so counts whole. On a bare vine it is a few per cent of the drive, and leaves with the
-mass: a steady speed sags by 1–4 % for that alone.
+It acts on the tail itself and so counts whole.
+
+Easily taken for `payload_friction` where cosθ or the payload's mass is wrong.
+
+Reduce it by growing horizontally.
 
 g is known and held; a falling body is the experiment that measures it, and then it is fitted.
 

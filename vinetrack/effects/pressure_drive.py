@@ -1,9 +1,14 @@
 """Pressure drive: the gas pushes the tip on.
 
-    tip force +PA, on the tail +½PA
+Matters always: everything else in the model is measured against this term.
 
-P is the gauge pressure that the other effects leave at the tip, A = πD²/4. Everything else in the model is
-measured against this term.
+    tip force +PA, on the tail +½PA, by ½ = 1/r
+
+P is the gauge pressure that the other effects leave at the tip, A = πD²/4.
+
+Easily taken for nothing, but an error of P or of D is an error of this: `pressure_gain`, `area_scale`.
+
+Reduce it by the regulator.
 
 Source: Blumenschein, Okamura, Hawkes (2017), Biomimetic and Biohybrid Systems, 522–531; Alvarez et al. (2025), Eq. (1).
 """

@@ -1,5 +1,8 @@
 """Reservoir depletion: the chamber's gas expands into the growing vine, and its pressure falls.
 
+Matters wherever A·L is more than a thousandth of V₀, most at low gauge pressure and late in growth. A regulator that
+refills the chamber works against it (`supply_refill`).
+
     P → (P₀ + P_atm) (V₀ / (V₀ + A y))^γ − P_atm
 
 V₀ is the chamber's volume and A·y what the vine has swept. Boyle's law needs absolute pressure: a volume change of a
@@ -7,9 +10,10 @@ few per cent takes tens of per cent off a small gauge pressure. With 3.7 L and a
 by 15 % (γ = 1, slow enough to stay at room temperature) to 21 % (γ = 1.4, too fast to exchange heat); 7 kPa by 51 to
 71 %.
 
-Matters wherever A·L is more than a thousandth of V₀, most at low gauge pressure and late in growth. Reduce it on the
-rig with a larger chamber beside the inlet, or measure the pressure during growth. A regulator that refills the chamber
-works against it.
+Easily taken for `tail_friction` in the first half of growth (all along with a reel), or for a `leak` at constant speed.
+Another chamber or another diameter tells them apart.
+
+Reduce it with a larger chamber beside the inlet, or measure the pressure during growth and give it as a trace.
 
 Source: the gas laws; Alvarez et al. (2025), section III-B, uses gauge pressure in P₂ = P₁V₁/V₂, which hides the effect.
 """
@@ -19,6 +23,7 @@ from vinetrack.effects import Parameter, Worked
 KIND = "physical"
 NEEDS = ("chamber_l",)
 IN_TRACE = True
+ORDER = 1
 EASILY_TAKEN_FOR = ("tail_friction", "leak")
 PARAMETERS = (
     Parameter("gamma", "γ", "1", 1.4, bounds=(1.0, 1.4), plausible=(1.0, 1.4), meaning="1 isothermal, 1.4 adiabatic"),
@@ -43,7 +48,7 @@ WORKED = (
     ),
     Worked(
         "pressure",
-        2.061e3,
+        2.013e3,
         "108325 × (3.7/3.82667)^1.4 − 101325: 71 % below 7 kPa",
         state={"pressure": 7e3, **_GROWN},
         rig=_PAPER,

@@ -38,10 +38,21 @@ def rig_of(trial: Trial) -> Rig:
         least_mass=fold + gas_density * area * length / trial.travel_ratio**2,
         has_bends=float(bool(trial.bends)),
         tail_on_reel=float(trial.tail_store == "reel"),
+        bend_count=float(len(trial.bends)),
+        bend_total=sum(bend.arc_m / bend.radius_m for bend in trial.bends),
+        as_printed=float(trial.mass_loss == "as_printed"),
+        tail_free=float(trial.tail_slack == "free"),
     )
 
 
-_COLUMN_OF_FIELD = {"chamber_l": "chamber_m3", "yield_pressure_kPa": "yield_pressure_Pa", "inlet_mm": "inlet_m"}
+_COLUMN_OF_FIELD = {
+    "chamber_l": "chamber_m3",
+    "yield_pressure_kPa": "yield_pressure_Pa",
+    "inlet_mm": "inlet_m",
+    "payload_g": "payload_kg",
+    "thickness_um": "thickness_m",
+    "length_mm": "length_m",
+}
 
 
 def check_needs(model: Model, trial: Trial) -> None:

@@ -1,0 +1,39 @@
+"""Area scale: the diameter was measured wrong, or laid flat and taken for round.
+
+Matters as twice its size on the drive: 1 % of 12 mm is 0.12 mm, 2 % of PA.
+
+    D → (1 + ε) D: A → (1 + ε)² A, λ → (1 + ε) λ, what was of what was measured
+
+λ follows because it is computed from D.
+
+Easily taken for `pressure_gain`: with a heavy payload, or where λ is weighed, nothing tells them apart. Depletion sees
+the swept volume and does.
+
+Reduce it by measuring the width of the flattened tube: the diameter is 2/π of it.
+
+Source: the geometry of a tube; Eq. (2) of Alvarez et al. (2025).
+"""
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "measurement"
+ORDER = 2
+EASILY_TAKEN_FOR = ("pressure_gain", "wall_stretch")
+PARAMETERS = (
+    Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.05, 0.05), meaning="relative error of D"),
+)
+
+
+def area(s, rig, eps):  # noqa: ARG001, D103
+    return s.area * (1.0 + eps) ** 2
+
+
+def film_gain(s, rig, eps):  # noqa: ARG001, D103
+    return 1.0 + eps
+
+
+WORKED = (
+    Worked("area", 4.7067e-4, "4.5239e-4 × 1.02²", state={"area": 4.5239e-4}, parameters={"eps": 0.02}),
+    Worked("film_gain", 1.02, "1 + 0.02", parameters={"eps": 0.02}),
+    Worked("film_gain", 1.0, "of no size", parameters={"eps": 0.0}),
+)

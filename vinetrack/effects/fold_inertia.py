@@ -1,0 +1,52 @@
+"""Fold inertia: the fold hands part of the energy of the film it stops back to the tail.
+
+Matters for every fast vine: the film arrives at the fold at the tail's speed and leaves it at rest. Without this term
+the fold swallows all of that energy; η = 1 is worth a drag coefficient of −133 on every vine of the paper's Table I.
+
+    tail force +η ¼λẋ², with ¼ = (r−1)/(2r)
+
+Film passes the tip at (r−1)ẏ, so the tail loses c = λ(r−1)/r for each metre it travels. A lossless fold keeps
+½m(x)ẋ² but for the work of the other forces: m ẍ = F + ½c ẋ². Between lost (η = 0) and kept (η = 1) lies what a real
+fold does. d(mẋ)/dt = F would add twice as much and create energy.
+
+Easily taken for a smaller n, and it cancels `air_drag`: the two are one curve on vines of one t/D.
+
+It cannot be reduced but by thinner film or slower growth; a payload that outweighs the film hides it.
+
+Source: the balance of energy at a moving fold, as for the falling folded chain: Wong & Yasui (2006), American Journal
+of Physics 74, 490–496.
+"""
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "physical"
+EASILY_TAKEN_FOR = ("air_drag", "eversion_damping")
+PARAMETERS = (
+    Parameter("eta", "η", "1", 0.5, bounds=(0.0, 1.0), plausible=(0.0, 1.0), meaning="share of the energy kept"),
+)
+
+
+def tail_force(s, rig, eta):  # noqa: D103
+    lost = s.linear_density * (rig.travel_ratio - 1.0) / rig.travel_ratio
+    return eta * 0.5 * lost * s.tail_velocity * s.tail_velocity
+
+
+_RIG = {"travel_ratio": 2.0}
+WORKED = (
+    Worked(
+        "tail_force",
+        0.22620,
+        "½ × ¼ × 1200 × π × 24 mm × 200 µm × 10² = 0.125 × 0.0180956 × 100",
+        state={"linear_density": 0.0180956, "tail_velocity": 10.0},
+        rig=_RIG,
+        parameters={"eta": 0.5},
+    ),
+    Worked(
+        "tail_force",
+        0.0,
+        "of no size",
+        state={"linear_density": 0.018, "tail_velocity": 10.0},
+        rig=_RIG,
+        parameters={"eta": 0.0},
+    ),
+)

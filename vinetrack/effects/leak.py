@@ -1,0 +1,44 @@
+"""Leak: gas escapes through the seam or the inlet while the vine grows.
+
+Matters where growth takes longer than a hundredth of the time the pressure would need to bleed away: slow growth near
+the yield pressure, old vines, no supply.
+
+    P → P e^(−t/τ), t from release
+
+The rate 1/τ is the parameter: no leak is 0, and what it takes off the pressure grows in proportion to it.
+
+Easily taken for `reservoir_depletion`, which falls with the volume swept and so, at constant speed, with time as well.
+Growth at two speeds on one chamber tells them apart.
+
+Reduce it by sealing; measure it on the blocked vine: shut the valve and watch the gauge.
+
+Source: the isothermal emptying of a volume through a laminar leak, linearised; any textbook on gas flow.
+"""
+
+import numpy as np
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "physical"
+IN_TRACE = True
+ORDER = 2
+EASILY_TAKEN_FOR = ("reservoir_depletion",)
+PARAMETERS = (
+    Parameter("rate", "1/τ", "1/s", 0.5, bounds=(0.0, 50.0), plausible=(0.0, 5.0), meaning="share of P lost a second"),
+)
+
+
+def pressure(s, rig, rate):  # noqa: ARG001, D103
+    return s.pressure * np.exp(-rate * s.time)
+
+
+WORKED = (
+    Worked(
+        "pressure",
+        25.335e3,
+        "28000 × e^(−0.5 × 0.2) = 28000 × 0.904837",
+        state={"pressure": 28e3, "time": 0.2},
+        parameters={"rate": 0.5},
+    ),
+    Worked("pressure", 28e3, "of no size", state={"pressure": 28e3, "time": 0.2}, parameters={"rate": 0.0}),
+)

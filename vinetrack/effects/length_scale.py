@@ -1,0 +1,33 @@
+"""Length scale: millimetres a pixel are wrong by a constant factor.
+
+Matters always: the target stood before or behind the plane of growth, or its size was misread. One per cent of distance
+to the camera is one per cent of length.
+
+    y → (1 + ε) y, what is reported of what was
+
+Easily taken for an error of B or for drag; together with the frame rate, pressure and B it hides in one loaded trial to
+a fraction of a micrometre. The end of growth at a known length shows it.
+
+Reduce it with a calibration target in the plane of growth, or a ruler beside the vine.
+
+Source: the geometry of projection; Hartley & Zisserman (2004), Multiple View Geometry in Computer Vision.
+"""
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "measurement"
+ORDER = 5
+EASILY_TAKEN_FOR = ("eversion_damping", "air_drag", "time_base")
+PARAMETERS = (
+    Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.1, 0.1), meaning="relative error of length"),
+)
+
+
+def observed_position(s, rig, eps):  # noqa: ARG001, D103
+    return s.observed * (1.0 + eps)
+
+
+WORKED = (
+    Worked("observed_position", 0.102, "0.1 m × 1.02", state={"observed": 0.1}, parameters={"eps": 0.02}),
+    Worked("observed_position", 0.1, "of no size", state={"observed": 0.1}, parameters={"eps": 0.0}),
+)

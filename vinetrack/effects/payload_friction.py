@@ -1,0 +1,52 @@
+"""Payload friction: the payload rubs along the wall of the vine it rides in.
+
+Matters with a payload, most on a horizontal vine, where the payload's whole weight lies on the wall.
+
+    tail force −μ_p m_pay g
+
+On a vertical rig nothing presses the payload on the wall but clinging film and crookedness: there μ_p is an effective
+coefficient, not that of the materials.
+
+Easily taken for an error of the growth angle or of the payload's mass: both are a force in proportion to m_pay. Growth
+upwards and downwards tells it from an angle, which changes sign.
+
+Reduce it with a smooth, round payload of smaller diameter, and powder.
+
+Source: Coulomb's law of friction.
+"""
+
+from vinetrack.constants import GRAVITY_M_S2
+from vinetrack.effects import Parameter, Worked
+
+KIND = "physical"
+NEEDS = ("payload_g",)
+EASILY_TAKEN_FOR = ("gravity",)
+PARAMETERS = (
+    Parameter(
+        "mu_p", "μ_p", "1", 0.3, bounds=(0.0, 10.0), plausible=(0.0, 1.5), meaning="friction of payload on the wall"
+    ),
+)
+
+
+def tail_force(s, rig, mu_p):  # noqa: D103
+    return -mu_p * rig.payload_mass * GRAVITY_M_S2 + 0.0 * s.lead_position
+
+
+WORKED = (
+    Worked(
+        "tail_force",
+        -0.10477,
+        "0.3 × 35.6 g × 9.81",
+        state={"lead_position": 0.1},
+        rig={"payload_mass": 35.6e-3},
+        parameters={"mu_p": 0.3},
+    ),
+    Worked(
+        "tail_force",
+        0.0,
+        "no payload",
+        state={"lead_position": 0.1},
+        rig={"payload_mass": 0.0},
+        parameters={"mu_p": 0.3},
+    ),
+)

@@ -1,0 +1,37 @@
+"""Pressure gain: the gauge's scale is wrong, for P and P_y alike.
+
+Matters at every pressure in proportion; pressures rounded to whole psi err by up to 1.5 %.
+
+    P → (1 + ε) P and P_y → (1 + ε) P_y, what was of what was read
+
+Easily taken for B together with the time base or the length scale, and for `area_scale`, from which nothing tells it
+apart where the film is weighed.
+
+Reduce it by calibrating the gauge against a column of water or a second gauge.
+
+Source: the linear error of a gauge; PA is all that Eq. (2) of Alvarez et al. (2025) knows of pressure.
+"""
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "measurement"
+ORDER = 4
+EASILY_TAKEN_FOR = ("area_scale", "eversion_damping", "time_base", "length_scale")
+PARAMETERS = (
+    Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.05, 0.05), meaning="relative error of P"),
+)
+
+
+def gauge(s, rig, eps):  # noqa: ARG001, D103
+    return s.pressure * (1.0 + eps)
+
+
+def yield_gauge(s, rig, eps):  # noqa: ARG001, D103
+    return s.yield_pressure * (1.0 + eps)
+
+
+WORKED = (
+    Worked("gauge", 28.56e3, "28 kPa × 1.02", state={"pressure": 28e3}, parameters={"eps": 0.02}),
+    Worked("yield_gauge", 3.06e3, "3 kPa × 1.02", state={"yield_pressure": 3e3}, parameters={"eps": 0.02}),
+    Worked("gauge", 28e3, "of no size", state={"pressure": 28e3}, parameters={"eps": 0.0}),
+)

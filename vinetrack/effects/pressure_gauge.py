@@ -1,0 +1,33 @@
+"""Pressure gauge: the gauge that P was read on is off by a constant, and P_y was not read on it.
+
+Matters most near the yield pressure: 0.5 kPa is a tenth of P − P_y at 8 kPa over 3 kPa.
+
+    P → P + δ, P_y unchanged, what was of what was read
+
+Read on one gauge, δ cancels in P − P_y and nothing changes.
+
+Easily taken for an error of P_y: in the base model P_y − δ is exactly the same, and no trial tells them apart.
+
+Reduce it by zeroing the gauge before each trial, and reading P_y on it too.
+
+Source: the zero error of a gauge; Eq. (2) of Alvarez et al. (2025) knows P − P_y only.
+"""
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "measurement"
+ORDER = 5
+EASILY_TAKEN_FOR = ("yield_pressure",)
+PARAMETERS = (
+    Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3), meaning="what the gauge lacks"),
+)
+
+
+def gauge(s, rig, delta):  # noqa: ARG001, D103
+    return s.pressure + delta
+
+
+WORKED = (
+    Worked("gauge", 28.5e3, "28 kPa + 0.5 kPa", state={"pressure": 28e3}, parameters={"delta": 500.0}),
+    Worked("gauge", 28e3, "of no size", state={"pressure": 28e3}, parameters={"delta": 0.0}),
+)

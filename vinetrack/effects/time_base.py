@@ -1,0 +1,32 @@
+"""Time base: the frame rate was not what the sheet says.
+
+Matters where the rate was set by hand, read off a container that plays back slowly, or drifts with the camera's
+temperature. Speeds err by as much as the rate.
+
+    t → (1 + ε) t, what is reported of what was
+
+Easily taken for `length_scale` (speed alone cannot tell them apart) or `pressure_gain`; on horizontal vines a gain of
+pressure and B together imitate it. Gravity does not: a falling body measures the rate.
+
+Reduce it by filming a strobe, a clock or a falling ball.
+
+Source: dimensional analysis of Eq. (2) of Alvarez et al. (2025).
+"""
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "measurement"
+EASILY_TAKEN_FOR = ("length_scale", "pressure_gain")
+PARAMETERS = (
+    Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.1, 0.1), meaning="relative error of time"),
+)
+
+
+def true_time(s, rig, eps):  # noqa: ARG001, D103
+    return s.time / (1.0 + eps)
+
+
+WORKED = (
+    Worked("true_time", 0.1, "0.102 s/1.02", state={"time": 0.102}, parameters={"eps": 0.02}),
+    Worked("true_time", 0.102, "of no size", state={"time": 0.102}, parameters={"eps": 0.0}),
+)
