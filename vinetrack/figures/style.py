@@ -168,13 +168,15 @@ def _at_least_an_octave(low: float, high: float) -> tuple[float, float]:
 
 def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 150) -> dict[str, bytes]:
     """Return the figure in each format, the same bytes for the same figure; PNG on white, the others transparent."""
-    dates = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
+    details: dict[str, dict[str, Any]] = {
+        "png": {"facecolor": "white", "metadata": {"Software": None}},
+        "svg": {"metadata": {"Date": None, "Creator": None}},
+        "pdf": {"metadata": {"CreationDate": None}},
+    }
     files = {}
     with look():
         for form in formats:
             file = io.BytesIO()
-            fig.savefig(
-                file, format=form, dpi=dpi, facecolor="white" if form == "png" else "none", metadata=dates[form]
-            )
+            fig.savefig(file, format=form, dpi=dpi, **details[form])
             files[form] = file.getvalue()
     return files

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.numbers import number, with_error
-from vinetrack.figures.style import METHOD_NAMES, RULE_NAMES, rows
+from vinetrack.figures.style import RULE_NAMES, rows
 from vinetrack.report.svg import inline_svg, speed_sparkline
 from vinetrack.report.words import REFERENCES, exponent_table, headline, methods, tally, vine_table, without_law
 
@@ -66,9 +66,9 @@ def build_report(content: ReportContent) -> str:
         style=Markup((folder / "report.css").read_text(encoding="utf-8")),
         headline=headline(content.damping),
         tally=tally(content.trials),
-        exponents=exponent_table(content.damping, METHOD_NAMES),
+        exponents=exponent_table(content.damping),
         without_law=without_law(content.damping),
-        vines=vine_table(content.damping, METHOD_NAMES),
+        vines=vine_table(content.damping),
         figures=[_figure(figure) for figure in content.figures if len(figure.svg) <= MAX_INLINE_SVG_BYTES],
         trials=[_trial(row, content) for row in rows(content.trials)],
         methods=methods(settings),

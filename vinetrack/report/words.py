@@ -6,12 +6,16 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.numbers import half_width, interval, number, with_error
+from vinetrack.figures.style import METHOD_NAMES
 
 if TYPE_CHECKING:
     import pandas as pd
 
 STATUSES = ("ok", "warning", "failed", "left_out")
 _STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "left_out": "left out on request"}
+
+TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, to the letter"}
+"""Rows of the tables of n and B; the last has set pressure, no weight, and the windows of the 3 % rule."""
 
 PREFERRED = "both_axes"
 """The fit whose numbers head the report: speed and force both have errors, and ignoring those of speed bends n."""
@@ -51,10 +55,10 @@ def tally(trials: pd.DataFrame) -> str:
     return f"{_count(len(trials), 'trial')}: {', '.join(parts)}." if parts else "No trials."
 
 
-def vine_table(damping: Mapping[str, Any], names: Mapping[str, str]) -> list[dict[str, str]]:
+def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
     """One row a vine and method: size, B and its intervals, R² and N, as text."""
     table = []
-    for method, method_name in names.items():
+    for method, method_name in TABLE_METHODS.items():
         for vine, law in ((damping.get(method) or {}).get("vines") or {}).items():
             table.append(
                 {
@@ -71,11 +75,13 @@ def vine_table(damping: Mapping[str, Any], names: Mapping[str, str]) -> list[dic
     return table
 
 
-def exponent_table(damping: Mapping[str, Any], names: Mapping[str, str]) -> list[dict[str, str]]:
+def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
     """One row a method: n and its intervals, or why there is none, as text."""
     table = []
-    for method, method_name in names.items():
-        fit = damping.get(method) or {}
+    for method, method_name in TABLE_METHODS.items():
+        fit = damping.get(method)
+        if fit is None:
+            continue
         table.append(
             {
                 "method": method_name,

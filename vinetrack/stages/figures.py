@@ -68,6 +68,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     from vinetrack.figures.exponents import draw_exponents
     from vinetrack.figures.overview import draw_overview
     from vinetrack.figures.scaling import draw_scaling
+    from vinetrack.figures.style import METHOD_NAMES
 
     results = Results(folder)
     damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)
@@ -76,7 +77,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
         name: read_result(results.kinematics(name))
         for name in described.loc[described["status"] != "left_out", "trial"]
     }
-    in_fit = [vine for fit in damping.values() for vine in fit["vines"]]
+    in_fit = [vine for method in METHOD_NAMES for vine in damping[method]["vines"]]
     points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
     drawings: dict[str, Figure] = {
         "damping_law": draw_damping_law(points, damping),

@@ -7,6 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.figures.style import METHOD_NAMES
 from vinetrack.provenance import describe_run
 from vinetrack.stages.results import Results, read_json, read_result
 from vinetrack.tables import write_json, write_text
@@ -50,13 +51,21 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
         damping=read_json(results.damping),
         provenance=provenance,
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
-        figures=[figure for name in FIGURES if (figure := _figure(results, name))],
+        figures=[figure for name in _drawn(results) if (figure := _figure(results, name))],
         trial_figures=_trial_figures(results, drawn) if len(drawn) <= MAX_TRIAL_PICTURES else {},
     )
     page = build_report(content)
     write_json(results.provenance, provenance)
     write_text(results.report, page)
     return results.report
+
+
+def _drawn(results: Results) -> list[str]:
+    """Figures with something in them; the others would only repeat why there is no law."""
+    damping, scaling = read_json(results.damping), read_json(results.scaling)
+    empty = set() if any(damping[method]["vines"] for method in METHOD_NAMES) else {"exponents"}
+    empty |= set() if scaling["isometric"] or scaling["thickness"] else {"scaling"}
+    return [name for name in FIGURES if name not in empty]
 
 
 def _figure(results: Results, name: str) -> ReportFigure | None:
