@@ -39,8 +39,8 @@ FAINTEST = 0.5
 """An edge of less than this much of its contrast is another thing's."""
 LONG_REST = 8
 """Frames of rest, counted from the motion, in which a bad fit is still sought again from many starts."""
-CLEAR_PX = 20.0
-"""Growth after which the surroundings of the start are free of what held the tip there."""
+CLEAR_PX = 60.0
+"""Growth after which the surroundings of the start are free of what held the tip there (20 mm at 3 px/mm)."""
 EVIDENCE_CLIP = 2.5
 """Widths beyond which a pixel is as unlike film (or background) as can be."""
 
@@ -225,9 +225,9 @@ def _first_state(strip: Strip, path: Floats, exposure: float) -> State:
 
 def repicture(strip: Strip, state: State, clip: float) -> State:
     """Solve every pixel's brightness before and after, given the edge; `clip` > 0 weighs strays down."""
-    when, dwell = _passing(state, strip.values.shape[2])
+    early, late = _passing(state, strip.values.shape[2])
     sums = kernels.gather(
-        strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, when, dwell,
+        strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
         MEMORY_FRAMES, state.pictures, clip,
     )  # fmt: skip
     half = len(strip.values) // 2
@@ -237,9 +237,9 @@ def repicture(strip: Strip, state: State, clip: float) -> State:
 
 
 def _passing(state: State, columns: int) -> tuple[Floats, Floats]:
-    """Frame at which the edge passes each column, and for how many frames about it the column is half covered.
+    """First and last frame in which the edge is over each column, shapes (n_along,).
 
-    Columns that stood covered from the start count as passed when the edge has left them by CLEAR_PX.
+    About the start, film counts only once the edge has got clear of it: a door may stand or swing there until then.
     """
     rising = np.maximum.accumulate(state.edge) + 1e-6 * np.arange(len(state.edge))
     frames = np.arange(len(rising), dtype=float)
@@ -247,10 +247,25 @@ def _passing(state: State, columns: int) -> tuple[Floats, Floats]:
     places = np.arange(columns, dtype=float)
     reach = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
     begin, end = frames[moving[0]], frames[moving[-1]]
+    behind = np.maximum(places + reach + float(state.lag.max()), clear_of_start(state.edge))
     early = np.clip(np.interp(places - reach, rising, frames), begin, end)
-    behind = np.maximum(places + reach + float(state.lag.max()), rising[0] + CLEAR_PX)
     late = np.clip(np.interp(behind, rising, frames), begin, end)
-    return 0.5 * (early + late), 0.5 * (late - early) + 1.0
+    return early, late
+
+
+def clear_of_start(edge: Floats) -> float:
+    """Place beyond which nothing that held the tip at its start is near: CLEAR_PX on, or a fifth of the way."""
+    return float(edge[0] + min(CLEAR_PX, 0.2 * (edge.max() - edge[0])))
+
+
+def core_frames(state: State, fit: Floats) -> NDArray[np.bool_]:
+    """Moving frames clear of the start that fit no worse than most, shape (n_frames,): those that tell of the tip."""
+    moving = moving_frames(state.edge)
+    clear = moving & (state.edge > clear_of_start(state.edge))
+    if clear.sum() < 5:
+        return moving
+    good = clear & (fit[:, 2] <= 1.3 * np.nanmedian(fit[clear, 2]))
+    return good if good.sum() >= 5 else clear
 
 
 def _second_path(strip: Strip, state: State, passed: tuple[int, int]) -> Floats:
@@ -300,7 +315,7 @@ def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
     if len(moving) < 5:
         return fit
     out = fit.copy()
-    bad = 1.5 * float(np.nanmedian(fit[moving, 2]))
+    bad = 1.5 * float(np.nanmedian(fit[core_frames(state, fit), 2]))
     central = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
     anchor = int(moving[np.argmin(central + _rough(fit[moving, 0]) + (fit[moving, 2] > bad))])
     for sense in (-1, 1):
@@ -356,7 +371,7 @@ def _restate(strip: Strip, state: State, fit: Floats, exposure: float) -> State:
     edge = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
     state = repicture(strip, state, 4 * strip.noise + 4)
-    by_distance, _, _ = residuals(strip, state, fit, moving_frames(edge))
+    by_distance, _, _ = residuals(strip, state, fit, core_frames(state, fit))
     seen = by_distance[:, 1] > 4
     ratio = np.where(seen, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
     smooth = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")

@@ -71,18 +71,18 @@ def gather(
     lengths: np.ndarray,
     lag: np.ndarray,
     blur: float,
-    when: np.ndarray,
-    dwell: np.ndarray,
+    early: np.ndarray,
+    late: np.ndarray,
     memory_frames: float,
     pictures: np.ndarray,
     clip: float,
 ) -> np.ndarray:
     """Sums for the least squares of (before, after) at every pixel; shape (11, n_across, n_along).
 
-    Frame t speaks of column s by a weight that falls as exp(−d / memory_frames), d the frames between t and the
-    passing of the edge, `when[s]` give or take `dwell[s]`: what was seen last before and first after counts most.
-    Rows of the answer: Σwq², Σwqp, Σwp², ΣwqV, ΣwpV (q = 1 − p), then weight, sum and sum of squares of V where only
-    background, and where only film, is seen.
+    The edge is over column s from frame `early[s]` to `late[s]`. Background counts before, film after, by a weight
+    that falls as exp(−frames / memory_frames): what was seen last before and first after counts most. Half-covered
+    pixels count in between, hardly. Rows of the answer: Σwq², Σwqp, Σwp², ΣwqV, ΣwpV (q = 1 − p), then weight, sum
+    and sum of squares of V where only background, and where only film, is seen.
     With `clip` > 0 a value that strays from the last solution is weighed down by 1/(1 + (r/clip)²).
     """
     n, rows, columns = strip.shape
@@ -95,7 +95,7 @@ def gather(
         table = cover_table(lengths[t], blur, reach)
         first, last = columns, 0
         for s in range(columns):
-            d = max(0.0, abs(t - when[s]) - dwell[s]) / memory_frames
+            d = max(early[s] - t, t - late[s], 0.0) / memory_frames
             share[s] = math.exp(-d) if d < FORGOTTEN else 0.0
             if share[s] > 0:
                 first, last = min(first, s), s + 1
@@ -105,9 +105,14 @@ def gather(
                 p, _ = _look_up(table, reach, at - s)
                 q = 1 - p
                 value = strip[t, u, s] * scale[t] + offset[t]
-                w = share[s] if p < 0.02 or p > 0.98 else PARTIAL * share[s]
-                if p > 0.02 and t < when[s] - dwell[s]:
-                    continue
+                w = share[s]
+                if p > 0.98:
+                    if t < late[s]:
+                        continue
+                elif p > 0.02:
+                    if t < early[s] or t > late[s]:
+                        continue
+                    w *= PARTIAL
                 if clip > 0:
                     r = value - pictures[1, u, s] * q - pictures[0, u, s] * p
                     w /= 1 + r * r / (clip * clip)

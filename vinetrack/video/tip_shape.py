@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.video.edge import ASSUMED_EXPOSURE, State, blur_lengths, moving_frames, residuals
+from vinetrack.video.edge import ASSUMED_EXPOSURE, State, blur_lengths, core_frames, residuals
 from vinetrack.video.strip import Strip
 
 Floats = NDArray[np.float64]
@@ -21,14 +21,10 @@ DEEPEST_LAG_PX = 60.0
 def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
     """Estimate how far each row of the tip lags behind its foremost point, then the optical blur.
 
-    Of the moving frames those with less blur by motion, and among them those that fit better than most, are used:
-    not those in which a door still stands before the tip.
+    From the core frames with less blur by motion: not those in which a door may still stand before the tip.
     """
-    moving = moving_frames(state.edge)
-    good = moving & (fit[:, 2] <= 1.2 * np.nanmedian(fit[moving, 2]))
-    slow = good & (state.lengths <= max(2.0, float(np.quantile(state.lengths[good], 0.5)) if good.any() else 2.0))
-    if slow.sum() < 4:
-        slow = moving
+    core = core_frames(state, fit)
+    slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
     for _ in range(3):
         _, by_row, _ = residuals(strip, state, fit, slow)
         step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
@@ -42,9 +38,9 @@ def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
 
 def find_exposure(strip: Strip, state: State, fit: Floats) -> float:
     """Exposure in frame periods that explains the blur of the faster frames best; a guess where none moves 2 px."""
-    moving = moving_frames(state.edge)
+    core = core_frames(state, fit)
     speed = blur_lengths(state.edge, 1.0)
-    fast = moving & (speed >= np.quantile(speed[moving], 0.5)) & (speed > 2)
+    fast = core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
     if not fast.any():
         return ASSUMED_EXPOSURE
     misfits = [residuals(strip, replace(state, lengths=speed * tau), fit, fast)[2] for tau in EXPOSURES]
