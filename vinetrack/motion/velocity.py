@@ -32,6 +32,10 @@ TRUSTED_GAIN = 0.5
 beyond what they can tell."""
 
 
+Centred = tuple[Indices, Floats, Floats]
+"""Window, velocity and error for unit noise at every point, of centred windows of one width."""
+
+
 def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, kappa: float = 3.0) -> Kinematics:
     """Position, velocity and acceleration of the leading edge at the usable points of a track.
 
@@ -94,7 +98,7 @@ def smooth(
     follows = [fit.misfit <= noise_m**2 * MISFIT_LIMITS[fit.misfit_terms] for fit in fits]
     centred = [fit.velocities(time_s, 0.0) for fit in fits]
     low, high, centred_error = _agreement(centred, follows, noise_m, kappa)
-    best, window_used, _, sigma = _narrowest(fits[0], centred[0], follows[0], noise_m)
+    best, window_used, sigma = _narrowest(fits[0], centred[0], follows[0], noise_m)
     fit_used = np.zeros(n, dtype=int)
     for side in SIDES:
         wider_agrees = np.full(n, len(fits) == 1)
@@ -114,17 +118,12 @@ def smooth(
     return values, np.maximum(sigma, TRUSTED_GAIN * centred_error), np.array(widths)[fit_used]
 
 
-Centred = tuple[Indices, Floats, Floats]
-
-
-def _narrowest(
-    fit: WindowFits, centred: Centred, follows: Mask, noise_m: float
-) -> tuple[Floats, Indices, Floats, Floats]:
+def _narrowest(fit: WindowFits, centred: Centred, follows: Mask, noise_m: float) -> tuple[Floats, Indices, Floats]:
     """Where nothing wider serves: the narrowest window, its error that of the noise or of its misfit if larger."""
-    window, velocity, gain = centred
+    window, _, gain = centred
     good = follows[window]
     sigma = np.where(good, noise_m, np.maximum(noise_m, KINK_GAIN * np.sqrt(fit.misfit[window]))) * gain
-    return np.where(good, sigma, np.inf), window.copy(), velocity, sigma
+    return np.where(good, sigma, np.inf), window.copy(), sigma
 
 
 def _agreement(
