@@ -1,0 +1,180 @@
+"""What a fit sees of an experiment: for every trial the measured positions, their instants and the pressure trace."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.records import Floats, Track, Trial
+from vinetrack.video.position_noise import position_noise, rest_points, rough_noise
+
+if TYPE_CHECKING:
+    from vinetrack.experiment import Experiment
+
+FEWEST_POINTS = 5
+GAP_FRAMES = 1.5
+"""A point later than this many frames after the one before begins a new stretch of noise, independent of the last."""
+
+MOVES_SIGMAS = 8.0
+
+END_FRACTION = 0.95
+"""The last part of the growth is left out: there the mass of a bare vine goes to nothing, its speed diverges, and one
+frame across the end of growth is a corner that no sensitivity describes. What lies behind the end is kept."""
+
+FRAMES_BEHIND_END = 2
+
+
+class FitError(ValueError):
+    """A fit cannot be made; the message is one sentence with a remedy."""
+
+
+@dataclass(frozen=True)
+class FitTrial:
+    """One trial as a fit sees it; arrays have shape (n_points,).
+
+    `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0
+    where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
+    `trace` holds time, s, on the clock of the track and gauge pressure, Pa.
+    """
+
+    trial: Trial
+    time_s: Floats
+    lead_position_m: Floats
+    first: NDArray[np.bool_]
+    n_rest: int
+    noise_m: float
+    correlation: float
+    trace: tuple[Floats, Floats] | None = None
+
+    @property
+    def frame_s(self) -> float:
+        """Spacing of the points, s."""
+        return float(np.median(np.diff(self.time_s)))
+
+
+Pairs = Iterable[tuple[Trial, Track]]
+
+
+def prepare(pairs: Pairs) -> tuple[list[FitTrial], dict[str, str]]:
+    """Trials that can be fitted, and for the others the reason why not, by name."""
+    data, left_out = [], {}
+    for trial, track in pairs:
+        try:
+            data.append(prepare_trial(trial, track))
+        except FitError as error:
+            left_out[trial.name] = str(error)
+    return data, left_out
+
+
+def prepare_trial(trial: Trial, track: Track) -> FitTrial:
+    """The usable points of a track, rest included, with what they say of their own noise.
+
+    Raises
+    ------
+    FitError
+        Fewer than five usable points, times that do not increase, or a leading edge that never moves.
+    """
+    usable = track.usable & ~_nearing_end(trial, track)
+    time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
+    if time_s.size < FEWEST_POINTS:
+        raise FitError(f"{time_s.size} usable points, at least {FEWEST_POINTS} are needed")
+    steps = np.diff(time_s)
+    if np.any(steps <= 0):
+        raise FitError("its times do not increase: sort the rows or drop repeated ones")
+    noise_m, correlation = position_noise(time_s, position_m)
+    moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
+    if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
+        raise FitError("its leading edge never moves forward beyond its noise")
+    trace = None
+    if track.pressure_Pa is not None:
+        known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
+        if np.count_nonzero(known) >= 2:
+            trace = (track.time_s[known].astype(float), track.pressure_Pa[known].astype(float))
+    n_rest = rest_points(position_m)
+    return FitTrial(
+        trial=trial,
+        time_s=time_s,
+        lead_position_m=position_m,
+        first=np.concatenate([[True], steps > GAP_FRAMES * np.median(steps)]),
+        n_rest=n_rest if n_rest < position_m.size else 0,
+        noise_m=noise_m,
+        correlation=correlation,
+        trace=trace,
+    )
+
+
+def _nearing_end(trial: Trial, track: Track) -> NDArray[np.bool_]:
+    """Frames on the last twentieth of the growth and the first two behind its end."""
+    near = np.zeros(track.time_s.size, dtype=bool)
+    use = np.flatnonzero(track.usable)
+    if not np.isfinite(trial.length_m) or use.size < FEWEST_POINTS:
+        return near
+    y = track.lead_position_m[use]
+    noise_m = 2 * rough_noise(y) + 1e-9
+    n_rest = rest_points(y)
+    n_rest = n_rest if n_rest < y.size else 0
+    begin_m = float(np.mean(y[: max(n_rest, 1)]))
+    # A track that stands still at its end, after a last step far above its noise, has seen the end of growth.
+    still = np.abs(y - np.median(y[-2:])) < 5 * noise_m
+    moving = np.flatnonzero(~still)
+    end = int(moving[-1]) + 1 if moving.size else y.size
+    reached = y.size - end >= 2 and y[end] - y[end - 1] > 5 * noise_m
+    last_m = float(np.median(y[-2:])) - (1 - END_FRACTION) * trial.length_m if reached else np.inf
+    late = y > min(begin_m + END_FRACTION * trial.length_m, last_m)
+    if reached:
+        late[end + FRAMES_BEHIND_END :] = False
+    near[use[late]] = True
+    return near
+
+
+def pairs_of(
+    experiment: Experiment | Path | str | Pairs, tracks: Mapping[str, Track] | None = None
+) -> tuple[list[tuple[Trial, Track]], dict[str, str]]:
+    """Trials and their tracks, and why some trials have none.
+
+    Parameters
+    ----------
+    experiment
+        An experiment, the path of its folder, or pairs of trial and track.
+    tracks
+        Tracks by name of trial, for recordings that were tracked before; else they are read from the experiment.
+
+    Raises
+    ------
+    ExperimentError
+        If the folder is no experiment.
+    """
+    from vinetrack.experiment import Experiment, read_experiment
+
+    if isinstance(experiment, (str, Path)):
+        experiment = read_experiment(experiment)
+    if not isinstance(experiment, Experiment):
+        return list(experiment), {}
+    pairs, left_out = [], {**experiment.failed, **experiment.left_out}
+    for trial in experiment.trials:
+        if tracks is not None and trial.name in tracks:
+            pairs.append((trial, tracks[trial.name]))
+            continue
+        try:
+            pairs.append((trial, _read(trial)))
+        except FitError as error:
+            left_out[trial.name] = str(error)
+    return pairs, left_out
+
+
+def _read(trial: Trial) -> Track:
+    """The track that an experiment brings along, frames that repeat or jump put right."""
+    from vinetrack.video.corrections import correct_frames
+    from vinetrack.video.importers import TrackError, load_track
+
+    if trial.track is None:
+        raise FitError("its recording has not been tracked: run snakemake, or give its track")
+    try:
+        return correct_frames(load_track(trial))
+    except TrackError as error:
+        raise FitError(str(error)) from error

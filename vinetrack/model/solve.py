@@ -1,0 +1,243 @@
+"""The iterations of a fit: new trajectories, new spreads and noise, one damped Newton step, until nothing moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vinetrack.model.fit_data import FitTrial
+from vinetrack.model.mixed import (
+    Frame,
+    State,
+    estimate_noise,
+    estimate_spreads,
+    marginal,
+    newton_step,
+    own_step,
+    penalty,
+)
+from vinetrack.model.sensitivity import DAMPING_DEVIATION, PRESSURE, RELEASE, Predictor
+from vinetrack.model.simulate import SimulationError
+from vinetrack.model.whitened import all_products, whiten
+from vinetrack.records import Floats
+
+MOST_ITERATIONS = 60
+SETTLED_DECREASE = 1e-2
+"""A step that promises less than this of −2 ln L moves every number by under a twentieth of its error."""
+
+SETTLED_SPREAD = 0.02
+FIRST_SPREADS = (0.01, 0.03)
+EXACT_PART = 2e-6
+"""Least noise, as part of a trial's travel: the integrator is no better."""
+
+LARGEST_DEVIATION = 0.4
+LARGEST_RELEASE_STEP_FRAMES = 2.0
+FEWEST_TO_SPARE = 3
+"""A spread is estimated where this many more trials feel it than there are numbers without a prior."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """What a fit is told instead of finding it: spreads of pressure and B, correlation and variances of the noise."""
+
+    spread: tuple[float, float] | None = None
+    noise: tuple[float, Floats] | None = None
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the iterations ended. `grams` and `columns` belong to `state`, see `whitened` and `sensitivity`."""
+
+    state: State
+    frame: Frame
+    grams: Floats
+    columns: tuple[Floats, ...]
+    estimable: tuple[bool, bool]
+    converged: bool
+    iterations: int
+
+
+def make_frame(predictor: Predictor, own: Floats) -> Frame:
+    """What stays the same during the iterations; `own` holds the first guess of releases and origins."""
+    layout, data = predictor.layout, predictor.data
+    lower, upper = layout.bounds
+    durations = np.array([item.time_s[-1] - item.time_s[0] for item in data])
+    spans = np.array([np.ptp(item.lead_position_m) for item in data])
+    frames = np.array([item.frame_s for item in data])
+    release_sd = np.where([item.n_rest > 0 for item in data], 10 * frames, 3 * durations)
+    return Frame(
+        index=layout.index,
+        feels=np.column_stack([predictor.feels_pressure, predictor.feels_damping]),
+        own_centre=own[:, :2].copy(),
+        own_precision=np.column_stack([1 / release_sd**2, 1 / (3 * spans) ** 2]),
+        prior_mean=layout.start,
+        prior_precision=layout.prior_precision,
+        lower=lower,
+        upper=upper,
+        free=np.ones(lower.size, dtype=bool),
+        points=np.array([float(item.time_s.size) for item in data]),
+        stretches=np.array([float(np.count_nonzero(item.first)) for item in data]),
+    )
+
+
+def first_state(data: Sequence[FitTrial], theta: Floats, own: Floats) -> State:
+    """A state to begin from: noise of the tracks alone, spreads as the sheet and experience say."""
+    weights = np.array([item.time_s.size for item in data], dtype=float)
+    rho = float(np.average([item.correlation for item in data], weights=weights))
+    variance = np.array([item.noise_m**2 * (1 - item.correlation**2) for item in data])
+    return State(theta, own, stated_spreads(data), rho, np.maximum(variance, floor(data)))
+
+
+def stated_spreads(data: Sequence[FitTrial]) -> tuple[float, float]:
+    """Spread of pressure that the sheet states, and 3 % for B."""
+    relative = [
+        item.trial.pressure_sigma_Pa / item.trial.pressure_Pa
+        for item in data
+        if item.trial.pressure_Pa > 0 and np.isfinite(item.trial.pressure_sigma_Pa)
+    ]
+    return (float(np.mean(relative)) if relative else FIRST_SPREADS[0]), FIRST_SPREADS[1]
+
+
+def floor(data: Sequence[FitTrial]) -> Floats:
+    """Least variance of a position that the integrator can answer for, m², shape (n_trials,)."""
+    return np.array([(EXACT_PART * np.ptp(item.lead_position_m)) ** 2 for item in data])
+
+
+def estimable(frame: Frame) -> tuple[bool, bool]:
+    """Whether there are trials enough to estimate the spread of pressure, and that of B."""
+    needed = np.count_nonzero(frame.prior_precision == 0) + FEWEST_TO_SPARE
+    pressure, damping = (bool(np.count_nonzero(frame.feels[:, k]) >= needed) for k in range(2))
+    return pressure, damping
+
+
+def solve(
+    predictor: Predictor,
+    frame: Frame,
+    state: State,
+    held: Held | None = None,
+    *,
+    warm: bool = False,
+    most_iterations: int = MOST_ITERATIONS,
+) -> Solution:
+    """Iterate to the end. `warm` says that the state is near it already.
+
+    Raises
+    ------
+    SimulationError
+        If the trajectories of the start cannot be followed.
+    """
+    held = held or Held()
+    can = (False, False) if held.spread is not None else estimable(frame)
+    if held.spread is not None:
+        state = replace(state, spread=held.spread)
+    if held.noise is not None:
+        state = replace(state, rho=held.noise[0], variance=held.noise[1])
+    damping, converged, iteration = (0.0 if warm else 1e-3), False, 0
+    columns = predictor.linearise(state.theta, state.own)
+    grams = _products(predictor, columns)
+    for iteration in range(1, most_iterations + 1):
+        early = not warm and iteration <= 3
+        before = state
+        state = _update_variances(predictor, frame, grams, state, can, held, early=early, search=iteration == 4)
+        moved = _variances_moved(before, state)
+        step, own_change, promised = newton_step(grams, frame, state, damping)
+        if promised < SETTLED_DECREASE and moved < SETTLED_SPREAD and not early:
+            converged = True
+            break
+        taken, damping = _take_step(predictor, frame, grams, state, step, own_change, damping)
+        if taken is None:
+            # No step helps: a corner of the cost, where a frame meets the end of growth. It is as low as it gets.
+            converged = moved < SETTLED_SPREAD
+            if converged:
+                break
+            continue
+        state = taken
+        columns = predictor.linearise(state.theta, state.own)
+        grams = _products(predictor, columns)
+    return Solution(state, frame, grams, tuple(columns), can, converged, iteration)
+
+
+def _products(predictor: Predictor, columns: Sequence[Floats]) -> Floats:
+    return all_products(columns, [item.first for item in predictor.data])
+
+
+def _update_variances(
+    predictor: Predictor,
+    frame: Frame,
+    grams: Floats,
+    state: State,
+    can: tuple[bool, bool],
+    held: Held,
+    *,
+    early: bool,
+    search: bool,
+) -> State:
+    """Noise and spreads anew; while the trajectories are still far off only the size of what is left."""
+    if held.noise is None:
+        rho, variance = estimate_noise(grams, frame, state, state.rho if early else None)
+        state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
+    if not early and any(can):
+        spread = estimate_spreads(marginal(grams, frame, state), frame, state, can, search=search)
+        state = replace(state, spread=spread)
+    return state
+
+
+def _variances_moved(before: State, after: State) -> float:
+    """Largest relative change among spreads and noise; spreads below a thousandth count as none."""
+    spreads = [abs(np.log((b + 1e-3) / (a + 1e-3))) for a, b in zip(before.spread, after.spread, strict=True)]
+    noise = np.max(np.abs(np.log(after.variance / before.variance)))
+    return float(max(*spreads, noise, abs(after.rho - before.rho)))
+
+
+def _take_step(
+    predictor: Predictor, frame: Frame, grams: Floats, state: State, step: Floats, own_change: Floats, damping: float
+) -> tuple[State | None, float]:
+    """The first of ever more damped steps that lowers the sum of squares, and the damping to go on with."""
+    now = cost(predictor, frame, state)
+    for _ in range(12):
+        theta = np.clip(state.theta + step, frame.lower, frame.upper)
+        try:
+            tried = replace(state, theta=theta, own=_limited(predictor, state.own, own_change))
+            tried = _follow(predictor, frame, tried)
+            better = cost(predictor, frame, tried) < now
+        except SimulationError:
+            better = False
+        if better:
+            return tried, damping * 0.1 if damping > 1e-6 else 0.0
+        damping = max(10 * damping, 1e-4)
+        step, own_change, _ = newton_step(grams, frame, state, damping)
+    return None, 0.0
+
+
+def _follow(predictor: Predictor, frame: Frame, state: State) -> State:
+    """The trials' own numbers brought to their best for the others.
+
+    They are known so well that a step of the shared numbers leaves the valley by its curvature alone.
+    """
+    grams = _products(predictor, predictor.linearise(state.theta, state.own, own_only=True))
+    return replace(state, own=_limited(predictor, state.own, own_step(grams, frame, state)))
+
+
+def _limited(predictor: Predictor, own: Floats, step: Floats) -> Floats:
+    """Own numbers after a step: the release moves by two frames at most, deviations stay below a half."""
+    reach = LARGEST_RELEASE_STEP_FRAMES * np.array([item.frame_s for item in predictor.data])
+    moved = own + step
+    moved[:, RELEASE] = own[:, RELEASE] + np.clip(step[:, RELEASE], -reach, reach)
+    deviations = [PRESSURE, DAMPING_DEVIATION]
+    moved[:, deviations] = np.clip(moved[:, deviations], -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    return moved
+
+
+def cost(predictor: Predictor, frame: Frame, state: State) -> float:
+    """Whitened sum of squares with what the priors add."""
+    residuals = predictor.residuals(state.theta, state.own)
+    total = penalty(frame, state)
+    for item, residual, variance in zip(predictor.data, residuals, state.variance, strict=True):
+        white = whiten(residual, item.first, state.rho)
+        total += float(white @ white) / variance
+    return total
+
+
+__all__ = ["Held", "Solution", "cost", "estimable", "first_state", "make_frame", "solve"]
