@@ -31,8 +31,6 @@ PRIOR_SD = 0.15
 """Relative scatter allowed to amplitude and level of the contrast from frame to frame."""
 MARGIN_PX = 6.0
 """Pixels beyond the blurred edge that take part: they hold amplitude and level."""
-FLOOR_PX = 0.02
-"""No edge in compressed video was ever better than this."""
 ASSUMED_EXPOSURE = 0.25
 """Exposure over frame period until it is estimated."""
 FAINTEST = 0.5
@@ -379,7 +377,10 @@ def _restate(strip: Strip, state: State, fit: Floats, exposure: float) -> State:
 
 
 def _finish(state: State, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
-    edge, sigma = fit[:, 0].copy(), np.hypot(fit[:, 1], FLOOR_PX)
+    core = core_frames(state, fit)
+    # Where the picture departs from the model (a door, a glint) the edge is worse than its curvature says.
+    strain = np.sqrt(np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0))
+    edge, sigma = fit[:, 0].copy(), fit[:, 1] * strain**2
     # A box of uniform dwell stands for the exposure: its middle is the mean position, ahead of mid-exposure by aτ²/24.
     bend = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
     edge = edge - np.clip(bend, -50, 50) * exposure**2 / 24

@@ -136,20 +136,23 @@ def gather(
 def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise: float, texture: float) -> np.ndarray:
     """Brightness after and before the edge at every pixel, and the variance about each; shape (4, n_across, n_along).
 
-    A pixel that never shows one of the two takes it, by `ridge`, from its row: film from the columns behind it,
-    background from those ahead, with weights falling as `memory`^distance; its variance is then `texture`².
+    A pixel that never shows one of the two, or whose background changes (a door swings there), takes it from its row:
+    film from the columns behind it, background from those ahead, with weights falling as `memory`^distance; its
+    variance is then `texture`².
     """
     _, rows, columns = sums.shape
     out = np.empty((4, rows, columns), np.float32)
     guess = np.empty(columns)
+    unsteady = (1.5 * texture) ** 2
     for u in range(rows):
         total, count, level = 0.0, 0.0, fallback
         for s in range(columns - 1, -1, -1):
             if count > 1e-3:
                 level = total / count
             guess[s] = level
-            total = total * memory + sums[6, u, s]
-            count = count * memory + sums[5, u, s]
+            steady = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise) < unsteady
+            total = total * memory + (sums[6, u, s] if steady else 0.0)
+            count = count * memory + (sums[5, u, s] if steady else 0.0)
         for s in range(columns - 1, -1, -1):
             if guess[s] != fallback:
                 break
@@ -163,22 +166,25 @@ def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise:
             total = total * memory + sums[9, u, s]
             count = count * memory + sums[8, u, s]
             # Never seen bare: what a half-covered pixel seems to show would follow any error of the edge.
-            bare, film = sums[5, u, s] > 0.1, sums[8, u, s] > 0.1
-            rq = ridge if bare else 50 * (1 + sums[0, u, s])
-            rp = ridge if film else 50 * (1 + sums[2, u, s])
+            own = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise)
+            bare, film = sums[5, u, s] > 0.1 and own < unsteady, sums[8, u, s] > 0.1
+            rq = ridge if bare else 1e4 * (1 + sums[0, u, s])
+            rp = ridge if film else 1e4 * (1 + sums[2, u, s])
             qq, qp, pp = sums[0, u, s] + rq, sums[1, u, s], sums[2, u, s] + rp
             vq, vp = sums[3, u, s] + rq * guess[s], sums[4, u, s] + rp * level
             det = qq * pp - qp * qp
             out[0, u, s] = (vp * qq - vq * qp) / det
             out[1, u, s] = (vq * pp - vp * qp) / det
             out[2, u, s] = _variance(sums[8, u, s], sums[9, u, s], sums[10, u, s], noise) if film else texture**2
-            out[3, u, s] = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise) if bare else texture**2
+            out[3, u, s] = own if bare else texture**2
     return out
 
 
 @njit(cache=True)
 def _variance(weight: float, total: float, squares: float, noise: float) -> float:
     """Variance of what a pixel showed, never below that of the noise, drawn towards it where few frames speak."""
+    if weight <= 0:
+        return noise**2
     own = max(squares / weight - (total / weight) ** 2, 0.0)
     return max((weight * own + 2 * noise**2) / (weight + 2), noise**2)
 

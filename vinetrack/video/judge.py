@@ -17,6 +17,8 @@ Bools = NDArray[np.bool_]
 
 LOST_SIGMA_PX = 4.0
 """A point known no better than this is no point."""
+FLOOR_PX = 0.06
+"""Errors that wander with film and background over many frames do not show as roughness: measured 0.04-0.09 px."""
 STEP_RATIO = 1.6
 """A step this many times its neighbours is no acceleration: a frame is missing."""
 
@@ -36,19 +38,19 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: fl
     """Stated errors scaled to the roughness of the track itself, shape (n_frames,).
 
     Fourth differences cancel any cubic motion and have variance Σ c² σ², c = (1, −4, 6, −4, 1). Their median size in
-    units of the stated errors is the factor; it is left at 1 where fewer than 8 of them exist.
+    units of the stated errors is the factor, left at 1 where fewer than 8 of them exist; FLOOR_PX is added in square.
     """
     weights = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
     if len(edge_px) < 5:
-        return sigma_px.copy()
+        return np.hypot(sigma_px, FLOOR_PX)
     windows = np.lib.stride_tricks.sliding_window_view
     difference = windows(edge_px, 5) @ weights
     expected = np.sqrt(windows(sigma_px**2, 5) @ weights**2)
     inside = windows(use, 5).all(axis=1) & np.isfinite(difference) & (expected > 0)
     if inside.sum() < 8:
-        return sigma_px.copy()
+        return np.hypot(sigma_px, FLOOR_PX)
     factor = 1.4826 * float(np.median(np.abs(difference[inside] / expected[inside])))
-    return sigma_px * float(np.clip(factor, smallest, 6.0))
+    return np.hypot(sigma_px * float(np.clip(factor, smallest, 6.0)), FLOOR_PX)
 
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
