@@ -44,8 +44,8 @@ def draw_exponents(damping: dict[str, Any], published: dict[str, Any] | None = N
     fits = {name: fit for name in METHOD_NAMES if (fit := damping.get(name) or {}).get("vines")}
     if not fits:
         return blank("No damping law could be fitted, so there is no exponent to show.")
-    vines = list(dict.fromkeys(vine for fit in fits.values() for vine in fit["vines"]))[:MAX_VINES]
     best = {vine: law for fit in fits.values() for vine, law in fit["vines"].items()}
+    vines = sorted(best, key=lambda vine: (best[vine]["diameter_mm"], best[vine]["thickness_um"], vine))[:MAX_VINES]
     with look():
         fig = Figure(figsize=(9.4, 1.9 + max(0.5 * len(vines), 1.2)), layout="constrained")
         left, right = fig.subplots(1, 2, width_ratios=(1, 1.35))

@@ -56,8 +56,8 @@ def tally(trials: pd.DataFrame) -> str:
 
 
 def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """One row a vine and method: size, B and its intervals, R² and N, as text."""
-    table = []
+    """One row a vine and method, smallest vine first: size, B and its intervals, R² and N, as text."""
+    table, sizes = [], []
     for method, method_name in TABLE_METHODS.items():
         for vine, law in ((damping.get(method) or {}).get("vines") or {}).items():
             table.append(
@@ -72,7 +72,9 @@ def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
                     "n_trials": str(law["n_trials"]),
                 }
             )
-    return table
+            sizes.append((law["diameter_mm"], law["thickness_um"], vine))
+    order = sorted(range(len(table)), key=lambda i: sizes[i])
+    return [table[i] for i in order]
 
 
 def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
