@@ -185,22 +185,23 @@ def slope(
     """
     member = data.member
     n = np.full(counts.shape[0], 0.4)
-    for _ in range(60):
-        weight = counts / (force_variance + n[:, None] ** 2 * speed_variance)
-        total = weight @ member
-        with np.errstate(invalid="ignore", divide="ignore"):
+    drawn = counts > 0
+    often = np.where(drawn, counts, 1.0)
+    # A resample of one point over and over has no slope: it runs off to infinity here and is dropped by the caller.
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        for _ in range(60):
+            weight = counts / (force_variance + n[:, None] ** 2 * speed_variance)
+            total = weight @ member
             mean_x = (weight * data.log_speed) @ member / total
             mean_y = (weight * log_force) @ member / total
-        dx, dy = data.log_speed - mean_x[:, data.vine], log_force - mean_y[:, data.vine]
-        drawn = counts > 0
-        dx, dy = np.where(drawn, dx, 0.0), np.where(drawn, dy, 0.0)
-        lever = weight * (dx * force_variance + n[:, None] * dy * speed_variance) / np.where(drawn, counts, 1.0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            update = np.sum(weight * lever * dy, axis=1) / np.sum(weight * lever * dx, axis=1)
-        settled = np.nanmax(np.abs(update - n), initial=0.0) < 1e-10
-        n = update
-        if settled:
-            break
+            dx = np.where(drawn, data.log_speed - mean_x[:, data.vine], 0.0)
+            dy = np.where(drawn, log_force - mean_y[:, data.vine], 0.0)
+            lever = weight**2 * (dx * force_variance + n[:, None] * dy * speed_variance) / often
+            update = np.sum(lever * dy, axis=1) / np.sum(lever * dx, axis=1)
+            settled = np.nanmax(np.abs(update - n), initial=0.0) < 1e-10
+            n = update
+            if settled:
+                break
     return n, mean_y - n[:, None] * mean_x
 
 
