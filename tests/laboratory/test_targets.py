@@ -41,7 +41,7 @@ def crossings(picture: np.ndarray, near: np.ndarray) -> np.ndarray:
         def misfit(p, x=x, y=y, levels=levels):
             a = ((x - p[0]) * np.cos(p[2]) + (y - p[1]) * np.sin(p[2])) / p[4]
             b = ((x - p[0]) * np.cos(p[3]) + (y - p[1]) * np.sin(p[3])) / p[4]
-            return (p[5] + p[7] * (x - x0) + p[8] * (y - y0) + p[6] * erf(a) * erf(b) - levels).ravel()
+            return (p[5] + p[7] * (x - x.mean()) + p[8] * (y - y.mean()) + p[6] * erf(a) * erf(b) - levels).ravel()
 
         starts = [[*corner, 0.0, np.pi / 2, 1.0, levels.mean(), sign * levels.std(), 0, 0] for sign in (1, -1)]
         fits = [least_squares(misfit, start, method="lm") for start in starts]

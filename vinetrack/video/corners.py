@@ -25,8 +25,9 @@ MARKER_OUTLIER = 0.3
 MARKER_TOLERANCE = 0.10
 """Markers that differ from `marker_mm` by more than this, as a share of it, were printed at another size. Blur alone
 makes small ones (25 px) look 4 % smaller."""
-OTHER_DICTIONARIES = tuple(f"DICT_{n}X{n}_{words}" for n in (4, 5, 6, 7) for words in (50, 100, 250, 1000))
-OTHER_DICTIONARIES += ("DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11")
+DICTIONARY_SIZES = (50, 100, 250, 1000)
+"""Words in OpenCV's dictionaries of each marker size; a smaller one is the beginning of a larger."""
+OTHER_DICTIONARIES = (*(f"DICT_{n}X{n}" for n in (4, 5, 6, 7)), "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11")
 
 
 class CornersError(ValueError):
@@ -125,9 +126,7 @@ def _words(name: str) -> Any:
 
     code = getattr(cv2.aruco, name, None)
     if code is None:
-        raise CornersError(
-            f"there is no marker dictionary {name}; choose one such as {', '.join(OTHER_DICTIONARIES[:4])}"
-        )
+        raise CornersError(f"there is no marker dictionary {name}; choose one such as DICT_4X4_100")
     return cv2.aruco.getPredefinedDictionary(code)
 
 
@@ -221,16 +220,22 @@ def _is_a_grid(corners_px: NDArray[Any]) -> bool:
 def _too_few(n: int, why: str) -> str:
     return (
         f"only {n} corners of the board can be read ({why}; at least {FEWEST_CORNERS}, not on one line, are needed); "
-        "show more of it, larger, in focus and evenly lit"
+        "show more of it, larger, in focus, evenly lit and not mirrored"
     )
 
 
 def _no_markers(grey: Grey, dictionary: str) -> str:
     """Say that there are no markers, and name the dictionary whose markers are there, if any."""
-    seen = {name: len(_markers(grey, _words(name))[1]) for name in OTHER_DICTIONARIES if name != dictionary}
-    best = max(seen, key=lambda name: seen[name])
-    if seen[best] >= 3:
-        return f"no marker of {dictionary} is seen, but {seen[best]} of {best}; correct `dictionary`"
+    best, numbers = "", np.empty(0, int)
+    for name in OTHER_DICTIONARIES:
+        family = f"{name}_{DICTIONARY_SIZES[-1]}" if name[-2] == "X" else name
+        ids = _markers(grey, _words(family))[1].ravel()
+        if name not in dictionary and len(ids) > len(numbers):
+            best, numbers = name, ids
+    if len(numbers) >= 3:
+        enough = next((size for size in DICTIONARY_SIZES if size > numbers.max()), DICTIONARY_SIZES[-1])
+        found = f"{best}_{enough}" if best[-2] == "X" else best
+        return f"no marker of {dictionary} is seen, but {len(numbers)} of {found}; correct `dictionary`"
     return (
         f"no marker of {dictionary} is seen; check `dictionary`, and that the board is in the picture, in focus, "
         "not mirrored and larger than 5 pixels a marker bit"
