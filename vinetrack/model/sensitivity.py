@@ -1,7 +1,8 @@
 """How the predicted positions of every trial answer to what a fit may move.
 
 Per trial there are four numbers of its own: the instant of release, the origin of position, the relative deviation of
-its pressure from what was set, and that of its B from its vine's, as a difference of logarithms. Behind them come the free numbers of the model.
+its pressure from what was set, and that of its B from its vine's, as a difference of logarithms. Behind them come the
+free numbers of the model.
 All trajectories, moved and unmoved, are simulated in one call.
 """
 

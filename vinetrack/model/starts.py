@@ -41,7 +41,7 @@ def candidates(layout: Layout, data: Sequence[FitTrial], predictor: Predictor) -
     own = first_own(data)
     tries = [sorted({number.start, *number.tries}) if number.tries else [number.start] for number in layout.free]
     combined = list(itertools.islice(itertools.product(*tries), 12))
-    found = []
+    found: list[tuple[Floats, Floats]] = []
     for values in combined:
         theta = np.array([number.inside(value) for value, number in zip(values, layout.free, strict=True)])
         found += _scan(layout, data, predictor, theta, own) if DAMPING in layout.keys else [(theta, own)]

@@ -1,0 +1,199 @@
+"""Fit a model to the measured trajectories of an experiment.
+
+    fit = vinetrack.fit(model, experiment)
+    print(fit)
+
+Positions are compared, not derivatives. Free are B of each vine, n, the yield pressure within the error the sheet gives
+it, and every parameter of further effects. Each trial has a release, an origin, and deviations of pressure and of B of
+its own, whose spreads are estimated: left out, they would be taken for missing physics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinetrack.model.assemble import assemble
+from vinetrack.model.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
+from vinetrack.model.fit_result import Fit, TrialFit
+from vinetrack.model.free import make_layout
+from vinetrack.model.left_out import predict_trials
+from vinetrack.model.mixed import deviance, marginal
+from vinetrack.model.model import Model, Value
+from vinetrack.model.sensitivity import Predictor
+from vinetrack.model.simulate import SimulationError
+from vinetrack.model.solve import Held, Solution, first_state, make_frame, solve
+from vinetrack.model.starts import candidates
+from vinetrack.records import Track
+
+if TYPE_CHECKING:
+    from vinetrack.experiment import Experiment
+
+__all__ = ["FitError", "fit", "predict", "refit"]
+
+POOR_FIT = 3.0
+"""χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried."""
+
+MOST_STARTS = 3
+
+
+def fit(
+    model: Model,
+    experiment: Experiment | Path | str | Pairs,
+    *,
+    tracks: Mapping[str, Track] | None = None,
+    fixed: Iterable[str] = (),
+    free: Iterable[str] = (),
+    shared: Mapping[str, str] | None = None,
+    start: Mapping[str, Value] | None = None,
+    spreads: tuple[float, float] | None = None,
+    noise: tuple[float, float] | None = None,
+    profile: bool = True,
+) -> Fit:
+    """Fit a model to all trials of an experiment.
+
+    Parameters
+    ----------
+    experiment
+        An experiment or its folder, or pairs of trial and track.
+    tracks
+        Tracks by name of trial, where the experiment brings recordings.
+    fixed, free
+        Parameters to hold at the model's values, or to fit although known beforehand (g). `n` will do for
+        `eversion_damping.n` where no other effect has an n; the yield pressure is `P_y`.
+    shared
+        `"all"` or `"vine"` by name of parameter, in place of what the effect says.
+    start
+        Values of further parameters to begin from; B and n are always looked for.
+    spreads
+        Relative spread of pressure and of B from trial to trial, in place of their estimates.
+    noise
+        Standard deviation of a position, m, and its lag-one correlation, in place of their estimates.
+    profile
+        Whether intervals near a bound are found by profile, which costs a few refits each.
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit, or the fit does not begin; the message is one sentence.
+    EffectError
+        If a trial lacks what an effect of the model needs.
+    ExperimentError
+        If the experiment cannot be read.
+    """
+    pairs, left_out = pairs_of(experiment, tracks)
+    data, unusable = prepare(pairs)
+    left_out = {**left_out, **unusable}
+    if not data:
+        reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())
+        raise FitError(f"No trial can be fitted: {reasons or 'there is none'}.")
+    fixed, free = tuple(fixed), tuple(free)
+    options = {"fixed": fixed, "free": free, "shared": dict(shared or {})}
+    layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
+    predictor = Predictor(layout, data)
+    held = _held(spreads, noise, data)
+    solution = _solve_from_scratch(predictor, held)
+    return assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
+
+
+def _held(spreads: tuple[float, float] | None, noise: tuple[float, float] | None, data: list[FitTrial]) -> Held:
+    if noise is None:
+        return Held(spreads)
+    sigma_m, rho = noise
+    return Held(spreads, (rho, np.full(len(data), sigma_m**2 * (1 - rho**2))))
+
+
+def _solve_from_scratch(predictor: Predictor, held: Held) -> Solution:
+    """The best of the solutions from the likeliest starts; the first will do where it explains the data."""
+    found: list[tuple[float, Solution]] = []
+    reason = ""
+    for _, theta, own in candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]:
+        frame = make_frame(predictor, own)
+        try:
+            solution = solve(predictor, frame, first_state(predictor.data, theta, own), held)
+        except SimulationError as error:
+            reason = str(error)
+            continue
+        part = marginal(solution.grams, frame, solution.state)
+        found.append((deviance(part, frame, solution.state, solution.state.spread), solution))
+        if solution.converged and excess(predictor, solution) < POOR_FIT:
+            break
+    if not found:
+        raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
+    return min(found, key=lambda one: one[0])[1]
+
+
+def excess(predictor: Predictor, solution: Solution) -> float:
+    """Variance that the model leaves against that of the noise of the tracks alone."""
+    alone = np.array([item.noise_m**2 * (1 - item.correlation**2) for item in predictor.data])
+    weights = solution.frame.points
+    return float(np.sum(weights * solution.state.variance) / max(np.sum(weights * alone), 1e-300))
+
+
+def refit(
+    before: Fit,
+    model: Model | None = None,
+    *,
+    fixed: Iterable[str] | None = None,
+    free: Iterable[str] | None = None,
+    start: Mapping[str, Value] | None = None,
+    hold_spreads: bool = False,
+    hold_noise: bool = False,
+    profile: bool = False,
+) -> Fit:
+    """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
+
+    Parameters
+    ----------
+    model
+        The other model; its values are those of the fit where it has the same parameters.
+    start
+        Values of parameters to begin from, of a new effect above all: a time constant begun at zero stays there.
+    hold_spreads, hold_noise
+        Keep spreads and noise of the fit instead of estimating them again.
+    """
+    model = model or before.model
+    known = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
+    model = model.with_values({**known, **(start or {})})
+    data, old = before.predictor.data, before.solution.state
+    names = {*model.parameter_names, "yield_pressure.P_y"}
+    kept = {
+        key: tuple(name for name in before.options[key] if _belongs(name, names)) if given is None else tuple(given)
+        for key, given in (("fixed", fixed), ("free", free))
+    }
+    shared = {name: how for name, how in before.options["shared"].items() if _belongs(name, names)}
+    layout = make_layout(model, data, fixed=kept["fixed"], free=kept["free"], shared=shared)
+    predictor = Predictor(layout, data)
+    frame = replace(make_frame(predictor, old.own), own_centre=before.solution.frame.own_centre)
+    theta = layout.start
+    values = {number.name: number.value for number in before.numbers}
+    for k, number in enumerate(layout.free):
+        if number.name in values and number.key not in (start or {}):
+            theta[k] = number.inside(float(np.clip(values[number.name], number.lower, number.upper)))
+    held = Held(old.spread if hold_spreads else None, (old.rho, old.variance) if hold_noise else None)
+    try:
+        solution = solve(predictor, frame, replace(old, theta=theta), held, warm=True)
+    except SimulationError as error:
+        raise FitError(f"The model cannot be followed from this start: {error}") from error
+    return assemble(predictor, solution, before.left_out, {**kept, "shared": shared, "held": held}, profile=profile)
+
+
+def _belongs(name: str, names: Iterable[str]) -> bool:
+    return any(name in (full, full.split(".")[1]) for full in names)
+
+
+def predict(found: Fit, pairs: Pairs) -> list[TrialFit]:
+    """What a fitted model says of trials that were not in the fit.
+
+    Each gets its own release and origin, nothing else: its deviations of pressure and B are zero.
+
+    Raises
+    ------
+    FitError
+        If a trial cannot be used, or its vine was not in the fit and B is one per vine.
+    """
+    return predict_trials(found, pairs)

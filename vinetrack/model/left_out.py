@@ -1,0 +1,91 @@
+"""What a fitted model says of trials it has not seen: their release and origin are found, nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinetrack.effects import EffectError
+from vinetrack.model.assemble import trial_fit
+from vinetrack.model.fit_data import FitError, FitTrial, Pairs, prepare_trial
+from vinetrack.model.free import YIELD_PRESSURE, Layout
+from vinetrack.model.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.model.simulate import SimulationError
+from vinetrack.model.starts import align, first_own
+from vinetrack.model.whitened import all_products, at_correlation
+from vinetrack.records import Floats, Track, Trial
+
+if TYPE_CHECKING:
+    from vinetrack.model.fit_result import Fit, TrialFit
+
+MOST_STEPS = 20
+SETTLED_FRAMES = 1e-3
+
+
+def predict_trials(found: Fit, pairs: Pairs) -> list[TrialFit]:
+    """Trials with their own release and origin, deviations zero; see `vinetrack.model.fit.predict`."""
+    data = [_known_yield(found, _prepared(trial, track)) for trial, track in pairs]
+    layout = _nothing_free(found, data)
+    predictor = Predictor(layout, data)
+    nothing = np.empty(0)
+    try:
+        own, _ = align(data, predictor, nothing, first_own(data))
+        own = _settle(found, predictor, own)
+        columns = predictor.linearise(nothing, own)
+        moved = predictor.run(predictor.jobs(nothing, own))
+    except SimulationError as error:
+        raise FitError(f"The model cannot be followed: {error}") from error
+    rho, variance = found.noise_correlation, found.noise_m**2 * (1 - found.noise_correlation**2)
+    square = _square(columns, data, rho) / variance
+    sigma = np.zeros((len(data), OWN))
+    sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square[:, :2, :2], hermitian=True)))
+    return [
+        trial_fit(item, own[i], sigma[i], moved[i].observed_position_m, moved[i].lead_velocity_m_s, rho, variance)
+        for i, item in enumerate(data)
+    ]
+
+
+def _prepared(trial: Trial, track: Track) -> FitTrial:
+    try:
+        return prepare_trial(trial, track)
+    except FitError as error:
+        raise FitError(f"Trial {trial.name}: {error}.") from error
+
+
+def _known_yield(found: Fit, item: FitTrial) -> FitTrial:
+    """The trial with the yield pressure that the fit found for its vine, where it found one."""
+    for number in found.numbers:
+        if number.key == YIELD_PRESSURE and number.vine == item.trial.vine:
+            return replace(item, trial=replace(item.trial, yield_pressure_Pa=number.value))
+    return item
+
+
+def _nothing_free(found: Fit, data: Sequence[FitTrial]) -> Layout:
+    try:
+        base = np.array([found.model.parameters_for(item.trial.vine) for item in data])
+    except EffectError as error:
+        raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
+    base = base.reshape(len(data), len(found.model.parameter_names))
+    return Layout(found.model, (), (), np.zeros((len(data), 0), dtype=int), base)
+
+
+def _square(columns: Sequence[Floats], data: Sequence[FitTrial], rho: float) -> Floats:
+    return at_correlation(all_products(columns, [item.first for item in data]), rho)
+
+
+def _settle(found: Fit, predictor: Predictor, own: Floats) -> Floats:
+    """Newton's steps in release and origin, no longer than two frames."""
+    frames = np.array([item.frame_s for item in predictor.data])
+    for _ in range(MOST_STEPS):
+        square = _square(predictor.linearise(np.empty(0), own), predictor.data, found.noise_correlation)
+        step = np.einsum("nij,nj->ni", np.linalg.pinv(square[:, :2, :2], hermitian=True), square[:, :2, -1])
+        step[:, RELEASE] = np.clip(step[:, RELEASE], -2 * frames, 2 * frames)
+        own = own.copy()
+        own[:, :2] += step
+        if np.all(np.abs(step[:, RELEASE]) < SETTLED_FRAMES * frames):
+            break
+    own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+    return own
