@@ -152,7 +152,7 @@ def _follow(
     if trial.travel_ratio == 1:
         from vinetrack.video.body import track_body
 
-        strip = cut_strip(luma, axis, 1.5 * half + 8)
+        strip = cut_strip(luma, axis, 1.5 * half + 12)
         fit = track_body(strip)
         return strip, _Edge(fit.position_px, fit.sigma_px, fit.unsure, fit.blur_px, exposure_frames)
     wide = half * 1.3 + (0.04 * axis.length_px if given else 3.0)
@@ -218,7 +218,7 @@ def odd_frames(luma: NDArray[Any]) -> NDArray[np.bool_]:
 def _repeated(strip: Strip, edge_px: Floats) -> NDArray[np.bool_]:
     """Frames whose surroundings of the edge are those of the frame before, shape (n,).
 
-    Compared with the noise of a moving picture: a fresh exposure differs at least by that.
+    Compared with what changes where the edge moves; and it must stand still between frames that show it moving on.
     """
     n, _, columns = strip.values.shape
     change = np.full(n, np.inf)
@@ -231,9 +231,12 @@ def _repeated(strip: Strip, edge_px: Floats) -> NDArray[np.bool_]:
     moving = np.zeros(n, dtype=bool)
     moving[1:] = np.diff(edge_px) > 1.0
     usual = float(np.median(change[moving])) if moving.any() else np.inf
-    still = np.zeros(n, dtype=bool)
-    still[1:] = np.abs(np.diff(edge_px)) < 0.5
-    return still & (change < 0.15 * usual)
+    repeated = np.zeros(n, dtype=bool)
+    for i in range(2, n - 1):
+        usual_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
+        stands = abs(edge_px[i] - edge_px[i - 1]) < 0.1 * usual_step
+        repeated[i] = usual_step > 2.0 and stands and change[i] < 0.15 * usual
+    return repeated
 
 
 def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str) -> list[str]:

@@ -1,0 +1,232 @@
+"""A finite body that moves as a whole (travel ratio 1), registered against itself along the axis.
+
+It leaves background behind it, perhaps dark on dark, so there is no film to compare with: a template is cut where the
+body is best seen, found again in every frame by correlation, refined by robust least squares with gain and level
+free, and replaced by the mean of what was found. Each pixel of the template counts by how little it varies from frame
+to frame: the body's own marks much, background that shows beside it little. The reported point is fixed on the body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.video.strip import Strip
+
+Floats = NDArray[np.float64]
+
+SEARCH_ROWS = 8
+"""Rows across by which the body may stray from the axis, from frame to frame of the search."""
+SEARCH_PX = 14
+"""Distance along the axis searched about the expected place."""
+STEPS = 8
+REFINEMENTS = 3
+MISPLACED_PX = 0.5
+"""Misplacement that the weights of the template forgive."""
+POOR_MATCH = 0.6
+"""Correlation with the template under which a point is doubtful."""
+
+
+@dataclass(frozen=True)
+class BodyFit:
+    """Position of the body along the strip, arrays of shape (n_frames,).
+
+    `position_px` is the column of the template's middle at mid-exposure, `across_px` its place across, `sigma_px` the
+    random error along, `match` the correlation with the template, `unsure` where that is poor or the body is cut by
+    the strip's end. `blur_px` is the half length of the body.
+    """
+
+    position_px: Floats
+    across_px: Floats
+    sigma_px: Floats
+    match: Floats
+    unsure: NDArray[np.bool_]
+    blur_px: float
+
+
+def track_body(strip: Strip) -> BodyFit:
+    """Register the moving body of a strip against itself.
+
+    Raises
+    ------
+    RecordingError
+        Where nothing moves along the strip.
+    """
+    from vinetrack.video.frames import RecordingError
+
+    pictures = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
+    pictures += strip.offset[:, None, None].astype(np.float32)
+    path, half = _coarse_path(pictures, strip.noise)
+    if np.isfinite(strip.axis.width_px):
+        # A body is about as long as it is wide, a glint on it is not.
+        half = max(half, round(0.75 * strip.axis.width_px))
+    if np.ptp(path) < 3:
+        raise RecordingError("nothing moves along the axis")
+    seed = _best_seen(path, half, pictures.shape[2])
+    template = _cut(pictures[seed], path[seed], 0.0, half)
+    weight = np.ones_like(template)
+    place = np.column_stack([path, np.zeros(len(path))])
+    for turn in range(REFINEMENTS):
+        place, error, match = _find_all(pictures, template, weight, place, half, first=turn == 0)
+        template, weight = _mean_template(pictures, place, match, half, strip.noise)
+    place, error, match = _find_all(pictures, template, weight, place, half, first=False)
+    inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
+    return BodyFit(place[:, 0], place[:, 1], error, match, ~inside | (match < POOR_MATCH), float(half))
+
+
+def _coarse_path(pictures: NDArray[np.float32], noise: float) -> tuple[Floats, int]:
+    """Middle of the body by frame, to a few pixels, and half its length along the axis.
+
+    Background is the median over frames spread evenly over the changes: a body that rests for long does not become
+    part of it.
+    """
+    n = len(pictures)
+    change = np.zeros(n)
+    change[1:] = np.abs(np.diff(pictures[:, ::2, ::2], axis=0)).clip(max=40).mean(axis=(1, 2))
+    total = np.cumsum(np.clip(change - 1.2 * float(np.quantile(change, 0.1)), 0, None) + 1e-3)
+    picks = np.unique(np.searchsorted(total, np.linspace(total[0], total[-1], min(n, 41))).clip(0, n - 1))
+    background = np.median(pictures[picks], axis=0)
+    strange = np.clip(np.abs(pictures - background) - 3 * noise, 0, 60).sum(axis=1)
+    half = _half_length(strange)
+    box = np.ones(2 * half + 1)
+    score = np.stack([np.convolve(row, box, mode="same") for row in strange])
+    return _forward_path(score / (float(np.quantile(score, 0.98)) + 1e-9)), half
+
+
+def _half_length(strange: NDArray[np.float32]) -> int:
+    """Half the length of what differs from the background: from the width of its autocorrelation along the axis."""
+    rows = strange[np.argsort(strange.sum(axis=1))[len(strange) // 2 :]]
+    rows = rows - rows.mean(axis=1, keepdims=True)
+    spectrum = np.abs(np.fft.rfft(rows, n=2 * rows.shape[1], axis=1)) ** 2
+    correlation = np.fft.irfft(spectrum.mean(axis=0))[: rows.shape[1] // 3]
+    below = np.flatnonzero(correlation < 0.35 * correlation[0])
+    width = int(below[0]) if len(below) else rows.shape[1] // 6
+    return int(np.clip(0.8 * width, 6, rows.shape[1] // 5))
+
+
+def _forward_path(score: Floats) -> Floats:
+    """Place by frame that never goes back and collects most score, each step weighed by how far it departs from rest."""
+    n, columns = score.shape
+    best = np.zeros_like(score)
+    came = np.zeros(score.shape, dtype=int)
+    best[0] = score[0]
+    for t in range(1, n):
+        running = np.maximum.accumulate(best[t - 1])
+        new = np.concatenate([[True], best[t - 1][1:] > running[:-1]])
+        came[t] = np.maximum.accumulate(np.where(new, np.arange(columns), 0))
+        best[t] = running + score[t]
+    path = np.zeros(n)
+    place = int(np.argmax(best[-1]))
+    for t in range(n - 1, -1, -1):
+        path[t] = place
+        place = came[t, place]
+    return path
+
+
+def _best_seen(path: Floats, half: int, columns: int) -> int:
+    """A frame in which the whole body is inside and on its way, near the middle of those."""
+    whole = np.flatnonzero((path > 1.3 * half) & (path < columns - 1 - 1.3 * half))
+    moving = [i for i in whole if 0 < i < len(path) - 1 and path[i + 1] > path[i - 1]]
+    chosen = np.array(moving) if len(moving) else whole
+    return int(chosen[len(chosen) // 2]) if len(chosen) else len(path) // 2
+
+
+def _cut(picture: NDArray[np.float32], along: float, across: float, half: int) -> NDArray[np.float32]:
+    """Patch of 2 half + 1 columns about (along, across), all rows but SEARCH_ROWS on each side, bicubic."""
+    import cv2
+
+    rows = picture.shape[0] - 2 * SEARCH_ROWS
+    length = 2 * half + 1
+    centre = (float(along), (picture.shape[0] - 1) / 2 + float(across))
+    matrix = np.array([[1.0, 0.0, centre[0] - half], [0.0, 1.0, centre[1] - (rows - 1) / 2]])
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(picture, matrix, (length, rows), flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _find_all(
+    pictures: NDArray[np.float32], template: NDArray[np.float32], weight: NDArray[np.float32], place: Floats, half: int,
+    first: bool,
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
+    """Place (n, 2) along and across, its error along (n,) and correlation (n,) in every frame."""
+    out, error, match = place.copy(), np.full(len(place), np.nan), np.zeros(len(place))
+    slope_across, slope_along = np.gradient(template)
+    for t, picture in enumerate(pictures):
+        guess = place[t]
+        if first:
+            guess = _by_correlation(picture, template, place[t], half)
+        out[t], error[t], match[t] = _refine(picture, template, weight, slope_along, slope_across, guess, half)
+    return out, error, match
+
+
+def _by_correlation(picture: NDArray[np.float32], template: NDArray[np.float32], guess: Floats, half: int) -> Floats:
+    """Whole-pixel place of the best correlation about `guess`."""
+    import cv2
+
+    reach = SEARCH_PX + half // 2
+    low = int(np.clip(guess[0] - half - reach, 0, max(picture.shape[1] - template.shape[1], 0)))
+    high = int(np.clip(guess[0] + half + reach + 1, low + template.shape[1], picture.shape[1]))
+    if high - low < template.shape[1]:
+        return guess
+    score = cv2.matchTemplate(np.ascontiguousarray(picture[:, low:high]), template, cv2.TM_CCOEFF_NORMED)
+    row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+    return np.array([low + column + half, row - SEARCH_ROWS], dtype=float)
+
+
+def _refine(
+    picture: NDArray[np.float32], template: NDArray[np.float32], weight: NDArray[np.float32],
+    slope_along: NDArray[np.float32], slope_across: NDArray[np.float32], guess: Floats, half: int,
+) -> tuple[Floats, float, float]:  # fmt: skip
+    """Gauss-Newton on place, gain and level, robust by 1/(1 + (r/3s)²); error along the axis and correlation."""
+    place = guess.astype(float).copy()
+    design = np.stack([slope_along, slope_across, template, np.ones_like(template)]).reshape(4, -1).astype(float)
+    flat = weight.ravel().astype(float)
+    sigma, correlation = np.nan, 0.0
+    robust = flat
+    for _ in range(STEPS):
+        patch = _cut(picture, place[0], place[1], half).ravel().astype(float)
+        weighted = design * robust
+        normal = weighted @ design.T + np.diag([1e-9, 1e-9, 1e-9, 1e-9])
+        solution = np.linalg.solve(normal, weighted @ patch)
+        residual = patch - solution @ design
+        size = 1.4826 * float(np.median(np.abs(residual * np.sqrt(flat)))) + 1e-6
+        robust = flat / (1 + residual**2 * flat / (9 * size**2))
+        gain = max(float(solution[2]), 0.1)
+        step = solution[:2] / gain
+        # patch(x) = gain · template(x + step): the body lies `step` behind the place looked at.
+        place -= np.clip(step, -2, 2)
+        place[1] = np.clip(place[1], -SEARCH_ROWS, SEARCH_ROWS)
+        if np.abs(step).max() < 2e-3:
+            break
+    inverse = np.linalg.pinv(normal)
+    spread = float(np.sum(robust * residual**2) / max(np.sum(robust > 0.2 * flat) - 4, 1))
+    sigma = float(np.sqrt(max(inverse[0, 0], 0.0) * spread)) / gain
+    model = solution[2] * design[2] + solution[3]
+    centred, other = patch - np.average(patch, weights=flat), model - np.average(model, weights=flat)
+    power = np.sqrt(np.sum(flat * centred**2) * np.sum(flat * other**2))
+    correlation = float(np.sum(flat * centred * other) / power) if power > 0 else 0.0
+    return place, sigma, correlation
+
+
+def _mean_template(
+    pictures: NDArray[np.float32], place: Floats, match: Floats, half: int, noise: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Median of what was found, and each pixel's weight: the inverse of its variance from frame to frame."""
+    whole = (place[:, 0] > 1.1 * half) & (place[:, 0] < pictures.shape[2] - 1 - 1.1 * half)
+    good = np.flatnonzero(whole & (match >= np.quantile(match, 0.3)))
+    if len(good) < 3:
+        good = np.argsort(match)[-3:]
+    good = good[np.unique(np.linspace(0, len(good) - 1, min(len(good), 60)).astype(int))]
+    stack = np.stack([_cut(pictures[t], place[t, 0], place[t, 1], half) for t in good])
+    first = np.median(stack, axis=0)
+    inner = first - first.mean()
+    gains = np.einsum("tij,ij->t", stack, inner) / float(np.sum(inner**2) + 1e-9)
+    stack = stack / np.clip(gains, 0.3, 3.0)[:, None, None]
+    stack -= np.median(stack - first, axis=(1, 2), keepdims=True)
+    template = np.median(stack, axis=0).astype(np.float32)
+    scatter = (1.4826 * np.median(np.abs(stack - template), axis=0)) ** 2
+    # A glint varies as its slope times the misplacement: that is what it is there to tell, not a fault of its own.
+    slope = np.sum(np.square(np.gradient(template)), axis=0)
+    variance = np.maximum(scatter - MISPLACED_PX**2 * slope, 0.0) + 2 * noise**2
+    return template, (1.0 / variance).astype(np.float32)
