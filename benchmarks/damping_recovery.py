@@ -20,6 +20,7 @@ import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -92,14 +93,21 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--natures", nargs="+", choices=NATURES, default=list(NATURES))
+    parser.add_argument("--rows", type=Path, help="keep a row a campaign and fit here, and go on from what it holds")
     given = parser.parse_args()
-    rows: list[dict[str, object]] = []
     seeds = range(given.first_seed, given.first_seed + given.campaigns)
+    done = pd.read_csv(given.rows) if given.rows and given.rows.exists() else pd.DataFrame()
+    tables = [done]
     with ProcessPoolExecutor(given.processes) as pool:
         for nature in given.natures:
-            for found in tqdm(pool.map(partial(measure, nature=nature), seeds), total=len(seeds), desc=nature):
-                rows += found
-    table = pd.DataFrame(rows)
+            known = set(done.loc[done["nature"] == nature, "seed"]) if len(done) else set()
+            todo = [seed for seed in seeds if seed not in known]
+            for found in tqdm(pool.map(partial(measure, nature=nature), todo), total=len(todo), desc=nature):
+                tables.append(pd.DataFrame(found).assign(nature=nature))
+                if given.rows:
+                    pd.concat(tables).to_csv(given.rows, index=False)
+    table = pd.concat(tables)
+    table = table[table["seed"].isin(seeds) & table["nature"].isin(given.natures)]
     print(f"\n{given.campaigns} campaigns a nature, seeds {seeds[0]}–{seeds[-1]}; true n = {PAPER_N}, B = {PAPER_B}\n")
     print(summary(table).to_string(index=False))
 
