@@ -33,7 +33,7 @@ if plan.is_demo:
     rule recordings:
         """Make what the demonstration's trial sheet names, once, in the virtual laboratory."""
         input:
-            plan.experiment / "trials.csv",
+            plan.sheets,
         output:
             plan.recordings,
         log:
@@ -57,7 +57,7 @@ rule tracks:
         plan.result("damping_points.csv"),
     log:
         plan.result("logs", "tracks.log"),
-    threads: workflow.cores
+    threads: 32  # scaled down to the cores that are given
     params:
         code=code_hash("tracks"),
         unwatched=plan.unwatched,
@@ -106,7 +106,7 @@ rule trial_figures:
         ],
     log:
         plan.result("logs", "trial_figures.log"),
-    threads: workflow.cores
+    threads: 32  # scaled down to the cores that are given
     params:
         code=code_hash("figures"),
         experiment=plan.experiment,

@@ -63,6 +63,11 @@ class Plan:
     is_demo: bool
 
     @property
+    def sheets(self) -> list[str]:
+        """The trial sheet and, where there is one, the settings beside it."""
+        return [path.as_posix() for path in self.inputs if path.name in SHARED_FILES]
+
+    @property
     def recordings(self) -> list[str]:
         """What the virtual laboratory makes of the demonstration's sheet."""
         return [path.as_posix() for path in self.inputs if path.name not in SHARED_FILES]
