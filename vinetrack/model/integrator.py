@@ -7,12 +7,16 @@ exceeds what holds it. An implicit method that is stable at any step, with the s
 all four.
 
 This file is the text of a compiled kernel: `vinetrack.model.kernel` sets what follows the marked line behind the
-`rates` of one model, so that the compiler sees both. Only numbers and arrays, nothing of Python's.
+`rates` of one model and `vinetrack.model.radau`, so that the compiler sees all. Only numbers and arrays, nothing of
+Python's.
 
 Source of the method: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.5 and IV.8.
 """
 
 from numba import njit
+
+from vinetrack.model.radau import C1, C2, carry_on, quintic, radau_step
+from vinetrack.model.slack import TAUT, follow_slack
 
 
 @njit(nogil=True)
@@ -39,23 +43,18 @@ def first_chamber(on, rig, theta):
     raise NotImplementedError
 
 
-# ---- what follows is set behind the rates of one model ----
-SQRT6 = 6.0**0.5
-C1, C2 = (4 - SQRT6) / 10, (4 + SQRT6) / 10
-A11, A12, A13 = (88 - 7 * SQRT6) / 360, (296 - 169 * SQRT6) / 1800, (-2 + 3 * SQRT6) / 225
-A21, A22, A23 = (296 + 169 * SQRT6) / 1800, (88 + 7 * SQRT6) / 360, (-2 - 3 * SQRT6) / 225
-A31, A32, A33 = (16 - SQRT6) / 36, (16 + SQRT6) / 36, 1 / 9
-# Slope of the collocation polynomial at the end of a step: free of the cancellation that f(v) suffers when stiff.
-S1 = (1 - C2) / (C1 * (C1 - C2) * (C1 - 1))
-S2 = (1 - C1) / (C2 * (C2 - C1) * (C2 - 1))
-S3 = 1 + 1 / (1 - C1) + 1 / (1 - C2)
-# The real eigenvalue of A⁻¹ and the weights of Hairer's estimate of the local error.
-MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)
-E1, E2, E3 = (-13 - 7 * SQRT6) / 3, (-13 + 7 * SQRT6) / 3, -1 / 3
+@njit(nogil=True)
+def tip_tension(time, x, v, chamber, resting, on, rig, theta, trace_time, trace_pressure, bends):
+    """Tension that the tip leaves for the tail, and rate of change of the chamber's pressure."""
+    raise NotImplementedError
 
+
+TAIL_FREE = False  #: whether `vinetrack.model.slack` is set behind; `rig[FREE]` and `rig[RATIO]` are then looked at
+FREE = RATIO = 0
+
+# ---- what follows is set behind the rates of one model ----
 RUNNING, ENDED, STALLED, TOO_HARD = 0, 1, 2, 3
 MOST_STEPS = 20_000
-MOST_NEWTON = 9
 
 
 @njit(nogil=True)
@@ -69,108 +68,6 @@ def typical_speed(time, x, chamber, on, rig, theta, trace_time, trace_pressure, 
             return min(2 * speed, ballistic)
         speed *= 0.5
     return speed
-
-
-@njit(nogil=True)
-def solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
-    """Cramer's rule for the Newton step of the three stages."""
-    k1 = m22 * m33 - m23 * m32
-    k2 = m23 * m31 - m21 * m33
-    k3 = m21 * m32 - m22 * m31
-    scale = 1 / (m11 * k1 + m12 * k2 + m13 * k3)
-    z1 = (b1 * k1 + m12 * (m23 * b3 - b2 * m33) + m13 * (b2 * m32 - m22 * b3)) * scale
-    z2 = (m11 * (b2 * m33 - m23 * b3) + b1 * k2 + m13 * (m21 * b3 - b2 * m31)) * scale
-    z3 = (m11 * (m22 * b3 - b2 * m32) + m12 * (b2 * m31 - m21 * b3) + b1 * k3) * scale
-    return z1, z2, z3
-
-
-@njit(nogil=True)
-def slope_in_speed(time, x, v, chamber, acceleration, scale, on, rig, theta, trace_time, trace_pressure, bends):
-    """∂a/∂v by a one-sided difference, upwards: below rest the law is another."""
-    delta = 1e-6 * max(abs(v), 1e-4 * scale)
-    other, _rate = rates(time, x, v + delta, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-    return (other - acceleration) / delta
-
-
-@njit(nogil=True)
-def radau_step(
-    time, x, v, chamber, slope, h, z1, z2, z3, scale, rtol, on, rig, theta, trace_time, trace_pressure, bends
-):
-    """One step of size h from (x, v, chamber); z1…z3 are first guesses of the speeds gained at the stages.
-
-    Returns
-    -------
-    (converged, error, x, v, slope, chamber, z1, z2, z3)
-        The error is in units of the tolerance; `slope` the acceleration at the end.
-    """
-    j1 = j2 = j3 = 0.0
-    g1 = g2 = g3 = 0.0
-    small = 1e-2 * rtol * scale
-    before = 1e300
-    fresh = False
-    converged = False
-    for iteration in range(MOST_NEWTON):
-        v1, v2, v3 = v + z1, v + z2, v + z3
-        x1 = x + h * (C1 * v + A11 * z1 + A12 * z2 + A13 * z3)
-        x2 = x + h * (C2 * v + A21 * z1 + A22 * z2 + A23 * z3)
-        x3 = x + h * (v + A31 * z1 + A32 * z2 + A33 * z3)
-        q1 = chamber + h * (A11 * g1 + A12 * g2 + A13 * g3)
-        q2 = chamber + h * (A21 * g1 + A22 * g2 + A23 * g3)
-        q3 = chamber + h * (A31 * g1 + A32 * g2 + A33 * g3)
-        t1, t2, t3 = time + C1 * h, time + C2 * h, time + h
-        f1, g1 = rates(t1, x1, v1, q1, on, rig, theta, trace_time, trace_pressure, bends)
-        f2, g2 = rates(t2, x2, v2, q2, on, rig, theta, trace_time, trace_pressure, bends)
-        f3, g3 = rates(t3, x3, v3, q3, on, rig, theta, trace_time, trace_pressure, bends)
-        if not fresh:
-            j1 = slope_in_speed(t1, x1, v1, q1, f1, scale, on, rig, theta, trace_time, trace_pressure, bends)
-            j2 = slope_in_speed(t2, x2, v2, q2, f2, scale, on, rig, theta, trace_time, trace_pressure, bends)
-            j3 = slope_in_speed(t3, x3, v3, q3, f3, scale, on, rig, theta, trace_time, trace_pressure, bends)
-            fresh = True
-        d1, d2, d3 = solve3(
-            1 - h * A11 * j1, -h * A12 * j2, -h * A13 * j3,
-            -h * A21 * j1, 1 - h * A22 * j2, -h * A23 * j3,
-            -h * A31 * j1, -h * A32 * j2, 1 - h * A33 * j3,
-            h * (A11 * f1 + A12 * f2 + A13 * f3) - z1,
-            h * (A21 * f1 + A22 * f2 + A23 * f3) - z2,
-            h * (A31 * f1 + A32 * f2 + A33 * f3) - z3,
-        )  # fmt: skip
-        z1, z2, z3 = z1 + d1, z2 + d2, z3 + d3
-        size = max(abs(d1), abs(d2), abs(d3))
-        if not size < 1e300:
-            return False, 1e300, x, v, slope, chamber, z1, z2, z3
-        if size <= small:
-            converged = True
-            break
-        if size > 0.1 * before:
-            fresh = False
-        if iteration > 3 and size > before:
-            break
-        before = size
-    if not converged:
-        return False, 1e300, x, v, slope, chamber, z1, z2, z3
-    # Hairer filters this with (μ/h − J)⁻¹. Not here: it hides what a long stiff step does wrong at its far end.
-    raw = (h * slope + E1 * z1 + E2 * z2 + E3 * z3) / MU
-    weight = rtol * max(scale, abs(v), abs(v + z3))
-    x_end = x + h * (v + A31 * z1 + A32 * z2 + A33 * z3)
-    chamber_end = chamber + h * (A31 * g1 + A32 * g2 + A33 * g3)
-    slope_end = (S1 * z1 + S2 * z2 + S3 * z3) / h
-    return True, abs(raw) / weight, x_end, v + z3, slope_end, chamber_end, z1, z2, z3
-
-
-@njit(nogil=True)
-def quintic(s, h, x0, v0, a0, x1, v1, a1):
-    """Position, speed and acceleration at the fraction s of a step, from those at its ends (Hermite, order 6)."""
-    d = x1 - x0 - h * v0 - 0.5 * h * h * a0
-    e = h * (v1 - v0 - h * a0)
-    f = h * h * (a1 - a0)
-    c3 = 10 * d - 4 * e + 0.5 * f
-    c4 = -15 * d + 7 * e - f
-    c5 = 6 * d - 3 * e + 0.5 * f
-    s2 = s * s
-    x = x0 + h * s * v0 + 0.5 * h * h * s2 * a0 + s2 * s * (c3 + s * (c4 + s * c5))
-    v = v0 + h * s * a0 + s2 * (3 * c3 + s * (4 * c4 + s * 5 * c5)) / h
-    a = a0 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5)) / (h * h)
-    return x, v, a
 
 
 @njit(nogil=True)
@@ -188,6 +85,31 @@ def time_of_end(stop, h, x0, v0, a0, x1, v1, a1):
 
 
 @njit(nogil=True)
+def time_of_slack(
+    time, h, x0, v0, a0, x1, v1, a1, chamber, chamber_end, on, rig, theta, trace_time, trace_pressure, bends
+):
+    """Fraction of a step at which the tail's tension comes to nothing, by bisection; 2 where it is taut at the end."""
+    tension, _rate = tip_tension(
+        time + h, x1, v1, chamber_end, False, on, rig, theta, trace_time, trace_pressure, bends
+    )
+    if tension >= 0:
+        return 2.0
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        x, v, _a = quintic(middle, h, x0, v0, a0, x1, v1, a1)
+        pressure = chamber + middle * (chamber_end - chamber)
+        tension, _rate = tip_tension(
+            time + middle * h, x, v, pressure, False, on, rig, theta, trace_time, trace_pressure, bends
+        )
+        if tension < 0:
+            high = middle
+        else:
+            low = middle
+    return high
+
+
+@njit(nogil=True)
 def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pressure, bends):
     """First instant after `time` at which the drive moves a vine at rest, and the chamber's pressure then.
 
@@ -195,7 +117,7 @@ def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pr
     """
     steps = max(256, 2 * trace_time.size)
     step = (until - time) / steps
-    for k in range(1, steps + 1):
+    for _step in range(steps):
         _a, rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
         _a, rate = rates(time, x, 0.0, chamber + 0.5 * step * rate, on, rig, theta, trace_time, trace_pressure, bends)
         if (
@@ -217,9 +139,21 @@ def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pr
 
 
 @njit(nogil=True)
+def rest_from(times, k, x, chamber, on, rig, theta, trace_time, trace_pressure, bends, out):
+    """Fill the rows of `out` from k with a vine at rest at x."""
+    for i in range(k, times.size):
+        out[i, 3] = observed(times[i], x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
+        out[i, 0] = x
+        out[i, 1] = 0.0
+        out[i, 2] = 0.0
+
+
+@njit(nogil=True)
 def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, stop, rtol, out):
-    """Follow one trajectory from rest at time 0; fill `out` (n_times, 4) with x, v, a of the tail and the
-    position of the leading edge that the camera reports, at `times`.
+    """Follow one trajectory from rest at time 0.
+
+    Fills `out` (n_times, 4) with x, v, a of the tail and the position of the leading edge that the camera reports, at
+    `times`; while a tail is slack, with r times those of the leading edge.
 
     `kink` is where along x the film's mass reaches its floor: a step ends there, for none is good across it. `times`
     must increase; before 0 the vine is at rest, after the end of growth (x = `stop`; infinite for a body that moves
@@ -227,8 +161,9 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
 
     Returns
     -------
-    (status, end_time, end_speed, n_steps)
-        `end_time` is that of the end of growth or of the last stall, NaN where there was neither.
+    (status, end_time, end_speed, n_steps, slack_time)
+        `end_time` is that of the end of growth or of the last stall, NaN where there was neither; `slack_time` when
+        the tail first went slack, NaN where it did not or may not.
     """
     count = times.size
     k = 0
@@ -240,12 +175,14 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
         out[k, 2] = 0.0
         k += 1
     if k == count:
-        return RUNNING, float("nan"), 0.0, 0
+        return RUNNING, float("nan"), 0.0, 0, float("nan")
     until = times[count - 1]
     time, x, v = 0.0, 0.0, 0.0
     n_steps = 0
     end_time = float("nan")
     at_rest = True
+    loose = False
+    slack_time = float("nan")
     h = 0.0
     slope = 0.0
     scale = 0.0
@@ -253,6 +190,36 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
     have_guess = False
     h_before = 1.0
     while True:
+        if TAIL_FREE and loose:
+            if slack_time != slack_time:
+                slack_time = time
+            status, k, time, x, v, chamber, end_speed = follow_slack(
+                times,
+                k,
+                time,
+                x,
+                v,
+                chamber,
+                on,
+                rig,
+                theta,
+                trace_time,
+                trace_pressure,
+                bends,
+                rig[RATIO],
+                stop,
+                rtol,
+                out,
+            )
+            if status != TAUT:
+                end_time = time if status == ENDED else end_time
+                if status == ENDED:
+                    rest_from(times, k, stop, chamber, on, rig, theta, trace_time, trace_pressure, bends, out)
+                return status, end_time, end_speed, n_steps, slack_time
+            loose, at_rest, have_guess = False, v <= 0, False
+            slope, _rate = rates(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends)
+            scale = max(scale, v)
+            h = 1e-2 * max(v, 1e-3 * scale) / max(abs(slope), 1e-9)
         if at_rest:
             if rest_acceleration(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends) <= 0:
                 start, chamber = wait_for_drive(
@@ -265,13 +232,20 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
                     out[k, 2] = 0.0
                     k += 1
                 if k == count:
-                    return STALLED, time, 0.0, n_steps
+                    return STALLED, time, 0.0, n_steps, slack_time
                 time = start
+            if TAIL_FREE and rig[FREE] > 0:
+                tension, _rate = tip_tension(
+                    time, x, 0.0, chamber, True, on, rig, theta, trace_time, trace_pressure, bends
+                )
+                if tension < 0:
+                    at_rest, loose, v = False, True, 0.0
+                    continue
             slope, _rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
             at_rest = False
             room = min(stop - x, 0.5 * slope * (until - time) ** 2 + 1e-9)
             scale = typical_speed(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends, slope, room)
-            h = 1e-3 * scale / slope
+            h = 1e-4 * scale / slope
             v = 0.0
             have_guess = False
         ahead = (kink if x < kink else stop) - x
@@ -291,7 +265,7 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
         )
         n_steps += 1
         if n_steps > MOST_STEPS:
-            return TOO_HARD, time, v, n_steps
+            return TOO_HARD, time, v, n_steps, slack_time
         if not ok:
             h *= 0.25
             have_guess = False
@@ -318,6 +292,13 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
         last = time + h
         ended = x_end >= stop
         fraction = time_of_end(stop, h, x, v, slope, x_end, v_end, slope_end) if ended else 1.0
+        if TAIL_FREE and rig[FREE] > 0:
+            slack = time_of_slack(
+                time, h, x, v, slope, x_end, v_end, slope_end, chamber, chamber_end,
+                on, rig, theta, trace_time, trace_pressure, bends,
+            )  # fmt: skip
+            if slack < 2 and (slack < fraction or not ended):
+                ended, loose, fraction = False, True, slack
         while k < count and times[k] <= time + fraction * h:
             part = (times[k] - time) / h
             now_x, now_v, now_a = quintic(part, h, x, v, slope, x_end, v_end, slope_end)
@@ -330,31 +311,20 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
         if ended:
             end_time = time + fraction * h
             _x, end_speed, _a = quintic(fraction, h, x, v, slope, x_end, v_end, slope_end)
-            while k < count:
-                out[k, 3] = observed(
-                    times[k], stop, 0.0, chamber_end, on, rig, theta, trace_time, trace_pressure, bends
-                )
-                out[k, 0] = stop
-                out[k, 1] = 0.0
-                out[k, 2] = 0.0
-                k += 1
-            return ENDED, end_time, end_speed, n_steps
+            rest_from(times, k, stop, chamber_end, on, rig, theta, trace_time, trace_pressure, bends, out)
+            return ENDED, end_time, end_speed, n_steps, slack_time
         if k == count:
-            return RUNNING, end_time, v_end, n_steps
+            return RUNNING, end_time, v_end, n_steps, slack_time
+        if loose:
+            chamber += fraction * (chamber_end - chamber)
+            x, v, _a = quintic(fraction, h, x, v, slope, x_end, v_end, slope_end)
+            time += fraction * h
+            continue
         time, x, v, slope, chamber = last, x_end, v_end, slope_end, chamber_end
         z1, z2, z3 = w1, w2, w3
         have_guess = True
         h_before = h
         h *= min(6.0, 0.9 * max(error, 1e-8) ** -0.25)
-
-
-@njit(nogil=True)
-def carry_on(s, z1, z2, z3):
-    """The cubic through (0, 0), (C1, z1), (C2, z2), (1, z3), at s."""
-    l1 = s * (s - C2) * (s - 1) / (C1 * (C1 - C2) * (C1 - 1))
-    l2 = s * (s - C1) * (s - 1) / (C2 * (C2 - C1) * (C2 - 1))
-    l3 = s * (s - C1) * (s - C2) / ((1 - C1) * (1 - C2))
-    return l1 * z1 + l2 * z2 + l3 * z3
 
 
 @njit(nogil=True)
@@ -377,15 +347,15 @@ def integrate_many(
 ):
     """`integrate` for many trials.
 
-    Trial i has times[starts[i]:starts[i+1]], rigs[i], thetas[i], the trace and the bends between its own starts. Fills
-    `out` (n_times, 4) and `ends` (n_trials, 4): status, end time, end speed, number of steps.
+    Trial i has times[starts[i]:starts[i+1]], on[i], rigs[i], thetas[i], the trace and the bends between its own starts.
+    Fills `out` (n_times, 4) and `ends` (n_trials, 5): status, end time, end speed, number of steps, time of slack.
     """
     for i in range(starts.size - 1):
         low, high = starts[i], starts[i + 1]
         trace = slice(trace_starts[i], trace_starts[i + 1])
-        status, end_time, end_speed, n_steps = integrate(
+        status, end_time, end_speed, n_steps, slack_time = integrate(
             times[low:high],
-            on,
+            on[i],
             rigs[i],
             thetas[i],
             trace_time[trace],
@@ -400,3 +370,4 @@ def integrate_many(
         ends[i, 1] = end_time
         ends[i, 2] = end_speed
         ends[i, 3] = n_steps
+        ends[i, 4] = slack_time

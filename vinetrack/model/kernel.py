@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import inspect
+import itertools
 import os
 import sys
 import tempfile
@@ -18,11 +19,14 @@ from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 
+from vinetrack import constants
 from vinetrack.effects import Effect, Rig
 from vinetrack.effects import _base as effects_base
 from vinetrack.effects._catalogue import load_module
 
-INTEGRATOR = Path(__file__).with_name("integrator.py")
+TEXTS = tuple(Path(__file__).with_name(name) for name in ("radau.py", "slack.py", "integrator.py"))
+"""What is set behind the rates, in this order; `slack` only where a tail may go slack."""
+
 MARK = "# ---- what follows is set behind the rates of one model ----\n"
 
 _HEAD = '''"""Machine-made: the effects {names} summed, and the integrator behind them."""
@@ -67,12 +71,11 @@ _SUM = """
 def {name}({arguments}):
     rig = Rig({rig_fields})
     film = 1.0
-    x, v = max(x, 0.0), max(v, 0.0)
-    y, ydot = x / rig.travel_ratio, v / rig.travel_ratio
+    {motion}
     yield_pressure = rig.yield_pressure
-    area, gain, bend_angle, tension, seen = rig.area, 1.0, angle_passed(y, bends), 0.0, y
+    area, gain, bend_angle, tension, seen = rig.area, 1.0, {angle}, 0.0, y
     mass, density = 0.0, rig.linear_density
-    measured = trace_time.size > 0
+    measured = {measured}
     chamber_rate, set_pressure, pressure = 0.0, rig.set_pressure, rig.set_pressure
     tip, tail = 0.0, 0.0
 {body}
@@ -82,8 +85,13 @@ _STATE = (
     "State(time, y, ydot, x, v, set_pressure, pressure, yield_pressure, area, density, mass, gain, bend_angle, "
     "tension, seen)"
 )
+_INDICES = {"FREE": "tail_free", "RATIO": "travel_ratio"}
 _COMMON = "on, rig_row, theta, trace_time, trace_pressure, bends"
 _MOTION = f"time, x, v, chamber, {_COMMON}"
+_MOVING = """x, v = max(x, 0.0), max(v, 0.0)
+    y, ydot = x / rig.travel_ratio, v / rig.travel_ratio"""
+_AT_REST = "v, ydot = 0.0, 0.0\n    x = max(x, 0.0)\n    y = x / rig.travel_ratio"
+_AT_RELEASE = "x, v, y, ydot, time = 0.0, 0.0, 0.0, 0.0, 0.0"
 
 
 class _Writer:
@@ -96,25 +104,26 @@ class _Writer:
     def has(self, hook: str) -> bool:
         return any(hook in effect.functions for effect in self.effects)
 
-    def calls(self, hook: str, target: str) -> list[str]:
-        lines, offset = [], 0
-        for i, effect in enumerate(self.effects):
-            arguments = "".join(f", theta[{offset + j}]" for j in range(len(effect.parameters)))
-            offset += len(effect.parameters)
+    def calls(self, hook: str, target: str, state: str = _STATE) -> list[str]:
+        lines = []
+        offsets = list(itertools.accumulate((len(effect.parameters) for effect in self.effects), initial=0))
+        for i, effect in sorted(enumerate(self.effects), key=lambda pair: pair[1].order):
             if hook not in effect.functions:
                 continue
+            arguments = "".join(f", theta[{offsets[i] + j}]" for j in range(len(effect.parameters)))
             name = f"{effect.name}__{hook}"
             self.loads[name] = f"{name} = njit(nogil=True)(load_module(Path({str(effect.path)!r})).{hook})"
             # A measured trace already holds what happens in the chamber.
             condition = f"on[{i}] and not measured" if effect.in_trace else f"on[{i}]"
-            lines += [f"if {condition}:", f"    {target.format(call=f'{name}({_STATE}, rig{arguments})')}"]
+            lines += [f"if {condition}:", f"    {target.format(call=f'{name}({state}, rig{arguments})')}"]
         return lines
 
     def pressure(self) -> list[str]:
-        """Gauge → what the chamber does → area and losses; where the area yields to pressure, twice."""
-        lines = [*self.calls("gauge", "set_pressure = {call}"), "pressure = set_pressure"]
+        """Gauge → what the chamber does → area and losses; where the area yields to pressure, until both agree."""
+        gauge = self.calls("gauge", "pressure = {call}")
+        lines = [*gauge, "set_pressure = pressure"]
         lines += ["if measured:", "    pressure = trace_at(time, trace_time, trace_pressure)"]
-        lines += [f"    {line}" for line in self.calls("gauge", "pressure = {call}")]
+        lines += [f"    {line}" for line in gauge]
         if self.has("chamber_rate"):
             lines += ["else:", "    pressure = chamber"]
         lines += self.calls("yield_gauge", "yield_pressure = {call}")
@@ -122,13 +131,16 @@ class _Writer:
         stretch = self.calls("area", "area = {call}")
         if not stretch:
             return lines + once
-        lines += ["start = pressure", "for _ in range(2):", "    area = rig.area"]
-        lines += [f"    {line}" for line in [*stretch, "pressure = start", *once]]
-        return [*lines, "area = rig.area", *stretch]
+        # An area that no effect changes agrees at once; each turn gains a digit or two on the strongest stretch.
+        lines += ["start = pressure", "for turn in range(30):", "    area_before, area = area, rig.area"]
+        lines += [f"    {line}" for line in stretch]
+        lines += ["    if turn > 0 and abs(area - area_before) <= 1e-12 * area:", "        break"]
+        return lines + [f"    {line}" for line in ["pressure = start", *once]]
 
     def mass(self) -> list[str]:
-        lines = [*self.calls("film_gain", "film = {call}"), "density = rig.linear_density * film"]
-        lines += ["mass = max(density * rig.length - rig.mass_loss * film * x, rig.least_mass) + rig.payload_mass"]
+        lines = [*self.calls("film_gain", "film *= {call}"), "density = rig.linear_density * film"]
+        lost = "rig.mass_loss * film * rig.travel_ratio * y"
+        lines += [f"mass = max(density * rig.length - {lost}, rig.least_mass) + rig.payload_mass"]
         return lines
 
     def forces(self) -> list[str]:
@@ -136,13 +148,20 @@ class _Writer:
         lines += self.calls("tip_force", "tip += {call}")
         return lines + self.calls("tail_force", "tail += {call}")
 
-    def function(self, name: str, arguments: str, lines: Sequence[str]) -> str:
-        rig_fields = ", ".join(f"rig_row[{i}]" for i in range(len(Rig._fields)))
-        body = "\n".join(f"    {line}" for line in lines)
-        return _SUM.format(name=name, arguments=arguments, rig_fields=rig_fields, body=body)
+    def function(self, name: str, arguments: str, motion: str, lines: Sequence[str]) -> str:
+        at_release = motion == _AT_RELEASE
+        return _SUM.format(
+            name=name,
+            arguments=arguments,
+            motion=motion,
+            rig_fields=", ".join(f"rig_row[{i}]" for i in range(len(Rig._fields))),
+            angle="0.0" if at_release else "angle_passed(y, bends)",
+            measured="False" if at_release else "trace_time.size > 0",
+            body="\n".join(f"    {line}" for line in lines),
+        )
 
 
-def sum_source(effects: Sequence[Effect]) -> str:
+def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     """Python text of the functions that `vinetrack.model.integrator` calls, for this sum of effects.
 
     Mass that effects add moves like the tail but has no weight of its own: it is counted after the forces.
@@ -151,44 +170,55 @@ def sum_source(effects: Sequence[Effect]) -> str:
     both = [*write.mass(), *write.pressure(), *write.forces()]
     added = write.calls("added_mass", "mass += {call}")
     seen = write.calls("observed_position", "seen = {call}")
+    rest = write.calls("rest_force", "tip += {call}")
+    # The chamber knows its own pressure, not what is left of it at the tip.
+    filling = write.calls("chamber_rate", "chamber_rate += {call}", _STATE.replace(" pressure,", " chamber,"))
+    per_mass = "return (tip / rig.travel_ratio + tail) / mass"
+    tension = "max(tip, 0.0) / rig.travel_ratio"
+    pushed = ["if rig.tail_free > 0:", "    tip = max(tip, 0.0)"] if tail_free else []
     functions = [
+        write.function("rates", _MOTION, _MOVING, [*both, *filling, *added, f"{per_mass}, chamber_rate"]),
         write.function(
-            "rates",
-            _MOTION,
-            [
-                *both,
-                *(write.calls("chamber_rate", "chamber_rate = {call}") if write.has("chamber_rate") else []),
-                *added,
-                "return (tip / rig.travel_ratio + tail) / mass, chamber_rate",
-            ],
+            "rest_acceleration", _MOTION.replace("v, ", ""), _AT_REST, [*both, *rest, *pushed, *added, per_mass]
         ),
-        write.function(
-            "rest_acceleration",
-            _MOTION.replace("v, ", ""),
-            ["v, ydot = 0.0, 0.0", *both, *write.calls("rest_force", "tip += {call}"), *added]
-            + ["return (tip / rig.travel_ratio + tail) / mass"],
-        ).replace("x, v = max(x, 0.0), max(v, 0.0)", "x, v = max(x, 0.0), 0.0"),
         write.function(
             "observed",
             _MOTION,
-            [*both, "tension = max(tip, 0.0) / rig.travel_ratio", *seen, "return seen"] if seen else ["return seen"],
+            _MOVING,
+            [*both, f"tension = {tension}", *seen, "return seen"] if seen else ["return seen"],
         ),
         write.function(
             "first_chamber",
             "on, rig_row, theta",
-            [*write.calls("gauge", "set_pressure = {call}"), "return set_pressure"],
-        )
-        .replace("angle_passed(y, bends)", "0.0")
-        .replace("trace_time.size > 0", "False")
-        .replace("x, v = max(x, 0.0), max(v, 0.0)", "x, v, time = 0.0, 0.0, 0.0"),
+            _AT_RELEASE,
+            [*write.calls("gauge", "pressure = {call}"), "return pressure"],
+        ),
     ]
+    if tail_free:
+        resting = ["if resting:", *[f"    {line}" for line in rest or ["pass"]]]
+        functions += [
+            write.function(
+                "tip_tension",
+                _MOTION.replace("chamber,", "chamber, resting,"),
+                _MOVING,
+                [*both, *resting, *filling, "return tip / rig.travel_ratio, chamber_rate"],
+            ),
+            write.function("free_fall", _MOTION.replace("x, v,", "y, ydot, x, v,"), "", [*both, "return tail / mass"]),
+        ]
     names = ", ".join(effect.name for effect in effects)
-    return _HEAD.format(names=names) + "\n".join(write.loads.values()) + _TABLES + "\n".join(functions) + "\n\n"
+    constants = [f"HAS_CHAMBER, TAIL_FREE = {write.has('chamber_rate')}, {tail_free}"]
+    constants += [f"{name} = {Rig._fields.index(field)}" for name, field in _INDICES.items()]
+    return "".join(
+        f"{part}\n"
+        for part in (_HEAD.format(names=names), *write.loads.values(), _TABLES, *functions, *constants, "", "")
+    )
 
 
-def _module_source(effects: Sequence[Effect]) -> str:
-    integrator = INTEGRATOR.read_text(encoding="utf-8").split(MARK)[1]
-    text = sum_source(effects) + integrator
+def _module_source(effects: Sequence[Effect], tail_free: bool) -> str:
+    text = sum_source(effects, tail_free)
+    for path in TEXTS:
+        if tail_free or path.stem != "slack":
+            text += path.read_text(encoding="utf-8").split(MARK)[1]
     # Only the outermost function is called from Python; what it calls is compiled into it.
     return text.replace("@njit(nogil=True)\ndef integrate_many", "@njit(nogil=True, cache=True)\ndef integrate_many")
 
@@ -213,12 +243,16 @@ def _cache_folder() -> Path:
 
 
 @lru_cache(maxsize=64)
-def kernel(effects: tuple[Effect, ...]) -> ModuleType:
-    """The compiled module for these effects; its `integrate_many` is described in `vinetrack.model.integrator`."""
+def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
+    """The compiled module for these effects; its `integrate_many` is described in `vinetrack.model.integrator`.
+
+    Only one for tails that may go slack holds `vinetrack.model.slack`: it takes longer to compile.
+    """
     import numba
 
-    source = _module_source(effects)
-    parts = [source, inspect.getsource(effects_base), inspect.getsource(load_module), numba.__version__, sys.version]
+    source = _module_source(effects, tail_free)
+    parts = [source, *(inspect.getsource(part) for part in (effects_base, load_module, constants))]
+    parts += [numba.__version__, sys.version]
     parts += [effect.path.read_text() for effect in effects]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     path = _cache_folder() / f"kernel_{digest}.py"
@@ -228,7 +262,8 @@ def kernel(effects: tuple[Effect, ...]) -> ModuleType:
             stream.write(source)
         Path(temporary).replace(path)
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[path.stem] = module  # numba finds its cached form by the module's name
     spec.loader.exec_module(module)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
 from vinetrack.records import Floats
@@ -112,6 +115,41 @@ class Model:
                     f"  {parameter.symbol}{f' ({vine})' if vine else ''} = {number:.6g}{unit}" for vine, number in pairs
                 ]
         return "\n".join(lines)
+
+
+def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
+    """Which effects act, shape (n_trials, n_effects), for parameters of shape (n_trials, n_parameters).
+
+    An effect of no size (every parameter at its `zero`) does not act, nor one that an acting effect replaces: so one
+    compiled model serves all the smaller ones in it.
+    """
+    on = np.ones((len(parameters), len(model.effects)), dtype=bool)
+    places = _places(model)
+    for i, (effect, place) in enumerate(zip(model.effects, places, strict=True)):
+        if effect.parameters:
+            on[:, i] = np.any(parameters[:, place] != np.array(effect.zero), axis=1)
+    acting = on.copy()
+    for i, effect in enumerate(model.effects):
+        for j, other in enumerate(model.effects):
+            if other.name in effect.replaces:
+                on[:, j] &= ~acting[:, i]
+    return on
+
+
+def asked(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]]:
+    """The functions of a hook in the order in which they are asked: place of the effect, function, its parameters."""
+    found = [
+        (effect.order, i, effect.functions[hook], place)
+        for i, (effect, place) in enumerate(zip(model.effects, _places(model), strict=True))
+        if hook in effect.functions
+    ]
+    return [(i, function, place) for _, i, function, place in sorted(found, key=lambda entry: entry[0])]
+
+
+def _places(model: Model) -> list[slice]:
+    """Where in the parameters each effect finds its own."""
+    ends = list(itertools.accumulate((len(effect.parameters) for effect in model.effects), initial=0))
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
 
 def make_model(names: Iterable[str] = BASE_EFFECTS, own: Mapping[str, Effect] | None = None) -> Model:

@@ -41,7 +41,7 @@ def rig_of(trial: Trial) -> Rig:
         bend_count=float(len(trial.bends)),
         bend_total=sum(bend.arc_m / bend.radius_m for bend in trial.bends),
         as_printed=float(trial.mass_loss == "as_printed"),
-        tail_free=float(trial.tail_slack == "free"),
+        tail_free=float(trial.tail_slack == "free" and not whole_body),
     )
 
 

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.effects import Rig, State
 from vinetrack.model.kernel import kernel
-from vinetrack.model.model import Model
+from vinetrack.model.model import Model, asked, effects_on
 from vinetrack.model.rig import check_needs, rig_of
 from vinetrack.records import Floats, Trial
 
@@ -20,6 +21,8 @@ RELATIVE_TOLERANCE = 1e-4
 of the distance travelled on every trial of the paper's protocol (`benchmarks/integrator.py` measures it)."""
 
 STATUS = ("running", "ended", "stalled", "too hard")
+
+_NOTHING = State(*(math.nan,) * len(State._fields))
 
 Trace = tuple[Floats, Floats]
 """Times since release, s, and gauge pressures, Pa, measured there."""
@@ -31,7 +34,8 @@ class Trajectory:
 
     `observed_position_m` is the lead position as the camera reports it: another where the model has measurement
     effects. `status` is `ended` where all film was everted before the last time asked for, `stalled` where it stopped
-    for good before, else `running`. `end_time_s` is when growth ended (or last stalled), NaN if it did not.
+    for good before, else `running`. `end_time_s` is when growth ended (or last stalled), NaN if it did not;
+    `slack_from_s` when the tail of a trial that lets it (`tail_slack: free`) first went slack.
     """
 
     time_s: Floats
@@ -44,10 +48,11 @@ class Trajectory:
     end_time_s: float
     end_lead_velocity_m_s: float
     n_steps: int
+    slack_from_s: float = math.nan
 
     @property
     def tail_velocity_m_s(self) -> Floats:
-        """Speed of the tail, shape (n_times,)."""
+        """Speed of the tail while it is taut, shape (n_times,)."""
         return self.travel_ratio * self.lead_velocity_m_s
 
 
@@ -108,14 +113,14 @@ def simulate_many(
     given = [trace for trace in traces if trace is not None]
     trace_time = np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0)
     trace_pressure = np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0)
-    limits = np.array([_limits(Rig(*rig)) for rig in rigs]).reshape(-1, 2)
+    on = effects_on(model, thetas)
+    limits = _limits(model, rigs, thetas, on)
     given_times = [np.asarray(t, dtype=float) for t in times_s]
-    asked = [_true_times(model, rig, theta, t) for rig, theta, t in zip(rigs, thetas, given_times, strict=True)]
-    times = np.concatenate(asked) if asked else np.empty(0)
-    out, ends = np.empty((times.size, 4)), np.empty((len(trials), 4))
-    resting = {name for effect in model.effects for name in effect.replaces}
-    on = np.array([effect.name not in resting for effect in model.effects])
-    kernel(model.effects).integrate_many(
+    true_times = _true_times(model, rigs, thetas, on, given_times)
+    times = np.concatenate(true_times) if true_times else np.empty(0)
+    out, ends = np.empty((times.size, 4)), np.empty((len(trials), 5))
+    tail_free = any(rig[Rig._fields.index("tail_free")] for rig in rigs)
+    kernel(model.effects, bool(tail_free)).integrate_many(
         starts,
         times,
         on,
@@ -126,34 +131,42 @@ def simulate_many(
         trace_pressure,
         bend_starts,
         np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
-        *limits.T.copy(),
+        *limits,
         relative_tolerance,
         out,
         ends,
     )
     return [
-        _trajectory(trials[i], given_times[i], out[a:b], ends[i])
-        for i, (a, b) in enumerate(itertools.pairwise(starts))
+        _trajectory(trials[i], given_times[i], out[a:b], ends[i]) for i, (a, b) in enumerate(itertools.pairwise(starts))
     ]
 
 
-def _limits(rig: Rig) -> tuple[float, float]:
-    """Tail travel at which the film's mass reaches its floor, and at which growth ends, m; infinite where there is none."""
-    end = rig.length * rig.travel_ratio or math.inf
-    floor = (rig.linear_density * rig.length - rig.least_mass) / rig.mass_loss if rig.mass_loss > 0 else math.inf
-    return max(floor, 0.0), end
+def _limits(model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Tail travel at which the film's mass reaches its floor, and at which growth ends, m; or infinite.
+
+    Both of shape (n_trials,).
+    """
+    rig = Rig(*rigs.T)
+    film = np.ones(len(rigs))
+    for effect, function, place in asked(model, "film_gain"):
+        gains = [function(_NOTHING, Rig(*row), *theta[place]) for row, theta in zip(rigs, thetas, strict=True)]
+        film *= np.where(on[:, effect], gains, 1.0)
+    end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
+    left = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
+    loss = np.asarray(rig.mass_loss)
+    return np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf), end
 
 
-def _true_times(model: Model, rig: Floats, theta: Floats, times_s: Floats) -> Floats:
-    """When what the camera stamps `times_s` really happened."""
-    offset = 0
-    for effect in model.effects:
-        arguments = theta[offset : offset + len(effect.parameters)]
-        offset += len(effect.parameters)
-        if "true_time" in effect.functions:
-            state = State(*(math.nan,) * len(State._fields))._replace(time=times_s)  # type: ignore[arg-type]
-            times_s = np.asarray(effect.functions["true_time"](state, Rig(*rig), *arguments), dtype=float)
-    return times_s
+def _true_times(
+    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], times_s: Sequence[Floats]
+) -> list[Floats]:
+    """When what the camera stamps `times_s` really happened, by trial."""
+    found = list(times_s)
+    for effect, function, place in asked(model, "true_time"):
+        for i in np.flatnonzero(on[:, effect]):
+            state = _NOTHING._replace(time=found[i])  # type: ignore[arg-type]
+            found[i] = np.asarray(function(state, Rig(*rigs[i]), *thetas[i, place]), dtype=float)
+    return found
 
 
 def _trajectory(trial: Trial, times_s: Floats, out: Floats, end: Floats) -> Trajectory:
@@ -172,6 +185,7 @@ def _trajectory(trial: Trial, times_s: Floats, out: Floats, end: Floats) -> Traj
         end_time_s=float(end[1]),
         end_lead_velocity_m_s=float(end[2]) / r,
         n_steps=int(end[3]),
+        slack_from_s=float(end[4]),
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vinetrack.effects import Effect, Rig, State
-from vinetrack.model.model import Model
+from vinetrack.model.model import Model, effects_on
 from vinetrack.model.rig import check_needs, rig_of
 from vinetrack.records import Floats, Trial
 
@@ -63,7 +63,7 @@ def evaluate(
     motion = [np.asarray(a, dtype=float) for a in (time_s, lead_position_m, lead_velocity_m_s)]
     state = _resting_state(trial, rig, *motion)
     ask.measured = measured_Pa is not None
-    film = ask("film_gain", state, rig, np.ones_like(motion[0]), "")
+    film = np.prod([np.ones_like(motion[0]), *ask.each("film_gain", state, rig).values()], axis=0)
     mass = np.maximum(film * (rig.linear_density * rig.length - rig.mass_loss * state.tail_position), rig.least_mass)
     state = state._replace(moving_mass=mass + rig.payload_mass, linear_density=rig.linear_density * film)
     state = _with_pressure(ask, state, rig, measured_Pa)
@@ -88,13 +88,12 @@ class _Asker:
     """Calls the hooks of a model's effects with the parameters of one trial's vine."""
 
     def __init__(self, model: Model, trial: Trial) -> None:
-        theta = dict(zip(model.parameter_names, model.parameters_for(trial.vine), strict=True))
-        resting = {name for effect in model.effects for name in effect.replaces}
-        self.effects = [effect for effect in model.effects if effect.name not in resting]
-        self.arguments = {
-            effect.name: [theta[f"{effect.name}.{parameter.name}"] for parameter in effect.parameters]
-            for effect in self.effects
-        }
+        theta = model.parameters_for(trial.vine)
+        values = iter(theta.tolist())
+        self.arguments = {effect.name: [next(values) for _ in effect.parameters] for effect in model.effects}
+        acting = effects_on(model, theta[None, :])[0]
+        effects = [effect for effect, acts in zip(model.effects, acting, strict=True) if acts]
+        self.effects = sorted(effects, key=lambda effect: effect.order)
         self.measured = False
 
     def _asked(self, hook: str) -> list[tuple[Effect, Callable[..., Any]]]:
@@ -151,37 +150,54 @@ def _resting_state(trial: Trial, rig: Rig, time: Floats, position: Floats, veloc
 
 
 def _with_pressure(ask: _Asker, state: State, rig: Rig, measured_Pa: Floats | None) -> State:
-    """Gauge, chamber, area and losses, in the order of the physics; where the area yields to pressure, twice."""
-    set_pressure = ask("gauge", state, rig, state.set_pressure, "set_pressure")
+    """Gauge, chamber, area and losses, in the order of the physics."""
+    set_pressure = ask("gauge", state, rig, state.pressure, "pressure")
     state = state._replace(set_pressure=set_pressure, pressure=set_pressure)
+    state = state._replace(yield_pressure=ask("yield_gauge", state, rig, state.yield_pressure, "yield_pressure"))
     if measured_Pa is not None:
         state = state._replace(pressure=np.asarray(measured_Pa, dtype=float))
         state = state._replace(pressure=ask("gauge", state, rig, state.pressure, "pressure"))
     elif ask.has("chamber_rate"):
         state = state._replace(pressure=_chamber(ask, state, rig))
-    state = state._replace(yield_pressure=ask("yield_gauge", state, rig, state.yield_pressure, "yield_pressure"))
-    start, area = state.pressure, state.area
-    for _ in range(2 if ask.has("area") else 1):
-        stretched = ask("area", state._replace(area=area), rig, area, "area")
-        state = state._replace(area=stretched, pressure=start)
+    return _settled(ask, state, rig)
+
+
+def _settled(ask: _Asker, state: State, rig: Rig) -> State:
+    """Area and pressure at the tip that agree with each other, from the pressure in the chamber."""
+    start, plain = state.pressure, state.area
+    area = plain
+    for turn in range(30):
+        before, area = area, ask("area", state._replace(area=plain), rig, plain, "area")
+        if turn > 0 and np.all(np.abs(area - before) <= 1e-12 * area):
+            break
+        state = state._replace(area=area, pressure=start)
         state = state._replace(pressure=ask("pressure", state, rig, start, "pressure"))
-    return state._replace(area=ask("area", state._replace(area=area), rig, area, "area"))
+    return state._replace(area=area)
 
 
 def _chamber(ask: _Asker, state: State, rig: Rig) -> Floats:
-    """Pressure of a chamber that follows its own equation, by the midpoint rule between the points of the motion."""
-    fields = [np.broadcast_to(np.asarray(value, dtype=float), np.shape(state.time)) for value in state]
+    """Pressure of a chamber that follows its own equation.
+
+    From point to point with the motion frozen half-way, exact in the pressure to first order: a supply quicker than
+    the steps between the points does no harm.
+    """
+    shape = np.shape(state.time)
+    fields = [np.broadcast_to(np.asarray(value, dtype=float), shape) for value in state]
+    half_way = [0.5 * (values[1:] + values[:-1]) for values in fields]
 
     def rate(i: int, pressure: float) -> float:
-        here = State(*(float(value[i]) for value in fields))._replace(pressure=pressure)
-        here = here._replace(area=float(ask("area", here, rig, here.area, "area")))
-        return float(ask("chamber_rate", here, rig, 0.0, ""))
+        here = State(*(float(values[i]) for values in half_way))._replace(pressure=pressure)
+        here = _settled(ask, here, rig)._replace(pressure=pressure)
+        return sum(float(value) for value in ask.each("chamber_rate", here, rig).values())
 
-    pressure = np.empty(np.shape(state.time))
+    pressure = np.empty(shape)
     pressure[0] = float(fields[State._fields.index("set_pressure")][0])
     for i, step in enumerate(np.diff(state.time)):
-        first = rate(i, pressure[i])
-        pressure[i + 1] = pressure[i] + step * 0.5 * (first + rate(i + 1, pressure[i] + step * first))
+        now = float(pressure[i])
+        change = rate(i, now)
+        delta = 1e-6 * (abs(now) + 1e3)
+        decay = step * (rate(i, now + delta) - change) / delta
+        pressure[i + 1] = now + step * change * (np.expm1(decay) / decay if decay else 1.0)
     return pressure
 
 
