@@ -13,6 +13,7 @@ Python's.
 Source of the method: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.5 and IV.8.
 """
 
+import numpy as np
 from numba import njit
 
 from vinetrack.model.radau import C1, C2, carry_on, quintic, radau_step
@@ -110,6 +111,18 @@ def time_of_slack(
 
 
 @njit(nogil=True)
+def filled(time, x, chamber, step, on, rig, theta, trace_time, trace_pressure, bends):
+    """Pressure of the chamber of a vine at rest after `step`; exact for a supply in proportion to what is lacking."""
+    _a, rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
+    if rate == 0:
+        return chamber
+    delta = 1e-6 * (abs(chamber) + 1e3)
+    _a, other = rates(time, x, 0.0, chamber + delta, on, rig, theta, trace_time, trace_pressure, bends)
+    decay = step * (other - rate) / delta
+    return chamber + step * rate * (np.expm1(decay) / decay if abs(decay) > 1e-12 else 1.0)
+
+
+@njit(nogil=True)
 def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pressure, bends):
     """First instant after `time` at which the drive moves a vine at rest, and the chamber's pressure then.
 
@@ -118,23 +131,19 @@ def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pr
     steps = max(256, 2 * trace_time.size)
     step = (until - time) / steps
     for _step in range(steps):
-        _a, rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-        _a, rate = rates(time, x, 0.0, chamber + 0.5 * step * rate, on, rig, theta, trace_time, trace_pressure, bends)
-        if (
-            rest_acceleration(time + step, x, chamber + step * rate, on, rig, theta, trace_time, trace_pressure, bends)
-            > 0
-        ):
+        after = filled(time, x, chamber, step, on, rig, theta, trace_time, trace_pressure, bends)
+        if rest_acceleration(time + step, x, after, on, rig, theta, trace_time, trace_pressure, bends) > 0:
             low, high = 0.0, step
-            for _ in range(40):
+            for _ in range(24):
                 middle = 0.5 * (low + high)
-                pressure = chamber + middle * rate
+                pressure = filled(time, x, chamber, middle, on, rig, theta, trace_time, trace_pressure, bends)
                 if rest_acceleration(time + middle, x, pressure, on, rig, theta, trace_time, trace_pressure, bends) > 0:
                     high = middle
                 else:
                     low = middle
-            return time + high, chamber + high * rate
+            return time + high, filled(time, x, chamber, high, on, rig, theta, trace_time, trace_pressure, bends)
         time += step
-        chamber += step * rate
+        chamber = after
     return until + 1.0, chamber
 
 
@@ -308,7 +317,7 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
             out[k, 2] = now_a
             out[k, 3] = observed(times[k], now_x, now_v, now_chamber, on, rig, theta, trace_time, trace_pressure, bends)
             k += 1
-        if ended:
+        if ended and time + fraction * h <= until:
             end_time = time + fraction * h
             _x, end_speed, _a = quintic(fraction, h, x, v, slope, x_end, v_end, slope_end)
             rest_from(times, k, stop, chamber_end, on, rig, theta, trace_time, trace_pressure, bends, out)
@@ -321,6 +330,8 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
             time += fraction * h
             continue
         time, x, v, slope, chamber = last, x_end, v_end, slope_end, chamber_end
+        # A drive that rises from nothing takes the speed far beyond what the start let expect.
+        scale = max(scale, v)
         z1, z2, z3 = w1, w2, w3
         have_guess = True
         h_before = h

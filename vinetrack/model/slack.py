@@ -190,11 +190,11 @@ def follow_slack(times, n, time, x, v, chamber, on, rig, theta, trace_time, trac
             out[n, 2] = (u_end - u) / h
             out[n, 3] = observed(times[n], r * now[2], speed, now[3], on, rig, theta, trace_time, trace_pressure, bends)
             n += 1
+        if n == times.size and time + part * h > until:
+            return RUNNING, n, until, end[0], end[1], end[3], u_end
         if status != RUNNING:
             now = slack_at(part, h, s, end, k)
             return status, n, time + part * h, r * now[2], max(now[1], 0.0), now[3], u_end
-        if n == times.size:
-            return RUNNING, n, time + h, end[0], end[1], end[3], u_end
         time += h
         s[:] = end
         # Where the payload has come to the tip it rests there.

@@ -111,7 +111,8 @@ class _Asker:
         for effect, function in self._asked(hook):
             value = function(state, rig, *self.arguments[effect.name])
             if name:
-                state = state._replace(**{name: value})
+                changed: dict[str, Any] = {name: value}
+                state = state._replace(**changed)
         return value
 
     def each(self, hook: str, state: State, rig: Rig) -> dict[str, Floats]:
@@ -155,7 +156,8 @@ def _with_pressure(ask: _Asker, state: State, rig: Rig, measured_Pa: Floats | No
     state = state._replace(set_pressure=set_pressure, pressure=set_pressure)
     state = state._replace(yield_pressure=ask("yield_gauge", state, rig, state.yield_pressure, "yield_pressure"))
     if measured_Pa is not None:
-        state = state._replace(pressure=np.asarray(measured_Pa, dtype=float))
+        measured: Any = np.asarray(measured_Pa, dtype=float)
+        state = state._replace(pressure=measured)
         state = state._replace(pressure=ask("gauge", state, rig, state.pressure, "pressure"))
     elif ask.has("chamber_rate"):
         state = state._replace(pressure=_chamber(ask, state, rig))
@@ -175,7 +177,7 @@ def _settled(ask: _Asker, state: State, rig: Rig) -> State:
     return state._replace(area=area)
 
 
-def _chamber(ask: _Asker, state: State, rig: Rig) -> Floats:
+def _chamber(ask: _Asker, state: State, rig: Rig) -> Any:
     """Pressure of a chamber that follows its own equation.
 
     From point to point with the motion frozen half-way, exact in the pressure to first order: a supply quicker than
