@@ -20,6 +20,9 @@ Floats = NDArray[np.float64]
 
 SMALL_PX = 240
 """Longest side of the pictures in which the axis is sought."""
+ORDERLY = 0.45
+"""Share of all change that one front explains where nothing else of weight goes on; a swinging door takes a fifth."""
+PREFIXES = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 MAX_FRAMES = 150
 """Frames, spread evenly over the changes, in which it is sought."""
 
@@ -78,22 +81,79 @@ def find_axis(luma: NDArray[Any]) -> Axis:
     if len(luma) < 3:
         raise RecordingError("fewer than 3 frames: no motion can be seen")
     small, factor = _small_frames(luma)
-    picked = _busy_frames(small)
+    best = _find_line(small, len(small))
+    if best.order < ORDERLY:
+        # It meets a wall, bends, sweeps: the longest beginning that is orderly tells the axis.
+        for part in PREFIXES:
+            shorter = _find_line(small, max(3, int(part * len(small))), patient=True)
+            worth = shorter.order * shorter.collected
+            if shorter.order >= ORDERLY and (best.order < ORDERLY or worth > best.order * best.collected):
+                best = shorter
+    if best.collected <= 0:
+        raise RecordingError("nothing moves in the picture")
+    return _to_picture(best, factor, luma.shape[1:])
+
+
+def is_orderly(luma: NDArray[Any], axis: Axis) -> bool:
+    """Whether most of what changes along `axis` is a front that passes once, and what it brings stays."""
+    small, factor = _small_frames(luma)
+    scaled = Axis(*(_shrunk(point, factor) for point in (axis.from_px, axis.to_px)), axis.width_px / factor)
+    angle = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
+    band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*small.shape[1:])))
+    x, y, time, weight, n_times = _changed_pixels(small, len(small))
+    near = np.abs((np.column_stack([x, y]) - scaled.from_px) @ scaled.normal) < band
+    if near.sum() < 12:
+        raise RecordingError("nothing moves along the axis")
+    line = x[near], y[near], time[near], weight[near]
+    agree, _, _ = _agreeing(*line, n_times, angle, np.array(scaled.from_px), band)
+    return bool(line[3][agree].sum() >= ORDERLY * line[3].sum())
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line in the small pictures and how much change it collects: `order` is its share of all change."""
+
+    angle: float
+    middle: Floats
+    half: float
+    ends: tuple[float, float]
+    collected: float
+    order: float
+
+
+def _shrunk(point: tuple[float, float], factor: float) -> tuple[float, float]:
+    return (point[0] + 0.5) / factor - 0.5, (point[1] + 0.5) / factor - 0.5
+
+
+def _changed_pixels(small: NDArray[np.float32], count: int) -> tuple[Floats, Floats, Floats, Floats, int]:
+    """Pixels that change within the first `count` frames: x, y, when, worth; and the number of times looked at."""
+    picked = _busy_frames(small[:count])
     when, worth = _changes(small[picked])
     rows, columns = np.nonzero(worth > 0)
-    if len(rows) < 12:
-        raise RecordingError("nothing moves in the picture")
-    x, y = columns.astype(float), rows.astype(float)
     time = when[rows, columns].astype(float)
-    # What comes first counts most: a vine that meets a wall bends, sweeps and grows on along another line.
-    weight = worth[rows, columns] * (1 - 0.8 * time / len(picked))
+    return columns.astype(float), rows.astype(float), time, worth[rows, columns].astype(float), len(picked)
+
+
+def _find_line(small: NDArray[np.float32], count: int, patient: bool = False) -> _Line:
+    """The best line in the first `count` frames; collects nothing where there is none (an error unless `patient`)."""
+    x, y, time, weight, n_times = _changed_pixels(small, count)
+    nothing = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
+    if len(x) < 12:
+        return nothing
     diagonal = float(np.hypot(*small.shape[1:]))
     band = max(3.0, 0.03 * diagonal)
-    angle, middle = _best_line(x, y, time, weight, len(picked), band, diagonal)
-    for _ in range(3):
-        angle, middle, half, ends = _refine(x, y, time, weight, len(picked), angle, middle, band)
-        band = float(np.clip(1.2 * half, 2.0, 0.2 * diagonal))
-    return _to_picture(angle, middle, half, ends, factor, luma.shape[1:])
+    # What comes first counts most: a vine that meets a wall bends, sweeps and grows on along another line.
+    early = weight * (1 - 0.8 * time / n_times)
+    try:
+        angle, middle = _best_line(x, y, time, early, n_times, band, diagonal)
+        for _ in range(3):
+            angle, middle, half, ends, collected = _refine(x, y, time, weight, n_times, angle, middle, band)
+            band = float(np.clip(1.2 * half, 2.0, 0.2 * diagonal))
+    except RecordingError:
+        if patient:
+            return nothing
+        raise
+    return _Line(angle, middle, half, ends, collected, collected / float(weight.sum()))
 
 
 def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
@@ -208,20 +268,27 @@ def _ordered_path(table: np.ndarray) -> np.ndarray:
     return passed
 
 
-def _refine(
+def _agreeing(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
-) -> tuple[float, Floats, float, tuple[float, float]]:
-    """Line through the pixels that change when the path passes them: direction, point, half width, ends along it."""
-    along_unit, across_unit = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-    along = (x - middle[0]) * along_unit[0] + (y - middle[1]) * along_unit[1]
-    across = (x - middle[0]) * across_unit[0] + (y - middle[1]) * across_unit[1]
-    low = float(along.min())
-    place = ((along - low) / 2).astype(int)
+) -> tuple[NDArray[np.bool_], Floats, Floats]:
+    """Pixels that change when the best ordered path along a line passes them; and their places along and across."""
+    along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
+    across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
+    place = ((along - float(along.min())) / 2).astype(int)
     near = np.abs(across) < band
     table = np.zeros((n_times, int(place.max()) + 1))
     np.add.at(table, (time[near].astype(int), place[near]), weight[near])
     passed = _ordered_path(table)
     agree = near & (np.abs(time - passed[place]) <= max(2.0, 0.03 * n_times))
+    return agree, along, across
+
+
+def _refine(
+    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
+) -> tuple[float, Floats, float, tuple[float, float], float]:
+    """Line through the pixels that agree with a path: direction, point, half width, ends along it, their worth."""
+    along_unit = np.array([np.cos(angle), np.sin(angle)])
+    agree, _, _ = _agreeing(x, y, time, weight, n_times, angle, middle, band)
     if agree.sum() < 8:
         raise RecordingError("what moves in the picture follows no line; give the axis in the settings")
     w = weight[agree]
@@ -238,17 +305,15 @@ def _refine(
     half = float(np.quantile(np.abs(lateral - shift), 0.95)) + 0.5
     s = (points - centre) @ main
     ends = float(np.quantile(s, 0.002)), float(np.quantile(s, 0.998))
-    return float(np.arctan2(main[1], main[0])), centre + shift * side, half, ends
+    return float(np.arctan2(main[1], main[0])), centre + shift * side, half, ends, float(w.sum())
 
 
-def _to_picture(
-    angle: float, middle: Floats, half: float, ends: tuple[float, float], factor: float, shape: tuple[int, ...]
-) -> Axis:
-    """Back to full pixels, with room behind and ahead as far as the picture goes."""
-    along = np.array([np.cos(angle), np.sin(angle)])
-    room = 6.0 * half + 12.0
-    centre = (middle + 0.5) * factor - 0.5
-    start, stop = (ends[0] - room) * factor, (ends[1] + room) * factor
+def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
+    """Back to full pixels, with room behind, and ahead as far as the picture goes."""
+    along = np.array([np.cos(line.angle), np.sin(line.angle)])
+    room = 6.0 * line.half + 12.0
+    centre = (line.middle + 0.5) * factor - 0.5
+    start, stop = (line.ends[0] - room) * factor, np.inf
     height, width = shape
     low, high = -np.inf, np.inf
     for origin, unit, size in ((centre[0], along[0], width), (centre[1], along[1], height)):
@@ -257,4 +322,4 @@ def _to_picture(
             low, high = max(low, a), min(high, b)
     start, stop = max(start, low), min(stop, high)
     first, last = centre + start * along, centre + stop * along
-    return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * half * factor)
+    return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * line.half * factor)

@@ -158,7 +158,7 @@ def _first_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
     if run.sum() < 9:
         raise ValueError("nothing moves along the axis")
     where = np.flatnonzero(run & strong)
-    passed = max(int(where[0]), _after_jump(path)), int(where[-1]) + 1
+    passed = max(int(where[0]), after_jump(path)), int(where[-1]) + 1
     return _run_up(np.clip(path, *passed)), passed
 
 
@@ -181,7 +181,7 @@ def _run_up(path: Floats) -> Floats:
     return out
 
 
-def _after_jump(path: Floats) -> int:
+def after_jump(path: Floats) -> int:
     """Column where growth begins in earnest: a path that leaps at its start and crawls on has not grown that far.
 
     At release the tail jerks inside the film that already stands, and its columns change without any front. No front

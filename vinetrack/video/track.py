@@ -1,4 +1,4 @@
-"""From a recording to a track: decode, find the axis, cut the strip, follow the edge (or the body), judge each point."""
+"""From a recording to a track: decode, find the axis, cut the strip, follow edge or body, judge each point."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.records import Track, Trial
-from vinetrack.video.axis import Axis, find_axis
+from vinetrack.video.axis import Axis, find_axis, is_orderly
 from vinetrack.video.edge import EdgeFit, outline, track_edge
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
 from vinetrack.video.judge import Judgement, calibrated_sigma, judge
@@ -101,7 +101,8 @@ def track_frames(
     kept = np.flatnonzero(~rejected)
     luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
     try:
-        strip, found = _follow(luma, trial, axis, exposure_s * capture_fps, m_per_px)
+        axis, orderly = _whereabouts(luma, axis, trial, m_per_px)
+        strip, found = _follow(luma, trial, axis, exposure_s * capture_fps, orderly)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
     repeated = _repeated(strip, found.edge_px)
@@ -116,10 +117,14 @@ def track_frames(
     if verdict.last_moving < 0:
         raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
     notes = [*frames.notes, *verdict.notes, *_ending(luma, verdict, found.edge_px, name)]
-    if rejected.any():
+    if not orderly:
         notes.append(
-            f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {np.flatnonzero(rejected)[0]}"
+            f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
+            "to about a pixel"
         )
+    if rejected.any():
+        first = int(np.flatnonzero(rejected)[0])
+        notes.append(f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {first}")
     track = _assemble(frames, kept, found, sigma, verdict, capture_fps, exposure_s, notes)
     track = _in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
@@ -134,7 +139,8 @@ def _capture_fps(trial: Trial, own: float | None) -> float:
     if own is not None:
         if np.isfinite(trial.capture_fps) and abs(trial.capture_fps / own - 1) > 1e-3:
             raise RecordingError(
-                f"{trial.name}: capture_fps is {trial.capture_fps:g} in the sheet but {own:g} in the frames; correct the sheet"
+                f"{trial.name}: capture_fps is {trial.capture_fps:g} in the sheet but {own:g} in the frames; "
+                "correct the sheet"
             )
         return own
     if not np.isfinite(trial.capture_fps):
@@ -142,28 +148,39 @@ def _capture_fps(trial: Trial, own: float | None) -> float:
     return trial.capture_fps
 
 
-def _follow(
-    luma: NDArray[Any], trial: Trial, axis: Axis | None, exposure_frames: float, m_per_px: float | None
-) -> tuple[Strip, _Edge]:
-    """Strip and positions; the axis is found or centred on the way."""
+def _whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, bool]:
+    """The axis, with a width, and whether what changes along it is one front that passes once and stays."""
     given = axis is not None
     axis = axis if axis is not None else find_axis(luma)
-    half = _half_width(axis, trial, m_per_px)
+    axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
+    if given:
+        # Room for an axis that is a few degrees off; `_follow` centres it.
+        axis = replace(axis, width_px=axis.width_px + 0.08 * axis.length_px)
+    return axis, trial.travel_ratio == 1 or is_orderly(luma, axis)
+
+
+def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, orderly: bool) -> tuple[Strip, _Edge]:
+    """Strip and positions; the axis is centred on what moves along it."""
+    half = axis.width_px / 2
     if trial.travel_ratio == 1:
         from vinetrack.video.body import track_body
 
         strip = cut_strip(luma, axis, 1.5 * half + 12)
         fit = track_body(strip)
         return strip, _Edge(fit.position_px, fit.sigma_px, fit.unsure, fit.blur_px, exposure_frames)
-    wide = half * 1.3 + (0.04 * axis.length_px if given else 3.0)
-    strip = cut_strip(luma, squared(axis), wide)
     try:
-        shift, slope, half = outline(strip)
-        strip = _centred(luma, strip, shift, slope, half, given)
-        fit = track_edge(strip, exposure_frames)
+        if not orderly:
+            from vinetrack.video.arrival import track_arrival
+
+            strip = cut_strip(luma, axis, min(5 * half, 0.25 * max(luma.shape[1:])))
+            edge, sigma = track_arrival(strip)
+            return strip, _Edge(edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames)
+        strip = cut_strip(luma, squared(axis), 1.3 * half + 3)
+        strip = _centred(luma, strip, *outline(strip))
+        front = track_edge(strip, exposure_frames)
     except ValueError as error:
         raise RecordingError(str(error)) from error
-    return strip, _Edge(fit.edge_px, fit.sigma_px, _unsure(fit), fit.blur_px, fit.exposure_frames)
+    return strip, _Edge(front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames)
 
 
 def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
@@ -176,7 +193,7 @@ def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
     return 0.1 * axis.length_px
 
 
-def _centred(luma: NDArray[Any], strip: Strip, shift: float, slope: float, half: float, given: bool) -> Strip:
+def _centred(luma: NDArray[Any], strip: Strip, shift: float, slope: float, half: float) -> Strip:
     """The strip about the tube's own centreline; the same one where it is centred already.
 
     A given axis keeps its ends' places along itself: only what lies across is corrected.
@@ -199,7 +216,7 @@ def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
 
 
 def odd_frames(luma: NDArray[Any]) -> NDArray[np.bool_]:
-    """Frames among the first three that resemble none of those after them: cameras are known to write such, shape (n,)."""
+    """Frames among the first three that resemble none after them, shape (n,): cameras are known to write such."""
     odd = np.zeros(len(luma), dtype=bool)
     if len(luma) < 8:
         return odd
@@ -259,10 +276,11 @@ def _assemble(
     frames: Frames, kept: NDArray[np.int_], found: _Edge, sigma: Floats, verdict: Judgement, capture_fps: float,
     exposure_s: float, notes: list[str],
 ) -> Track:  # fmt: skip
-    """A row for every decoded frame; those rejected have no position."""
+    """A row for every decoded frame; those rejected, or after the end of what follows the axis, have no position."""
     n = len(frames)
     edge, error = np.full(n, np.nan), np.full(n, np.nan)
     flag = np.full(n, "rejected", dtype="<U64")
+    flag[int(kept[-1]) + 1 :] = "after_end"
     slot = frames.slot.astype(float)
     lost = np.array(["lost" in f.split(";") for f in verdict.flag], dtype=bool)
     edge[kept] = np.where(lost, np.nan, found.edge_px)
