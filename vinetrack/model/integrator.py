@@ -123,6 +123,27 @@ def filled(time, x, chamber, step, on, rig, theta, trace_time, trace_pressure, b
 
 
 @njit(nogil=True)
+def once_it_shows(time, until, x, chamber, delay, on, rig, theta, trace_time, trace_pressure, bends):
+    """When a drive that rises from nothing at `time` has moved a vine by 10⁻⁹ of its way, and the chamber's pressure.
+
+    Before, the drive is a small difference of large forces, no more than rounding, and the vine as good as at rest.
+    """
+    start, pressure = time, chamber
+    while time + delay < until:
+        after = filled(time, x, chamber, delay, on, rig, theta, trace_time, trace_pressure, bends)
+        if rest_acceleration(time + delay, x, after, on, rig, theta, trace_time, trace_pressure, bends) <= 0:
+            break
+        slope, _rate = rates(time + delay, x, 0.0, after, on, rig, theta, trace_time, trace_pressure, bends)
+        room = 0.5 * slope * delay**2
+        speed = typical_speed(time + delay, x, after, on, rig, theta, trace_time, trace_pressure, bends, slope, room)
+        if delay * speed > 1e-9 * (x + 1e-3):
+            break
+        start, pressure = time + delay, after
+        delay *= 2
+    return start, pressure
+
+
+@njit(nogil=True)
 def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pressure, bends):
     """First instant after `time` at which the drive moves a vine at rest, and the chamber's pressure then.
 
@@ -141,7 +162,10 @@ def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pr
                     high = middle
                 else:
                     low = middle
-            return time + high, filled(time, x, chamber, high, on, rig, theta, trace_time, trace_pressure, bends)
+            pressure = filled(time, x, chamber, high, on, rig, theta, trace_time, trace_pressure, bends)
+            return once_it_shows(
+                time + high, until, x, pressure, 1e-7 * step, on, rig, theta, trace_time, trace_pressure, bends
+            )
         time += step
         chamber = after
     return until + 1.0, chamber

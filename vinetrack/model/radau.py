@@ -69,7 +69,7 @@ def radau_step(
     """
     j1 = j2 = j3 = 0.0
     g1 = g2 = g3 = 0.0
-    small = 1e-2 * rtol * scale
+    small = 1e-2 * rtol * max(scale, abs(v))
     before = 1e300
     q1 = q2 = q3 = chamber
     jc = 0.0
