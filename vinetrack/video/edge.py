@@ -66,10 +66,11 @@ class EdgeFit:
 
 @dataclass(frozen=True)
 class State:
-    """What alternates: the edge (n_frames,) and its blur lengths, the tip's lag by row and optical blur, and the
-    pictures (4, n_across, n_along): brightness after and before the edge and the variance about each.
+    """What alternates.
 
-    `inflation` multiplies those variances by distance ahead of the edge, 1 px a bin about its middle.
+    The edge (n_frames,) and its blur lengths, the tip's lag by row and optical blur, and the pictures
+    (4, n_across, n_along): brightness after and before the edge and the variance about each. `inflation` multiplies
+    those variances by distance ahead of the edge, 1 px a bin about its middle.
     """
 
     edge: Floats

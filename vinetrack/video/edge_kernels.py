@@ -28,7 +28,7 @@ BLOCK = 1
 """Columns in a block whose sum tells how far noise adds up: about one grain of film."""
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def cover_table(length: float, blur: float, reach: float) -> np.ndarray:
     """Cover p and slope dp/dx at x = −reach, −reach + STEP, … ; shape (n, 2).
 
@@ -50,7 +50,7 @@ def cover_table(length: float, blur: float, reach: float) -> np.ndarray:
     return table
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def _look_up(table: np.ndarray, reach: float, x: float) -> tuple[float, float]:
     if x <= -reach:
         return 0.0, 0.0
@@ -62,7 +62,7 @@ def _look_up(table: np.ndarray, reach: float, x: float) -> tuple[float, float]:
     return table[i, 0] + f * (table[i + 1, 0] - table[i, 0]), table[i, 1] + f * (table[i + 1, 1] - table[i, 1])
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def gather(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -77,16 +77,16 @@ def gather(
     pictures: np.ndarray,
     clip: float,
 ) -> np.ndarray:
-    """Sums for the least squares of (before, after) at every pixel; shape (11, n_across, n_along).
+    """Sums for the least squares of (before, after) at every pixel; shape (n_across, n_along, 11).
 
     The edge is over column s from frame `early[s]` to `late[s]`. Background counts before, film after, by a weight
     that falls as exp(−frames / memory_frames): what was seen last before and first after counts most. Half-covered
-    pixels count in between, hardly. Rows of the answer: Σwq², Σwqp, Σwp², ΣwqV, ΣwpV (q = 1 − p), then weight, sum
-    and sum of squares of V where only background, and where only film, is seen.
+    pixels count in between, hardly. The answer's columns: Σwq², Σwqp, Σwp², ΣwqV, ΣwpV (q = 1 − p) of those, then
+    weight, sum and sum of squares of V where only background, and where only film, is seen.
     With `clip` > 0 a value that strays from the last solution is weighed down by 1/(1 + (r/clip)²).
     """
     n, rows, columns = strip.shape
-    sums = np.zeros((11, rows, columns), np.float32)
+    sums = np.zeros((rows, columns, 11), np.float32)
     share = np.zeros(columns)
     for t in range(n):
         if not math.isfinite(edge[t]):
@@ -116,23 +116,25 @@ def gather(
                 if clip > 0:
                     r = value - pictures[1, u, s] * q - pictures[0, u, s] * p
                     w /= 1 + r * r / (clip * clip)
-                sums[0, u, s] += w * q * q
-                sums[1, u, s] += w * q * p
-                sums[2, u, s] += w * p * p
-                sums[3, u, s] += w * q * value
-                sums[4, u, s] += w * p * value
+                at_pixel = sums[u, s]
                 if q > 0.98:
-                    sums[5, u, s] += w
-                    sums[6, u, s] += w * value
-                    sums[7, u, s] += w * value * value
+                    at_pixel[5] += w
+                    at_pixel[6] += w * value
+                    at_pixel[7] += w * value * value
                 elif p > 0.98:
-                    sums[8, u, s] += w
-                    sums[9, u, s] += w * value
-                    sums[10, u, s] += w * value * value
+                    at_pixel[8] += w
+                    at_pixel[9] += w * value
+                    at_pixel[10] += w * value * value
+                else:
+                    at_pixel[0] += w * q * q
+                    at_pixel[1] += w * q * p
+                    at_pixel[2] += w * p * p
+                    at_pixel[3] += w * q * value
+                    at_pixel[4] += w * p * value
     return sums
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise: float, texture: float) -> np.ndarray:
     """Brightness after and before the edge at every pixel, and the variance about each; shape (4, n_across, n_along).
 
@@ -140,7 +142,7 @@ def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise:
     film from the columns behind it, background from those ahead, with weights falling as `memory`^distance; its
     variance is then `texture`².
     """
-    _, rows, columns = sums.shape
+    rows, columns, _ = sums.shape
     out = np.empty((4, rows, columns), np.float32)
     guess = np.empty(columns)
     unsteady = (1.5 * texture) ** 2
@@ -150,37 +152,38 @@ def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise:
             if count > 1e-3:
                 level = total / count
             guess[s] = level
-            steady = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise) < unsteady
-            total = total * memory + (sums[6, u, s] if steady else 0.0)
-            count = count * memory + (sums[5, u, s] if steady else 0.0)
+            steady = _variance(sums[u, s, 5], sums[u, s, 6], sums[u, s, 7], noise) < unsteady
+            total = total * memory + (sums[u, s, 6] if steady else 0.0)
+            count = count * memory + (sums[u, s, 5] if steady else 0.0)
         for s in range(columns - 1, -1, -1):
             if guess[s] != fallback:
                 break
-            guess[s] = sums[6, u, s] / sums[5, u, s] if sums[5, u, s] > 0 else fallback
+            guess[s] = sums[u, s, 6] / sums[u, s, 5] if sums[u, s, 5] > 0 else fallback
         total, count, level = 0.0, 0.0, fallback
         for s in range(columns):
             if count > 1e-3:
                 level = total / count
-            elif sums[8, u, s] > 0:
-                level = sums[9, u, s] / sums[8, u, s]
-            total = total * memory + sums[9, u, s]
-            count = count * memory + sums[8, u, s]
+            elif sums[u, s, 8] > 0:
+                level = sums[u, s, 9] / sums[u, s, 8]
+            total = total * memory + sums[u, s, 9]
+            count = count * memory + sums[u, s, 8]
             # Never seen bare: what a half-covered pixel seems to show would follow any error of the edge.
-            own = _variance(sums[5, u, s], sums[6, u, s], sums[7, u, s], noise)
-            bare, film = sums[5, u, s] > 0.1 and own < unsteady, sums[8, u, s] > 0.1
-            rq = ridge if bare else 1e4 * (1 + sums[0, u, s])
-            rp = ridge if film else 1e4 * (1 + sums[2, u, s])
-            qq, qp, pp = sums[0, u, s] + rq, sums[1, u, s], sums[2, u, s] + rp
-            vq, vp = sums[3, u, s] + rq * guess[s], sums[4, u, s] + rp * level
+            own = _variance(sums[u, s, 5], sums[u, s, 6], sums[u, s, 7], noise)
+            bare, film = sums[u, s, 5] > 0.1 and own < unsteady, sums[u, s, 8] > 0.1
+            qq, qp, pp = sums[u, s, 0] + sums[u, s, 5], sums[u, s, 1], sums[u, s, 2] + sums[u, s, 8]
+            vq, vp = sums[u, s, 3] + sums[u, s, 6], sums[u, s, 4] + sums[u, s, 9]
+            rq = ridge if bare else 1e4 * (1 + qq)
+            rp = ridge if film else 1e4 * (1 + pp)
+            qq, pp, vq, vp = qq + rq, pp + rp, vq + rq * guess[s], vp + rp * level
             det = qq * pp - qp * qp
             out[0, u, s] = (vp * qq - vq * qp) / det
             out[1, u, s] = (vq * pp - vp * qp) / det
-            out[2, u, s] = _variance(sums[8, u, s], sums[9, u, s], sums[10, u, s], noise) if film else texture**2
+            out[2, u, s] = _variance(sums[u, s, 8], sums[u, s, 9], sums[u, s, 10], noise) if film else texture**2
             out[3, u, s] = own if bare else texture**2
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def _variance(weight: float, total: float, squares: float, noise: float) -> float:
     """Variance of what a pixel showed, never below that of the noise, drawn towards it where few frames speak."""
     if weight <= 0:
@@ -189,7 +192,7 @@ def _variance(weight: float, total: float, squares: float, noise: float) -> floa
     return max((weight * own + 2 * noise**2) / (weight + 2), noise**2)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def film_evidence(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, pictures: np.ndarray, width: float, clip: float
 ) -> np.ndarray:
@@ -212,7 +215,7 @@ def film_evidence(
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def fit_edges(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -246,7 +249,7 @@ def fit_edges(
         half = reach + margin
         gain, level = 0.0, 0.0
         for _ in range(rounds):
-            first = max(0, int(math.ceil(y - half - deepest)))
+            first = max(0, math.ceil(y - half - deepest))
             last = min(columns, int(y + half) + 1)
             yy, yg, yl, gg, gl, ll = 1e-12, 0.0, 0.0, prior_sd**-2, 0.0, prior_sd**-2
             ry, rg, rl = 0.0, -gain * prior_sd**-2, -level * prior_sd**-2
@@ -299,7 +302,7 @@ def fit_edges(
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
 def residual_sums(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -314,7 +317,7 @@ def residual_sums(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """What the fit leaves: by distance ahead of the edge, by row, and in all.
 
-    First answer: shape (n, 2), bins of 1 px about the middle: the sum over frames of z² / var z, with z = Σ C r / v over
+    First answer: shape (n, 2), bins of 1 px about the middle: the sum over frames of z² / var z, z = Σ C r / v over
     blocks of BLOCK columns and all rows, and the count: 1 on average for white noise, more where noise adds up across
     neighbours (grain of the film, its tail moving inside). Second: shape (n_across, 2), Σ g r and Σ g² with g the
     slope of the model in the row's own lag. Third: the mean of log(1 + r²/9v̄), v̄ the mean
@@ -337,7 +340,7 @@ def residual_sums(
         reach = 0.5 * lengths[t] + 4 * blur + 0.5
         table = cover_table(lengths[t], blur, reach)
         half = reach + margin
-        first = max(0, int(math.ceil(y - half - lag.max())))
+        first = max(0, math.ceil(y - half - lag.max()))
         last = min(columns, int(y + half) + 1)
         column[:] = 0.0
         for u in range(rows):

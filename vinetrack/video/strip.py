@@ -6,7 +6,7 @@ mean picture and its slopes, robust against what does move there (a door, a hand
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ GAP_PX = 5
 BAND_PX = (14, 44)
 """Least and greatest height of a band."""
 REFERENCE_FRAMES = 15
+PIXELS = 9000
+"""Pixels of the bands that are used, evenly spread: enough for a shift of 0.01 px."""
 SHAKE_FLOOR_PX = 0.04
 """Shake below this is left alone: moving a picture by it costs more than it mends."""
 
@@ -56,6 +58,13 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
         scale, offset, shift, steadied = _steady(luma, axis, bands, unit)
     values = sample(luma, axis, np.arange(-half, half + 1), shift if steadied else None)
     return Strip(values, scale, offset, shift, _noise(values, scale), axis, steadied)
+
+
+def recut(strip: Strip, luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
+    """The same frames cut along a slightly different axis; gain and shift are those of `strip`."""
+    half = int(np.ceil(half_px))
+    values = sample(luma, axis, np.arange(-half, half + 1), strip.shift_px if strip.steadied else None)
+    return replace(strip, values=values, axis=axis)
 
 
 def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: Floats | None = None) -> NDArray[Any]:
@@ -179,19 +188,20 @@ def _basis(reference: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _register(views: list[NDArray[Any]], basis: list[NDArray[np.float32]]) -> tuple[Floats, Floats]:
-    """Gain, level, shift along and across of every frame (n, 4), and the error of the shift (n,), by robust least squares.
+    """Gain, level, shift along and across of every frame (n, 4), and the error of the shift (n,), robustly.
 
     frame(x) = gain · picture(x − shift) + level. Where the bands show no texture the level is held near zero and the
     shift is left at zero.
     """
-    design = np.concatenate(basis, axis=1)[:, ::2].astype(np.float64)
+    every = max(1, sum(part.shape[1] for part in basis) // PIXELS)
+    design = np.concatenate(basis, axis=1)[:, ::every].astype(np.float64)
     n = len(views[0])
     out, error = np.zeros((n, 4)), np.full(n, np.inf)
     gram = design @ design.T
     level = float(np.abs(design[0]).mean()) + 1e-9
     ridge = np.diag([0.0, 25.0 * gram[1, 1] * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
     for t in range(n):
-        data = np.concatenate([view[t, 1:-1, 1:-1].ravel() for view in views])[::2].astype(np.float64)
+        data = np.concatenate([view[t, 1:-1, 1:-1].ravel() for view in views])[::every].astype(np.float64)
         keep = None
         for _ in range(3):
             d, g, v = (design, gram, data) if keep is None else (design[:, keep], None, data[keep])

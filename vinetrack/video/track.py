@@ -14,7 +14,7 @@ from vinetrack.video.axis import Axis, find_axis, is_orderly
 from vinetrack.video.edge import EdgeFit, outline, track_edge
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
 from vinetrack.video.judge import Judgement, calibrated_sigma, judge
-from vinetrack.video.strip import Strip, cut_strip, squared
+from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
 Floats = NDArray[np.float64]
 
@@ -205,7 +205,7 @@ def _centred(luma: NDArray[Any], strip: Strip, shift: float, slope: float, half:
     start = strip.axis.points(np.array(0.0), shift)
     stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
     turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
-    return cut_strip(luma, squared(turned), half * 1.1 + 3)
+    return recut(strip, luma, squared(turned), half * 1.1 + 3)
 
 
 def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
