@@ -155,3 +155,10 @@ def test_the_last_line_is_silent_about_a_report_older_than_its_sheet(
     os.utime(folder / "trials.csv", (report.stat().st_mtime + 5,) * 2)
     workflow._say_where(plan)
     assert capsys.readouterr().out == ""
+
+
+def test_a_slash_at_the_end_of_the_path_changes_no_stage(tmp_path: Path) -> None:
+    folder = str(experiment(tmp_path / "v"))
+    with_slash, without = (make_plan({"experiment": path}, tmp_path) for path in (folder + "/", folder))
+    assert with_slash.stage_settings() == without.stage_settings()
+    assert (with_slash.experiment, with_slash.results) == (without.experiment, without.results)

@@ -146,7 +146,11 @@ def report(
     with _sentences(log):
         from vinetrack.stages.report import write_report
 
-        path = write_report(_read(experiment), results, _run_settings(settings).model_dump(mode="json"))
+        path = write_report(
+            _read(experiment),
+            results,
+            _run_settings(settings).model_dump(mode="json", exclude={"experiment", "results"}),
+        )
         typer.echo(f"Report: {path}")
 
 

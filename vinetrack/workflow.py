@@ -97,8 +97,12 @@ class Plan:
         return [(name, form, self.result("figures", f"{prefix}{name}.{form}")) for name in names for form in formats]
 
     def stage_settings(self, *keys: str) -> str:
-        """The settings a stage depends on, or all of them, as JSON: a change of others leaves its results alone."""
-        return json.dumps(self.settings.model_dump(mode="json", include=set(keys) or None), sort_keys=True)
+        """The settings a stage depends on, or all of them, as JSON: a change of others leaves its results alone.
+
+        Paths are no settings of a stage: the same folder may be written with a slash at its end or without.
+        """
+        chosen = set(keys) or set(type(self.settings).model_fields) - {"experiment", "results"}
+        return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
 
 
 def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
