@@ -10,7 +10,7 @@ The tip is a moving pulley: whatever acts there counts 1/r on the tail; what act
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -162,6 +162,7 @@ class Effect:
     in_trace: bool = False  #: a pressure measured during growth already holds it
     replaces: tuple[str, ...] = ()  #: effects that it contains and that rest while it is in the model
     order: int = 3  #: place among the effects of one hook
+    corners: Callable[[Rig], Sequence[float]] | None = None  #: lead positions where its force has a corner, m
 
     @property
     def formula(self) -> str:

@@ -42,6 +42,10 @@ def tail_force(s, rig, mu_w):  # noqa: D103
     return -mu_w * np.minimum(s.lead_position, rig.length - s.lead_position)
 
 
+def corners(rig):  # noqa: D103
+    return () if rig.tail_on_reel > 0.0 else (rig.length / 2,)
+
+
 WORKED = (
     Worked(
         "tail_force",

@@ -182,15 +182,16 @@ def rest_from(times, k, x, chamber, on, rig, theta, trace_time, trace_pressure, 
 
 
 @njit(nogil=True)
-def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, stop, rtol, out):
+def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, stop, rtol, out):
     """Follow one trajectory from rest at time 0.
 
     Fills `out` (n_times, 4) with x, v, a of the tail and the position of the leading edge that the camera reports, at
     `times`; while a tail is slack, with r times those of the leading edge.
 
-    `kink` is where along x the film's mass reaches its floor: a step ends there, for none is good across it. `times`
-    must increase; before 0 the vine is at rest, after the end of growth (x = `stop`; infinite for a body that moves
-    as a whole) it stays there with its last speed and acceleration given as 0.
+    `kinks`, rising, is where along x the forces have corners, such as where the film's mass reaches its floor: a step
+    ends at each, for none is good across it. `times` must increase; before 0 the vine is at rest, after the end of
+    growth (x = `stop`; infinite for a body that moves as a whole) it stays there with its last speed and acceleration
+    given as 0.
 
     Returns
     -------
@@ -222,6 +223,7 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
     z1 = z2 = z3 = 0.0
     have_guess = False
     h_before = 1.0
+    passed = 0
     while True:
         if TAIL_FREE and loose:
             if slack_time != slack_time:
@@ -281,7 +283,10 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
             h = 1e-4 * scale / slope
             v = 0.0
             have_guess = False
-        ahead = (kink if x < kink else stop) - x
+        while passed < kinks.size and x >= kinks[passed]:
+            passed += 1
+        kink = kinks[passed] if passed < kinks.size else stop
+        ahead = min(kink, stop) - x
         if v > 0 and h * v > 1.05 * ahead:
             h = 1.02 * ahead / v
         if have_guess:
@@ -318,7 +323,7 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kink, st
             h *= max(0.2, 0.9 * error**-0.25)
             have_guess = False
             continue
-        if x < kink and x_end > kink + 1e-7 * stop:
+        if kink < stop and x_end > kink + 1e-7 * stop:
             h *= time_of_end(kink + 5e-8 * stop, h, x, v, slope, x_end, v_end, slope_end)
             have_guess = False
             continue
@@ -382,8 +387,9 @@ def integrate_many(
 ):
     """`integrate` for many trials.
 
-    Trial i has times[starts[i]:starts[i+1]], on[i], rigs[i], thetas[i], the trace and the bends between its own starts.
-    Fills `out` (n_times, 4) and `ends` (n_trials, 5): status, end time, end speed, number of steps, time of slack.
+    Trial i has times[starts[i]:starts[i+1]], on[i], rigs[i], thetas[i], kinks[i] (padded with infinity), and the trace
+    and the bends between its own starts. Fills `out` (n_times, 4) and `ends` (n_trials, 5): status, end time, end
+    speed, number of steps, time of slack.
     """
     for i in range(starts.size - 1):
         low, high = starts[i], starts[i + 1]

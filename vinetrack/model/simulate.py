@@ -114,7 +114,7 @@ def simulate_many(
     trace_time = np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0)
     trace_pressure = np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0)
     on = effects_on(model, thetas)
-    limits = _limits(model, rigs, thetas, on)
+    kinks, stops = _limits(model, rigs, thetas, on, trials)
     given_times = [np.asarray(t, dtype=float) for t in times_s]
     true_times = _true_times(model, rigs, thetas, on, given_times)
     times = np.concatenate(true_times) if true_times else np.empty(0)
@@ -131,7 +131,8 @@ def simulate_many(
         trace_pressure,
         bend_starts,
         np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
-        *limits,
+        kinks,
+        stops,
         relative_tolerance,
         out,
         ends,
@@ -141,10 +142,13 @@ def simulate_many(
     ]
 
 
-def _limits(model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Tail travel at which the film's mass reaches its floor, and at which growth ends, m; or infinite.
+def _limits(
+    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], trials: Sequence[Trial]
+) -> tuple[Floats, Floats]:
+    """Tail travel at which forces have corners, rising, and at which growth ends, m; infinite where they do not.
 
-    Both of shape (n_trials,).
+    Of shape (n_trials, n_corners) and (n_trials,). Corners are where the film's mass reaches its floor, where bends
+    begin and end, and what effects say of theirs.
     """
     rig = Rig(*rigs.T)
     film = np.ones(len(rigs))
@@ -154,7 +158,21 @@ def _limits(model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_]) -
     end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
     left = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
     loss = np.asarray(rig.mass_loss)
-    return np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf), end
+    floor = np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf)
+    cornered = [i for i, effect in enumerate(model.effects) if effect.corners is not None]
+    if not cornered and not any(trial.bends for trial in trials):
+        return floor[:, None].copy(), end
+    found = [[edge for bend in trial.bends for edge in (bend.start_m, bend.start_m + bend.arc_m)] for trial in trials]
+    for i in cornered:
+        corners = model.effects[i].corners
+        assert corners is not None
+        for k in np.flatnonzero(on[:, i]).tolist():
+            found[k] += corners(Rig(*rigs[k]))
+    kinks = np.full((len(trials), 1 + max(map(len, found), default=0)), math.inf)
+    kinks[:, 0] = floor
+    for k, positions in enumerate(found):
+        kinks[k, 1 : 1 + len(positions)] = np.array(positions) * trials[k].travel_ratio
+    return np.sort(kinks, axis=1), end
 
 
 def _true_times(
