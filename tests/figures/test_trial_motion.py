@@ -48,7 +48,7 @@ def words(drawn: Figure) -> str:
 def test_every_rule_has_its_verdict_and_reason_in_words() -> None:
     said = words(figure(window("gated", True, "steady"), window("paper", True), window("user", False, "too early")))
     assert "gated rule: accepted, x_ss 2.000 ± 0.010" in said
-    assert "paper's rule (3 %): accepted".replace(" %", "\N{NO-BREAK SPACE}%") in said
+    assert "paper's rule: accepted" in said
     assert "chosen by hand: rejected" in said
     assert "too early" in said
 

@@ -35,7 +35,7 @@ VINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 RULE_COLOURS = {"gated": BLUE, "paper": VERMILLION, "user": GREEN}
 """The three ways of choosing a steady window, the same colours in every figure."""
 
-RULE_NAMES = {"gated": "gated rule", "paper": "paper's rule (3 %)", "user": "chosen by hand"}
+RULE_NAMES = {"gated": "gated rule", "paper": "paper's rule", "user": "chosen by hand"}
 
 METHOD_COLOURS = {"log_log": VERMILLION, "both_axes": BLUE}
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
