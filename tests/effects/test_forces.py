@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from by_hand import ATM, BARE, G, LEVEL, LOADED, RT_AIR, Vine, assert_same_motion, simulated
+from by_hand import ATM, BARE, LEVEL, LOADED, RT_AIR, G, Vine, assert_same_motion, simulated
 
 from vinetrack.records import Bend
 
@@ -50,9 +50,7 @@ def test_fold_inertia_is_a_quarter_of_lambda(vine: Vine) -> None:
 
 @BOTH
 def test_linear_damping(vine: Vine) -> None:
-    assert_same_motion(
-        vine, {"linear_damping.b": 0.1}, lambda _t, x, v: (vine.base(x, v) - 0.5 * 0.1 * v) / vine.m(x)
-    )
+    assert_same_motion(vine, {"linear_damping.b": 0.1}, lambda _t, x, v: (vine.base(x, v) - 0.5 * 0.1 * v) / vine.m(x))
 
 
 @BOTH
@@ -92,9 +90,7 @@ def test_capstan_friction_counts_the_bends_that_the_tip_has_passed() -> None:
         angle = min(max(y - 0.05, 0.0), 0.06) / 0.05 + min(max(y - 0.18, 0.0), 0.04) / 0.08
         return (vine.base(x, v) - 0.1 * (math.exp(0.7 * angle) - 1)) / vine.m(x)
 
-    assert_same_motion(
-        vine, {"capstan_friction.C": 0.1, "capstan_friction.mu_c": 0.7}, acceleration, bends=bends
-    )
+    assert_same_motion(vine, {"capstan_friction.C": 0.1, "capstan_friction.mu_c": 0.7}, acceleration, bends=bends)
 
 
 def test_capstan_friction_as_printed_is_a_constant() -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from by_hand import ATM, BARE, LOADED, N, RT_AIR, Vine, assert_same_motion, simulated, whole_catalogue
+from by_hand import ATM, BARE, LOADED, RT_AIR, N, Vine, assert_same_motion, simulated, whole_catalogue
 
 from vinetrack.effects import EffectError, catalogue
 from vinetrack.model.model import base_model, make_model
