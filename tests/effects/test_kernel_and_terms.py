@@ -1,0 +1,97 @@
+"""The compiled kernel and the terms along a known motion say the same, for every effect and for all together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from by_hand import BARE, LOADED, Vine, simulated, whole_catalogue
+
+from vinetrack.effects import catalogue
+from vinetrack.model.kernel import kernel
+from vinetrack.model.model import Model, base_model, effects_on
+from vinetrack.model.simulate import rig_of, simulate
+from vinetrack.model.terms import evaluate
+from vinetrack.records import Bend, Trial
+
+BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
+
+
+def sizes_of(name: str) -> dict[str, float]:
+    return {f"{name}.{parameter.name}": parameter.default for parameter in catalogue()[name].parameters}
+
+
+def accelerations(
+    model: Model, trial: Trial, time: np.ndarray, y: np.ndarray, v: np.ndarray, chamber: np.ndarray | None = None
+) -> list[float]:
+    """Of the tail, by the compiled rates, at these pressures of the chamber (none: as at release)."""
+    compiled = kernel(model.effects)
+    theta = model.parameters_for(trial.vine)
+    on, rig = effects_on(model, theta[None])[0], np.array(rig_of(trial))
+    bends = np.array([(b.start_m, b.arc_m, b.radius_m) for b in trial.bends]).reshape(-1, 3)
+    pressures = np.full(time.size, compiled.first_chamber(on, rig, theta)) if chamber is None else chamber
+    common = (on, rig, theta, np.empty(0), np.empty(0), bends)
+    return [compiled.rates(t, 2 * a, 2 * b, p, *common)[0] for t, a, b, p in zip(time, y, v, pressures, strict=True)]
+
+
+@pytest.mark.parametrize("vine", [BARE, LOADED], ids=["bare", "loaded"])
+@pytest.mark.parametrize("name", catalogue())
+def test_each_effect(name: str, vine: Vine) -> None:
+    model = whole_catalogue(sizes_of(name))
+    trial = vine.trial(bends=BENDS)
+    time, y = np.linspace(0.01, 0.1, 25), np.linspace(0.01, 0.95 * vine.L, 25)
+    v = np.linspace(0.2, 12.0, 25)
+    terms = evaluate(model, trial, time, y, v)
+    chamber = terms.pressure_Pa if name == "supply_refill" else None
+    np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
+
+
+def test_all_together() -> None:
+    names = [name for name, effect in catalogue().items() if effect.kind != "base" and name != "supply_refill"]
+    model = whole_catalogue({key: size for name in names for key, size in sizes_of(name).items()})
+    time, y, v = np.linspace(0.01, 0.1, 25), np.linspace(0.01, 0.27, 25), np.linspace(0.2, 12.0, 25)
+    trial = LOADED.trial(bends=BENDS)
+    terms = evaluate(model, trial, time, y, v)
+    got = accelerations(model, trial, time, y, v)
+    np.testing.assert_allclose(got, terms.acceleration_m_s2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("tau", [1e-4, 0.02, 1.0])
+def test_the_chambers_pressure_along_a_motion_is_that_of_the_simulation(tau: float) -> None:
+    sizes = {"supply_refill.tau": tau, "supply_refill.gamma": 1.4, "eversion_damping.B": LOADED.B}
+    model = whole_catalogue(sizes)
+    times = np.linspace(0, 0.15, 1501)
+    got = simulate(model, LOADED.trial(), times)
+    terms = evaluate(model, LOADED.trial(), times, got.lead_position_m, got.lead_velocity_m_s)
+    # Ṗ by hand, at points of the motion: what the table of pressures says changes as its equation asks.
+    P, y, ydot, A = terms.pressure_Pa, got.lead_position_m, got.lead_velocity_m_s, LOADED.A
+    rate = -1.4 * (P + 101_325) * A * ydot / (3.7e-3 + A * y) + (LOADED.P - P) / tau
+    slope = np.gradient(P, times)
+    assert np.max(np.abs((slope - rate)[5:-5])) < 2e-3 * np.max(np.abs(1.4 * 129e3 * A * ydot / 3.7e-3))
+
+
+def test_mass_area_and_pressure_of_the_terms_are_those_of_the_state() -> None:
+    terms = evaluate(whole_catalogue({}), LOADED.trial(), np.array([0.1]), np.array([0.1]), np.array([2.0]))
+    # λ = 1200·π·0.024·2e-4 = 18.0956 g/m; m = 0.28 λ − ½λ·0.2 + 35.6 g = 0.18·18.0956 + 35.6 = 38.857 g
+    assert terms.mass_kg[0] == pytest.approx(38.857e-3, rel=1e-4)
+    assert terms.area_m2[0] == pytest.approx(4.5239e-4, rel=1e-4)
+    assert terms.pressure_Pa[0] == 28e3
+
+
+def test_effects_of_no_size_leave_the_base_model_as_it_is() -> None:
+    times = np.linspace(0, 0.2, 80)
+    base = base_model().with_values({"eversion_damping.B": LOADED.B, "eversion_damping.n": 0.37})
+    plain = simulate(base, LOADED.trial(), times)
+    whole = simulated(LOADED, {}, times)
+    np.testing.assert_allclose(whole.observed_position_m, plain.observed_position_m, rtol=0, atol=1e-6 * LOADED.L)
+
+
+def test_an_effect_at_its_zero_rests_and_so_does_what_it_replaces_wake() -> None:
+    model = whole_catalogue({"reservoir_depletion.gamma": 1.4})
+    on = effects_on(model, model.parameters_for("v")[None, :])[0]
+    acting = {effect.name for effect, acts in zip(model, on, strict=True) if acts}
+    assert acting == {"pressure_drive", "gravity", "eversion_damping", "yield_pressure", "reservoir_depletion"}
+    refilled = model.with_values({"supply_refill.tau": 0.1})
+    on = effects_on(refilled, refilled.parameters_for("v")[None, :])[0]
+    acting = {effect.name for effect, acts in zip(refilled, on, strict=True) if acts}
+    assert "supply_refill" in acting
+    assert "reservoir_depletion" not in acting
