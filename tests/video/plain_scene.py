@@ -114,7 +114,7 @@ def plain_scene(plan: Plan) -> Scene:
         if plan.door:
             swing = 14.0 * max(0.0, i - plan.rest_frames + 3)
             panel = (along > plan.start_px + 24 + 0.6 * swing) & (along < plan.start_px + 60 + 0.6 * swing)
-            picture = np.where(panel & (across < 60 - swing), 25.0, picture)
+            picture = np.where(panel & (across < 60 - swing) & (across > -80), 25.0, picture)
         if plan.payload and edge[i] > 0.75 * plan.end_px:
             ahead = edge[i] + 3.0 * (edge[i] - 0.75 * plan.end_px)
             picture = np.where((np.abs(along - ahead) < 12) & (np.abs(across) < 10), 230.0, picture)
@@ -139,9 +139,10 @@ def write_video(
     bit_rate: int = 0,
     options: dict[str, str] | None = None,
     playback_fps: int = 60,
+    container_options: dict[str, str] | None = None,
 ) -> Path:
     """Write frames (n, h, w) as a video whose container claims `playback_fps`."""
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=container_options or {}) as container:
         stream = container.add_stream(codec, rate=Fraction(playback_fps), options=options or {})
         stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], pix_fmt
         if bit_rate:

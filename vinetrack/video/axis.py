@@ -142,8 +142,8 @@ def _find_line(small: NDArray[np.float32], count: int, patient: bool = False) ->
         return nothing
     diagonal = float(np.hypot(*small.shape[1:]))
     band = max(3.0, 0.03 * diagonal)
-    # What comes first counts most: a vine that meets a wall bends, sweeps and grows on along another line.
-    early = weight * (1 - 0.8 * time / n_times)
+    # Of a vine that bends and sweeps what comes first counts most; else a door, which swings first, would count too.
+    early = weight * (1 - 0.8 * time / n_times) if patient else weight
     try:
         angle, middle = _best_line(x, y, time, early, n_times, band, diagonal)
         for _ in range(3):

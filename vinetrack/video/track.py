@@ -172,7 +172,7 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
         if not orderly:
             from vinetrack.video.arrival import track_arrival
 
-            strip = cut_strip(luma, axis, min(5 * half, 0.25 * max(luma.shape[1:])))
+            strip = cut_strip(luma, axis, min(8 * half, 0.3 * max(luma.shape[1:])))
             edge, sigma = track_arrival(strip)
             return strip, _Edge(edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames)
         strip = cut_strip(luma, squared(axis), 1.3 * half + 3)
