@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.video.edge import ASSUMED_EXPOSURE, State, blur_lengths, core_frames, residuals
+from vinetrack.video.edge import ASSUMED_EXPOSURE, State, blur_lengths, core_frames, fit_edges, residuals
 from vinetrack.video.strip import Strip
 
 Floats = NDArray[np.float64]
@@ -16,6 +16,7 @@ BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8, 3.6])
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 FASTEST_LAG_STEP_PX = 4.0
 DEEPEST_LAG_PX = 60.0
+FEW_FRAMES = 16
 
 
 def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
@@ -32,8 +33,19 @@ def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
         state = replace(state, lag=lag, edge=state.edge - lead)
     candidates = BLURS_PX if anew else state.blur * np.array([0.7, 0.85, 1, 1.2, 1.4])
-    misfits = [residuals(strip, replace(state, blur=float(blur)), fit, slow)[2] for blur in candidates]
+    few = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // FEW_FRAMES)]
+    misfits = [_misfit_refitted(strip, replace(state, blur=float(blur)), few) for blur in candidates]
     return replace(state, blur=float(np.clip(_least(candidates, np.array(misfits)), 0.4, 5.0)))
+
+
+def _misfit_refitted(strip: Strip, state: State, frames: NDArray[np.int_]) -> float:
+    """Misfit of some frames with their edges sought anew: a blur must not be judged by edges fitted with another."""
+    edge = np.full(len(state.edge), np.nan)
+    edge[frames] = state.edge[frames]
+    fit = fit_edges(strip, replace(state, edge=edge))
+    use = np.isfinite(fit[:, 0])
+    edge[use] = fit[use, 0]
+    return residuals(strip, replace(state, edge=edge), fit, use)[2]
 
 
 def find_exposure(strip: Strip, state: State, fit: Floats) -> float:
