@@ -73,6 +73,8 @@ class Reference:
         for piece in self.pieces:
             knots = piece(piece.ts)[2]
             inside = (times_s > knots[0]) & (times_s <= knots[-1])
+            if not inside.any():
+                continue
             s = np.interp(times_s[inside], knots, piece.ts)
             for _ in range(20):
                 u, x, t = piece(s)

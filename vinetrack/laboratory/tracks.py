@@ -6,6 +6,7 @@ Every trial draws from its own stream of random numbers, so that leaving one out
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -44,7 +45,7 @@ class VirtualTrial:
 def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
     """Grow and measure these trials; the same seed gives the same numbers."""
     model = nature.model()
-    draws = [np.random.default_rng([nature.seed, i]) for i in range(len(trials))]
+    draws = [_draw(nature.seed, 0, trial.name) for trial in trials]
     errors = _yield_errors(trials, nature)
     true, damping = [], []
     theta = np.array([model.parameters_for(trial.vine) for trial in trials])
@@ -74,9 +75,13 @@ def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
 
 def _yield_errors(trials: Sequence[Trial], nature: Nature) -> dict[str, float]:
     """How far the true yield pressure of each vine lies from the stated one, Pa."""
-    draw = np.random.default_rng([nature.seed, 1_000_003])
-    vines = list(dict.fromkeys(trial.vine for trial in trials))
-    return {vine: 1e3 * nature.yield_error_kPa * draw.standard_normal() for vine in vines}
+    vines = dict.fromkeys(trial.vine for trial in trials)
+    return {vine: 1e3 * nature.yield_error_kPa * _draw(nature.seed, 1, vine).standard_normal() for vine in vines}
+
+
+def _draw(seed: int, kind: int, name: str) -> np.random.Generator:
+    """A stream of random numbers that belongs to one trial (kind 0) or vine (kind 1), by its name."""
+    return np.random.default_rng([seed, kind, zlib.crc32(name.encode())])
 
 
 def _frame_times(trial: Trial, nature: Nature, draw: np.random.Generator) -> tuple[Floats, float]:
@@ -156,8 +161,8 @@ def _faults(
     shown = np.flatnonzero(~lost)
     stale = moving[shown] & (draw.uniform(size=shown.size) < nature.repeated)
     stale[0] = False
-    shown = shown.copy()
-    shown[stale] = shown[np.flatnonzero(stale) - 1]
+    # Where several follow each other, all show the last frame that was fresh.
+    shown = shown[np.maximum.accumulate(np.where(stale, 0, np.arange(shown.size)))]
     rows = np.flatnonzero(stale)
     return shown, np.arange(shown.size), tuple(np.flatnonzero(lost).tolist()), tuple(rows.tolist())
 
@@ -206,7 +211,7 @@ def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
 
 
 def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str = "") -> None:
-    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`. No truth goes there."""
+    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`; no truth."""
     write_tracks(grown, folder / "tracks")
     write_csv(folder / "trials.csv", sheet([trial.stated for trial in grown]))
     if settings:
