@@ -115,9 +115,17 @@ def measure(name: str, path: Path, truth: Truth, travel_ratio: float) -> tuple[R
         return Row(name, int(moving.sum()), int(moving.sum()), np.nan, np.nan, np.nan, np.nan, str(error)), None
     spent = (time.perf_counter() - decoded) / len(frames) * 1e3
     del start
-    tips = np.column_stack([truth.tip_x_px, truth.tip_y_px])
-    along = (tips - tracking.axis.from_px) @ tracking.axis.direction
+    along = along_axis(truth, tracking)
     return compare(name, tracking, along, moving, spent), tracking
+
+
+def along_axis(truth: Truth, tracking: Tracking) -> np.ndarray:
+    """True edge along the tracked axis, freed of the camera's shake: a line of even scale through the tip's places."""
+    tips = np.column_stack([truth.tip_x_px, truth.tip_y_px])
+    seen = np.isfinite(tips).all(axis=1) & np.isfinite(truth.lead_px) & truth.in_frame
+    design = np.column_stack([np.ones(seen.sum()), truth.lead_px[seen]])
+    line, *_ = np.linalg.lstsq(design, (tips[seen] - tracking.axis.from_px) @ tracking.axis.direction, rcond=None)
+    return line[0] + line[1] * truth.lead_px
 
 
 def compare(name: str, tracking: Tracking, along_px: np.ndarray, moving: np.ndarray, spent: float) -> Row:

@@ -35,6 +35,8 @@ ASSUMED_EXPOSURE = 0.25
 """Exposure over frame period until it is estimated."""
 FAINTEST = 0.5
 """An edge of less than this much of its contrast is another thing's."""
+ASTRAY_PX = 3.0
+"""Error stated where nothing like the edge is found where the motion leads."""
 LONG_REST = 8
 """Frames of rest, counted from the motion, in which a bad fit is still sought again from many starts."""
 CLEAR_PX = 60.0
@@ -306,9 +308,9 @@ def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
     """Fits that break the motion, or hardly fit, sought again where the motion leads, shape (n_frames, 6).
 
     From the middle of the motion backwards and forwards: the edge never retreats, and a step is at most 1.3 times (or
-    1.5 px more than) its neighbour. Where a fit breaks that, or is half again as bad as most (it caught the far side
-    of a door, a payload), the best fit inside is taken if it is better, or breaks the motion less and is not much
-    worse. A frame that is missing breaks it too: no fit inside then comes near, and the first one stands.
+    1.5 px more than) its neighbour. A fit that breaks that (it caught the far side of a door, a payload) gives way to
+    the best one that does not; only a good fit at two to four whole steps stands, for frames may be missing. A fit
+    half again as bad as most gives way to a better one.
     """
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
@@ -329,9 +331,20 @@ def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
             if not np.isfinite(near) or (inside and (out[t, 2] <= bad or resting > LONG_REST)):
                 continue
             better = _best_between(strip, state, t, low, high, 1 if resting > LONG_REST else 9)
-            if better is not None and better[2] < (1.0 if inside else 1.5) * np.nan_to_num(out[t, 2], nan=np.inf):
+            if inside:
+                if better is not None and better[2] < out[t, 2]:
+                    out[t] = better
+            elif better is None:
+                out[t] = (float(np.clip(np.nan_to_num(out[t, 0], nan=near), low, high)), ASTRAY_PX, 4 * bad, 0, 0, 0)
+            elif not (_may_be_gap(out[t, 0] - near, step) and out[t, 2] <= bad and better[2] > 1.5 * out[t, 2]):
                 out[t] = better
     return out
+
+
+def _may_be_gap(stride: float, step: float) -> bool:
+    """Whether a stride looks like two to four whole steps: frames are missing, and the point is right."""
+    ratio = abs(stride) / max(step, 1e-6)
+    return step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25
 
 
 def _rough(edge: Floats) -> NDArray[np.bool_]:

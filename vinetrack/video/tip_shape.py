@@ -12,11 +12,13 @@ from vinetrack.video.strip import Strip
 
 Floats = NDArray[np.float64]
 
-BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8, 3.6])
+BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 FASTEST_LAG_STEP_PX = 4.0
 DEEPEST_LAG_PX = 60.0
 FEW_FRAMES = 16
+OPTICAL_BLUR_PX = (0.4, 3.0)
+"""From a sharp pixel to a picture out of focus; more is taken for blur only where noise drowns the edge."""
 
 
 def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
@@ -35,7 +37,7 @@ def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
     candidates = BLURS_PX if anew else state.blur * np.array([0.7, 0.85, 1, 1.2, 1.4])
     few = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // FEW_FRAMES)]
     misfits = [_misfit_refitted(strip, replace(state, blur=float(blur)), few) for blur in candidates]
-    return replace(state, blur=float(np.clip(_least(candidates, np.array(misfits)), 0.4, 5.0)))
+    return replace(state, blur=float(np.clip(_least(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
 
 
 def _misfit_refitted(strip: Strip, state: State, frames: NDArray[np.int_]) -> float:
