@@ -24,7 +24,8 @@ class Terms:
 
     `tip_N` and `tail_N` hold the forces by effect: those at the tip count 1/r on the tail, those on the tail whole.
     `tension_N` is what the tip leaves for the tail, T₁; where it is negative the tail would have to push, which it
-    cannot.
+    cannot. `mass_kg` moves and has weight; `inertia_kg` holds also what effects add to it. `state` is what the effects
+    saw.
     """
 
     pressure_Pa: Floats
@@ -34,6 +35,8 @@ class Terms:
     tail_N: Mapping[str, Floats]
     tension_N: Floats
     acceleration_m_s2: Floats
+    inertia_kg: Floats
+    state: State
 
 
 def evaluate(
@@ -81,6 +84,8 @@ def evaluate(
         tail_N=tail,
         tension_N=tension,
         acceleration_m_s2=(tension + tail_sum) / moved,
+        inertia_kg=np.asarray(moved),
+        state=state,
     )
 
 
