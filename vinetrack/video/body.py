@@ -35,7 +35,7 @@ class BodyFit:
 
     `position_px` is the column of the template's middle at mid-exposure, `across_px` its place across, `sigma_px` the
     random error along, `match` the correlation with the template, `unsure` where that is poor or the body is cut by
-    the strip's end. `blur_px` is the half length of the body.
+    the strip's end. `half_px` is half the length of the template.
     """
 
     position_px: Floats
@@ -43,7 +43,7 @@ class BodyFit:
     sigma_px: Floats
     match: Floats
     unsure: NDArray[np.bool_]
-    blur_px: float
+    half_px: float
 
 
 def track_body(strip: Strip) -> BodyFit:

@@ -35,6 +35,14 @@ ASSUMED_EXPOSURE = 0.25
 """Exposure over frame period until it is estimated."""
 FAINTEST = 0.5
 """An edge of less than this much of its contrast is another thing's."""
+START_PX = 0.4
+"""Error near the start, where background is seen briefly or never and a door may swing: measured 0.1 to 1 px."""
+START_REACH_PX = 25.0
+"""Growth over which that error falls to 1/e."""
+SELFSAME = 0.4
+"""Share of the usual contrast under which film and background near the start are the same thing seen twice."""
+DOOR_PX = 2.5
+"""Error where all of the background about the edge is crossed by something else, as measured with doors."""
 ASTRAY_PX = 3.0
 """Error stated where nothing like the edge is found where the motion leads."""
 LONG_REST = 8
@@ -49,7 +57,8 @@ EVIDENCE_CLIP = 2.5
 class EdgeFit:
     """Leading edge in strip pixels, all arrays of shape (n_frames,).
 
-    `edge_px` at mid-exposure, `sigma_px` its random error, `misfit` the mean squared residual in units of the noise
+    `edge_px` at mid-exposure, `sigma_px` its random error, `start_sigma_px` what is to be
+    added in square near the start (see START_PX), `misfit` the mean squared residual in units of the noise
     (1 is perfect), `amplitude` its contrast relative to that of the pixels it passes; `contrast` is their mean signed
     contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far each row of the tip lags behind
     its foremost point; `passed` the first and last column passed.
@@ -57,6 +66,7 @@ class EdgeFit:
 
     edge_px: Floats
     sigma_px: Floats
+    start_sigma_px: Floats
     misfit: Floats
     amplitude: Floats
     contrast: Floats
@@ -234,7 +244,25 @@ def repicture(strip: Strip, state: State, clip: float) -> State:
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
     pictures = kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
+    hidden = _film_from_the_start(state, pictures)
+    if hidden.any():
+        sums[:, hidden, 5:8] = 0.0
+        pictures = kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
     return replace(state, pictures=pictures)
+
+
+def _film_from_the_start(state: State, pictures: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Columns about the start whose background looks like their film, shape (n_along,): it was film all along.
+
+    An edge put too far back makes film its own background, without contrast and so without a say against it.
+    """
+    contrast = np.sqrt(np.mean((pictures[0] - pictures[1]) ** 2, axis=0))
+    columns = np.arange(len(contrast))
+    near = (columns > state.edge[0] - 5) & (columns < clear_of_start(state.edge))
+    later = (columns >= clear_of_start(state.edge)) & (columns < state.edge.max() - 5)
+    if later.sum() < 10:
+        return np.zeros(len(contrast), dtype=bool)
+    return near & (contrast < SELFSAME * float(np.median(contrast[later])))
 
 
 def _passing(state: State, columns: int) -> tuple[Floats, Floats]:
@@ -390,15 +418,28 @@ def _restate(strip: Strip, state: State, fit: Floats, exposure: float) -> State:
     return replace(state, inflation=np.clip(smooth, 0.3, 50.0))
 
 
+def _door_share(state: State, edge: Floats) -> Floats:
+    """Share of the pixels about the edge before which something else passes, shape (n_frames,)."""
+    changing = (state.pictures[3] > 1.05 * TEXTURE**2).mean(axis=0)
+    columns = len(changing)
+    low = np.clip(edge - 4, 0, columns - 1).astype(int)
+    high = np.clip(edge + 14, 1, columns).astype(int)
+    total = np.concatenate([[0.0], np.cumsum(changing)])
+    return (total[high] - total[low]) / np.maximum(high - low, 1)
+
+
 def _finish(state: State, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
     core = core_frames(state, fit)
     # Where the picture departs from the model (a door, a glint) the edge is worse than its curvature says.
     strain = np.sqrt(np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0))
-    edge, sigma = fit[:, 0].copy(), fit[:, 1] * strain**2
+    edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
+    edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * strain**2, ASTRAY_PX)
+    sigma = np.hypot(sigma, DOOR_PX * _door_share(state, edge_now))
     # A box of uniform dwell stands for the exposure: its middle is the mean position, ahead of mid-exposure by aτ²/24.
     bend = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
     edge = edge - np.clip(bend, -50, 50) * exposure**2 / 24
     contrast = (state.pictures[0] - state.pictures[1]).mean(axis=0).astype(float)
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
-    return EdgeFit(edge, sigma, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)
+    doubt = START_PX * np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX)
+    return EdgeFit(edge, sigma, doubt, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)

@@ -17,8 +17,8 @@ Bools = NDArray[np.bool_]
 
 LOST_SIGMA_PX = 4.0
 """A point known no better than this is no point."""
-FLOOR_PX = 0.06
-"""Errors that wander with film and background over many frames do not show as roughness: measured 0.04-0.09 px."""
+FLOOR_PX = 0.08
+"""Errors that wander with film and background over many frames do not show as roughness: measured 0.05-0.12 px."""
 STEP_RATIO = 1.6
 """A step this many times its neighbours is no acceleration: a frame is missing."""
 

@@ -41,13 +41,15 @@ class Tracking:
 
 @dataclass(frozen=True)
 class _Edge:
-    """Positions along the axis by frame, px, from whichever tracker."""
+    """Positions along the axis by frame, px, from whichever tracker; `reach_px` is what must be seen ahead of one."""
 
     edge_px: Floats
     sigma_px: Floats
     unsure: NDArray[np.bool_]
     blur_px: float
     exposure_frames: float
+    reach_px: float
+    start_sigma_px: Floats | float = 0.0
 
 
 def track_recording(
@@ -78,7 +80,7 @@ def track_recording(
     if trial.video is None:
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
-    capture_fps = _capture_fps(trial, recording.capture_fps)
+    capture_fps = capture_rate(trial, recording.capture_fps)
     frames = read_frames(recording)
     return track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
 
@@ -108,8 +110,8 @@ def track_frames(
     repeated = _repeated(strip, found.edge_px)
     moving = np.gradient(found.edge_px) > 0.3 if len(kept) > 1 else np.ones(len(kept), bool)
     sigma = calibrated_sigma(found.edge_px, found.sigma_px, moving & np.isfinite(found.edge_px))
-    reach = 3 * found.blur_px + 1
-    end_px = strip.axis.length_px - reach
+    sigma = np.hypot(sigma, found.start_sigma_px)
+    end_px = strip.axis.length_px - found.reach_px
     verdict = judge(
         found.edge_px, sigma, frames.slot[kept], unsure=found.unsure, damaged=frames.damaged[kept],
         repeated=repeated, end_px=end_px,
@@ -134,7 +136,7 @@ def track_frames(
     )
 
 
-def _capture_fps(trial: Trial, own: float | None) -> float:
+def capture_rate(trial: Trial, own: float | None) -> float:
     """The capture rate: the user's; that of DNG frames where the sheet is blank; refused where the two differ."""
     if own is not None:
         if np.isfinite(trial.capture_fps) and abs(trial.capture_fps / own - 1) > 1e-3:
@@ -167,20 +169,21 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
 
         strip = cut_strip(luma, axis, 1.5 * half + 12)
         fit = track_body(strip)
-        return strip, _Edge(fit.position_px, fit.sigma_px, fit.unsure, fit.blur_px, exposure_frames)
+        return strip, _Edge(fit.position_px, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px)
     try:
         if not orderly:
             from vinetrack.video.arrival import track_arrival
 
             strip = cut_strip(luma, axis, min(8 * half, 0.3 * max(luma.shape[1:])))
             edge, sigma = track_arrival(strip)
-            return strip, _Edge(edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames)
+            return strip, _Edge(edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames, 2.0)
         strip = cut_strip(luma, squared(axis), 1.3 * half + 3)
         strip = _centred(luma, strip, *outline(strip))
         front = track_edge(strip, exposure_frames)
     except ValueError as error:
         raise RecordingError(str(error)) from error
-    return strip, _Edge(front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames)
+    reach = 3 * front.blur_px + 1
+    return strip, _Edge(front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames, reach)
 
 
 def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:

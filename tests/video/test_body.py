@@ -1,0 +1,89 @@
+"""A body registered against itself: a disc drawn at known places, bright, dark on dark, falling with known g."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from vinetrack.records import Trial
+from vinetrack.video.axis import Axis
+from vinetrack.video.body import track_body
+from vinetrack.video.frames import Frames, Recording, RecordingError, Region
+from vinetrack.video.strip import cut_strip
+from vinetrack.video.track import track_frames
+
+RATE = 1000.0
+G_PX = 9.81 / 0.5e-3 / RATE**2  # px a frame², at 0.5 mm a pixel
+SHAPE = (420, 160)
+
+
+def falling_disc(seed, body=150.0, back=70.0, marks=25.0, rest=8, n=185):
+    """Frames (n, height, width), uint8, of a marked disc falling from rest, and its true row (n,)."""
+    rng = np.random.default_rng(seed)
+    backdrop = back + cv2.GaussianBlur(rng.standard_normal(SHAPE).astype(np.float32), (0, 0), 3) * 40
+    pattern = cv2.GaussianBlur(rng.standard_normal((61, 61)).astype(np.float32), (0, 0), 3)
+    pattern = marks * pattern / pattern.std()
+    t = np.clip(np.arange(n) - rest, 0, None)
+    row = 50 + 0.5 * G_PX * t**2
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float32)
+    frames = np.empty((n, *SHAPE), np.uint8)
+    for i in range(n):
+        distance = np.hypot(y - row[i], x - 80)
+        cover = np.clip(24 - distance + 0.5, 0, 1)
+        matrix = np.array([[1, 0, 80 - 30], [0, 1, row[i] - 30]], np.float32)
+        drawn = cv2.warpAffine(pattern, matrix, SHAPE[::-1], flags=cv2.INTER_CUBIC)
+        picture = cv2.GaussianBlur(backdrop + cover * (body + drawn - backdrop), (0, 0), 0.8)
+        frames[i] = np.clip(np.rint(picture + rng.normal(0, 2, SHAPE)), 0, 255)
+    return frames, row
+
+
+def in_memory(luma):
+    recording = Recording(Path("fall.mp4"), "container", luma.shape[2], luma.shape[1], 8, len(luma))
+    return Frames(recording, recording.whole, luma, np.arange(len(luma)), np.zeros(len(luma), dtype=bool))
+
+
+BALL = Trial(name="ball", capture_fps=RATE, m_per_px=0.5e-3, travel_ratio=1)
+
+
+@pytest.mark.parametrize(("body", "back"), [(150.0, 70.0), (60.0, 55.0)], ids=["bright", "dark on dark"])
+def test_falling_disc(body, back):
+    frames, row = falling_disc(301, body, back)
+    track = track_frames(in_memory(frames), BALL, RATE).track
+    used = track.usable & (row > 90) & (row < 340)
+    error = track.edge_px[used] - row[used]
+    assert used.sum() > 70
+    assert error.std() < 0.12
+    fall = np.polyfit(track.time_s[used], track.lead_position_m[used], 2)
+    assert 2 * fall[0] == pytest.approx(9.81, rel=0.01)
+
+
+def test_body_strip_directly_along_a_given_axis():
+    frames, row = falling_disc(302)
+    strip = cut_strip(frames, Axis((80.0, 0.0), (80.0, 419.0), 48.0), 40)
+    fit = track_body(strip)
+    inside = ~fit.unsure
+    assert inside.sum() > 120
+    assert (fit.position_px - row)[inside].std() < 0.12
+    assert np.abs(np.median(fit.across_px)) < 1.0
+
+
+def test_body_that_leaves_the_picture_ends_the_track():
+    frames, row = falling_disc(303, n=215)
+    track = track_frames(in_memory(frames), BALL, RATE).track
+    assert any("leaves the picture" in note for note in track.notes)
+    assert "after_end" in track.flag[-1]
+    assert track.usable[(row > 90) & (row < 350)].all()
+
+
+def test_nothing_moving_is_said():
+    frames, _ = falling_disc(304, n=12, rest=20)
+    strip = cut_strip(np.repeat(frames[:1], 12, axis=0), Axis((80.0, 0.0), (80.0, 419.0), 48.0), 40)
+    with pytest.raises(RecordingError, match="nothing moves"):
+        track_body(strip)
+
+
+def test_region_of_a_recording_is_its_whole_picture():
+    assert in_memory(np.zeros((3, 20, 30), np.uint8)).region == Region(0, 0, 30, 20)

@@ -1,0 +1,63 @@
+"""Recordings made by others, read from the folder that VINETRACK_REAL_DATA names; skipped where it is unset."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vinetrack.records import Trial
+from vinetrack.video.axis import Axis
+from vinetrack.video.frames import read_frames
+from vinetrack.video.track import track_recording
+
+FOLDER = os.environ.get("VINETRACK_REAL_DATA", "")
+pytestmark = [
+    pytest.mark.real,
+    pytest.mark.skipif(not FOLDER, reason="VINETRACK_REAL_DATA is unset: no real recordings to try"),
+]
+REAL = Path(FOLDER)
+RULER_M_PER_PX = 0.27307e-3
+
+
+def test_free_fall_gives_g():
+    trial = Trial(
+        name="ball", video=REAL / "freefall_1000fps" / "freefall.mp4", capture_fps=1000.0, m_per_px=RULER_M_PER_PX,
+        travel_ratio=1,
+    )  # fmt: skip
+    track = track_recording(trial).track
+    falling = track.usable & np.array(["before_release" not in flag for flag in track.flag])
+    assert falling.sum() > 150
+    time, position = track.time_s[falling], track.lead_position_m[falling]
+    fall = np.polyfit(time, position, 2)
+    assert 9.5 < 2 * fall[0] < 9.7
+    assert np.std(position - np.polyval(fall, time)) < 0.15 * RULER_M_PER_PX
+
+
+@pytest.mark.parametrize("axis", [None, Axis((20.0, 95.0), (250.0, 95.0), 22.0)], ids=["axis found", "axis given"])
+def test_growing_vine_is_followed_to_the_wall(axis):
+    trial = Trial(name="vine", video=REAL / "vine_growth", capture_fps=30.0, m_per_px=1.0)
+    tracking = track_recording(trial, axis)
+    track = tracking.track
+    x = tracking.axis.points(track.edge_px)[:, 0]
+    free = track.usable & (x > 55) & (x < 200)
+    assert free.sum() > 80
+    slope = np.polyfit(np.flatnonzero(free), x[free], 1)[0]
+    assert 1.3 < slope < 1.6
+    assert np.nanmin(x) < 55
+    assert np.nanmax(x) > 210
+    assert any("it met a wall" in note for note in track.notes)
+
+
+def test_the_picture_that_is_not_a_frame_is_left_out():
+    frames = read_frames(REAL / "vine_growth")
+    assert len(frames) == 212
+    assert any("frame_ref.jpg" in note for note in frames.notes)
+
+
+def test_tossed_ball_is_read_whole():
+    frames = read_frames(REAL / "balltoss" / "balltoss.mp4")
+    assert frames.luma.shape == (13, 480, 640)
+    assert frames.notes == ()
