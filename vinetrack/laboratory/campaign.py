@@ -75,7 +75,8 @@ def damping_pressures_kPa(scale: int, count: int = 10) -> np.ndarray:
     # x/x_relax = 2L / (v τ) with τ = m / (½ n B v^(n−1)), solved for v at 3.2.
     fastest = (vine.length_m * PAPER_N * B / (3.2 * film_kg)) ** (1 / (2 - PAPER_N))
     drive_Pa = B * np.array([slowest, fastest]) ** PAPER_N / vine.area_m2
-    return np.round(np.linspace(*(vine.yield_pressure_Pa + drive_Pa), count) / 1e3, 1)
+    lowest, highest = (vine.yield_pressure_Pa + drive_Pa).tolist()
+    return np.asarray(np.round(np.linspace(lowest, highest, count) / 1e3, 1))
 
 
 def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
@@ -91,7 +92,7 @@ def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
 
 
 def paper_payload(replicates: int = 4) -> list[Trial]:
-    """The protocol of the paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads."""
+    """The paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads."""
     trials = campaign(isometric_vine(4), (7, 14, 28), replicates, payload_g=35.6, prefix="fig4_")
     thinner = replace(isometric_vine(4), thickness_um=150.0)
     for payload_g in (10.0, 20.0, 35.6, 50.0):

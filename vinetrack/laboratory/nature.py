@@ -1,4 +1,4 @@
-"""What is true in a virtual experiment and hidden from the analysis: the physics, the scatter, the noise, the faults."""
+"""What is true in a virtual experiment and hidden from the analysis: physics, scatter, noise, faults."""
 
 from __future__ import annotations
 

@@ -60,9 +60,9 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
     Parameters
     ----------
     points
-        A row a trial, as `vinetrack.motion.summary` makes them: those with `used` enter `log_log` and `both_axes`; every
-        trial that could, by its payload and travel ratio, and has a window by the published rule enters `paper` with set
-        pressure, without weight and fitted as published.
+        A row a trial, as `vinetrack.motion.summary` makes them: those with `used` enter `log_log` and `both_axes`;
+        every trial that could, by its payload and travel ratio, and has a window by the published rule enters `paper`
+        with set pressure, without weight and fitted as published.
 
     Returns
     -------
@@ -245,8 +245,8 @@ def _fit(
                 "B_95": [float(np.exp(low[i + 1])), float(np.exp(high[i + 1]))],
                 "B_95_total": [float(np.exp(low_total[i + 1])), float(np.exp(high_total[i + 1]))],
                 "R2": _r_squared(data.log_force[data.vine == i], residual[data.vine == i]),
-                "diameter_mm": float(vines.loc[name, "diameter_mm"]),
-                "thickness_um": float(vines.loc[name, "thickness_um"]),
+                "diameter_mm": float(vines["diameter_mm"][name]),
+                "thickness_um": float(vines["thickness_um"][name]),
                 "n_trials": int(np.sum(data.vine == i)),
             }
             for i, name in enumerate(data.names)
