@@ -350,8 +350,9 @@ def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
     for sense in (-1, 1):
         resting = 0
         for t in range(anchor + sense, -1 if sense < 0 else len(fit), sense):
-            near, beyond = out[t - sense, 0], out[min(max(t - 2 * sense, 0), len(fit) - 1), 0]
-            step = abs(near - beyond) if np.isfinite(beyond) else 0.0
+            near = out[t - sense, 0]
+            past = out[np.clip([t - sense, t - 2 * sense, t - 3 * sense], 0, len(fit) - 1), 0]
+            step = float(np.nan_to_num(np.abs(np.diff(past))).max())  # of two: a frame may repeat the one before it
             resting = resting + 1 if step < 0.3 else 0
             far = max(1.3 * step, step + 1.5)
             low, high = (near - far, near + 0.8) if sense < 0 else (near - 0.8, near + far)
@@ -362,9 +363,11 @@ def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
             if inside:
                 if better is not None and better[2] < out[t, 2]:
                     out[t] = better
+            elif _may_be_gap(out[t, 0] - near, step) and out[t, 2] <= bad and (better is None or better[2] > out[t, 2]):
+                continue
             elif better is None:
                 out[t] = (float(np.clip(np.nan_to_num(out[t, 0], nan=near), low, high)), ASTRAY_PX, 4 * bad, 0, 0, 0)
-            elif not (_may_be_gap(out[t, 0] - near, step) and out[t, 2] <= bad and better[2] > 1.5 * out[t, 2]):
+            else:
                 out[t] = better
     return out
 

@@ -54,7 +54,7 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: fl
 
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
-    """First and last frame in which the edge is on its way: (0, n − 1) where it never rests, (n, −1) where it only rests.
+    """First and last frame in which the edge is on its way; (0, n − 1) if it never rests, (n, −1) if it only rests.
 
     At rest means: within three sigma, at least 0.4 px (0.25 px at the end, where a creeping stop still tells), of
     the level that it keeps up to, or from, there.
@@ -126,9 +126,8 @@ def judge(
         notes.append(f"the leading edge leaves the picture at frame {left}; later frames are not used")
     copies = repeated & (np.arange(n) > first) & (np.arange(n) <= last)
     if copies.any():
-        notes.append(
-            f"{int(copies.sum())} frames repeat the one before them and are dropped, first frame {np.flatnonzero(copies)[0]}"
-        )
+        which = int(np.flatnonzero(copies)[0])
+        notes.append(f"{int(copies.sum())} frames repeat the one before them and are dropped, first frame {which}")
     outlying = _outliers(y, sigma_px, first, last)
     for i in range(n):
         parts = (
@@ -187,7 +186,8 @@ def _mend_times(
             if retime and abs(ratio - whole) < 0.2 and whole <= 4:
                 mended[i:] += whole - 1
                 notes.append(
-                    f"{whole - 1} frame(s) missing before frame {i} by the step of the motion; later frames are timed accordingly"
+                    f"{whole - 1} frame(s) missing before frame {i} by the step of the motion; "
+                    "later frames are timed accordingly"
                 )
             else:
                 notes.append(f"a step of {ratio:.1f} times its neighbours before frame {i}: frames may be missing")
