@@ -140,12 +140,19 @@ def compare(name: str, tracking: Tracking, along_px: np.ndarray, moving: np.ndar
 
 def show(rows: list[Row]) -> None:
     """Print the table and its medians."""
-    print(f"{'recording':28s} {'moving':>6s} {'lost':>4s} {'SD':>7s} {'bias':>7s} {'stated':>7s} {'pull':>5s} {'ms/frame':>8s}")
+    heads = ("moving", "lost", "SD", "bias", "stated", "pull", "ms/frame")
+    print(f"{'recording':28s}" + "".join(f"{head:>9s}" for head in heads))
     for r in rows:
-        print(f"{r.name:28s} {r.n_moving:6d} {r.lost:4d} {r.sd:7.3f} {r.bias:+7.3f} {r.stated:7.3f} {r.pull:5.2f} {r.ms_per_frame:8.2f} {r.note}")
+        numbers = f"{r.sd:9.3f}{r.bias:+9.3f}{r.stated:9.3f}{r.pull:9.2f}{r.ms_per_frame:9.2f}"
+        print(f"{r.name:28s}{r.n_moving:9d}{r.lost:9d}{numbers} {r.note}", flush=True)
     sd = np.array([r.sd for r in rows])
     within = np.mean([1 / 1.5 <= r.pull <= 1.5 for r in rows])
-    print(f"median SD {np.nanmedian(sd):.3f} px, worst {np.nanmax(sd):.3f}; lost {sum(r.lost for r in rows)} of {sum(r.n_moving for r in rows)}; pulls within a factor 1.5: {within:.0%}\n")
+    lost, moving = sum(r.lost for r in rows), sum(r.n_moving for r in rows)
+    print(
+        f"median SD {np.nanmedian(sd):.3f} px, worst {np.nanmax(sd):.3f}; lost {lost} of {moving} moving frames; ",
+        end="",
+    )
+    print(f"stated errors within a factor 1.5: {within:.0%}\n", flush=True)
 
 
 def demo_rows(seeds: list[int], folder: Path) -> list[Row]:

@@ -97,7 +97,7 @@ def find_axis(luma: NDArray[Any]) -> Axis:
 def is_orderly(luma: NDArray[Any], axis: Axis) -> bool:
     """Whether most of what changes along `axis` is a front that passes once, and what it brings stays."""
     small, factor = _small_frames(luma)
-    scaled = Axis(*(_shrunk(point, factor) for point in (axis.from_px, axis.to_px)), axis.width_px / factor)
+    scaled = Axis(_shrunk(axis.from_px, factor), _shrunk(axis.to_px, factor), axis.width_px / factor)
     angle = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
     band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*small.shape[1:])))
     x, y, time, weight, n_times = _changed_pixels(small, len(small))

@@ -107,7 +107,7 @@ def _half_length(strange: NDArray[np.float32]) -> int:
 
 
 def _forward_path(score: Floats) -> Floats:
-    """Place by frame that never goes back and collects most score, each step weighed by how far it departs from rest."""
+    """Place by frame, shape (n_frames,), that never goes back and collects most score."""
     n, columns = score.shape
     best = np.zeros_like(score)
     came = np.zeros(score.shape, dtype=int)
@@ -151,7 +151,7 @@ def _find_all(
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Place (n, 2) along and across, its error along (n,) and correlation (n,) in every frame."""
     out, error, match = place.copy(), np.full(len(place), np.nan), np.zeros(len(place))
-    slope_across, slope_along = np.gradient(template)
+    slope_across, slope_along = np.gradient(template, axis=0), np.gradient(template, axis=1)
     for t, picture in enumerate(pictures):
         guess = place[t]
         if first:

@@ -171,7 +171,7 @@ def luma_plane(frame: av.VideoFrame, region: Region) -> NDArray[Any]:
         return np.array(frame.to_ndarray(format=target)[region.slices])
     plane = frame.planes[0]
     dtype = np.dtype(np.uint8) if depth <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
-    rows = np.frombuffer(plane, dtype=dtype).reshape(-1, plane.line_size // dtype.itemsize)
+    rows = np.frombuffer(memoryview(plane), dtype=dtype).reshape(-1, plane.line_size // dtype.itemsize)
     copied = rows[region.slices].copy()
     return copied if dtype.itemsize == 1 else copied.astype(np.uint16, copy=False)
 
@@ -313,6 +313,6 @@ class _quiet_log:  # noqa: N801 - used as a context, like a function
     def __exit__(self, *exc: object) -> None:
         import av.logging
 
-        self._capture.__exit__(*exc)
+        self._capture.__exit__(None, None, None)
         self._complaints.extend(message.strip() for _, _, message in self._logs)
         av.logging.set_level(self._level)

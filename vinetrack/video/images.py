@@ -101,7 +101,8 @@ def _numbered_files(folder: Path) -> tuple[tuple[Path, ...], tuple[int, ...], tu
             groups.setdefault((match.group(1), file.suffix.lower()), []).append((int(match.group(2)), file))
     if not groups:
         return tuple(images), (), ()
-    group = sorted(max(groups.values(), key=len))
+    longest = max(groups, key=lambda name: len(groups[name]))
+    group = sorted(groups[longest])
     files = tuple(file for _, file in group)
     numbers = tuple(number for number, _ in group)
     left_out = [f.name for f in images if f not in set(files)]

@@ -181,7 +181,7 @@ def _steady(
 def _basis(reference: NDArray[Any]) -> NDArray[np.float32]:
     """Mean picture, one, and its slopes along and across, shape (4, n_pixels)."""
     picture = reference.astype(np.float32)
-    across, along = np.gradient(picture)
+    across, along = np.gradient(picture, axis=0), np.gradient(picture, axis=1)
     inner = (slice(1, -1), slice(1, -1))
     parts = (picture[inner], np.ones_like(picture[inner]), -along[inner], -across[inner])
     return np.stack([part.ravel() for part in parts])
