@@ -22,7 +22,7 @@ from vinetrack.records import Floats
 
 HARD_TO_TELL_APART = 0.98
 ADDS_NOTHING = 0.95
-MISSES = 1.3
+MISSES = 2.0
 SPREAD_NAMES = ("pressure", "B")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,7 +116,7 @@ def _nearing_end(trial: Trial, track: Track) -> NDArray[np.bool_]:
     if not np.isfinite(trial.length_m) or use.size < FEWEST_POINTS:
         return near
     y = track.lead_position_m[use]
-    noise_m = 2 * rough_noise(y) + 1e-9
+    noise_m = rough_noise(y) + 1e-9
     n_rest = rest_points(y)
     n_rest = n_rest if n_rest < y.size else 0
     begin_m = float(np.mean(y[: max(n_rest, 1)]))
@@ -127,7 +128,9 @@ def _nearing_end(trial: Trial, track: Track) -> NDArray[np.bool_]:
     last_m = float(np.median(y[-2:])) - (1 - END_FRACTION) * trial.length_m if reached else np.inf
     late = y > min(begin_m + END_FRACTION * trial.length_m, last_m)
     if reached:
-        late[end + FRAMES_BEHIND_END :] = False
+        # Noise hides the end for as long as the last steps are no larger; behind it the model must have stopped too.
+        step_m = max(float(np.median(np.diff(y[max(end - 10, 0) : end]))), 1e-9)
+        late[end + FRAMES_BEHIND_END + math.ceil(min(10 * noise_m / step_m, y.size)) :] = False
     near[use[late]] = True
     return near
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.model.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE
+from vinetrack.model.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, RELEASE
 from vinetrack.model.whitened import at_correlation
 from vinetrack.records import Floats
 
@@ -77,11 +77,15 @@ def own_prior(frame: Frame, state: State) -> tuple[Floats, Floats]:
     return centre, precision
 
 
-def penalty(frame: Frame, state: State) -> float:
-    """What the priors add to the sum of squares."""
+def shared_penalty(frame: Frame, state: State) -> float:
+    """What the priors of the free numbers add to the sum of squares."""
+    return float(np.sum(frame.prior_precision * (state.theta - frame.prior_mean) ** 2))
+
+
+def own_penalty(frame: Frame, state: State) -> Floats:
+    """What the priors of the trials' own numbers add, shape (n_trials,)."""
     centre, precision = own_prior(frame, state)
-    prior = frame.prior_precision * (state.theta - frame.prior_mean) ** 2
-    return float(np.sum(precision * (state.own - centre) ** 2) + np.sum(prior))
+    return np.asarray(np.sum(precision * (state.own - centre) ** 2, axis=1))
 
 
 def gather(blocks: Floats, frame: Frame) -> Floats:
@@ -123,12 +127,15 @@ def newton_step(grams: Floats, frame: Frame, state: State, damping: float) -> tu
     return step, own_step, promised
 
 
-def own_step(grams: Floats, frame: Frame, state: State) -> Floats:
-    """Step of the trials' own numbers alone, shape (n_trials, 4)."""
+def own_step(grams: Floats, frame: Frame, state: State, *, pinned: bool = False) -> Floats:
+    """Step of the trials' own numbers alone, shape (n_trials, 4); `pinned` leaves the release where it is."""
     white = at_correlation(grams, state.rho) / state.variance[:, None, None]
     centre, precision = own_prior(frame, state)
     square = white[:, :OWN, :OWN] + precision[:, :, None] * np.eye(OWN)
     slope = white[:, :OWN, -1] - precision * (state.own - centre)
+    if pinned:
+        square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
+        square[:, RELEASE, RELEASE] = 1.0
     return np.asarray(solve_each(square, slope[:, :, None])[:, :, 0])
 
 

@@ -116,8 +116,7 @@ class Predictor:
             columns[i][:, -1] = self._residual(i, moved[i], own)
         for job, (place, step), other in zip(jobs, moves, moved, strict=True):
             if place >= 0:
-                change = other.observed_position_m - moved[job.trial].observed_position_m
-                columns[job.trial][:, place] = change / step
+                columns[job.trial][:, place] = _change(moved[job.trial], other) / step
         self._share_damping(columns)
         if not own_only:
             self._adapt(columns)
@@ -172,6 +171,15 @@ class Predictor:
             self.steps[column] = _step(float(np.max(answers[:, OWN + column])), float(self.steps[column]))
         for i in np.flatnonzero(self.feels_pressure):
             self.pressure_step[i] = _step(float(answers[i, PRESSURE]), float(self.pressure_step[i]))
+
+
+def _change(plain: Trajectory, other: Trajectory) -> Floats:
+    """How far positions moved. Where growth has ended nothing that only delays the end moves them."""
+    change = other.observed_position_m - plain.observed_position_m
+    if plain.status == "ended":
+        over = plain.time_s > plain.end_time_s
+        change[over] = change[-1] if other.status == "ended" else 0.0
+    return change
 
 
 def _step(answer: float, before: float) -> float:

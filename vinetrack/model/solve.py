@@ -15,8 +15,9 @@ from vinetrack.model.mixed import (
     estimate_spreads,
     marginal,
     newton_step,
+    own_penalty,
     own_step,
-    penalty,
+    shared_penalty,
 )
 from vinetrack.model.sensitivity import DAMPING_DEVIATION, PRESSURE, RELEASE, Predictor
 from vinetrack.model.simulate import SimulationError
@@ -200,8 +201,8 @@ def _take_step(
         theta = np.clip(state.theta + step, frame.lower, frame.upper)
         try:
             tried = replace(state, theta=theta, own=_limited(predictor, state.own, own_change))
-            tried = _follow(predictor, frame, tried)
-            better = cost(predictor, frame, tried) < now
+            tried, reached = _follow(predictor, frame, tried)
+            better = reached < now
         except SimulationError:
             better = False
         if better:
@@ -211,13 +212,24 @@ def _take_step(
     return None, 0.0
 
 
-def _follow(predictor: Predictor, frame: Frame, state: State) -> State:
-    """The trials' own numbers brought to their best for the others.
+def _follow(predictor: Predictor, frame: Frame, state: State) -> tuple[State, float]:
+    """The trials' own numbers brought to their best for the others, and the cost there.
 
-    They are known so well that a step of the shared numbers leaves the valley by its curvature alone.
+    They are known so well that a step of the shared numbers leaves the valley by its curvature alone. Every trial
+    takes what serves it best: where a release meets a frame, the cost has a corner at which no full step helps.
     """
     grams = _products(predictor, predictor.linearise(state.theta, state.own, own_only=True))
-    return replace(state, own=_limited(predictor, state.own, own_step(grams, frame, state)))
+    ways = [
+        state,
+        *(
+            replace(state, own=_limited(predictor, state.own, own_step(grams, frame, state, pinned=pinned)))
+            for pinned in (False, True)
+        ),
+    ]
+    costs = np.array([trial_costs(predictor, frame, way) for way in ways])
+    best = np.argmin(costs, axis=0)
+    own = np.array([ways[way].own[i] for i, way in enumerate(best)])
+    return replace(state, own=own), float(np.sum(np.min(costs, axis=0))) + shared_penalty(frame, state)
 
 
 def _limited(predictor: Predictor, own: Floats, step: Floats) -> Floats:
@@ -230,14 +242,19 @@ def _limited(predictor: Predictor, own: Floats, step: Floats) -> Floats:
     return moved
 
 
-def cost(predictor: Predictor, frame: Frame, state: State) -> float:
-    """Whitened sum of squares with what the priors add."""
+def trial_costs(predictor: Predictor, frame: Frame, state: State) -> Floats:
+    """Whitened sum of squares of every trial with what the priors of its own numbers add, shape (n_trials,)."""
     residuals = predictor.residuals(state.theta, state.own)
-    total = penalty(frame, state)
-    for item, residual, variance in zip(predictor.data, residuals, state.variance, strict=True):
-        white = whiten(residual, item.first, state.rho)
-        total += float(white @ white) / variance
-    return total
+    squares = [
+        float(np.sum(whiten(residual, item.first, state.rho) ** 2)) / variance
+        for item, residual, variance in zip(predictor.data, residuals, state.variance, strict=True)
+    ]
+    return np.array(squares) + own_penalty(frame, state)
+
+
+def cost(predictor: Predictor, frame: Frame, state: State) -> float:
+    """Whitened sum of squares of all trials with what the priors add."""
+    return float(np.sum(trial_costs(predictor, frame, state))) + shared_penalty(frame, state)
 
 
 __all__ = ["Held", "Solution", "cost", "estimable", "first_state", "make_frame", "solve"]
