@@ -181,5 +181,11 @@ class Effect:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Effect) and (self.name, self.path) == (other.name, other.path)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel between processes as the file it was read from."""
+        from vinetrack.effects._catalogue import load_effect
+
+        return load_effect, (self.path,)
+
     def __repr__(self) -> str:
         return f"<effect {self.name}: {self.formula}>"

@@ -23,7 +23,7 @@ NEEDS = ("yield_pressure_kPa",)
 EASILY_TAKEN_FOR = ("yield_pressure",)
 PARAMETERS = (
     Parameter(
-        "P_s", "P_s", "Pa", 5e3, bounds=(0.0, 1e6), plausible=(1e3, 30e3), meaning="gauge pressure that starts growth"
+        "P_s", "P_s", "Pa", 6e3, bounds=(0.0, 1e6), plausible=(1e3, 30e3), meaning="gauge pressure that starts growth"
     ),
 )
 

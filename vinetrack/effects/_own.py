@@ -1,0 +1,141 @@
+"""A user's own effects: read, and tried out before a model is built on them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from vinetrack.effects._base import Effect, Rig, State, Worked
+from vinetrack.effects._catalogue import EffectError, load_effect
+
+_STATE = State(
+    time=0.05,
+    lead_position=0.1,
+    lead_velocity=1.5,
+    tail_position=0.2,
+    tail_velocity=3.0,
+    set_pressure=28e3,
+    pressure=27e3,
+    yield_pressure=3e3,
+    area=4.5e-4,
+    linear_density=0.018,
+    moving_mass=0.039,
+    damping_gain=1.1,
+    bend_angle=0.5,
+    tail_tension=2.0,
+    observed=0.101,
+)
+_RIG = Rig(
+    set_pressure=28e3,
+    yield_pressure=3e3,
+    diameter=24e-3,
+    thickness=200e-6,
+    length=0.28,
+    area=4.5e-4,
+    linear_density=0.018,
+    mass_loss=0.009,
+    payload_mass=0.0356,
+    cos_angle=1.0,
+    travel_ratio=2.0,
+    ambient_pressure=101_325.0,
+    chamber_volume=3.7e-3,
+    inlet_area=2.8e-5,
+    least_mass=6e-5,
+    has_bends=1.0,
+    tail_on_reel=0.0,
+    bend_count=1.0,
+    bend_total=1.0,
+    as_printed=0.0,
+    tail_free=0.0,
+)
+
+UNCHANGED = {
+    "true_time": _STATE.time,
+    "film_gain": 1.0,
+    "gauge": _STATE.pressure,
+    "yield_gauge": _STATE.yield_pressure,
+    "area": _STATE.area,
+    "chamber_rate": 0.0,
+    "pressure": _STATE.pressure,
+    "damping_gain": _STATE.damping_gain,
+    "added_mass": 0.0,
+    "tip_force": 0.0,
+    "tail_force": 0.0,
+    "rest_force": 0.0,
+    "observed_position": _STATE.observed,
+}
+"""What a function must leave behind, in the state above, where its effect has no size."""
+
+
+def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
+    """A user's effects by name, each read and tried out.
+
+    Raises
+    ------
+    EffectError
+        If a file is no effect, two have one name, or one does not do what it says; one sentence.
+    """
+    found: dict[str, Effect] = {}
+    for path in map(Path, paths):
+        effect = load_effect(path)
+        if effect.name in found:
+            raise EffectError(f"{path}: there is another effect named {effect.name!r}, {found[effect.name].path}.")
+        faults = list(behaviour_faults(effect))
+        if faults:
+            raise EffectError(f"{path}: {faults[0]}.")
+        found[effect.name] = effect
+    return found
+
+
+def behaviour_faults(effect: Effect) -> Iterator[str]:
+    """What an effect does other than its file says: worked numbers missed, size where there should be none.
+
+    Effects that change nothing at rest are asked in motion; a function that cannot be compiled is named.
+    """
+    for hook in effect.functions:
+        yield from _compile_faults(effect, hook)
+    for worked in effect.worked:
+        yield from _worked_faults(effect, worked)
+    if effect.parameters:
+        for hook, function in effect.functions.items():
+            value = float(function(_STATE, _RIG, *effect.zero))
+            if not math.isclose(value, UNCHANGED[hook], rel_tol=1e-9, abs_tol=1e-12):
+                zero = ", ".join(f"{p.name} = {p.zero:g}" for p in effect.parameters)
+                yield f"{hook} gives {value:.6g} at {zero}, where nothing should change ({UNCHANGED[hook]:g})"
+
+
+def worked_value(effect: Effect, worked: Worked) -> float:
+    """What the effect gives at the state, rig and parameters of a worked number; all else is NaN.
+
+    Raises
+    ------
+    KeyError
+        If the worked number names no function of the effect, or lacks one of its parameters.
+    """
+    state = State(*(math.nan,) * len(State._fields))._replace(**worked.state)
+    rig = Rig(*(math.nan,) * len(Rig._fields))._replace(**worked.rig)
+    arguments = [worked.parameters[parameter.name] for parameter in effect.parameters]
+    return float(effect.functions[worked.hook](state, rig, *arguments))
+
+
+def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
+    try:
+        value = worked_value(effect, worked)
+    except (KeyError, ValueError) as error:
+        yield f"a worked number of {worked.hook} cannot be tried ({error})"
+        return
+    if not math.isclose(value, worked.expected, rel_tol=worked.rel, abs_tol=1e-12):
+        yield f"{worked.hook} gives {value:.6g} where worked out by hand it is {worked.expected:.6g} ({worked.how})"
+
+
+def _compile_faults(effect: Effect, hook: str) -> Iterator[str]:
+    from numba import njit
+    from numba.core.errors import NumbaError
+
+    try:
+        njit(effect.functions[hook])(_STATE, _RIG, *(parameter.default for parameter in effect.parameters))
+    except NumbaError:
+        yield f"{hook} cannot be compiled: it may use numbers, math and numpy functions only"
+    except Exception as error:
+        yield f"{hook} fails in motion ({type(error).__name__}: {error})"

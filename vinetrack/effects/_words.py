@@ -1,0 +1,60 @@
+"""The catalogue in words: a list of all effects, and one explained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from vinetrack.effects._base import KINDS, Effect, Parameter
+
+_HEAD = ("name", "kind", "parameters")
+
+
+def listing(effects: Iterable[Effect], own: Mapping[str, Effect] | None = None) -> list[str]:
+    """Lines: name, kind, parameters with units, aligned, and below each its formula; base effects first."""
+    mine = set((own or {}).values())
+    effects = sorted(effects, key=lambda effect: KINDS.index(effect.kind))
+    entries = []
+    for effect in effects:
+        parameters = ", ".join(f"{p.symbol} ({p.unit})" for p in effect.parameters) or "–"
+        entries.append(
+            (effect.name, f"{effect.kind}, own" if effect in mine else effect.kind, parameters, effect.formula)
+        )
+    widths = [max(len(row[i]) for row in [_HEAD, *entries]) for i in range(2)]
+    lines = [f"{_HEAD[0]:<{widths[0]}}  {_HEAD[1]:<{widths[1]}}  {_HEAD[2]}"]
+    for name, kind, parameters, formula in entries:
+        lines += [f"{name:<{widths[0]}}  {kind:<{widths[1]}}  {parameters}", f"    {formula}"]
+    return lines
+
+
+def explanation(effect: Effect) -> list[str]:
+    """Lines: what one effect is, in the words of its file, then its parameters and how it stands to others."""
+    lines = [f"{effect.name} ({effect.kind})", "", *effect.text.splitlines(), ""]
+    if effect.parameters:
+        lines += ["Parameters, in files by the name in brackets:", *_parameter_table(effect), ""]
+    facts = [
+        ("Needs of the trial sheet", ", ".join(effect.needs)),
+        ("Easily taken for", ", ".join(effect.easily_taken_for)),
+        ("Replaces, while in the model", ", ".join(effect.replaces)),
+        ("A pressure measured during growth", "already holds it" if effect.in_trace else ""),
+        ("File", str(effect.path)),
+    ]
+    return [*lines, *(f"{what}: {words}" for what, words in facts if words)]
+
+
+def _parameter_table(effect: Effect) -> list[str]:
+    head = ("symbol", "unit", "default", "bounds", "plausible", "no size at", "one for", "meaning")
+    rows = [head, *(_cells(effect, parameter) for parameter in effect.parameters)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+    return [
+        "  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
+def _cells(effect: Effect, p: Parameter) -> tuple[str, ...]:
+    plausible = f"{p.plausible[0]:g} to {p.plausible[1]:g}" if p.plausible else "–"
+    # A shape, such as an exponent or a length, does not make an effect vanish: its `zero` is its default.
+    zero = "–" if p.zero == p.default else f"{p.zero:g}"
+    bounds = f"{p.bounds[0]:g} to {p.bounds[1]:g}"
+    shared = "each vine" if p.shared == "vine" else "all"
+    meaning = f"{p.meaning} [{effect.name}.{p.name}]{', known beforehand' if p.held else ''}"
+    return p.symbol, p.unit, f"{p.default:g}", bounds, plausible, zero, shared, meaning
