@@ -73,17 +73,23 @@ def check(experiment: ExperimentPath) -> None:
 
 
 @app.command()
-def effects() -> None:
-    """The catalogue of effects, with formulas, parameters and units."""
+def effects(
+    name: Annotated[str | None, typer.Argument(help="Explain this one.", metavar="NAME", show_default=False)] = None,
+    experiment: Annotated[
+        Path | None, typer.Option("--experiment", help="Folder whose own effects to include.", show_default=False)
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", help="Draw what NAME does, to this file.", show_default=False)
+    ] = None,
+) -> None:
+    """The catalogue of effects, with formulas, parameters and units; or one explained."""
     with _sentences(None):
-        from vinetrack.effects import catalogue
+        from vinetrack.stages.effects import describe_effects
+        from vinetrack.workflow import find_experiment
 
-        for effect in catalogue().values():
-            typer.echo(f"{effect.name} ({effect.kind}): {effect.summary}")
-            typer.echo(f"    {effect.formula}")
-            for parameter in effect.parameters:
-                low, high = parameter.bounds
-                typer.echo(f"    {parameter.symbol} ({parameter.unit}): {parameter.meaning}, {low:g} to {high:g}")
+        folder = None if experiment is None else find_experiment(experiment)
+        for line in describe_effects(name, folder, figure):
+            typer.echo(line)
 
 
 @app.command(rich_help_panel="Stages of the workflow")
