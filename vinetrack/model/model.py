@@ -29,10 +29,10 @@ class Model:
     >>> import vinetrack.effects as effects
     >>> model = base_model() + effects.reservoir_depletion
     >>> print(model)
-    m(x) ẍ = tip force +PA, on the tail +½PA
+    m(x) ẍ = tip force +PA, on the tail +½PA, by ½ = 1/r
              tail force +m(x) g cosθ
-             tip force −B ẋⁿ, on the tail −½B ẋⁿ
-             tip force −P_y A, on the tail −½P_y A
+             tip force −B ẋⁿ, on the tail −½B ẋⁿ, by ½ = 1/r
+             tip force −P_y A, on the tail −½P_y A, by ½ = 1/r
              P → (P₀ + P_atm) (V₀ / (V₀ + A y))^γ − P_atm
       g = 9.81 m/s²
       B = 3 N·(s/m)ⁿ

@@ -1,0 +1,204 @@
+"""A user's own effect: read, tried out, listed, explained and simulated; and every way in which it can be none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from by_hand import LOADED, followed
+from click.testing import Result
+from typer.testing import CliRunner
+
+from vinetrack.cli import app
+from vinetrack.effects import EffectError, catalogue, load_effect
+from vinetrack.effects._own import UNCHANGED, behaviour_faults, own_effects
+from vinetrack.model.model import base_model, make_model
+from vinetrack.model.simulate import simulate
+
+BRUSH = '''"""Brush: bristles at the mouth hold the tail back, the more the further it has run.
+
+    tail force −q √x
+
+Reduce it by taking the brush away.
+"""
+
+import numpy as np
+
+from vinetrack.effects import Parameter, Worked
+
+PARAMETERS = (Parameter("q", "q", "N/√m", 0.8, bounds=(0.0, 10.0), meaning="grip of the bristles"),)
+
+
+def tail_force(s, rig, q):
+    return -q * np.sqrt(s.tail_position)
+
+
+WORKED = (Worked("tail_force", -0.4, "0.8 × √0.25", state={"tail_position": 0.25}, parameters={"q": 0.8}),)
+'''
+
+
+def written(folder: Path, text: str = BRUSH, name: str = "brush.py") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(folder: Path, text: str, name: str = "brush.py") -> str:
+    with pytest.raises(EffectError) as caught:
+        own_effects([written(folder, text, name)])
+    message = str(caught.value)
+    assert message.startswith(str(folder / name))
+    assert "\n" not in message
+    return message
+
+
+def test_it_is_simulated_like_any_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VINETRACK_CACHE", str(tmp_path))  # its path is new each time: nothing to keep
+    brush = own_effects([written(tmp_path)])
+    model = make_model([*base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
+    travel = followed(lambda _t, x, v: (LOADED.base(x, v) - 0.8 * max(x, 0.0) ** 0.5) / LOADED.m(x), 1.8 * LOADED.L)
+    times = np.linspace(0, travel.end, 41)  # type: ignore[attr-defined]
+    got = simulate(model, LOADED.trial(), times).lead_position_m
+    np.testing.assert_allclose(got, travel(times) / 2, rtol=0, atol=1e-5 * LOADED.L)
+
+
+def test_a_missed_worked_number_is_told_with_its_arithmetic(tmp_path: Path) -> None:
+    message = refusal(tmp_path, BRUSH.replace("-0.4,", "-0.3,"))
+    assert "tail_force gives -0.4 where worked out by hand it is -0.3 (0.8 × √0.25)" in message
+
+
+def test_a_size_that_is_none_but_does_something_is_told(tmp_path: Path) -> None:
+    message = refusal(tmp_path, BRUSH.replace("-q * np", "-(q + 0.1) * np").replace("-0.4,", "-0.45,"))
+    assert "at q = 0, where nothing should change" in message
+
+
+def test_what_cannot_be_compiled_is_told(tmp_path: Path) -> None:
+    text = BRUSH.replace("return -q", 'open("x") if q < 0 else None\n    return -q')
+    assert "tail_force cannot be compiled" in refusal(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("def tail_force", "def pull", "defines none of the functions"),
+        ("(s, rig, q)", "(s, rig)", "must be tail_force(s, rig, q)"),
+        ("    tail force −q √x\n", "", "show the formula on an indented line"),
+        ("import numpy as np\n", "import numpy as np\n1/0\n", "ZeroDivisionError"),
+        ("import numpy as np\n", "import numpy as np\nKIND = 'guess'\n", "KIND is 'guess'"),
+        ('"N/√m", 0.8', '"N/√m", 80.0', "the default of q lies outside its bounds"),
+        ('Parameter("q", "q", "N/√m", 0.8, bounds=(0.0, 10.0), meaning="grip of the bristles"),', "3,", "PARAMETERS"),
+    ],
+)
+def test_a_file_that_is_no_effect_is_told_what_it_lacks(tmp_path: Path, old: str, new: str, told: str) -> None:
+    assert old in BRUSH
+    assert told in refusal(tmp_path, BRUSH.replace(old, new))
+
+
+def test_a_name_in_capitals_is_refused(tmp_path: Path) -> None:
+    assert "lower_case" in refusal(tmp_path, BRUSH, "Brush.py")
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(EffectError, match=r"brush\.py: there is no such effect file"):
+        own_effects([tmp_path / "brush.py"])
+
+
+def test_two_of_one_name_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    with pytest.raises(EffectError, match="another effect named 'brush'"):
+        own_effects([written(tmp_path / "a"), written(tmp_path / "b")])
+
+
+@pytest.mark.parametrize("name", catalogue())
+def test_the_catalogue_passes_what_is_asked_of_a_users_own(name: str) -> None:
+    assert list(behaviour_faults(catalogue()[name])) == []
+
+
+def test_every_hook_has_a_value_that_leaves_all_as_it_was() -> None:
+    from vinetrack.effects import HOOKS
+
+    assert set(UNCHANGED) == set(HOOKS)
+
+
+# ---- the command ----
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["effects", *map(str, arguments)], catch_exceptions=False)
+
+
+def experiment(folder: Path, effects: str) -> Path:
+    (folder / "experiment.yaml").write_text(f"effects: {effects}\n", encoding="utf-8")
+    return folder
+
+
+def test_the_list_is_aligned_and_has_the_users_own(tmp_path: Path) -> None:
+    written(tmp_path)
+    done = run("--experiment", experiment(tmp_path, "[brush.py]"))
+    assert done.exit_code == 0
+    lines = done.output.splitlines()
+    column = lines[0].index("kind")
+    named = [line for line in lines[1:] if not line.startswith("    ")]
+    assert len(named) == len(catalogue()) + 1
+    assert all(line[column - 2 : column] == "  " and line[column].islower() for line in named)
+    assert any(line.startswith("brush ") and "physical, own" in line and "q (N/√m)" in line for line in named)
+
+
+def test_one_is_explained_in_words(tmp_path: Path) -> None:
+    done = run("leak")
+    assert done.exit_code == 0
+    for words in (
+        "Matters where",
+        "P → P e^(−t/τ)",
+        "Easily taken for",
+        "Reduce it",
+        "Source:",
+        "[leak.rate]",
+        "0 to 5",
+    ):
+        assert words in done.output
+    written(tmp_path)
+    assert "bristles" in run("brush", "--experiment", experiment(tmp_path, "[brush.py]")).output
+
+
+def test_a_name_misspelt_is_suggested() -> None:
+    done = run("air_drg")
+    assert done.exit_code == 1
+    assert "Did you mean 'air_drag'?" in done.output
+
+
+def test_a_broken_effect_of_an_experiment_is_one_sentence(tmp_path: Path) -> None:
+    written(tmp_path, BRUSH.replace("-0.4,", "-0.3,"))
+    done = run("--experiment", experiment(tmp_path, "[brush.py]"))
+    assert done.exit_code == 1
+    assert len(done.output.strip().splitlines()) == 1
+    assert "worked out by hand" in done.output
+
+
+def test_an_effect_outside_the_experiment_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    written(tmp_path)
+    done = run("--experiment", experiment(tmp_path / "in", "[../brush.py]"))
+    assert done.exit_code == 1
+    assert "effects" in done.output
+
+
+def test_the_picture_is_written_where_it_is_wanted(tmp_path: Path) -> None:
+    done = run("air_drag", "--figure", tmp_path / "drag.png")
+    assert done.exit_code == 0
+    assert (tmp_path / "drag.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("arguments", [("air_drag", "--figure", "drag.doc"), ("--figure", "all.png")])
+def test_a_picture_that_cannot_be_is_refused(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    done = run(*(tmp_path / a if "." in a else a for a in arguments))
+    assert done.exit_code == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_effects_of_one_name_are_read_again_when_their_file_changes(tmp_path: Path) -> None:
+    first = load_effect(written(tmp_path))
+    second = load_effect(written(tmp_path, BRUSH.replace("0.8, bounds", "0.9, bounds")))
+    assert (first.parameters[0].default, second.parameters[0].default) == (0.8, 0.9)

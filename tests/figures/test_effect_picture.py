@@ -1,0 +1,58 @@
+"""What an effect does, drawn: the table behind the picture, and the picture."""
+
+from __future__ import annotations
+
+import matplotlib.colors as mcolors
+import numpy as np
+import pandas as pd
+import pytest
+
+from vinetrack.effects import catalogue
+from vinetrack.figures.effect_picture import draw_effect
+from vinetrack.figures.style import BLUE, render
+from vinetrack.model.effect_motion import effect_motion, reference_words
+
+FASTER = {"fold_inertia", "wall_stretch", "gravity"}
+
+
+def table() -> pd.DataFrame:
+    t = np.linspace(0, 0.2, 50)
+    return pd.DataFrame(
+        {
+            "time_s": t,
+            "without_position_m": t,
+            "with_position_m": 0.9 * t,
+            "without_velocity_m_s": np.ones(50),
+            "with_velocity_m_s": np.full(50, 0.9),
+            "difference_m": -0.1 * t,
+        }
+    )
+
+
+def test_both_curves_are_drawn_in_millimetres_and_milliseconds() -> None:
+    fig = draw_effect("drag", "C = 1", "a vine", table())
+    position, speed, gap = fig.axes
+    drawn = {mcolors.to_hex(line.get_color()).upper(): line for line in position.lines}
+    np.testing.assert_allclose(drawn[BLUE.upper()].get_ydata(), 900 * table()["time_s"])
+    np.testing.assert_allclose(drawn[BLUE.upper()].get_xdata(), 1e3 * table()["time_s"])
+    assert gap.lines[-1].get_ydata()[-1] == pytest.approx(-20.0)
+    assert "m/s" in speed.get_ylabel()
+    assert "C = 1" in position.get_legend().get_texts()[1].get_text()
+    assert render(fig, ["png"])["png"].startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", [name for name, effect in catalogue().items() if effect.parameters])
+def test_every_effect_shows_on_the_reference_vine(name: str) -> None:
+    found = effect_motion(catalogue()[name])
+    assert np.isfinite(found.to_numpy()).all()
+    assert np.max(np.abs(found["difference_m"])) > 1e-6
+    if catalogue()[name].kind == "physical" and name not in ("tail_stretch", *FASTER):
+        assert found["difference_m"].iloc[-1] < 0
+    if name in FASTER:
+        assert found["difference_m"].iloc[-1] > 0
+
+
+def test_the_caption_says_what_is_simulated() -> None:
+    assert "28 kPa" in reference_words(catalogue()["leak"])
+    assert "horizontal" in reference_words(catalogue()["static_yield"])
+    assert "bend" in reference_words(catalogue()["capstan_friction"])
