@@ -35,14 +35,14 @@ ASSUMED_EXPOSURE = 0.25
 """Exposure over frame period until it is estimated."""
 FAINTEST = 0.5
 """An edge of less than this much of its contrast is another thing's."""
-START_PX = 0.4
-"""Error near the start, where background is seen briefly or never and a door may swing: measured 0.1 to 1 px."""
+START_PX = 0.1
+"""Error near the start, where background is seen briefly or never."""
 START_REACH_PX = 25.0
 """Growth over which that error falls to 1/e."""
 SELFSAME = 0.4
 """Share of the usual contrast under which film and background near the start are the same thing seen twice."""
-DOOR_PX = 2.5
-"""Error where all of the background about the edge is crossed by something else, as measured with doors."""
+DOOR_PX = 0.45
+"""What is added to that where everything before the start is crossed by a door."""
 ASTRAY_PX = 3.0
 """Error stated where nothing like the edge is found where the motion leads."""
 LONG_REST = 8
@@ -122,7 +122,7 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
         if turn < 3:
             state = find_shape(strip, state, fit, turn == 0)
         fit = mend_jumps(strip, state, fit_edges(strip, state))
-    return _finish(state, fit, exposure, passed)
+    return _finish(strip, state, fit, exposure, passed)
 
 
 def outline(strip: Strip, parts: int = 8) -> tuple[float, float, float]:
@@ -421,28 +421,38 @@ def _restate(strip: Strip, state: State, fit: Floats, exposure: float) -> State:
     return replace(state, inflation=np.clip(smooth, 0.3, 50.0))
 
 
-def _door_share(state: State, edge: Floats) -> Floats:
-    """Share of the pixels about the edge before which something else passes, shape (n_frames,)."""
-    changing = (state.pictures[3] > 1.05 * TEXTURE**2).mean(axis=0)
-    columns = len(changing)
-    low = np.clip(edge - 4, 0, columns - 1).astype(int)
-    high = np.clip(edge + 14, 1, columns).astype(int)
-    total = np.concatenate([[0.0], np.cumsum(changing)])
-    return (total[high] - total[low]) / np.maximum(high - low, 1)
+def _disturbed_start(strip: Strip, state: State) -> float:
+    """Share of the columns before the start that change before the edge reaches them: a door swings there."""
+    begin, columns = state.edge[0], strip.values.shape[2]
+    places = np.arange(int(begin) + 6, min(int(begin + CLEAR_PX), columns - 1))
+    moving = np.flatnonzero(moving_frames(state.edge))
+    if len(places) < 10 or moving[0] < 2:
+        return 0.0
+    first = max(0, int(moving[0]) - 15)
+    rising = np.maximum.accumulate(state.edge)
+    contrast = float(np.median(np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))))
+    changed = 0
+    for place in places:
+        arrival = int(np.searchsorted(rising, place - 5.0))
+        seen = strip.values[first : max(arrival - 1, first + 1), :, place].mean(axis=1)
+        change = np.ptp(seen * strip.scale[first : first + len(seen)] + strip.offset[first : first + len(seen)])
+        changed += change > max(0.25 * contrast, 4.0)
+    return changed / len(places)
 
 
-def _finish(state: State, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
+def _finish(strip: Strip, state: State, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
     core = core_frames(state, fit)
     # Where the picture departs from the model (a door, a glint) the edge is worse than its curvature says.
     strain = np.sqrt(np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0))
     edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
     edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * strain**2, ASTRAY_PX)
-    sigma = np.hypot(sigma, DOOR_PX * _door_share(state, edge_now))
     # A box of uniform dwell stands for the exposure: its middle is the mean position, ahead of mid-exposure by aτ²/24.
     bend = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
     edge = edge - np.clip(bend, -50, 50) * exposure**2 / 24
     contrast = (state.pictures[0] - state.pictures[1]).mean(axis=0).astype(float)
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
-    doubt = START_PX * np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX)
+    doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state)) * np.exp(
+        -np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX
+    )
     return EdgeFit(edge, sigma, doubt, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)

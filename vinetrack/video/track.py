@@ -183,7 +183,10 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
     except ValueError as error:
         raise RecordingError(str(error)) from error
     reach = 3 * front.blur_px + 1
-    return strip, _Edge(front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames, reach)
+    return strip, _Edge(
+        front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames, reach,
+        front.start_sigma_px,
+    )  # fmt: skip
 
 
 def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
