@@ -169,9 +169,7 @@ def main() -> None:
         alone = best_of(5 * repeats, lambda own=own, case=case: simulate(own, case.trial, case.times_s))
         found = cheapest(case, max(error, TARGET), repeats)
         if found is None:
-            print(
-                f"{case.trial.name:26}{case.times_s.size:7d}{error:10.1e}{moved.n_steps:6d}{1e6 * alone:9.0f}  none"
-            )
+            print(f"{case.trial.name:26}{case.times_s.size:7d}{error:10.1e}{moved.n_steps:6d}{1e6 * alone:9.0f}  none")
             continue
         quick = best_of(repeats, lambda case=case, found=found: lsoda(case, compiled=True)(*found[2:]))
         lines.append((error, alone, found[0], quick, found[1]))
@@ -184,12 +182,11 @@ def main() -> None:
     few = [Case(c.trial, c.B, c.end_s, c.times_s[-1:], c.tail_m[-1:]) for c in cases]
     end_only = best_of(10 * repeats, lambda: together(few)) / len(cases)
     plain, compiled = table[:, 2].mean(), table[:, 3].mean()
+    errors = table[:, 0]
     print(
-        f"\nlargest error {table[:, 0].max():.1e} ({table[:-1, 0].max():.1e} without the fast vine), median {np.median(table[:, 0]):.1e}"
+        f"\nlargest error {errors.max():.1e} ({errors[:-1].max():.1e} without the fast vine), median {np.median(errors):.1e}"
     )
-    print(
-        f"mean over {len(cases)} trials, µs a trajectory: LSODA {1e6 * plain:.0f}, LSODA with a compiled right-hand side {1e6 * compiled:.0f}"
-    )
+    print(f"mean over {len(cases)} trials, µs a trajectory: LSODA {1e6 * plain:.0f}, compiled {1e6 * compiled:.0f}")
     for words, seconds in (
         ("one by one", table[:, 1].mean()),
         ("all in one call", all_at_once),

@@ -134,7 +134,9 @@ def _compile_faults(effect: Effect, hook: str) -> Iterator[str]:
     from numba.core.errors import NumbaError
 
     try:
-        njit(effect.functions[hook])(_STATE, _RIG, *(parameter.default for parameter in effect.parameters))
+        # As the kernel is compiled: without the means to make an array.
+        compiled = njit(effect.functions[hook], _nrt=False)
+        compiled(_STATE, _RIG, *(parameter.default for parameter in effect.parameters))
     except NumbaError:
         yield f"{hook} cannot be compiled: it may use numbers, math and numpy functions only"
     except Exception as error:
