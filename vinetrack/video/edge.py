@@ -14,41 +14,28 @@ from numpy.typing import NDArray
 
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
+from vinetrack.video.edge_state import (
+    CLEAR_PX,
+    State,
+    blur_lengths,
+    core_frames,
+    fit_edges,
+    moving_frames,
+    repicture,
+    residuals,
+)
+from vinetrack.video.mend import ASTRAY_PX, mend_jumps
 from vinetrack.video.strip import Strip
+from vinetrack.video.tip_shape import ASSUMED_EXPOSURE, find_exposure, find_shape
 
 Floats = NDArray[np.float64]
 
-MEMORY_FRAMES = 6.0
-"""What a pixel showed this long before and after its passing counts 1/e: enough frames to average noise, few enough
-that a door that has swung away, or a tube that sways, is forgotten."""
-RIDGE = 0.05
-"""Weight, in frames, of a pixel's neighbours where it was seen itself: (noise / texture)² of 2 / 9 grey levels."""
-MEMORY = 0.93
-"""Neighbours' weights fall to 1/e over 14 px, a few times the grain of film and background."""
-TEXTURE = 12.0
-"""Standard deviation, grey levels, of a pixel about its neighbours, where it was never seen itself."""
-PRIOR_SD = 0.15
-"""Relative scatter allowed to amplitude and level of the contrast from frame to frame."""
-MARGIN_PX = 6.0
-"""Pixels beyond the blurred edge that take part: they hold amplitude and level."""
-ASSUMED_EXPOSURE = 0.25
-"""Exposure over frame period until it is estimated."""
-FAINTEST = 0.5
-"""An edge of less than this much of its contrast is another thing's."""
 START_PX = 0.1
 """Error near the start, where background is seen briefly or never."""
 START_REACH_PX = 25.0
 """Growth over which that error falls to 1/e."""
-SELFSAME = 0.4
-"""Share of the usual contrast under which film and background near the start are the same thing seen twice."""
 DOOR_PX = 0.45
 """What is added to that where everything before the start is crossed by a door."""
-ASTRAY_PX = 3.0
-"""Error stated where nothing like the edge is found where the motion leads."""
-LONG_REST = 8
-"""Frames of rest, counted from the motion, in which a bad fit is still sought again from many starts."""
-CLEAR_PX = 60.0
-"""Growth after which the surroundings of the start are free of what held the tip there (20 mm at 3 px/mm)."""
 EVIDENCE_CLIP = 2.5
 """Widths beyond which a pixel is as unlike film (or background) as can be."""
 
@@ -76,23 +63,6 @@ class EdgeFit:
     passed: tuple[int, int]
 
 
-@dataclass(frozen=True)
-class State:
-    """What alternates.
-
-    The edge (n_frames,) and its blur lengths, the tip's lag by row and optical blur, and the pictures
-    (4, n_across, n_along): brightness after and before the edge and the variance about each. `inflation` multiplies
-    those variances by distance ahead of the edge, 1 px a bin about its middle.
-    """
-
-    edge: Floats
-    lengths: Floats
-    lag: Floats
-    blur: float
-    pictures: NDArray[np.float32]
-    inflation: Floats
-
-
 def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -> EdgeFit:
     """Track the leading edge through a strip, growing towards higher columns.
 
@@ -106,8 +76,6 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    from vinetrack.video.tip_shape import find_exposure, find_shape
-
     path, passed = _first_path(strip)
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = _first_state(strip, path, exposure)
@@ -211,90 +179,11 @@ def after_jump(path: Floats) -> int:
     return begin
 
 
-def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
-    """Length of the motion blur in every frame, shape (n_frames,): speed times exposure, px."""
-    if len(edge) < 3:
-        return np.zeros(len(edge))
-    speed = np.gradient(edge)
-    smooth = np.convolve(np.pad(speed, 1, mode="edge"), [0.25, 0.5, 0.25], mode="valid")
-    return np.clip(smooth, 0, None) * exposure_frames
-
-
-def moving_frames(edge: Floats) -> NDArray[np.bool_]:
-    """Frames in which the edge is on its way, shape (n_frames,); all of them where hardly any is."""
-    speed = np.abs(np.gradient(edge)) if len(edge) > 1 else np.zeros(len(edge))
-    moving = speed > max(0.2, 0.1 * float(np.quantile(speed, 0.95)))
-    return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
-
-
 def _first_state(strip: Strip, path: Floats, exposure: float) -> State:
     rows, columns = strip.values.shape[1:]
     blank = np.zeros((4, rows, columns), np.float32)
     state = State(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank, np.ones(3))
     return repicture(strip, state, 0.0)
-
-
-def repicture(strip: Strip, state: State, clip: float) -> State:
-    """Solve every pixel's brightness before and after, given the edge; `clip` > 0 weighs strays down."""
-    early, late = _passing(state, strip.values.shape[2])
-    sums = kernels.gather(
-        strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
-        MEMORY_FRAMES, state.pictures, clip,
-    )  # fmt: skip
-    half = len(strip.values) // 2
-    middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
-    pictures = kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
-    hidden = _film_from_the_start(state, pictures)
-    if hidden.any():
-        sums[:, hidden, 5:8] = 0.0
-        pictures = kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
-    return replace(state, pictures=pictures)
-
-
-def _film_from_the_start(state: State, pictures: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Columns about the start whose background looks like their film, shape (n_along,): it was film all along.
-
-    An edge put too far back makes film its own background, without contrast and so without a say against it.
-    """
-    contrast = np.sqrt(np.mean((pictures[0] - pictures[1]) ** 2, axis=0))
-    columns = np.arange(len(contrast))
-    near = (columns > state.edge[0] - 5) & (columns < clear_of_start(state.edge))
-    later = (columns >= clear_of_start(state.edge)) & (columns < state.edge.max() - 5)
-    if later.sum() < 10:
-        return np.zeros(len(contrast), dtype=bool)
-    return near & (contrast < SELFSAME * float(np.median(contrast[later])))
-
-
-def _passing(state: State, columns: int) -> tuple[Floats, Floats]:
-    """First and last frame in which the edge is over each column, shapes (n_along,).
-
-    About the start, film counts only once the edge has got clear of it: a door may stand or swing there until then.
-    """
-    rising = np.maximum.accumulate(state.edge) + 1e-6 * np.arange(len(state.edge))
-    frames = np.arange(len(rising), dtype=float)
-    moving = np.flatnonzero(moving_frames(state.edge))
-    places = np.arange(columns, dtype=float)
-    reach = 0.5 * float(np.median(state.lengths)) + 3 * state.blur + 1
-    begin, end = frames[moving[0]], frames[moving[-1]]
-    behind = np.maximum(places + reach + float(state.lag.max()), clear_of_start(state.edge))
-    early = np.clip(np.interp(places - reach, rising, frames), begin, end)
-    late = np.clip(np.interp(behind, rising, frames), begin, end)
-    return early, late
-
-
-def clear_of_start(edge: Floats) -> float:
-    """Place beyond which nothing that held the tip at its start is near: CLEAR_PX on, or a fifth of the way."""
-    return float(edge[0] + min(CLEAR_PX, 0.2 * (edge.max() - edge[0])))
-
-
-def core_frames(state: State, fit: Floats) -> NDArray[np.bool_]:
-    """Moving frames clear of the start that fit no worse than most, shape (n_frames,): those that tell of the tip."""
-    moving = moving_frames(state.edge)
-    clear = moving & (state.edge > clear_of_start(state.edge))
-    if clear.sum() < 5:
-        return moving
-    good = clear & (fit[:, 2] <= 1.3 * np.nanmedian(fit[clear, 2]))
-    return good if good.sum() >= 5 else clear
 
 
 def _second_path(strip: Strip, state: State, passed: tuple[int, int]) -> Floats:
@@ -322,91 +211,6 @@ def _novelty(strip: Strip, edge: Floats) -> NDArray[np.float32]:
     usual = float(np.median(change[moving_frames(edge)]))
     floor = float(np.quantile(change, 0.05))
     return np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
-
-
-def fit_edges(strip: Strip, state: State) -> Floats:
-    """Most likely edge of every frame, shape (n_frames, 6); see `edge_kernels.fit_edges`."""
-    return kernels.fit_edges(
-        strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, state.pictures,
-        state.inflation, PRIOR_SD, MARGIN_PX, 12,
-    )  # fmt: skip
-
-
-def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
-    """Fits that break the motion, or hardly fit, sought again where the motion leads, shape (n_frames, 6).
-
-    From the middle of the motion backwards and forwards: the edge never retreats, and a step is at most 1.3 times (or
-    1.5 px more than) its neighbour. A fit that breaks that (it caught the far side of a door, a payload) gives way to
-    the best one that does not; only a good fit at two to four whole steps stands, for frames may be missing. A fit
-    half again as bad as most gives way to a better one.
-    """
-    moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
-    if len(moving) < 5:
-        return fit
-    out = fit.copy()
-    bad = 1.5 * float(np.nanmedian(fit[core_frames(state, fit), 2]))
-    central = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
-    anchor = int(moving[np.argmin(central + _rough(fit[moving, 0]) + (fit[moving, 2] > bad))])
-    for sense in (-1, 1):
-        resting = 0
-        for t in range(anchor + sense, -1 if sense < 0 else len(fit), sense):
-            near = out[t - sense, 0]
-            past = out[np.clip([t - sense, t - 2 * sense, t - 3 * sense], 0, len(fit) - 1), 0]
-            step = float(np.nan_to_num(np.abs(np.diff(past))).max())  # of two: a frame may repeat the one before it
-            resting = resting + 1 if step < 0.3 else 0
-            far = max(1.3 * step, step + 1.5)
-            low, high = (near - far, near + 0.8) if sense < 0 else (near - 0.8, near + far)
-            inside = low <= out[t, 0] <= high
-            if not np.isfinite(near) or (inside and (out[t, 2] <= bad or resting > LONG_REST)):
-                continue
-            better = _best_between(strip, state, t, low, high, 1 if resting > LONG_REST else 9)
-            if inside:
-                if better is not None and better[2] < out[t, 2]:
-                    out[t] = better
-            elif _may_be_gap(out[t, 0] - near, step) and out[t, 2] <= bad and (better is None or better[2] > out[t, 2]):
-                continue
-            elif better is None:
-                out[t] = (float(np.clip(np.nan_to_num(out[t, 0], nan=near), low, high)), ASTRAY_PX, 4 * bad, 0, 0, 0)
-            else:
-                out[t] = better
-    return out
-
-
-def _may_be_gap(stride: float, step: float) -> bool:
-    """Whether a stride looks like two to four whole steps: frames are missing, and the point is right."""
-    ratio = abs(stride) / max(step, 1e-6)
-    return step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25
-
-
-def _rough(edge: Floats) -> NDArray[np.bool_]:
-    """Points that stray from the mean of their neighbours by more than a pixel and a tenth of the step, (n,)."""
-    rough = np.ones(len(edge), dtype=bool)
-    step = np.abs(edge[2:] - edge[:-2]) / 2
-    rough[1:-1] = np.abs(edge[1:-1] - 0.5 * (edge[2:] + edge[:-2])) > 1.0 + 0.15 * step
-    return rough
-
-
-def _best_between(strip: Strip, state: State, t: int, low: float, high: float, starts: int) -> Floats | None:
-    """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
-    best = None
-    for start in np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]:
-        edge = np.full(len(state.edge), np.nan)
-        edge[t] = start
-        found = fit_edges(strip, replace(state, edge=edge))[t]
-        inside = low - 0.5 <= found[0] <= high + 0.5 and found[3] > FAINTEST - 1
-        if inside and np.isfinite(found[2]) and (best is None or found[2] < best[2]):
-            best = found
-    return best
-
-
-def residuals(strip: Strip, state: State, fit: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
-    """What the fit leaves in the frames of `use`; see `edge_kernels.residual_sums`."""
-    filled = np.nan_to_num(fit)
-    filled[:, 0] = state.edge
-    return kernels.residual_sums(
-        strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.pictures,
-        MARGIN_PX, use,
-    )  # fmt: skip
 
 
 def _restate(strip: Strip, state: State, fit: Floats, exposure: float) -> State:

@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.video.edge import ASSUMED_EXPOSURE, State, blur_lengths, core_frames, fit_edges, residuals
+from vinetrack.video.edge_state import State, blur_lengths, core_frames, fit_edges, residuals
 from vinetrack.video.strip import Strip
 
 Floats = NDArray[np.float64]
 
 BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
+ASSUMED_EXPOSURE = 0.25
+"""Exposure over frame period until it is estimated."""
 FASTEST_LAG_STEP_PX = 4.0
 DEEPEST_LAG_PX = 60.0
 FEW_FRAMES = 16

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.records import Track, Trial
 from vinetrack.video.axis import Axis, find_axis, is_orderly
-from vinetrack.video.edge import EdgeFit, outline, track_edge
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
 from vinetrack.video.judge import Judgement, calibrated_sigma, judge
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
+
+if TYPE_CHECKING:
+    from vinetrack.video.edge import EdgeFit
 
 Floats = NDArray[np.float64]
 
@@ -170,6 +172,8 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
         strip = cut_strip(luma, axis, 1.5 * half + 12)
         fit = track_body(strip)
         return strip, _Edge(fit.position_px, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px)
+    from vinetrack.video.edge import outline, track_edge
+
     try:
         if not orderly:
             from vinetrack.video.arrival import track_arrival
