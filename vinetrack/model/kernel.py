@@ -220,10 +220,12 @@ def _module_source(effects: Sequence[Effect], tail_free: bool) -> str:
     for path in TEXTS:
         if tail_free or path.stem != "slack":
             text += path.read_text(encoding="utf-8").split(MARK)[1]
-    # Only the outermost function is called from Python; what it calls is compiled into it. Nothing here makes an array:
-    # not to count references to those passed along, nor to look for division by zero, is three times as fast.
+    # Only the outermost function is called from Python; what it calls is compiled into it. Nothing but a slack tail
+    # makes an array: not to count references to those passed along, nor to look for division by zero, is three times
+    # as fast.
     text = text.replace("@njit(nogil=True)\ndef integrate_many", "@njit(nogil=True, cache=True)\ndef integrate_many")
-    return text.replace("njit(nogil=True", "njit(nogil=True, error_model='numpy', _nrt=False")
+    counting = "" if tail_free else ", _nrt=False"
+    return text.replace("njit(nogil=True", f"njit(nogil=True, error_model='numpy'{counting}")
 
 
 def _cache_folder() -> Path:

@@ -55,17 +55,17 @@ _COLUMN_OF_FIELD = {
 }
 
 
-def check_needs(model: Model, trial: Trial) -> None:
-    """Refuse a trial that lacks what an effect of the model needs.
+def check_needs(model: Model, *trials: Trial) -> None:
+    """Refuse trials that lack what an effect of the model needs.
 
     Raises
     ------
     EffectError
         Naming the effect, the column and the trial.
     """
-    for effect in model.effects:
-        for column in effect.needs:
-            attribute = _COLUMN_OF_FIELD.get(column, column)
+    needs = [(effect, column, _COLUMN_OF_FIELD.get(column, column)) for effect in model for column in effect.needs]
+    for trial in trials:
+        for effect, column, attribute in needs:
             value = getattr(trial, attribute, math.nan)
             if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
                 raise EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")

@@ -100,11 +100,11 @@ def simulate_many(
     its own in place of the model's.
     """
     traces = traces or [None] * len(trials)
-    for trial in trials:
-        check_needs(model, trial)
+    check_needs(model, *trials)
     rigs = np.array([rig_of(trial) for trial in trials], dtype=float).reshape(len(trials), len(Rig._fields))
     if parameters is None:
-        parameters = np.array([model.parameters_for(trial.vine) for trial in trials])
+        of_vine = {vine: model.parameters_for(vine) for vine in {trial.vine for trial in trials}}
+        parameters = np.array([of_vine[trial.vine] for trial in trials])
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(len(trials), len(model.parameter_names))
     starts = np.concatenate([[0], np.cumsum([len(times) for times in times_s])]).astype(np.int64)
     trace_starts = np.concatenate([[0], np.cumsum([0 if t is None else len(t[0]) for t in traces])]).astype(np.int64)
@@ -153,13 +153,13 @@ def _limits(
     rig = Rig(*rigs.T)
     film = np.ones(len(rigs))
     for effect, function, place in asked(model, "film_gain"):
-        gains = [function(_NOTHING, Rig(*row), *theta[place]) for row, theta in zip(rigs, thetas, strict=True)]
-        film *= np.where(on[:, effect], gains, 1.0)
+        for k in np.flatnonzero(on[:, effect]).tolist():
+            film[k] *= function(_NOTHING, Rig(*rigs[k]), *thetas[k, place])
     end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
     left = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
     loss = np.asarray(rig.mass_loss)
     floor = np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf)
-    cornered = [i for i, effect in enumerate(model.effects) if effect.corners is not None]
+    cornered = [i for i, effect in enumerate(model.effects) if effect.corners is not None and on[:, i].any()]
     if not cornered and not any(trial.bends for trial in trials):
         return floor[:, None].copy(), end
     found = [[edge for bend in trial.bends for edge in (bend.start_m, bend.start_m + bend.arc_m)] for trial in trials]
