@@ -45,16 +45,52 @@ if plan.is_demo:
             "python -m vinetrack.laboratory {params.folder:q} 2>&1 | tee {log:q}"
 
 
-rule tracks:
-    """All trials in one job: a process takes longer to start than a track takes to analyse."""
+rule recording:
+    """One recording, from its file to its motion."""
     input:
-        plan.inputs,
+        lambda wildcards: plan.filmed[wildcards.trial],
     output:
-        plan.per_trial("tracks", "", ".csv"),
-        plan.per_trial("kinematics", "", ".csv"),
-        plan.result("trials.csv"),
-        plan.result("steady.csv"),
-        plan.result("damping_points.csv"),
+        plan.result("tracks", "{trial}.csv"),
+        plan.result("kinematics", "{trial}.csv"),
+        plan.result("analysed", "{trial}.json"),
+        [
+            report(
+                plan.result("figures", "strip_{trial}." + form),
+                caption="vinetrack/report/captions/strip.rst",
+                category="Recordings",
+                labels={"trial": "{trial}", "format": form},
+            )
+            for form in plan.settings.figures.formats
+        ],
+    log:
+        plan.result("logs", "recording_{trial}.log"),
+    wildcard_constraints:
+        trial=plan.one_of(plan.filmed),
+    params:
+        code=code_hash("tracks"),
+        unwatched=plan.unwatched,
+        experiment=plan.experiment,
+        results=plan.results,
+        settings=plan.stage_settings(
+            "steady",
+            "velocity",
+            "final_at_fraction",
+            "efficiency_at_mm",
+            "figures",
+        ),
+    shell:
+        "vinetrack recording {params.experiment:q} {wildcards.trial:q} {params.results:q}"
+        " --settings {params.settings:q} --log {log:q}"
+
+
+rule tracks:
+    """All trials that come as tracks, in one job: a process takes longer to start than a track takes to analyse."""
+    input:
+        plan.track_inputs,
+    output:
+        plan.per_trial("tracks", ".csv", plan.tracked),
+        plan.per_trial("kinematics", ".csv", plan.tracked),
+        plan.per_trial("analysed", ".json", plan.tracked),
     log:
         plan.result("logs", "tracks.log"),
     threads: 32  # scaled down to the cores that are given
@@ -69,6 +105,25 @@ rule tracks:
     shell:
         "vinetrack tracks {params.experiment:q} {params.results:q} --settings {params.settings:q}"
         " --threads {threads} --log {log:q}"
+
+
+rule gather:
+    """What every trial gave, as the tables of the experiment."""
+    input:
+        plan.sheets,
+        plan.per_trial("analysed", ".json"),
+    output:
+        plan.result("trials.csv"),
+        plan.result("steady.csv"),
+        plan.result("damping_points.csv"),
+    log:
+        plan.result("logs", "gather.log"),
+    params:
+        code=code_hash("gather"),
+        experiment=plan.experiment,
+        results=plan.results,
+    shell:
+        "vinetrack gather {params.experiment:q} {params.results:q} --log {log:q}"
 
 
 rule damping:
@@ -91,8 +146,8 @@ rule damping:
 rule trial_figures:
     """Position, speed and steady stretches of every trial."""
     input:
-        plan.per_trial("tracks", "", ".csv"),
-        plan.per_trial("kinematics", "", ".csv"),
+        plan.per_trial("tracks", ".csv"),
+        plan.per_trial("kinematics", ".csv"),
         plan.result("steady.csv"),
     output:
         [
@@ -120,7 +175,7 @@ rule trial_figures:
 rule campaign_figures:
     """The damping law, its numbers, its scale, and all trials at a glance."""
     input:
-        plan.per_trial("kinematics", "", ".csv"),
+        plan.per_trial("kinematics", ".csv"),
         plan.result("trials.csv"),
         plan.result("damping_points.csv"),
         plan.result("damping.json"),

@@ -93,6 +93,24 @@ def effects(
 
 
 @app.command(rich_help_panel="Stages of the workflow")
+def recording(
+    experiment: ExperimentPath,
+    trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],
+    results: ResultsPath,
+    settings: SettingsText = "{}",
+    log: LogPath = None,
+) -> None:
+    """One recording to its track, kinematics and strip."""
+    with _sentences(log):
+        from vinetrack.stages.recordings import analyse_recording
+
+        read = _read(experiment)
+        if trial not in [one.name for one in read.trials if one.video is not None]:
+            raise typer.BadParameter(f"{trial!r} is no trial with a recording in {experiment}", param_hint="TRIAL")
+        typer.echo(analyse_recording(read, trial, results, _run_settings(settings)))
+
+
+@app.command(rich_help_panel="Stages of the workflow")
 def tracks(
     experiment: ExperimentPath,
     results: ResultsPath,
@@ -100,15 +118,23 @@ def tracks(
     threads: Threads = 1,
     log: LogPath = None,
 ) -> None:
-    """Positions to tracks, kinematics, steady windows and trials.csv."""
+    """Positions measured elsewhere to tracks, kinematics and steady windows."""
     with _sentences(log):
         from vinetrack.stages.tracks import analyse_tracks
 
-        table = analyse_tracks(_read(experiment), results, _run_settings(settings), threads)
-        failed = table[table["status"] == "failed"]
-        typer.echo(f"{len(table)} trials, {len(failed)} failed.")
-        for name, reason in list(zip(failed["trial"], failed["reason"], strict=True))[:10]:
-            typer.echo(f"  {name}: {reason}")
+        failed = analyse_tracks(_read(experiment), results, _run_settings(settings), threads)
+        for line in failed[:10]:
+            typer.echo(f"  {line}")
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def gather(experiment: ExperimentPath, results: ResultsPath, log: LogPath = None) -> None:
+    """What every trial gave, as trials.csv, steady.csv and damping_points.csv."""
+    with _sentences(log):
+        from vinetrack.stages.tracks import gather as gather_trials
+
+        table = gather_trials(_read(experiment), results)
+        typer.echo(f"{len(table)} trials, {int((table['status'] == 'failed').sum())} failed.")
 
 
 @app.command(rich_help_panel="Stages of the workflow")

@@ -37,6 +37,7 @@ SHARED_FILES = ("trials.csv", "experiment.yaml")
 _INTAKE = ("records.py", "constants.py", "tables.py", "columns.py", "sheet.py", "naming.py", "experiment.py")
 STAGE_CODE = {
     "tracks": (*_INTAKE, "settings.py", "stages", "video", "motion", "effects", "model"),
+    "gather": ("tables.py", "stages"),
     "damping": ("tables.py", "stages", "motion"),
     "figures": ("tables.py", "stages", "figures"),
     "report": ("tables.py", "stages", "provenance.py", "figures", "report"),
@@ -49,14 +50,15 @@ STAGE_CODE = {
 class Plan:
     """One run of the workflow.
 
-    `trials` are all that get files (those that failed at the sheet too, with empty ones), `inputs` what they are read
-    from, `unwatched` a fingerprint of inputs that cannot stand in a rule, `is_demo` whether the recordings are made on
-    first use by the virtual laboratory.
+    `trials` are all that get files (those that failed at the sheet too, with empty ones); `filmed` those of them that
+    come as recordings, each with its own inputs; `inputs` what all are read from; `unwatched` a fingerprint of inputs
+    that cannot stand in a rule; `is_demo` whether the recordings are made on first use by the virtual laboratory.
     """
 
     experiment: Path
     results: Path
     trials: tuple[str, ...]
+    filmed: Mapping[str, tuple[str, ...]]
     inputs: tuple[Path, ...]
     unwatched: str
     settings: RunSettings
@@ -76,9 +78,25 @@ class Plan:
         """Path of a result."""
         return self.results.joinpath(*parts).as_posix()
 
-    def per_trial(self, folder: str, prefix: str, suffix: str) -> list[str]:
-        """One result a trial."""
-        return [self.result(folder, f"{prefix}{trial}{suffix}") for trial in self.trials]
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """Trials that do not come as recordings."""
+        return tuple(trial for trial in self.trials if trial not in self.filmed)
+
+    @property
+    def track_inputs(self) -> list[str]:
+        """What trials that do not come as recordings are read from."""
+        own = {path for paths in self.filmed.values() for path in paths} - set(self.sheets)
+        return [path.as_posix() for path in self.inputs if path.as_posix() not in own]
+
+    def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
+        """One result for each of these trials, by default all."""
+        return [self.result(folder, f"{trial}{suffix}") for trial in (self.trials if trials is None else trials)]
+
+    @staticmethod
+    def one_of(names: Iterable[str]) -> str:
+        """A pattern that these names match and nothing else does."""
+        return "|".join(sorted(names)) or "there-is-none"
 
     def campaign_figures(self) -> list[tuple[str, str, str]]:
         """Figures of the whole experiment: name, format and path."""
@@ -90,7 +108,8 @@ class Plan:
 
     def figure_files(self) -> list[str]:
         """Paths of all figures."""
-        return [path for _, _, path in (*self.campaign_figures(), *self.trial_figures())]
+        figures = (*self.campaign_figures(), *self.trial_figures(), *self._figures(self.filmed, "strip_"))
+        return [path for _, _, path in figures]
 
     def _figures(self, names: Iterable[str], prefix: str) -> list[tuple[str, str, str]]:
         formats = self.settings.figures.formats
@@ -135,9 +154,20 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
     present = (path for path in files if path is not None and (is_demo or path.exists()))
     shared = [path for name in SHARED_FILES if (path := folder / name).exists()]
-    inputs = dict.fromkeys([*shared, *present])
+    target = getattr(experiment.settings.calibration, "image", None)
+    targets = [folder / target] if target is not None and (is_demo or (folder / target).exists()) else []
+    inputs = dict.fromkeys([*shared, *targets, *present])
     watched = tuple(path for path in inputs if not _has_brace(path))
-    return Plan(folder, results, trials, watched, _fingerprint(inputs), settings, is_demo)
+    filmed = {
+        trial.name: tuple(
+            path.as_posix()
+            for path in (*shared, *targets, trial.video, trial.pressure_trace)
+            if path is not None and path in watched
+        )
+        for trial in experiment.trials
+        if trial.video is not None
+    }
+    return Plan(folder, results, trials, filmed, watched, _fingerprint(inputs), settings, is_demo)
 
 
 def _has_brace(path: Path) -> bool:

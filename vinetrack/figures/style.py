@@ -32,10 +32,10 @@ BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", 
 VINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, SKY, ORANGE)
 VINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
-RULE_COLOURS = {"gated": BLUE, "paper": VERMILLION, "user": GREEN}
-"""The three ways of choosing a steady window, the same colours in every figure."""
+RULE_COLOURS = {"gated": BLUE, "quasi_steady": PURPLE, "paper": VERMILLION, "user": GREEN}
+"""The ways of choosing a steady window, the same colours in every figure."""
 
-RULE_NAMES = {"gated": "gated rule", "paper": "paper's rule", "user": "chosen by hand"}
+RULE_NAMES = {"gated": "gated rule", "quasi_steady": "quasi-steady", "paper": "paper's rule", "user": "chosen by hand"}
 
 METHOD_COLOURS = {"log_log": VERMILLION, "both_axes": BLUE}
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}

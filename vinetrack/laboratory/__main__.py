@@ -1,19 +1,27 @@
-"""Grow the trials of an experiment folder in the virtual laboratory and write the tracks its sheet names.
+"""Grow the trials of an experiment folder in the virtual laboratory and make what its sheet names.
 
-    python -m vinetrack.laboratory data/demo [--nature FILE] [--truth FILE]
+    python -m vinetrack.laboratory data/demo [--nature FILE] [--truth FILE] [--processes N]
 
-The sheet says what is to be grown; `--nature` what is true and hidden (default: that of the demonstration). The truth
-is written only where `--truth` says, never inside the experiment.
+Trials with a `video` are filmed, with the calibration picture that `experiment.yaml` names; those with a `track` are
+measured. The sheet says what is to be grown; `--nature` what is true and hidden (default: that of the demonstration).
+The truth is written only where `--truth` says, never inside the experiment.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from vinetrack.experiment import read_experiment
+import yaml
+
+from vinetrack.experiment import Experiment, read_experiment
+from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
 from vinetrack.laboratory.nature import read_nature
-from vinetrack.laboratory.tracks import grow, write_tracks, write_truth
+from vinetrack.laboratory.tracks import VirtualTrial, grow, write_tracks, write_truth
 
 DEMO = Path(__file__).with_name("demo.yaml")
 
@@ -24,17 +32,41 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("experiment", type=Path)
     parser.add_argument("--nature", type=Path, default=DEMO)
     parser.add_argument("--truth", type=Path)
+    parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
     given = parser.parse_args(arguments)
     experiment = read_experiment(given.experiment, strict=True)
     nature = read_nature(given.nature)
     grown = grow(experiment.trials, nature)
-    folders = {trial.track.parent for trial in experiment.trials if trial.track is not None}
-    if len(folders) != 1:
-        parser.error("every trial of the sheet needs a `track`, all in one folder")
-    write_tracks(grown, folders.pop())
+    filmed = [trial for trial in grown if trial.stated.video is not None]
+    measured = [trial for trial in grown if trial.stated.track is not None]
+    for folder in {trial.stated.track.parent for trial in measured if trial.stated.track is not None}:
+        write_tracks([trial for trial in measured if trial.stated.track and trial.stated.track.parent == folder], folder)
+    if filmed:
+        content: dict[str, Any] = yaml.safe_load(given.nature.read_text(encoding="utf-8"))
+        _film(experiment, filmed, make_filming(content.get("filming", {})), nature.seed, given.processes)
     if given.truth is not None:
         write_truth(grown, nature, given.truth)
-    print(f"Grown in the virtual laboratory: {len(grown)} trials, {sum(g.track.time_s.size for g in grown)} frames.")
+    n_frames = sum(trial.track.time_s.size for trial in grown)
+    print(f"Grown in the virtual laboratory: {len(grown)} trials, {n_frames} frames.", flush=True)
+
+
+def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, seed: int, processes: int) -> None:
+    """Film every trial, in a few processes, with a line for each that is done."""
+    image = getattr(experiment.settings.calibration, "image", None)
+    if image is not None:
+        picture_target(filming, experiment.folder / image, seed)
+    one = partial(_film_one, filming=filming, seed=seed)
+    with ProcessPoolExecutor(processes) as pool:
+        for i, name in enumerate(pool.map(one, grown, range(len(grown)))):
+            print(f"filmed {i + 1} of {len(grown)}: {name}", flush=True)
+
+
+def _film_one(trial: VirtualTrial, number: int, filming: Filming, seed: int) -> str:
+    path = trial.stated.video
+    assert path is not None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    truth = film(trial, filming, path, seed + number)
+    return f"{trial.stated.name}, {truth.time_s.size} frames"
 
 
 if __name__ == "__main__":

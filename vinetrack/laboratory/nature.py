@@ -48,8 +48,9 @@ class Nature:
 
 
 def read_nature(path: Path) -> Nature:
-    """Read a nature from YAML; its keys are the fields of `Nature`."""
+    """Read a nature from YAML; its keys are the fields of `Nature`, and `filming`, which is not read here."""
     content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    content.pop("filming", None)
     for key in ("effects", "release_frames", "origin_m"):
         if key in content:
             content[key] = tuple(content[key])

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.laboratory.nature import Nature
+from vinetrack.model.model import Model
 from vinetrack.model.simulate import Trajectory, simulate_many
 from vinetrack.model.terms import pressure_along
 from vinetrack.records import Floats, Track, Trial
@@ -25,12 +26,14 @@ from vinetrack.tables import write_csv, write_json, write_text
 class VirtualTrial:
     """One trial as it was grown and as it was measured.
 
-    `stated` is the trial as the sheet states it, `true` as it was. `track` is what the analysis gets; its zeros are
-    arbitrary. The rest is the truth at the track's rows: SI, the release at `release_s` on the track's clock.
+    `stated` is the trial as the sheet states it, `true` as it was, `model` what drove it. `track` is what the analysis
+    gets; its zeros are arbitrary. The rest is the truth at the track's rows: SI, the release at `release_s` on the
+    track's clock.
     """
 
     stated: Trial
     true: Trial
+    model: Model
     damping: float
     track: Track
     release_s: float
@@ -51,11 +54,9 @@ def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
     theta = np.array([model.parameters_for(trial.vine) for trial in trials])
     column = model.parameter_names.index("eversion_damping.B") if "eversion_damping" in model else None
     for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
-        pressure_Pa = trial.pressure_Pa * (1 + nature.pressure_scatter * draw.standard_normal())
+        set_Pa = trial.pressure_Pa * (1 + nature.pressure_scatter * draw.standard_normal())
         factor = 1 + nature.damping_scatter * draw.standard_normal()
-        true.append(
-            replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=trial.yield_pressure_Pa + errors[trial.vine])
-        )
+        true.append(replace(trial, pressure_Pa=set_Pa, yield_pressure_Pa=trial.yield_pressure_Pa + errors[trial.vine]))
         if column is not None:
             theta[i, column] *= factor
         damping.append(float(theta[i, column]) if column is not None else math.nan)
@@ -69,7 +70,9 @@ def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
         pressure_Pa = pressure_along(
             trial_model, true[i], times[i] - release[i], moved[i].lead_position_m, moved[i].lead_velocity_m_s
         )
-        grown.append(_measure(trial, true[i], damping[i], times[i], release[i], moved[i], pressure_Pa, nature, draw))
+        grown.append(
+            _measure(trial, true[i], trial_model, damping[i], times[i], release[i], moved[i], pressure_Pa, nature, draw)
+        )
     return grown
 
 
@@ -89,12 +92,13 @@ def _frame_times(trial: Trial, nature: Nature, draw: np.random.Generator) -> tup
     step_s = 1 / trial.capture_fps
     resting = draw.integers(nature.release_frames[0], nature.release_frames[1], endpoint=True)
     release_s = (resting - 1 + draw.uniform()) * step_s
-    return np.arange(nature.longest_frames) * step_s, float(release_s)
+    return np.arange(nature.longest_frames, dtype=float) * step_s, float(release_s)
 
 
 def _measure(
     trial: Trial,
     true: Trial,
+    model: Model,
     damping: float,
     time_s: Floats,
     release_s: float,
@@ -125,6 +129,7 @@ def _measure(
     return VirtualTrial(
         stated=trial,
         true=true,
+        model=model,
         damping=damping,
         track=track,
         release_s=release_s,

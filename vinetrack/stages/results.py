@@ -138,6 +138,14 @@ class Results:
         """How the leading edge moved."""
         return result_file(self.folder / "kinematics", trial, ".csv")
 
+    def analysed(self, trial: str) -> Path:
+        """What one trial adds to the tables of the experiment."""
+        return result_file(self.folder / "analysed", trial, ".json")
+
+    def strip_figure(self, trial: str, suffix: str) -> Path:
+        """The strip of one recording with its tracked edge."""
+        return result_file(self.folder / "figures", f"strip_{trial}", suffix)
+
     def figure(self, name: str, suffix: str) -> Path:
         """A figure of the whole experiment."""
         return result_file(self.folder / "figures", name, suffix)

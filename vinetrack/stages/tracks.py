@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import traceback
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +19,15 @@ from vinetrack.stages.results import (
     KINEMATICS_COLUMNS,
     POINT_COLUMNS,
     STEADY_COLUMNS,
+    TEXT_COLUMNS,
     TRACK_COLUMNS,
     TRIALS_COLUMNS,
+    TRUTH_COLUMNS,
     Results,
     empty_table,
+    read_json,
 )
-from vinetrack.tables import write_csv
+from vinetrack.tables import write_csv, write_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,52 +38,115 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-NO_RECORDINGS_YET = "recordings cannot be tracked by this version: give the positions as a table, in the column track"
 INTERNAL_FAULT = "could not be analysed: a fault of the program, written down in the log of this stage"
 
 
-@dataclass(frozen=True)
-class _Analysed:
-    """What one trial adds to the tables of the experiment; `fault` is the traceback of an unforeseen error."""
+def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, n_workers: int = 1) -> list[str]:
+    """Analyse every trial that comes as a track; write `tracks/`, `kinematics/` and `analysed/` of each.
 
-    row: dict[str, Any]
-    windows: list[dict[str, Any]]
-    point: dict[str, Any] | None
-    fault: str = ""
+    Trials whose row of the sheet is at fault get empty files here too.
+
+    Returns
+    -------
+    list of str
+        A line for every trial that failed: its name and why.
+    """
+    results = Results(folder)
+    for name, reason in experiment.failed.items():
+        write_empty(results, name, bare_row(name, "failed", reason))
+    model_of(experiment)
+    work = partial(_analyse_track, results=results, settings=settings, experiment=experiment)
+    trials = [trial for trial in experiment.trials if trial.video is None]
+    said = list(map_trials(work, trials, n_workers, "tracks"))
+    for trial, (reason, fault) in zip(trials, said, strict=True):
+        log.info("%s: %s", trial.name, reason or "analysed")
+        if fault:
+            log.error("trial %s:\n%s", trial.name, fault)
+    failed = {trial.name: reason for trial, (reason, _) in zip(trials, said, strict=True) if reason}
+    return [f"{name}: {reason}" for name, reason in (*experiment.failed.items(), *failed.items())]
 
 
-def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, n_workers: int = 1) -> pd.DataFrame:
-    """Analyse every trial and write `tracks/`, `kinematics/`, `trials.csv`, `steady.csv` and `damping_points.csv`.
+def _analyse_track(trial: Trial, results: Results, settings: RunSettings, experiment: Experiment) -> tuple[str, str]:
+    """Analyse one track, in a worker; return why it failed and the traceback of an unforeseen error, blank if none."""
+    from vinetrack.video.importers import TrackError, load_track
+
+    try:
+        track = load_track(trial)
+    except TrackError as error:
+        reason = f"{trial.track.name + ' ' if trial.track else ''}{error}"
+        write_empty(results, trial.name, failed_row(trial, reason))
+        return reason, ""
+    return analyse(trial, track, results, settings, experiment)
+
+
+def analyse(
+    trial: Trial, track: Track, results: Results, settings: RunSettings, experiment: Experiment, **columns: float
+) -> tuple[str, str]:
+    """From a track to the files of one trial; `columns` of `trials.csv` are known to the caller alone.
+
+    Returns
+    -------
+    (reason, fault)
+        Why it failed and the traceback of an unforeseen error, blank if none.
+    """
+    from vinetrack.motion.summary import TrialError, summarise_trial
+
+    try:
+        summary = summarise_trial(trial, track, settings, model_of(experiment))
+    except TrialError as error:
+        write_empty(results, trial.name, failed_row(trial, str(error)))
+        return str(error), ""
+    except Exception:
+        write_empty(results, trial.name, failed_row(trial, INTERNAL_FAULT))
+        return INTERNAL_FAULT, traceback.format_exc()
+    write_csv(results.track(trial.name), track_table(summary.track))
+    write_csv(results.kinematics(trial.name), kinematics_table(summary.kinematics))
+    windows = [_window_row(trial.name, window) for window in summary.windows.values()]
+    write_json(
+        results.analysed(trial.name),
+        {"row": dict(summary.row) | columns, "windows": windows, "point": dict(summary.point)},
+    )
+    return "", ""
+
+
+def gather(experiment: Experiment, folder: Path) -> pd.DataFrame:
+    """Put what every trial gave into `trials.csv`, `steady.csv` and `damping_points.csv`.
 
     Returns
     -------
     DataFrame
         `trials.csv` as written, in the order of the sheet.
-    """
-    import pandas as pd
 
+    Raises
+    ------
+    ResultsError
+        If a trial has not been analysed.
+    """
     results = Results(folder)
-    for name in experiment.failed:
-        _write_empty(results, name)
-    effects = experiment.settings.model, tuple(experiment.folder / path for path in experiment.settings.effects)
-    _model(*effects)
-    work = partial(_analyse_trial, results=results, settings=settings, effects=effects)
-    analysed = {found.row["trial"]: found for found in map_trials(work, experiment.trials, n_workers, "tracks")}
-    for name, found in analysed.items():
-        if found.fault:
-            log.error("trial %s:\n%s", name, found.fault)
-    rows = {name: found.row for name, found in analysed.items()}
-    rows |= {name: _bare_row(name, "failed", reason) for name, reason in experiment.failed.items()}
-    rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
-    table = pd.DataFrame([rows[name] for name in experiment.names], columns=list(TRIALS_COLUMNS))
-    windows = [window for found in analysed.values() for window in found.windows]
-    points = [found.point for found in analysed.values() if found.point]
-    write_csv(results.steady, pd.DataFrame(windows, columns=list(STEADY_COLUMNS)))
-    write_csv(results.points, pd.DataFrame(points, columns=list(POINT_COLUMNS)))
+    found = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
+    rows = {name: content["row"] for name, content in found.items()}
+    rows |= {name: bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
+    table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
+    write_csv(results.steady, _frame([row for content in found.values() for row in content["windows"]], STEADY_COLUMNS))
+    write_csv(results.points, _frame([c["point"] for c in found.values() if c["point"]], POINT_COLUMNS))
     write_csv(results.trials, table)
     for row in table.itertuples():
         log.info("%s: %s %s", row.trial, row.status, row.reason)
     return table
+
+
+def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame:
+    """Rows as a table of these columns; a number that JSON could not hold is NaN again."""
+    import pandas as pd
+
+    frame = pd.DataFrame(rows, columns=list(columns))
+    numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS]
+    return frame.astype(dict.fromkeys(numbers, float))
+
+
+def model_of(experiment: Experiment) -> Model:
+    """The model in use; every process makes its own, since a user's effects cannot travel between processes."""
+    return _model(experiment.settings.model, tuple(experiment.folder / path for path in experiment.settings.effects))
 
 
 @lru_cache(maxsize=1)
@@ -93,41 +158,19 @@ def _model(names: tuple[str, ...], own: tuple[Path, ...]) -> Model:
     return make_model(names, {effect.name: effect for effect in map(load_effect, own)})
 
 
-def _analyse_trial(
-    trial: Trial, results: Results, settings: RunSettings, effects: tuple[tuple[str, ...], tuple[Path, ...]]
-) -> _Analysed:
-    """One trial from its file to its rows; its own files are written here, in the worker."""
-    from vinetrack.motion.summary import TrialError, summarise_trial
-    from vinetrack.video.importers import TrackError, load_track
-
-    try:
-        if trial.track is None:
-            raise TrackError(NO_RECORDINGS_YET)
-        summary = summarise_trial(trial, load_track(trial), settings, _model(*effects))
-    except TrackError as error:
-        return _failed(results, trial, f"{trial.track.name + ' ' if trial.track else ''}{error}")
-    except TrialError as error:
-        return _failed(results, trial, str(error))
-    except Exception:
-        return _failed(results, trial, INTERNAL_FAULT, traceback.format_exc())
-    write_csv(results.track(trial.name), track_table(summary.track))
-    write_csv(results.kinematics(trial.name), kinematics_table(summary.kinematics))
-    windows = [_window_row(trial.name, window) for window in summary.windows.values()]
-    return _Analysed(dict(summary.row), windows, dict(summary.point))
+def failed_row(trial: Trial, reason: str) -> dict[str, Any]:
+    """The row of `trials.csv` of a trial that could not be analysed."""
+    return bare_row(trial.name, "failed", reason) | {"vine": trial.vine, "condition": trial.condition}
 
 
-def _failed(results: Results, trial: Trial, reason: str, fault: str = "") -> _Analysed:
-    _write_empty(results, trial.name)
-    row = _bare_row(trial.name, "failed", reason) | {"vine": trial.vine, "condition": trial.condition}
-    return _Analysed(row, [], None, fault)
-
-
-def _write_empty(results: Results, trial: str) -> None:
+def write_empty(results: Results, trial: str, row: dict[str, Any]) -> None:
+    """Files of a trial without results: headers alone, and its row."""
     write_csv(results.track(trial), empty_table(TRACK_COLUMNS))
     write_csv(results.kinematics(trial), empty_table(KINEMATICS_COLUMNS))
+    write_json(results.analysed(trial), {"row": row, "windows": [], "point": None})
 
 
-def _bare_row(trial: str, status: str, reason: str) -> dict[str, Any]:
+def bare_row(trial: str, status: str, reason: str) -> dict[str, Any]:
     """A row of `trials.csv` for a trial without results."""
     blank: dict[str, Any] = dict.fromkeys(TRIALS_COLUMNS, np.nan)
     return blank | {"trial": trial, "vine": "", "condition": "", "status": status, "reason": reason, "steady_rule": ""}

@@ -1,0 +1,95 @@
+"""One recording: its strip through time with the tracked edge, and the edge on the first, middle and last frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.figures.style import INK, MUTED, ORANGE, SKY, VERMILLION, legend_above, look
+from vinetrack.records import UNUSABLE_FLAGS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from vinetrack.video.track import Tracking
+
+LARGEST_PX = 480
+"""Pictures are drawn with at most so many pixels a side: enough to see the edge, small enough for a page of many."""
+
+UNREMARKABLE = frozenset({"before_release"})
+
+
+def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
+    """Draw the strip of one tracked recording.
+
+    Parameters
+    ----------
+    title : name of the trial.
+    tracking : what the tracker made of the recording.
+    m_per_px : scale along the axis, for millimetres on the right.
+    """
+    from matplotlib.figure import Figure
+
+    with look():
+        aspect = min(max(picture.shape[0] / picture.shape[1] for _, picture in tracking.pictures), 2.2)
+        pictures_in = 7.2 / len(tracking.pictures) * aspect + 0.35
+        fig = Figure(figsize=(7.2, 3.9 + pictures_in), layout="constrained")
+        above, below = fig.subfigures(2, 1, height_ratios=[3.9, pictures_in])
+        above.patch.set_alpha(0)
+        below.patch.set_alpha(0)
+        ax = above.add_subplot()
+        _draw_kymograph(ax, title, tracking, m_per_px)
+        frames = below.subplots(1, len(tracking.pictures), squeeze=False)[0]
+        for axes, (frame, picture) in zip(frames, tracking.pictures, strict=True):
+            _draw_frame(axes, tracking, frame, picture)
+    return fig
+
+
+def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -> None:
+    track, strip = tracking.track, tracking.kymograph
+    step_rows, step_columns = (max(1, -(-size // LARGEST_PX)) for size in strip.shape)
+    small = strip[::step_rows, ::step_columns]
+    time_ms = 1e3 * track.time_s
+    dark, light = np.nanpercentile(small, [1, 99])
+    extent = (0.0, float(strip.shape[1]), float(time_ms[-1]), float(time_ms[0]))
+    ax.imshow(small, aspect="auto", extent=extent, cmap="gray", vmin=dark, vmax=light, interpolation="nearest")
+    edge, odd = track.edge_px, flagged(track.flag)
+    fine = ~odd & np.isfinite(edge)
+    ax.plot(edge[fine], time_ms[fine], color=ORANGE, linewidth=1.0, label=f"leading edge, N = {int(fine.sum())}")
+    if odd.any():
+        shown = odd & np.isfinite(edge)
+        label = f"flagged, N = {int(odd.sum())}"
+        ax.plot(edge[shown], time_ms[shown], "x", color=SKY, markersize=4, markeredgewidth=1.1, label=label)
+    ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)")
+    ax.grid(visible=False)
+    top = ax.secondary_xaxis(-0.17, functions=(lambda px: 1e3 * m_per_px * px, lambda mm: mm / (1e3 * m_per_px)))
+    top.set_xlabel("along the growth axis (mm)")
+    legend_above(ax, 2)
+    ax.set_title(title, loc="right", fontsize=10, color=MUTED, fontweight="normal")
+
+
+def flagged(flag: Any) -> np.ndarray:
+    """Mask, shape (n,): points whose flag says more than that the vine still rests."""
+    parts = [set(str(one).split(";")) - UNREMARKABLE - {""} for one in flag]
+    return np.array([bool(one) for one in parts], dtype=bool)
+
+
+def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -> None:
+    step = max(1, -(-max(picture.shape) // LARGEST_PX))
+    height, width = picture.shape
+    ax.imshow(picture[::step, ::step], cmap="gray", extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+    ax.set(xticks=[], yticks=[])
+    ax.grid(visible=False)
+    track = tracking.track
+    edge = float(track.edge_px[frame]) if frame < track.edge_px.size else np.nan
+    if np.isfinite(edge):
+        half = 0.75 * tracking.axis.width_px
+        half = half if np.isfinite(half) else 0.25 * min(height, width)
+        ends = np.array([tracking.axis.points(np.array(edge), across) for across in (-half, half)])
+        unusable = bool(UNUSABLE_FLAGS.intersection(str(track.flag[frame]).split(";")))
+        ax.plot(ends[:, 0], ends[:, 1], color=SKY if unusable else VERMILLION, linewidth=1.8)
+    ax.set_xlim(-0.5, width - 0.5)
+    ax.set_ylim(height - 0.5, -0.5)
+    ax.set_title(f"frame {frame}, {1e3 * track.time_s[frame]:.1f} ms", fontsize=9, fontweight="normal", color=INK)

@@ -1,0 +1,81 @@
+"""One recording to its track, kinematics, strip figure and row; whatever is wrong with it is its own affair."""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vinetrack.stages.results import Results
+from vinetrack.stages.tracks import INTERNAL_FAULT, analyse, failed_row, write_empty
+from vinetrack.tables import write_bytes
+
+if TYPE_CHECKING:
+    from vinetrack.experiment import Experiment
+    from vinetrack.records import Trial
+    from vinetrack.settings import RunSettings
+    from vinetrack.video.measure import Measurement
+
+log = logging.getLogger(__name__)
+
+
+def analyse_recording(experiment: Experiment, name: str, folder: Path, settings: RunSettings) -> str:
+    """Track the recording of one trial and analyse its motion; write all files of the trial.
+
+    Returns
+    -------
+    str
+        A line for a person: what was found, or why it failed.
+    """
+    trial = experiment.trial(name)
+    results = Results(folder)
+    reason, fault = _analyse(experiment, trial, results, settings)
+    if fault:
+        log.error("trial %s:\n%s", name, fault)
+    log.info("%s: %s", name, reason or "analysed")
+    return f"{name}: failed: {reason}" if reason else f"{name}: tracked."
+
+
+def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: RunSettings) -> tuple[str, str]:
+    from vinetrack.video.frames import RecordingError
+    from vinetrack.video.importers import TrackError, attach_pressure, read_pressure_trace
+    from vinetrack.video.measure import measure_recording
+
+    measurement = None
+    try:
+        measurement = measure_recording(trial, experiment.settings, experiment.folder)
+        track = measurement.tracking.track
+        if trial.pressure_trace is not None:
+            track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+        reason, fault = analyse(
+            trial,
+            track,
+            results,
+            settings,
+            experiment,
+            mm_per_px=1e3 * measurement.m_per_px,
+            scale_rel_sigma=measurement.scale_rel_sigma,
+        )
+    except (RecordingError, TrackError) as error:
+        reason, fault = str(error), ""
+        write_empty(results, trial.name, failed_row(trial, reason))
+    except Exception:
+        reason, fault = INTERNAL_FAULT, traceback.format_exc()
+        write_empty(results, trial.name, failed_row(trial, reason))
+    _draw(trial, results, measurement, reason, settings)
+    return reason, fault
+
+
+def _draw(trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings) -> None:
+    from vinetrack.figures.strip import draw_strip
+    from vinetrack.figures.style import blank, render
+
+    if measurement is None:
+        figure = blank(f"{trial.name}: {reason}")
+    else:
+        figure = draw_strip(trial.name, measurement.tracking, measurement.m_per_px)
+    path = partial(results.strip_figure, trial.name)
+    for form, data in render(figure, settings.figures.formats, settings.figures.dpi).items():
+        write_bytes(path(f".{form}"), data)

@@ -1,0 +1,111 @@
+"""A recording measured: its track in metres by the calibration that its experiment names, and how good the scale is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vinetrack.records import Floats, Trial
+from vinetrack.video.axis import Axis, find_axis
+from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
+from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
+from vinetrack.video.track import Tracking, capture_rate, track_frames
+
+if TYPE_CHECKING:
+    from vinetrack.settings import ExperimentSettings
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A tracked recording with its scale.
+
+    `m_per_px` is the mean along the growth axis and `scale_rel_sigma` its relative standard error, NaN where unknown:
+    an error that all points share, kept apart from the random error of each. `calibration` is None where the scale is
+    the trial's own `mm_per_px`.
+    """
+
+    tracking: Tracking
+    m_per_px: float
+    scale_rel_sigma: float
+    calibration: PlaneCalibration | None
+
+
+def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) -> Measurement:
+    """Decode, calibrate and track the recording of one trial.
+
+    Parameters
+    ----------
+    trial
+        Its `video`, frame rate, exposure and diameter; its `m_per_px` overrides the calibration.
+    settings
+        `calibration` and `axis` are used.
+    folder
+        The experiment's folder, from which the calibration's picture counts.
+
+    Raises
+    ------
+    RecordingError
+        In one sentence, where recording or calibration cannot be used.
+    """
+    if trial.video is None:
+        raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
+    recording = inspect_recording(trial.video)
+    capture_fps = capture_rate(trial, recording.capture_fps)
+    calibration = _calibration(trial, settings, folder, recording.width, recording.height)
+    frames = read_frames(recording)
+    m_per_px, rel_sigma, position_m = trial.m_per_px, math.nan, None
+    axis = _given_axis(settings, m_per_px if calibration is None else calibration.m_per_px)
+    if calibration is not None:
+        axis = axis or _found_axis(frames.luma, trial)
+        along = calibration.along(axis.from_px, axis.to_px)
+        m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
+    elif not math.isfinite(m_per_px):
+        raise RecordingError(
+            f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
+        )
+    tracking = _tracked(frames, trial, capture_fps, axis, m_per_px, position_m, calibration)
+    return Measurement(tracking, m_per_px, rel_sigma, calibration)
+
+
+def _tracked(
+    frames: object,
+    trial: Trial,
+    capture_fps: float,
+    axis: Axis | None,
+    m_per_px: float,
+    position_m: Callable[[Floats], Floats] | None,
+    calibration: PlaneCalibration | None,
+) -> Tracking:
+    tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)  # type: ignore[arg-type]
+    notes = tuple(note for note in (calibration.notes if calibration is not None else ()))
+    return replace(tracking, track=replace(tracking.track, notes=(*tracking.track.notes, *notes)))
+
+
+def _calibration(
+    trial: Trial, settings: ExperimentSettings, folder: Path, width_px: int, height_px: int
+) -> PlaneCalibration | None:
+    """The calibration of the experiment; None where the trial brings a scale of its own or there is none."""
+    if math.isfinite(trial.m_per_px) or settings.calibration is None:
+        return None
+    try:
+        return calibrate(settings.calibration, folder, width_px, height_px)
+    except CalibrationError as error:
+        raise RecordingError(f"calibration: {error}") from error
+
+
+def _given_axis(settings: ExperimentSettings, m_per_px: float) -> Axis | None:
+    if settings.axis is None:
+        return None
+    given = settings.axis
+    width_px = given.width_mm / 1e3 / m_per_px if given.width_mm is not None else math.nan
+    return Axis(tuple(given.from_px), tuple(given.to_px), width_px)
+
+
+def _found_axis(luma: object, trial: Trial) -> Axis:
+    try:
+        return find_axis(luma)  # type: ignore[arg-type]
+    except RecordingError as error:
+        raise RecordingError(f"{trial.video.name if trial.video else trial.name}: {error}") from error
