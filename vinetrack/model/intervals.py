@@ -23,6 +23,9 @@ from vinetrack.records import Floats
 SINGULAR = 1e-10
 """Smallest eigenvalue of an information matrix of unit diagonal at which two numbers can still be told apart."""
 
+SILENT = 1e-6
+"""Information below which a number moves no trajectory: χ² would change by this for the whole scale of the number."""
+
 NEAR_A_BOUND = 3.5
 LOG_STEP = 0.1
 
@@ -48,7 +51,7 @@ def precision(solution: Solution) -> Precision:
 def _precision(part: Marginal, frame: Frame, state: State, spread: tuple[float, float]) -> Precision:
     information = normal_equations(part, frame, state, spread)[0]
     diagonal = np.diag(information)
-    silent = frame.free & ~(diagonal > 0)
+    silent = frame.free & ~(diagonal > SILENT)
     k = np.flatnonzero(frame.free & ~silent)
     covariance = np.zeros_like(information)
     tied = np.zeros(diagonal.size, dtype=bool)
