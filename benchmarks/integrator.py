@@ -70,7 +70,9 @@ def make_case(trial: Trial, B: float) -> Case:
 
 
 @njit
-def compiled_rates(x: float, v: float, drive: float, k: float, film: float, lost: float, floor: float, payload: float):
+def compiled_rates(
+    x: float, v: float, drive: float, k: float, film: float, lost: float, floor: float, payload: float
+) -> tuple[float, float]:
     mass = max(film - lost * x, floor) + payload
     return v, (drive - k * max(v, 0.0) ** PAPER_N) / mass + G
 
