@@ -186,7 +186,7 @@ def main() -> None:
     plain, compiled = table[:, 2].mean(), table[:, 3].mean()
     errors = table[:, 0]
     print(
-        f"\nlargest error {errors.max():.1e} ({errors[:-1].max():.1e} without the fast vine), median {np.median(errors):.1e}"
+        f"\nlargest error {errors.max():.1e}, without the fast vine {errors[:-1].max():.1e}, median {np.median(errors):.1e}"
     )
     print(f"mean over {len(cases)} trials, µs a trajectory: LSODA {1e6 * plain:.0f}, compiled {1e6 * compiled:.0f}")
     for words, seconds in (
