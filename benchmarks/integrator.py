@@ -185,9 +185,8 @@ def main() -> None:
     end_only = best_of(10 * repeats, lambda: together(few)) / len(cases)
     plain, compiled = table[:, 2].mean(), table[:, 3].mean()
     errors = table[:, 0]
-    print(
-        f"\nlargest error {errors.max():.1e}, without the fast vine {errors[:-1].max():.1e}, median {np.median(errors):.1e}"
-    )
+    most, usual = errors.max(), np.median(errors)
+    print(f"\nlargest error {most:.1e}, without the fast vine {errors[:-1].max():.1e}, median {usual:.1e}")
     print(f"mean over {len(cases)} trials, µs a trajectory: LSODA {1e6 * plain:.0f}, compiled {1e6 * compiled:.0f}")
     for words, seconds in (
         ("one by one", table[:, 1].mean()),
