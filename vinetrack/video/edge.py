@@ -30,12 +30,12 @@ from vinetrack.video.tip_shape import ASSUMED_EXPOSURE, find_exposure, find_shap
 
 Floats = NDArray[np.float64]
 
-START_PX = 0.1
+START_PX = 0.2
 """Error near the start, where background is seen briefly or never."""
 START_REACH_PX = 25.0
 """Growth over which that error falls to 1/e."""
-DOOR_PX = 0.45
-"""What is added to that where everything before the start is crossed by a door."""
+DOOR_PX = 0.8
+"""What is added to that where a door crosses everything before the start and the picture departs from the model."""
 EVIDENCE_CLIP = 2.5
 """Widths beyond which a pixel is as unlike film (or background) as can be."""
 
@@ -256,7 +256,7 @@ def _finish(strip: Strip, state: State, fit: Floats, exposure: float, passed: tu
     contrast = (state.pictures[0] - state.pictures[1]).mean(axis=0).astype(float)
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
-    doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state)) * np.exp(
-        -np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX
-    )
+    near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX)
+    trouble = np.clip((strain**2 - 1.3) / 1.5, 0.0, 1.0)
+    doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state) * trouble) * near_start
     return EdgeFit(edge, sigma, doubt, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)
