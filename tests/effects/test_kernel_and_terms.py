@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from by_hand import BARE, LOADED, Vine, simulated, whole_catalogue
@@ -95,3 +97,16 @@ def test_an_effect_at_its_zero_rests_and_so_does_what_it_replaces_wake() -> None
     acting = {effect.name for effect, acts in zip(refilled, on, strict=True) if acts}
     assert "supply_refill" in acting
     assert "reservoir_depletion" not in acting
+
+
+def test_the_gas_in_the_floor_of_the_mass_is_not_counted_twice() -> None:
+    # At the end a bare vine's moving mass is its fold, λπt, and a quarter of the gas ρ_gas A L; nothing on top of it.
+    vine = BARE
+    model = whole_catalogue({"gas_inertia.factor": 1.0})
+    terms = evaluate(model, vine.trial(), np.zeros(1), np.array([vine.L]), np.zeros(1))
+    gas = (vine.P + 101_325) / (287 * 293) * vine.A * vine.L / 4
+    fold = vine.lam * math.pi * vine.t
+    assert terms.inertia_kg[0] == pytest.approx(fold + gas, rel=1e-9)
+    rest = np.zeros(1)
+    compiled = accelerations(model, vine.trial(), rest, np.array([vine.L]), rest)
+    np.testing.assert_allclose(compiled, terms.acceleration_m_s2, rtol=1e-9)

@@ -9,7 +9,10 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from by_hand import BARE, LEVEL, LOADED, Vine, simulated
+from by_hand import BARE, LEVEL, LOADED, Vine, simulated, whole_catalogue
+from scipy.optimize import least_squares
+
+from vinetrack.model.terms import evaluate
 
 TIMES = np.linspace(0, 0.12, 60)
 SAME = 2e-6
@@ -99,3 +102,40 @@ def test_payload_friction_is_an_error_of_the_angle() -> None:
     tilted = Vine(**{**bob.__dict__, "down": -0.2})
     assert gap(bob, {"payload_friction.mu_p": 0.2}, {}, tilted) < SAME
     assert gap(bob, {"payload_friction.mu_p": 0.2}, {}) > 1e-2
+
+
+def test_a_scale_is_length_payload_gain_and_damping_on_the_level() -> None:
+    # y' = s·y with L' = sL and m' = s·m: forces of s², so P' = s²P and B' = s^(2 − n) B.
+    s = 1.03
+    other = Vine(**{**LEVEL.__dict__, "L": s * LEVEL.L, "payload": s * LEVEL.payload})
+    imitation = {"pressure_gain.eps": s**2 - 1, "eversion_damping.B": LEVEL.B * s ** (2 - 0.37)}
+    assert gap(LEVEL, {"length_scale.eps": s - 1}, imitation, other) < SAME
+    assert gap(LEVEL, {"length_scale.eps": s - 1}, {}) > 1e-2
+
+
+def test_depletion_on_one_vine_at_one_pressure_is_nearly_tail_friction_on_a_reel() -> None:
+    vine = Vine(D=24e-3, t=200e-6, L=0.28, P=28e3, P_y=3e3, B=6.44)
+    times = np.linspace(0, 0.12, 60)
+    truth = simulated(vine, {"reservoir_depletion.gamma": 1.4}, times).observed_position_m
+
+    def left(free: np.ndarray) -> np.ndarray:
+        sizes = {"tail_friction.mu_w": free[0], "eversion_damping.B": free[1], "eversion_damping.n": free[2]}
+        return simulated(vine, sizes, times, tail_store="reel").observed_position_m - truth
+
+    found = least_squares(left, [1.0, 6.44, 0.37], x_scale=[1.0, 1.0, 0.1], diff_step=1e-4)
+    whole = np.max(np.abs(left(np.array([0.0, 6.44, 0.37]))))
+    assert whole > 15e-3
+    assert np.max(np.abs(found.fun)) < 0.5e-3
+
+
+def test_leak_and_isothermal_depletion_are_one_line_at_constant_speed() -> None:
+    times = np.linspace(0.0, 0.1, 60)
+    motion = (times, 1.5 * times, np.full(60, 1.5))
+    trial = LOADED.trial()
+
+    def fall(sizes: Mapping[str, float]) -> np.ndarray:
+        return evaluate(whole_catalogue(sizes), trial, *motion).pressure_Pa - LOADED.P
+
+    leak, depletion = fall({"leak.rate": 1.0}), fall({"reservoir_depletion.gamma": 1.0})
+    cosine = leak @ depletion / np.linalg.norm(leak) / np.linalg.norm(depletion)
+    assert cosine > 0.9995

@@ -1,12 +1,14 @@
 """The catalogue of physical and measurement effects, one file each.
 
-`vinetrack.effects.gravity` is the effect of that name; `catalogue()` all of them; `load_effect(path)` a user's own.
+`vinetrack.effects.gravity` is the effect of that name; `catalogue()` all of them; `load_effect(path)` one of
+a user's own, `own_effects(paths)` all of them, tried out.
 """
 
 from __future__ import annotations
 
 from vinetrack.effects._base import HOOKS, Effect, Parameter, Rig, State, Worked
 from vinetrack.effects._catalogue import BASE_EFFECTS, EffectError, catalogue, find_effect, load_effect
+from vinetrack.effects._own import own_effects
 
 __all__ = [
     "BASE_EFFECTS",
@@ -20,6 +22,7 @@ __all__ = [
     "catalogue",
     "find_effect",
     "load_effect",
+    "own_effects",
 ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from vinetrack.effects._base import Effect, Rig, State, Worked
 from vinetrack.effects._catalogue import EffectError, load_effect
@@ -135,7 +136,8 @@ def _compile_faults(effect: Effect, hook: str) -> Iterator[str]:
 
     try:
         # As the kernel is compiled: without the means to make an array.
-        compiled = njit(effect.functions[hook], _nrt=False)
+        flags: dict[str, Any] = {"_nrt": False}
+        compiled = njit(**flags)(effect.functions[hook])
         compiled(_STATE, _RIG, *(parameter.default for parameter in effect.parameters))
     except NumbaError:
         yield f"{hook} cannot be compiled: it may use numbers, math and numpy functions only"

@@ -7,7 +7,8 @@ Matters early, when everything accelerates, and in wide vines of thin film: the 
     y ÿ goes left as mass of the tail: f ¼ρ_gas A y, by ¼ = 1/r²
 
 ρ_gas = (P + P_atm)/(287 T). f = 1 is a plug of gas as wide as the vine, moving with the leading edge; the core taken up
-by the tail and the profile of the flow change it by some tenths.
+by the tail and the profile of the flow change it by some tenths. The floor that the mass of a bare vine comes to at
+the end holds this gas already: it is not counted twice.
 
 Easily taken for `air_drag` or `inlet_loss`, by its ½ẏ². The start of growth, where they are nothing, tells them apart.
 

@@ -134,14 +134,21 @@ class _Writer:
         # An area that no effect changes agrees at once; each turn gains a digit or two on the strongest stretch.
         lines += ["start = pressure", "for turn in range(30):", "    area_before, area = area, rig.area"]
         lines += [f"    {line}" for line in stretch]
-        lines += ["    if turn > 0 and abs(area - area_before) <= 1e-12 * area:", "        break"]
+        lines += ["    if turn > 0 and abs(area - area_before) <= 1e-10 * area:", "        break"]
         return lines + [f"    {line}" for line in ["pressure = start", *once]]
 
     def mass(self) -> list[str]:
         lines = [*self.calls("film_gain", "film *= {call}"), "density = rig.linear_density * film"]
         lost = "rig.mass_loss * film * rig.travel_ratio * y"
-        lines += [f"mass = max(density * rig.length - {lost}, rig.least_mass) + rig.payload_mass"]
+        lines += [f"film_mass = density * rig.length - {lost}"]
+        lines += ["mass = max(film_mass, rig.least_mass) + rig.payload_mass"]
         return lines
+
+    def inertia(self) -> list[str]:
+        """All that moves with the tail; what effects add counts in the floor that the mass comes to."""
+        added = self.calls("added_mass", "added += {call}")
+        total = "mass = max(film_mass + added, rig.least_mass) + rig.payload_mass"
+        return ["added = 0.0", *added, total] if added else []
 
     def forces(self) -> list[str]:
         lines = self.calls("damping_gain", "gain = {call}")
@@ -173,7 +180,7 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     """
     write = _Writer(effects)
     both = [*write.mass(), *write.pressure(), *write.forces()]
-    added = write.calls("added_mass", "mass += {call}")
+    added = write.inertia()
     seen = write.calls("observed_position", "seen = {call}")
     rest = write.calls("rest_force", "tip += {call}")
     # The chamber knows its own pressure, not what is left of it at the tip.

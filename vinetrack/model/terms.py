@@ -67,13 +67,15 @@ def evaluate(
     state = _resting_state(trial, rig, *motion)
     ask.measured = measured_Pa is not None
     film = np.prod([np.ones_like(motion[0]), *ask.each("film_gain", state, rig).values()], axis=0)
-    mass = np.maximum(film * (rig.linear_density * rig.length - rig.mass_loss * state.tail_position), rig.least_mass)
-    state = state._replace(moving_mass=mass + rig.payload_mass, linear_density=rig.linear_density * film)
+    film_mass = film * (rig.linear_density * rig.length - rig.mass_loss * state.tail_position)
+    weighed = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
+    state = state._replace(moving_mass=weighed, linear_density=rig.linear_density * film)
     state = _with_pressure(ask, state, rig, measured_Pa)
     state = state._replace(damping_gain=ask("damping_gain", state, rig, state.damping_gain, "damping_gain"))
     tip, tail = ask.each("tip_force", state, rig), ask.each("tail_force", state, rig)
     tip_sum = sum(tip.values(), np.zeros_like(motion[0]))
-    moved = sum(ask.each("added_mass", state, rig).values(), state.moving_mass)
+    film_mass = sum(ask.each("added_mass", state, rig).values(), film_mass)
+    moved = np.maximum(film_mass, rig.least_mass) + rig.payload_mass
     tail_sum = sum(tail.values(), np.zeros_like(motion[0]))
     tension = tip_sum / rig.travel_ratio
     return Terms(
@@ -175,7 +177,7 @@ def _settled(ask: _Asker, state: State, rig: Rig) -> State:
     area = plain
     for turn in range(30):
         before, area = area, ask("area", state._replace(area=plain), rig, plain, "area")
-        if turn > 0 and np.all(np.abs(area - before) <= 1e-12 * area):
+        if turn > 0 and np.all(np.abs(area - before) <= 1e-10 * area):
             break
         state = state._replace(area=area, pressure=start)
         state = state._replace(pressure=ask("pressure", state, rig, start, "pressure"))
