@@ -10,7 +10,7 @@ import pytest
 from vinetrack.effects import catalogue
 from vinetrack.figures.effect_picture import draw_effect
 from vinetrack.figures.style import BLUE, render
-from vinetrack.model.effect_motion import effect_motion, reference_words
+from vinetrack.model.effect_motion import effect_motion, reference_words, size_words
 
 FASTER = {"fold_inertia", "wall_stretch", "gravity"}
 
@@ -37,7 +37,8 @@ def test_both_curves_are_drawn_in_millimetres_and_milliseconds() -> None:
     np.testing.assert_allclose(drawn[BLUE.upper()].get_xdata(), 1e3 * table()["time_s"])
     assert gap.lines[-1].get_ydata()[-1] == pytest.approx(-20.0)
     assert "m/s" in speed.get_ylabel()
-    assert "C = 1" in position.get_legend().get_texts()[1].get_text()
+    assert [text.get_text() for text in position.get_legend().get_texts()] == ["without", "with"]
+    assert "drag: C = 1" in [text.get_text() for text in fig.texts]
     assert render(fig, ["png"])["png"].startswith(b"\x89PNG")
 
 
@@ -50,6 +51,12 @@ def test_every_effect_shows_on_the_reference_vine(name: str) -> None:
         assert found["difference_m"].iloc[-1] < 0
     if name in FASTER:
         assert found["difference_m"].iloc[-1] > 0
+
+
+def test_the_size_is_the_one_that_was_simulated() -> None:
+    assert size_words(catalogue()["eversion_damping"]) == "B = 6.44 N·(s/m)ⁿ, n = 0.37"
+    assert size_words(catalogue()["air_drag"]) == "C_D = 1"
+    assert size_words(catalogue()["pressure_drive"]) == ""
 
 
 def test_the_caption_says_what_is_simulated() -> None:

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.figures.style import BLUE, INK, MUTED, VERMILLION, legend_above, look
+from vinetrack.figures.style import BLUE, INK, MUTED, VERMILLION, fitting_size, look
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+_WIDTH_IN = 7.2
 
 
 def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
@@ -27,13 +29,12 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     from matplotlib.figure import Figure
 
     time_ms = 1e3 * table["time_s"].to_numpy()
-    label = f"with {name}" + (f" ({size})" if size else "")
     with look():
-        fig = Figure(figsize=(7.2, 7.0))
+        fig = Figure(figsize=(_WIDTH_IN, 7.0))
         position, speed, gap = fig.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
         for axes, key, factor in ((position, "position_m", 1e3), (speed, "velocity_m_s", 1.0)):
-            axes.plot(time_ms, factor * table[f"without_{key}"], color=MUTED, lw=2.4, label=f"without {name}")
-            axes.plot(time_ms, factor * table[f"with_{key}"], color=BLUE, label=label)
+            axes.plot(time_ms, factor * table[f"without_{key}"], color=MUTED, lw=2.4, label="without")
+            axes.plot(time_ms, factor * table[f"with_{key}"], color=BLUE, label="with")
         difference_mm = 1e3 * table["difference_m"].to_numpy()
         gap.axhline(0.0, color=INK, lw=0.8)
         gap.plot(time_ms, difference_mm, color=VERMILLION)
@@ -43,10 +44,12 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
         speed.set_ylabel("its speed ẏ (m/s)")
         gap.set_ylabel("difference (mm)")
         gap.set_xlabel("time since release (ms)")
-        legend_above(position)
+        title = name + (f": {size}" if size else "")
+        fig.text(0.12, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.52 * 72 * _WIDTH_IN, 11))
+        position.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
         fig.align_ylabels()
-        fig.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.12, hspace=0.14)
-        fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 100), color=MUTED, fontsize=8.8, va="bottom")
+        fig.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.135, hspace=0.14)
+        fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 104), color=MUTED, fontsize=8.8, va="bottom")
     return fig
 
 

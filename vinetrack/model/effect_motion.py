@@ -69,11 +69,20 @@ def effect_motion(effect: Effect) -> pd.DataFrame:
 
 def reference_words(effect: Effect) -> str:
     """The vine and trial of `effect_motion`, for the caption of a picture."""
-    vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44, 35.6 g"
+    vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
     if _acts_at_rest(effect):
         return f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
     bends = ", one radian of bend after 100 mm" if effect.name == "capstan_friction" else ""
     return f"{vine}, 28 kPa, straight down, chamber 3.7 L, inlet 6 mm{bends}"
+
+
+def size_words(effect: Effect) -> str:
+    """Its parameters with the values of `effect_motion`, such as `C_D = 1`; blank where it has none."""
+    values = [REFERENCE_VALUES.get(f"{effect.name}.{p.name}", p.default) for p in effect.parameters]
+    return ", ".join(
+        f"{p.symbol} = {value:g}{'' if p.unit == '1' else ' ' + p.unit}"
+        for p, value in zip(effect.parameters, values, strict=True)
+    )
 
 
 def _acts_at_rest(effect: Effect) -> bool:

@@ -57,14 +57,13 @@ def write_picture(effect: Effect, path: Path) -> None:
     """Draw what an effect does to the reference vine; the file's ending says in which form."""
     from vinetrack.figures.effect_picture import draw_effect
     from vinetrack.figures.style import render
-    from vinetrack.model.effect_motion import effect_motion, reference_words
+    from vinetrack.model.effect_motion import effect_motion, reference_words, size_words
     from vinetrack.tables import write_bytes
 
     if path.suffix.lower() not in FORMATS:
         raise ExperimentError(
             [Problem(message="is no kind of picture", file=str(path), remedy=f"end it in {', '.join(FORMATS)}")]
         )
-    size = ", ".join(f"{p.symbol} = {p.default:g}{'' if p.unit == '1' else ' ' + p.unit}" for p in effect.parameters)
-    fig = draw_effect(effect.name, size, reference_words(effect), effect_motion(effect))
+    fig = draw_effect(effect.name, size_words(effect), reference_words(effect), effect_motion(effect))
     form = path.suffix.lower()[1:]
     write_bytes(path, render(fig, [form])[form])
