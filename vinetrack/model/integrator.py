@@ -315,6 +315,14 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, s
                 x += 0.5 * h * max(v, 0.0)
                 time += h
                 end_time = time
+                while k < count and times[k] <= time:
+                    out[k, 3] = observed(times[k], x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
+                    out[k, 0] = x
+                    out[k, 1] = 0.0
+                    out[k, 2] = 0.0
+                    k += 1
+                if k == count:
+                    return STALLED, end_time, 0.0, n_steps, slack_time
                 continue
             h *= 0.3
             have_guess = False
