@@ -25,7 +25,13 @@ L, PAYLOAD, P_Y, B, N, G = 0.28, 35.6e-3, 3e3, 6.44, 0.37, 9.81
 MU = 0.5
 
 MODEL = base_model().with_values({"eversion_damping.B": B, "eversion_damping.n": N})
-RUBBING = (MODEL + catalogue()["payload_friction"]).with_values({"payload_friction.mu_p": MU})
+WITH_MORE = (MODEL + catalogue()["payload_friction"] + catalogue()["supply_refill"]).with_values(
+    {"payload_friction.mu_p": 0.0, "supply_refill.tau": 0.0, "supply_refill.gamma": 0.0}
+)
+"""Both at no size: one compiled model for the tests that use either."""
+
+RUBBING = WITH_MORE.with_values({"payload_friction.mu_p": MU})
+REFILLED = WITH_MORE.with_values({"supply_refill.tau": 0.5, "supply_refill.gamma": 1.4})
 
 
 def trial(P: float, **others: object) -> Trial:
@@ -145,13 +151,41 @@ FALL_AND_RISE = (np.array([0.0, 0.05, 0.06, 0.10, 0.11, 1.0]), np.array([28e3, 2
 def test_the_tip_takes_up_the_slack_of_a_payload_that_rubs() -> None:
     times = np.linspace(0, 0.2, 201)
     truth = by_hand(times, lambda t: float(np.interp(t, *FALL_AND_RISE)), down=0.0, mu=MU, max_step=1e-3)
-    level = trial(28e3, growth_angle_rad=math.pi / 2)
+    level = trial(28e3, growth_angle_rad=math.pi / 2, chamber_m3=3.7e-3)
     # The coasting tail carries an error of its speed on for a tenth of a second: a tighter tolerance than usual.
     got = simulate(RUBBING, level, times, trace=FALL_AND_RISE, relative_tolerance=1e-6)
     assert len(truth.switches) == 2  # slack, and taut again
     assert truth.switches[1] < times[-1]
     assert got.slack_from_s == pytest.approx(truth.switches[0], abs=1e-5)
     np.testing.assert_allclose(got.lead_position_m, truth.y, rtol=0, atol=1e-5 * truth.y[-1])
+
+
+def test_the_chamber_goes_on_filling_while_the_tail_is_slack() -> None:
+    def rate(ydot: float, y: float, P: float) -> float:
+        return -1.4 * (P + 101_325) * A * ydot / (3.7e-3 + A * y) + (20e3 - P) / 0.5
+
+    def taut(_t: float, s: np.ndarray) -> list[float]:
+        x, v, P = s
+        m = LAMBDA * L - LAMBDA / 2 * x + PAYLOAD
+        return [v, (0.5 * (P - P_Y) * A + m * G - 0.5 * B * max(v, 0.0) ** N) / m, rate(v / 2, x / 2, P)]
+
+    def tension(_t: float, s: np.ndarray) -> float:
+        return (s[2] - P_Y) * A - B * max(s[1], 0.0) ** N
+
+    def slack(_t: float, s: np.ndarray) -> list[float]:
+        return [tip_speed(s[1]), rate(tip_speed(s[1]), s[0], s[1])]
+
+    tension.terminal, tension.direction = True, -1  # type: ignore[attr-defined]
+    how = {"rtol": 1e-10, "atol": 1e-12, "dense_output": True}
+    first = solve_ivp(taut, (0.0, 0.2), [0.0, 0.0, 20e3], "LSODA", events=tension, **how)
+    onset = float(first.t[-1])
+    second = solve_ivp(slack, (onset, 0.2), [first.y[0, -1] / 2, first.y[2, -1]], "LSODA", **how)
+    times = np.linspace(0, 0.2, 101)
+    truth = np.where(times < onset, first.sol(np.minimum(times, onset))[0] / 2, second.sol(np.maximum(times, onset))[0])
+    got = simulate(REFILLED, trial(20e3, chamber_m3=3.7e-3), times)
+    assert 0.01 < onset < 0.15
+    assert got.slack_from_s == pytest.approx(onset, abs=1e-5)
+    np.testing.assert_allclose(got.lead_position_m, truth, rtol=0, atol=1e-5 * truth[-1])
 
 
 def test_below_the_yield_pressure_the_payload_falls_and_the_tip_stays() -> None:

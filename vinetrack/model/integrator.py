@@ -215,7 +215,7 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, s
     n_steps = 0
     end_time = float("nan")
     at_rest = True
-    loose = False
+    loose = closed_in = False
     slack_time = float("nan")
     h = 0.0
     slope = 0.0
@@ -344,7 +344,12 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, s
                 on, rig, theta, trace_time, trace_pressure, bends,
             )  # fmt: skip
             if slack < 2 and (slack < fraction or not ended):
-                ended, loose, fraction = False, True, slack
+                if not closed_in:
+                    # Within a step the chamber's pressure is known less well than at its ends: end one here.
+                    closed_in, have_guess = True, False
+                    h *= slack
+                    continue
+                ended, loose, closed_in, fraction = False, True, False, slack
         while k < count and times[k] <= time + fraction * h:
             part = (times[k] - time) / h
             now_x, now_v, now_a = quintic(part, h, x, v, slope, x_end, v_end, slope_end)
