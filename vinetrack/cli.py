@@ -61,9 +61,10 @@ def check(experiment: ExperimentPath) -> None:
     """Check the sheet, settings, tracks and videos, in seconds, before any work."""
     with _sentences(None):
         from vinetrack.experiment import check_experiment, format_problems
+        from vinetrack.video.survey import survey
         from vinetrack.workflow import find_experiment
 
-        problems = check_experiment(find_experiment(experiment))
+        problems = check_experiment(find_experiment(experiment), survey)
         for line in format_problems(problems):
             typer.echo(line)
         if any(problem.severity == "error" for problem in problems):

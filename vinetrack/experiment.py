@@ -262,13 +262,13 @@ def _from_table_error(error: Exception, file: str, **details: Any) -> Problem:
     return Problem(message=message, file=file, remedy=remedy, **details)
 
 
-VideoCheck = Callable[[Trial], Iterable[Problem]]
+Survey = Callable[[Experiment, list[Trial]], Iterable[Problem]]
 
 
-def check_experiment(folder: Path | str, open_video: VideoCheck | None = None) -> list[Problem]:
+def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> list[Problem]:
     """Every problem of an experiment that can be found in seconds: sheet, settings, tracks, and that videos exist.
 
-    `open_video` may look into the recording of a trial; its problems are listed with the others.
+    `open_videos` may look into the recordings that are there, and the calibration; see `vinetrack.video.survey`.
     """
     try:
         experiment = read_experiment(folder, strict=False)
@@ -281,13 +281,19 @@ def check_experiment(folder: Path | str, open_video: VideoCheck | None = None) -
             problems.append(
                 Problem(message=message, file=SETTINGS, column=key, value=relative, remedy="check the path")
             )
+    found: list[Problem] = []
+    there: list[Trial] = []
     for trial in experiment.trials:
-        found = _check_track(trial) if trial.track else _check_video(trial)
-        if trial.video and not found and open_video is not None:
-            found = list(open_video(trial))
-        line = experiment.lines[trial.name]
-        problems += [replace(problem, file=SHEET, trial=trial.name, line=line) for problem in found]
-    return problems
+        of_trial = _check_track(trial) if trial.track else _check_video(trial)
+        found += [replace(problem, trial=trial.name) for problem in of_trial]
+        if trial.video and not of_trial:
+            there.append(trial)
+    if there and open_videos is not None:
+        found += open_videos(experiment, there)
+    lines = experiment.lines
+    return problems + [
+        replace(problem, file=SHEET, line=lines[problem.trial]) if problem.trial else problem for problem in found
+    ]
 
 
 def _check_track(trial: Trial) -> list[Problem]:

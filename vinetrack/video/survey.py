@@ -1,0 +1,145 @@
+"""Recordings and calibration looked at before any work: what can be known in seconds, without decoding.
+
+Every recording is opened and its header read; its frames are counted where the file's own index, or a walk through
+its packets, tells without decoding. The calibration is read once for each size of picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.problems import Problem
+from vinetrack.records import Trial
+from vinetrack.settings import Axis, ExperimentSettings
+from vinetrack.video.frames import Recording, RecordingError, inspect_recording
+from vinetrack.video.track import FEWEST_FRAMES, capture_rate
+
+if TYPE_CHECKING:
+    from vinetrack.experiment import Experiment
+
+SETTINGS = "experiment.yaml"
+LARGEST_WALKED_BYTES = 64_000_000
+"""A file without an index is read to its end to count its frames; of larger ones a hundred would take minutes."""
+
+
+def survey(experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
+    """Say what is wrong with the recordings of these trials, each with the trial's name, and with the calibration.
+
+    Parameters
+    ----------
+    experiment
+        Its settings (`calibration`, `axis`) and folder.
+    trials
+        Those whose recording is there to be opened.
+    """
+    problems: list[Problem] = []
+    opened: dict[Trial, Recording] = {}
+    for trial in trials:
+        try:
+            opened[trial] = recording = inspect_recording(trial.video or Path())
+            found = _judge(trial, recording)
+        except RecordingError as error:
+            found = [_unusable(error, trial.video.name if trial.video else "")]
+        problems += [replace(problem, trial=trial.name) for problem in found]
+    return problems + _judge_scale(experiment.settings, experiment.folder, opened)
+
+
+def _judge(trial: Trial, recording: Recording) -> list[Problem]:
+    """A recording that opens, against what the sheet says of it and what the file declares."""
+    place: dict[str, Any] = {"column": "video", "value": recording.path.name}
+    try:
+        capture_rate(trial, recording.capture_fps)
+    except RecordingError as error:
+        message, _, remedy = str(error).removeprefix(f"{trial.name}: capture_fps ").rpartition("; ")
+        return [Problem(message=message or remedy, column="capture_fps", remedy=remedy if message else "")]
+    found = [
+        Problem(message=f"is odd: {note.removeprefix(f'{recording.path.name}: ')}", severity="warning", **place)
+        for note in recording.notes
+    ]
+    declared, present = recording.declared_frames, frames_present(recording)
+    count = declared if present is None else present
+    if count is not None and count < FEWEST_FRAMES:
+        remedy = f"at least {FEWEST_FRAMES} are needed"
+        return [*found, Problem(message=f"has {count} frames", remedy=remedy, **place)]
+    if declared is not None and present is not None and present < declared:
+        message = f"is cut short: {present} of the {declared} frames that it declares are there"
+        remedy = "copy it from the camera again"
+        found.append(Problem(message=message, severity="warning", remedy=remedy, **place))
+    return found
+
+
+def frames_present(recording: Recording) -> int | None:
+    """How many frames lie in the file as far as that is known without decoding; None where it is not."""
+    if recording.kind != "container":
+        return recording.declared_frames
+    import av
+
+    size = recording.path.stat().st_size
+    try:
+        with av.open(str(recording.path)) as container:
+            stream = container.streams.video[0]
+            entries = stream.index_entries
+            if stream.frames and len(entries) >= stream.frames:
+                return sum(entry.pos + entry.size <= size for entry in entries)
+            if size > LARGEST_WALKED_BYTES:
+                return None
+            return sum(1 for packet in container.demux(stream) if packet.size)
+    except (av.error.FFmpegError, AttributeError):
+        # A walk that ends in an error has met damage that decoding will put into words.
+        return None
+
+
+def _judge_scale(settings: ExperimentSettings, folder: Path, opened: dict[Trial, Recording]) -> list[Problem]:
+    """What is wrong with calibration and axis, for the recordings that open."""
+    problems: list[Problem] = []
+    unscaled = [trial for trial in opened if not math.isfinite(trial.m_per_px)]
+    sizes = sorted({(opened[trial].width, opened[trial].height) for trial in unscaled})
+    if unscaled and settings.calibration is None:
+        some = "no recording has" if len(unscaled) == len(opened) else f"{len(unscaled)} recordings have no"
+        remedy = "give it here, or mm_per_px in the sheet"
+        message = f"is missing: {some} a scale" if some.startswith("no ") else f"is missing: {some} scale"
+        problems.append(Problem(message=message, file=SETTINGS, column="calibration", remedy=remedy))
+    elif unscaled:
+        problems += _judge_calibration(settings, folder, sizes)
+    if settings.axis is not None:
+        outside = [recording for recording in opened.values() if not _inside(settings.axis, recording)]
+        if outside:
+            message = f"leaves the picture of {outside[0].path.name}, {outside[0].width} × {outside[0].height} pixels"
+            remedy = "give two points inside it"
+            problems.append(Problem(message=message, file=SETTINGS, column="axis", remedy=remedy))
+    return problems
+
+
+def _judge_calibration(settings: ExperimentSettings, folder: Path, sizes: list[tuple[int, int]]) -> list[Problem]:
+    """Read the calibration for each size of recording; the first complaint is enough."""
+    from vinetrack.video.calibration import CalibrationError, calibrate
+
+    image = getattr(settings.calibration, "image", None)
+    if settings.calibration is None or (image is not None and not (folder / image).exists()):
+        return []
+    place: dict[str, Any] = {"file": SETTINGS, "column": "calibration" if image is None else "calibration.image"}
+    notes: dict[str, None] = {}
+    for width_px, height_px in sizes:
+        try:
+            calibration = calibrate(settings.calibration, folder, width_px, height_px)
+        except CalibrationError as error:
+            message, _, remedy = str(error).removeprefix("calibration: ").rpartition("; ")
+            return [Problem(message=f"cannot be used: {message or remedy}", remedy=remedy if message else "", **place)]
+        if image is not None:
+            notes |= dict.fromkeys(calibration.notes)
+    return [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
+
+
+def _inside(axis: Axis, recording: Recording) -> bool:
+    ends = (axis.from_px, axis.to_px)
+    return all(-0.5 <= x <= recording.width - 0.5 and -0.5 <= y <= recording.height - 0.5 for x, y in ends)
+
+
+def _unusable(error: RecordingError, name: str) -> Problem:
+    message, _, remedy = str(error).removeprefix(f"{name}: ").rpartition("; ")
+    words = f"cannot be used: {message or remedy}"
+    return Problem(message=words, column="video", value=name, remedy=remedy if message else "")
