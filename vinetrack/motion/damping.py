@@ -9,14 +9,15 @@ gives n (D. York et al., Am. J. Phys. 72, 367, 2004). The scatter is whatever th
 
 Intervals resample whole trials within each vine, so that nothing is assumed about the scatter. Resampling cannot see
 two things. One is the flattening of `log_log`: its intervals are moved by what its own scatter implies (its estimates
-are not: they are the published method). The other is an error that all trials of a vine share: the `…_total`
-intervals add that of the yield pressure.
+are not: they are the published method). The other is an error that trials share: the `…_total` intervals add that
+of the yield pressure, common to a vine, and that of the scale, common to all: a scale that is off by ε moves every
+ln x_ss by ε and every ln B by −n·ε, and leaves n alone.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,6 +45,7 @@ class Points:
     force_error: Floats
     set_error: Floats
     yield_error: Floats
+    scale_error: Floats
     force: Floats
     vine: np.ndarray
     names: tuple[str, ...]
@@ -82,7 +84,8 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
     ----------
     points
         A row a trial: `trial, vine, diameter_mm, thickness_um, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N,
-        yield_force_sigma_N` and, optional, `pressure_source` (`trace` where the force was measured, else `set`).
+        yield_force_sigma_N` and, optional, `pressure_source` (`trace` where the force was measured, else `set`) and
+        `scale_rel_sigma` (relative error of the scale, which all trials share).
         Vines with fewer than three trials, or a span of forces below 1.2, are left out and named.
     resamples, seed
         Number of resamples, and the seed that makes them repeatable.
@@ -91,7 +94,7 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
     -------
     dict
         `log_log` and `both_axes`, each with `n`, `n_95` (from resampling whole trials), `n_95_total` (with the stated
-        error of the yield pressures too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number of
+        errors of yield pressures and scale too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number of
         trials), `covariance` of n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (how it
         was found), `left_out`, and `refused`: None, or why there is no fit.
     """
@@ -160,6 +163,9 @@ def _logarithms(points: pd.DataFrame) -> Points:
         force_error=np.where(measured, force_error, 0.0),
         set_error=np.where(measured, 0.0, force_error),
         yield_error=np.nan_to_num(points["yield_force_sigma_N"].to_numpy(float)),
+        scale_error=relative("scale_rel_sigma", np.ones(len(points)))
+        if "scale_rel_sigma" in points
+        else np.zeros(len(points)),
         force=force,
         vine=np.array([index[name] for name in points["vine"].astype(str)]),
         names=names,
@@ -219,8 +225,8 @@ def _fit(
     residual = data.log_force - log_B[data.vine] - n * data.log_speed
     scatter = math.sqrt(float(residual @ residual) / dof) if dof > 0 else math.nan
     covariance = _covariance(data, n, speed_variance, force_variance, scatter, both_axes)
-    draws = _resample(data, speed_variance, force_variance, resamples, seed, with_yield=False)
-    total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_yield=True)
+    draws = _resample(data, speed_variance, force_variance, resamples, seed, with_shared=False)
+    total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_shared=True)
     by_resampling = n_points >= FEWEST_FOR_RESAMPLING and dof > 0
     estimate = np.concatenate([[n], log_B])
     spread = _widening(data, dof)
@@ -312,18 +318,23 @@ def _covariance(
 
 
 def _resample(
-    data: Points, speed_variance: Floats, force_variance: Floats, resamples: int, seed: int, *, with_yield: bool
+    data: Points, speed_variance: Floats, force_variance: Floats, resamples: int, seed: int, *, with_shared: bool
 ) -> Floats:
-    """Fits to trials drawn with replacement within each vine, shape (n_kept, 1 + n_vines): columns n, ln B."""
+    """Fits to trials drawn with replacement within each vine, shape (n_kept, 1 + n_vines): columns n, ln B.
+
+    `with_shared` draws the errors that trials share as well: of the yield pressure once a vine, of the scale once.
+    """
     random = np.random.default_rng(seed)
     counts = np.zeros((resamples, data.log_force.size))
     for i in range(len(data.names)):
         rows = np.flatnonzero(data.vine == i)
         counts[:, rows] = random.multinomial(rows.size, np.full(rows.size, 1 / rows.size), size=resamples)
     log_force = data.log_force[None]
-    if with_yield:
+    if with_shared:
         shift = random.standard_normal((resamples, len(data.names)))[:, data.vine] * data.yield_error
         log_force = np.log(np.maximum(data.force - shift, 1e-3 * data.force))
+        scale = random.standard_normal((resamples, 1)) * data.scale_error
+        data = replace(data, log_speed=data.log_speed + scale)
     n, log_B = slope(log_force, counts, data, speed_variance, force_variance)
     draws = np.column_stack([n, log_B])
     return draws[np.isfinite(draws).all(axis=1) & (n > 0)]

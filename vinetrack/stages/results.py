@@ -73,6 +73,7 @@ POINT_COLUMNS = (
     "force_N",
     "force_sigma_N",
     "yield_force_sigma_N",
+    "scale_rel_sigma",
     "x_ss_paper_m_s",
     "force_paper_N",
     "eligible",

@@ -102,10 +102,9 @@ def analyse(
     write_csv(results.track(trial.name), track_table(summary.track))
     write_csv(results.kinematics(trial.name), kinematics_table(summary.kinematics))
     windows = [_window_row(trial.name, window) for window in summary.windows.values()]
-    write_json(
-        results.analysed(trial.name),
-        {"row": dict(summary.row) | columns, "windows": windows, "point": dict(summary.point)},
-    )
+    row = dict(summary.row) | columns
+    point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
+    write_json(results.analysed(trial.name), {"row": row, "windows": windows, "point": point})
     return "", ""
 
 
