@@ -314,6 +314,7 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, s
                 at_rest = True
                 x += 0.5 * h * max(v, 0.0)
                 time += h
+                chamber = chamber_end
                 end_time = time
                 while k < count and times[k] <= time:
                     out[k, 3] = observed(times[k], x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
