@@ -136,18 +136,18 @@ def one_way(n_trials: int, count: int, spread: float, seed: int) -> tuple[Soluti
 
 
 def test_the_spread_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
-    solution, means = one_way(12, 25, 0.2, seed=4)
+    solution, means = one_way(12, 25, 0.05, seed=4)
     expected = math.sqrt(means.var(ddof=1) - 0.01**2 / 25)
     assert solution.state.spread[1] == pytest.approx(expected, rel=2e-3)
 
 
 def test_the_error_of_a_common_level_is_that_of_a_mean_of_trials() -> None:
-    solution, means = one_way(12, 25, 0.2, seed=5)
+    solution, means = one_way(12, 25, 0.05, seed=5)
     assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)
 
 
 def test_degrees_of_freedom_of_a_common_level_are_the_trials_less_one() -> None:
-    solution, _ = one_way(12, 25, 0.2, seed=6)
+    solution, _ = one_way(12, 25, 0.05, seed=6)
     assert degrees_of_freedom(solution)[0] == pytest.approx(11, rel=0.03)
 
 

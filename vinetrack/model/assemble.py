@@ -16,7 +16,7 @@ from vinetrack.model.intervals import Precision, degrees_of_freedom, near_bound,
 from vinetrack.model.mixed import deviance, estimate_spreads, marginal, own_prior
 from vinetrack.model.model import Model, Value
 from vinetrack.model.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
-from vinetrack.model.solve import Solution
+from vinetrack.model.solve import Solution, chi2_per_dof
 from vinetrack.model.whitened import at_correlation, whiten
 from vinetrack.records import Floats
 
@@ -69,16 +69,6 @@ def log_likelihood(solution: Solution) -> float:
     part = marginal(solution.grams, solution.frame, solution.state)
     spread = estimate_spreads(part, solution.frame, solution.state, solution.estimable, restricted=False)
     return -0.5 * deviance(part, solution.frame, solution.state, spread, restricted=False)
-
-
-def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
-    """What the model leaves, whitened, against the noise of the tracks alone; NaN where these are exact."""
-    alone = np.array([item.noise_m**2 * (1 - item.correlation**2) for item in predictor.data])
-    if not (alone > 0).all():
-        return math.nan
-    left = at_correlation(solution.grams, solution.state.rho)[:, -1, -1]
-    taken = np.count_nonzero(solution.frame.free) / left.size + 2 + solution.frame.feels.any(axis=1)
-    return float(np.sum(left / alone) / np.sum(np.maximum(solution.frame.points - taken, 1.0)))
 
 
 def fitted_model(layout: Layout, numbers: Sequence[Number]) -> Model:

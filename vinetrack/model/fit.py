@@ -26,7 +26,7 @@ from vinetrack.model.mixed import deviance, marginal
 from vinetrack.model.model import Model, Value
 from vinetrack.model.sensitivity import Predictor
 from vinetrack.model.simulate import SimulationError
-from vinetrack.model.solve import Held, Solution, first_state, make_frame, solve
+from vinetrack.model.solve import MOST_ITERATIONS, Held, Solution, chi2_per_dof, first_state, make_frame, solve
 from vinetrack.model.starts import candidates
 from vinetrack.records import Track
 
@@ -39,6 +39,8 @@ POOR_FIT = 3.0
 """χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried."""
 
 MOST_STARTS = 3
+ITERATIONS_TO_CONFIRM = 20
+"""For a second start where the first settled but fits poorly: most often physics is missing, and no start helps."""
 
 
 def fit(
@@ -114,24 +116,20 @@ def _solve_from_scratch(predictor: Predictor, held: Held) -> Solution:
     for _, theta, own in candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]:
         frame = make_frame(predictor, own)
         try:
-            solution = solve(predictor, frame, first_state(predictor.data, theta, own), held)
+            most = MOST_ITERATIONS if not any(one.converged for _, one in found) else ITERATIONS_TO_CONFIRM
+            state = first_state(predictor.data, theta, own)
+            solution = solve(predictor, frame, state, held, most_iterations=most)
         except SimulationError as error:
             reason = str(error)
             continue
         part = marginal(solution.grams, frame, solution.state)
         found.append((deviance(part, frame, solution.state, solution.state.spread), solution))
-        if solution.converged and excess(predictor, solution) < POOR_FIT:
+        settled = [one for _, one in found if one.converged]
+        if settled and (len(found) > 1 or not chi2_per_dof(predictor, solution) > POOR_FIT):
             break
     if not found:
         raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
     return min(found, key=lambda one: one[0])[1]
-
-
-def excess(predictor: Predictor, solution: Solution) -> float:
-    """Variance that the model leaves against that of the noise of the tracks alone."""
-    alone = np.array([item.noise_m**2 * (1 - item.correlation**2) for item in predictor.data])
-    weights = solution.frame.points
-    return float(np.sum(weights * solution.state.variance) / max(np.sum(weights * alone), 1e-300))
 
 
 def refit(

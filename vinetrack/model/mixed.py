@@ -22,9 +22,17 @@ from vinetrack.model.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, RELEAS
 from vinetrack.model.whitened import at_correlation
 from vinetrack.records import Floats
 
-LEAST_SPREAD, LARGEST_SPREAD = 1e-5, 0.5
-LARGEST_CORRELATION = 0.97
-CORRELATIONS = np.concatenate([np.linspace(-0.5, 0.9, 29), [0.93, 0.95, LARGEST_CORRELATION]])
+LEAST_SPREAD = 1e-5
+LARGEST_SPREAD = (0.04, 0.15)
+"""Of pressure and B: four times what a batch of vines shows. Beyond, a trial would bend its own pressure and B until
+they pass for whatever the model lacks."""
+
+LARGEST_CORRELATION = 0.9998
+"""Nearly 1: what a wrong model leaves is slow and large, and must not count as thousands of independent points."""
+
+CORRELATIONS = np.concatenate(
+    [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97, 0.985, 0.993, 0.997, 0.999, LARGEST_CORRELATION]]
+)
 SPREAD_COLUMNS = (PRESSURE, DAMPING_DEVIATION)
 
 
@@ -247,7 +255,7 @@ def estimate_spreads(
     def at(logs: Floats) -> tuple[float, float]:
         spread = list(state.spread)
         for k, value in zip(which, logs, strict=True):
-            spread[k] = float(np.clip(math.exp(value), LEAST_SPREAD, LARGEST_SPREAD))
+            spread[k] = float(np.clip(math.exp(value), LEAST_SPREAD, LARGEST_SPREAD[k]))
         return spread[0], spread[1]
 
     def cost(logs: Floats) -> float:
@@ -269,7 +277,7 @@ def estimate_noise(grams: Floats, frame: Frame, state: State, rho: float | None 
     """Correlation of the noise, the same for all trials, and the variance of its innovations in each, m².
 
     Restricted likelihood of what is left once each trial's own numbers have been fitted. A trial's variance is drawn to
-    that of all as far as trials do not differ by more than chance.
+    that of all as far as trials do not differ by more than chance. The correlation is `rho` where given.
     """
     grid = CORRELATIONS if rho is None else np.array([rho])
     centre, precision = own_prior(frame, state)

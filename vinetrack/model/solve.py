@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,7 +22,8 @@ from vinetrack.model.mixed import (
 )
 from vinetrack.model.sensitivity import DAMPING_DEVIATION, PRESSURE, RELEASE, Predictor
 from vinetrack.model.simulate import SimulationError
-from vinetrack.model.whitened import all_products, whiten
+from vinetrack.model.starts import first_own
+from vinetrack.model.whitened import all_products, at_correlation, whiten
 from vinetrack.records import Floats
 
 MOST_ITERATIONS = 60
@@ -33,8 +35,13 @@ FIRST_SPREADS = (0.01, 0.03)
 EXACT_PART = 2e-6
 """Least noise, as part of a trial's travel: the integrator is no better."""
 
-LARGEST_DEVIATION = 0.4
+LARGEST_DEVIATION_STEP = 0.3
+LARGEST_DEVIATION = 0.9
 LARGEST_RELEASE_STEP_FRAMES = 2.0
+RELEASE_ROOM_FRAMES, ORIGIN_ROOM_SIGMAS = 10.0, 10.0
+"""Where the rest is seen it says of release and origin what it says through its points, a hundred times less a second
+time: that only counts where a wrong model would drag both along."""
+
 FEWEST_TO_SPARE = 3
 """A spread is estimated where this many more trials feel it than there are numbers without a prior."""
 
@@ -67,12 +74,15 @@ def make_frame(predictor: Predictor, own: Floats) -> Frame:
     durations = np.array([item.time_s[-1] - item.time_s[0] for item in data])
     spans = np.array([np.ptp(item.lead_position_m) for item in data])
     frames = np.array([item.frame_s for item in data])
-    release_sd = np.where([item.n_rest > 0 for item in data], 10 * frames, 3 * durations)
+    rests = np.array([item.n_rest > 0 for item in data])
+    release_sd = np.where(rests, RELEASE_ROOM_FRAMES * frames, 3 * durations)
+    noise = np.array([item.noise_m for item in data])
+    origin_sd = np.where(rests, np.maximum(ORIGIN_ROOM_SIGMAS * noise, 1e-4 * spans), 3 * spans)
     return Frame(
         index=layout.index,
         feels=np.column_stack([predictor.feels_pressure, predictor.feels_damping]),
-        own_centre=own[:, :2].copy(),
-        own_precision=np.column_stack([1 / release_sd**2, 1 / (3 * spans) ** 2]),
+        own_centre=np.where(rests[:, None], first_own(data)[:, :2], own[:, :2]),
+        own_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
         prior_mean=layout.start,
         prior_precision=layout.prior_precision,
         lower=lower,
@@ -85,10 +95,14 @@ def make_frame(predictor: Predictor, own: Floats) -> Frame:
 
 def first_state(data: Sequence[FitTrial], theta: Floats, own: Floats) -> State:
     """A state to begin from: noise of the tracks alone, spreads as the sheet and experience say."""
-    weights = np.array([item.time_s.size for item in data], dtype=float)
-    rho = float(np.average([item.correlation for item in data], weights=weights))
+    rho = track_correlation(data)
     variance = np.array([item.noise_m**2 * (1 - item.correlation**2) for item in data])
     return State(theta, own, stated_spreads(data), rho, np.maximum(variance, floor(data)))
+
+
+def track_correlation(data: Sequence[FitTrial]) -> float:
+    """Lag-one correlation of the noise as the tracks alone show it."""
+    return float(np.average([item.correlation for item in data], weights=[item.time_s.size for item in data]))
 
 
 def stated_spreads(data: Sequence[FitTrial]) -> tuple[float, float]:
@@ -158,6 +172,18 @@ def solve(
         columns = predictor.linearise(state.theta, state.own)
         grams = _products(predictor, columns)
     return Solution(state, frame, grams, tuple(columns), can, converged, iteration)
+
+
+def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
+    """What the model leaves against the noise that the tracks show alone, of their correlation; NaN if none do."""
+    data = predictor.data
+    rho = track_correlation(data)
+    noise = np.array([item.noise_m**2 for item in data]) * (1 - rho**2)
+    if not (noise > 0).all():
+        return math.nan
+    left = at_correlation(solution.grams, rho)[:, -1, -1]
+    taken = np.count_nonzero(solution.frame.free) / left.size + 2 + solution.frame.feels.any(axis=1)
+    return float(np.sum(left / noise) / np.sum(np.maximum(solution.frame.points - taken, 1.0)))
 
 
 def _products(predictor: Predictor, columns: Sequence[Floats]) -> Floats:
@@ -233,12 +259,13 @@ def _follow(predictor: Predictor, frame: Frame, state: State) -> tuple[State, fl
 
 
 def _limited(predictor: Predictor, own: Floats, step: Floats) -> Floats:
-    """Own numbers after a step: the release moves by two frames at most, deviations stay below a half."""
+    """Own numbers after a step: the release moves by two frames at most, a deviation by 0.3."""
     reach = LARGEST_RELEASE_STEP_FRAMES * np.array([item.frame_s for item in predictor.data])
     moved = own + step
     moved[:, RELEASE] = own[:, RELEASE] + np.clip(step[:, RELEASE], -reach, reach)
     deviations = [PRESSURE, DAMPING_DEVIATION]
-    moved[:, deviations] = np.clip(moved[:, deviations], -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    stride = np.clip(step[:, deviations], -LARGEST_DEVIATION_STEP, LARGEST_DEVIATION_STEP)
+    moved[:, deviations] = np.clip(own[:, deviations] + stride, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     return moved
 
 
