@@ -114,7 +114,7 @@ def test_both_axes_agrees_with_odrpack_on_the_same_points_and_errors() -> None:
     x, y = np.log(points["x_ss_m_s"].to_numpy()), np.log(points["force_N"].to_numpy())
     x_sigma, y_sigma = draw.uniform(0.02, 0.1, count), draw.uniform(0.005, 0.03, count)
     zero = np.zeros(count)
-    data = Points(x, y, zero, zero, zero, zero, np.exp(y), vine, names)
+    data = Points(x, y, zero, zero, zero, zero, zero, np.exp(y), vine, names)
     n, log_B = slope(y[None], np.ones((1, count)), data, x_sigma**2, y_sigma**2)
     solved = odr_fit(
         lambda x, beta: beta[1 + vine] + beta[0] * x,
@@ -140,10 +140,10 @@ def test_a_resample_weighs_as_many_copies() -> None:
     counts = default_rng(4).multinomial(20, np.full(20, 0.05))
     x_var, y_var = np.linspace(1e-3, 4e-3, 20), np.linspace(2e-4, 1e-4, 20)
     drawn = slope(
-        y[None], counts[None].astype(float), Points(x, y, *[zero] * 4, np.exp(y), vine, ("a", "b")), x_var, y_var
+        y[None], counts[None].astype(float), Points(x, y, *[zero] * 5, np.exp(y), vine, ("a", "b")), x_var, y_var
     )
     rows = np.repeat(np.arange(20), counts)
-    copies = Points(x[rows], y[rows], *[zero[rows]] * 4, np.exp(y[rows]), vine[rows], ("a", "b"))
+    copies = Points(x[rows], y[rows], *[zero[rows]] * 5, np.exp(y[rows]), vine[rows], ("a", "b"))
     written_out = slope(y[rows][None], np.ones((1, 20)), copies, x_var[rows], y_var[rows])
     assert drawn[0][0] == pytest.approx(written_out[0][0], rel=1e-8)
     np.testing.assert_allclose(drawn[1], written_out[1], rtol=1e-8)
@@ -307,6 +307,36 @@ def test_where_yield_pressures_are_off_only_the_total_interval_covers() -> None:
         fit = fit_damping(scattered(seed, yield_error=1.0), resamples=300, seed=seed)["both_axes"]
         inner += fit["n_95"][0] <= N <= fit["n_95"][1]
         outer += fit["n_95_total"][0] <= N <= fit["n_95_total"][1]
+    assert outer >= binom.ppf(0.001, 60, 0.95)
+    assert inner < outer
+
+
+def test_an_error_of_the_scale_moves_every_B_by_n_times_it_and_leaves_n_alone() -> None:
+    """Exact points have no other error: speeds 1 % off make ln B 1.96·n·1 % wide either side."""
+    points = campaign(default_rng(0)).assign(scale_rel_sigma=0.01, yield_force_sigma_N=0.0)
+    fit = fit_damping(points, resamples=4000)["both_axes"]
+    assert fit["n_95_total"] == pytest.approx(fit["n_95"], abs=1e-9)
+    for found in fit["vines"].values():
+        assert found["B_95"] == pytest.approx([found["B"]] * 2, rel=1e-6)
+        below, above = np.log(np.array(found["B_95_total"]) / found["B"])
+        assert (-below, above) == pytest.approx((1.96 * N * 0.01,) * 2, rel=0.08)
+
+
+def test_an_unknown_error_of_the_scale_counts_for_nothing() -> None:
+    points = scattered(12)
+    known = fit_damping(points, resamples=100)
+    assert fit_damping(points.assign(scale_rel_sigma=np.nan), resamples=100) == known
+
+
+def test_where_the_scale_is_off_only_the_total_interval_of_B_covers() -> None:
+    """By its stated 3 %, the same for all trials."""
+    inner = outer = 0
+    for seed in range(3000, 3060):
+        points = scattered(seed, vines=("R2",)).assign(scale_rel_sigma=0.03)
+        points["x_ss_m_s"] *= 1 + 0.03 * default_rng([77, seed]).standard_normal()
+        found = fit_damping(points, resamples=300, seed=seed)["both_axes"]["vines"]["R2"]
+        inner += found["B_95"][0] <= B["R2"] <= found["B_95"][1]
+        outer += found["B_95_total"][0] <= B["R2"] <= found["B_95_total"][1]
     assert outer >= binom.ppf(0.001, 60, 0.95)
     assert inner < outer
 
