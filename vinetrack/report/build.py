@@ -9,14 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.numbers import number, with_error
 from vinetrack.figures.style import RULE_NAMES, rows
+from vinetrack.report.recordings import (
+    LARGEST_SVG_BYTES,
+    SHARED_ERROR,
+    Recording,
+    calibration_table,
+    recording_entry,
+)
 from vinetrack.report.svg import inline_svg, speed_sparkline
 from vinetrack.report.words import REFERENCES, exponent_table, headline, methods, tally, vine_table, without_law
 
 if TYPE_CHECKING:
     import pandas as pd
-
-MAX_INLINE_SVG_BYTES = 1_500_000
-"""A larger picture is left as a file beside the report."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,11 @@ class ReportFigure:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportContent:
-    """Everything the report is made of: the tables of the results folder, its pictures and its provenance."""
+    """Everything the report is made of: the tables of the results folder, its pictures and its provenance.
+
+    `recordings` has an entry for every trial that came as one, `n_strips_left_out` says how many of their strips were
+    too many for one page.
+    """
 
     name: str
     trials: pd.DataFrame
@@ -43,6 +51,8 @@ class ReportContent:
     kinematics: Mapping[str, pd.DataFrame]
     figures: Sequence[ReportFigure] = ()
     trial_figures: Mapping[str, str] = field(default_factory=dict)
+    recordings: Mapping[str, Recording] = field(default_factory=dict)
+    n_strips_left_out: int = 0
 
 
 def build_report(content: ReportContent) -> str:
@@ -69,8 +79,16 @@ def build_report(content: ReportContent) -> str:
         exponents=exponent_table(content.damping),
         without_law=without_law(content.damping),
         vines=vine_table(content.damping),
-        figures=[_figure(figure) for figure in content.figures if len(figure.svg) <= MAX_INLINE_SVG_BYTES],
+        figures=[_figure(figure) for figure in content.figures if len(figure.svg) <= LARGEST_SVG_BYTES],
         trials=[_trial(row, content) for row in rows(content.trials)],
+        recordings=[
+            recording_entry(row.trial, content.recordings[row.trial], row, content.trial_figures.get(row.trial, ""))
+            for row in rows(content.trials)
+            if row.trial in content.recordings
+        ],
+        n_strips_left_out=content.n_strips_left_out,
+        calibrations=calibration_table(content.recordings),
+        shared_error=SHARED_ERROR,
         methods=methods(settings),
         references=REFERENCES,
         settings=sorted(_flat(settings)),
@@ -97,7 +115,8 @@ def _trial(row: Any, content: ReportContent) -> dict[str, Any]:
     from markupsafe import Markup
 
     curve = content.kinematics.get(row.trial)
-    spark, svg = "", content.trial_figures.get(row.trial, "")
+    filmed = row.trial in content.recordings
+    spark, svg = "", "" if filmed else content.trial_figures.get(row.trial, "")
     if curve is not None and len(curve) > 1:
         time_s, speed_m_s = (curve[name].to_numpy(dtype=float) for name in ("time_s", "lead_velocity_m_s"))
         spark = speed_sparkline(time_s, speed_m_s, (row.steady_from_s, row.steady_to_s))
@@ -112,6 +131,7 @@ def _trial(row: Any, content: ReportContent) -> dict[str, Any]:
         "force": number(row.force_N),
         "final": number(row.final_lead_velocity_m_s),
         "efficiency": number(100 * row.efficiency),
+        "filmed": filmed,
         "spark": Markup(spark),
         "svg": Markup(inline_svg(svg, f"t-{row.trial}", f"Trial {row.trial}")) if svg else "",
         "windows": [_window(window) for window in rows(content.windows[content.windows["trial"] == row.trial])],

@@ -133,7 +133,8 @@ def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
             "and with errors on both axes (York), where the vines' own scatter stands with the measured errors. "
             f"Intervals hold 95 % and come from {damping.get('resamples', 2000)} resamplings of whole trials (seed "
             f"{damping.get('seed', 0)}), or from Student's t where there are too few trials to resample; the wider "
-            "ones add the stated error of the yield pressure, which all trials of a vine share.",
+            "ones add the stated errors that trials share: of the yield pressure, common to a vine, and of the scale, "
+            "common to all recordings.",
         ),
     ]
 

@@ -6,11 +6,11 @@ import logging
 import traceback
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from vinetrack.stages.results import Results
+from vinetrack.stages.results import Results, read_json
 from vinetrack.stages.tracks import INTERNAL_FAULT, analyse, failed_row, write_empty
-from vinetrack.tables import write_bytes
+from vinetrack.tables import write_bytes, write_json
 
 if TYPE_CHECKING:
     from vinetrack.experiment import Experiment
@@ -58,6 +58,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
             mm_per_px=1e3 * measurement.m_per_px,
             scale_rel_sigma=measurement.scale_rel_sigma,
         )
+        _add_calibration(results, trial.name, measurement, getattr(experiment.settings.calibration, "image", None))
     except (RecordingError, TrackError) as error:
         reason, fault = str(error), ""
         write_empty(results, trial.name, failed_row(trial, reason))
@@ -66,6 +67,23 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
         write_empty(results, trial.name, failed_row(trial, reason))
     _draw(trial, results, measurement, reason, settings)
     return reason, fault
+
+
+def _add_calibration(results: Results, name: str, measurement: Measurement, image: str | None) -> None:
+    """Add to the file of a trial what the scale of its recording rests on."""
+    found = measurement.calibration
+    entry: dict[str, Any] = {
+        "kind": "sheet" if found is None else found.kind,
+        "image": image if found is not None else None,
+        "mm_per_px": 1e3 * measurement.m_per_px,
+        "scale_rel_sigma": measurement.scale_rel_sigma,
+        "reprojection_px": None if found is None else found.reprojection_px,
+        "n_corners": 0 if found is None else found.n_corners,
+        "n_pictures": 0 if found is None else found.n_pictures,
+        "notes": [] if found is None else found.notes,
+    }
+    path = results.analysed(name)
+    write_json(path, read_json(path) | {"calibration": entry})
 
 
 def _draw(trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings) -> None:

@@ -15,6 +15,7 @@ from vinetrack.tables import write_json, write_text
 if TYPE_CHECKING:
     from vinetrack.experiment import Experiment
     from vinetrack.report.build import ReportFigure
+    from vinetrack.report.recordings import Recording
 
 FIGURES = {
     "damping_law": ("Steady force and steady speed", "damping_points.csv"),
@@ -38,12 +39,16 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
 
     results = Results(folder)
     inputs = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace) if path]
+    target = getattr(experiment.settings.calibration, "image", None)
+    inputs += [experiment.folder / target] if target is not None else []
     shared = [path for name in ("trials.csv", "experiment.yaml") if (path := experiment.folder / name).exists()]
     provenance = describe_run(
         experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model
     )
     trials = read_result(results.trials)
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
+    filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
+    few = len(drawn) <= MAX_TRIAL_PICTURES
     content = ReportContent(
         name=experiment.name,
         trials=trials,
@@ -52,7 +57,9 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
         provenance=provenance,
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
         figures=[figure for name in _drawn(results) if (figure := _figure(results, name))],
-        trial_figures=_trial_figures(results, drawn) if len(drawn) <= MAX_TRIAL_PICTURES else {},
+        trial_figures=_trial_figures(results, drawn) if few else {},
+        recordings={name: _recording(results, name, few) for name in filmed},
+        n_strips_left_out=0 if few else len(filmed),
     )
     page = build_report(content)
     write_json(results.provenance, provenance)
@@ -78,6 +85,17 @@ def _figure(results: Results, name: str) -> ReportFigure | None:
     caption = (files("vinetrack.report") / "captions" / f"{name}.rst").read_text(encoding="utf-8")
     data = (results.folder / data_name).read_text(encoding="utf-8")
     return ReportFigure(name, title, " ".join(caption.split()), path.read_text(encoding="utf-8"), data_name, data)
+
+
+def _recording(results: Results, name: str, with_strip: bool) -> Recording:
+    from vinetrack.report.recordings import Recording
+
+    strip = results.strip_figure(name, ".svg")
+    return Recording(
+        strip=strip.read_text(encoding="utf-8") if with_strip and strip.exists() else "",
+        flags=read_result(results.track(name))["flag"].tolist(),
+        calibration=read_json(results.analysed(name)).get("calibration"),
+    )
 
 
 def _trial_figures(results: Results, names: list[str]) -> dict[str, str]:

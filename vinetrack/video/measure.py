@@ -80,7 +80,8 @@ def _tracked(
     calibration: PlaneCalibration | None,
 ) -> Tracking:
     tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)  # type: ignore[arg-type]
-    notes = tuple(note for note in (calibration.notes if calibration is not None else ()))
+    # What is to be said of a scale that was merely given belongs to the experiment, not to each of its trials.
+    notes = calibration.notes if calibration is not None and math.isfinite(calibration.reprojection_px) else ()
     return replace(tracking, track=replace(tracking.track, notes=(*tracking.track.notes, *notes)))
 
 
@@ -101,7 +102,8 @@ def _given_axis(settings: ExperimentSettings, m_per_px: float) -> Axis | None:
         return None
     given = settings.axis
     width_px = given.width_mm / 1e3 / m_per_px if given.width_mm is not None else math.nan
-    return Axis(tuple(given.from_px), tuple(given.to_px), width_px)
+    (from_x, from_y), (to_x, to_y) = given.from_px, given.to_px
+    return Axis((from_x, from_y), (to_x, to_y), width_px)
 
 
 def _found_axis(luma: object, trial: Trial) -> Axis:

@@ -1,0 +1,108 @@
+"""Recordings and calibrations in the report, from entries written by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from test_report import EVIL, SVG, Tags, page, trials
+
+from vinetrack.report.recordings import LARGEST_SVG_BYTES, SHARED_ERROR, Recording, calibration_table, count_frames
+
+BOARD = {
+    "kind": "charuco",
+    "image": "calibration/board.png",
+    "mm_per_px": 0.2407,
+    "scale_rel_sigma": 9e-5,
+    "reprojection_px": 0.031,
+    "n_corners": 52,
+    "n_pictures": 1,
+    "notes": ["the target spans only 40 % of the picture"],
+}
+
+
+def recording(**changes: object) -> Recording:
+    return Recording(SVG, ["before_release", "", "", "doubtful"], {**BOARD, **changes})
+
+
+def test_strip_and_motion_stand_side_by_side_and_the_motion_once() -> None:
+    html = page(recordings={"a": recording()}, trial_figures={"a": SVG})
+    assert html.count('<div class="pair">') == 1
+    assert html.count('aria-label="Strip of a with its tracked edge"') == 1
+    assert html.count('aria-label="Motion of a"') == 1
+    assert 'id="recording-a"' in html
+    assert 'href="#recording-a"' in html
+    assert not Tags(html).wrong
+
+
+def test_an_experiment_of_tracks_has_neither_section() -> None:
+    html = page()
+    assert "Recordings" not in html
+    assert 'id="calibration"' not in html
+
+
+def test_the_calibration_is_listed_with_its_error_and_what_it_rests_on() -> None:
+    html = page(recordings={"a": recording()})
+    for words in ("ChArUco board", "calibration/board.png", "0.240700", "0.0090 %", "0.031 px", "52 in 1", "40 %"):
+        assert words in html
+    assert SHARED_ERROR.replace("'", "&#39;") in html
+
+
+def test_the_error_of_the_scale_is_said_to_be_apart_from_random_error() -> None:
+    assert "kept apart from the random error" in SHARED_ERROR
+
+
+def test_recordings_of_one_target_share_a_row_and_its_largest_error() -> None:
+    shared = {"a": recording(), "b": recording(mm_per_px=0.2409, scale_rel_sigma=2e-4)}
+    (row,) = calibration_table(shared)
+    assert (row["trials"], row["mm_per_px"], row["error"]) == ("2 recordings", "0.240700 to 0.240900", "0.020 %")
+
+
+def test_a_scale_of_the_sheet_has_an_unknown_error_and_a_row_for_each_value() -> None:
+    own = {
+        "kind": "sheet",
+        "image": None,
+        "scale_rel_sigma": None,
+        "reprojection_px": None,
+        "n_corners": 0,
+        "notes": [],
+    }
+    table = calibration_table({"a": recording(**own, mm_per_px=0.3), "b": recording(**own, mm_per_px=0.4)})
+    assert [(row["trials"], row["error"], row["reprojection"]) for row in table] == [
+        ("a", "unknown", "–"),
+        ("b", "unknown", "–"),
+    ]
+
+
+@pytest.mark.parametrize("unknown", [None, math.nan])
+def test_an_error_that_is_not_known_is_said_so(unknown: float | None) -> None:
+    (row,) = calibration_table({"a": recording(scale_rel_sigma=unknown)})
+    assert row["error"] == "unknown"
+
+
+def test_a_failed_recording_shows_its_reason_and_no_picture() -> None:
+    failed = trials("a", status="failed", reason="a.mp4: not a video")
+    html = page(trials=failed, recordings={"a": Recording(SVG, [])}, trial_figures={"a": SVG})
+    assert "a.mp4: not a video" in html
+    assert '<div class="pair">' not in html
+
+
+def test_too_many_strips_stay_files_and_it_says_so() -> None:
+    html = page(recordings={"a": Recording("", ["", ""])}, n_strips_left_out=61)
+    assert "With 61 recordings the pictures stay beside this page" in html
+    assert "2 frames" in html
+
+
+def test_a_strip_too_large_for_the_page_is_left_out() -> None:
+    html = page(recordings={"a": Recording(SVG + " " * LARGEST_SVG_BYTES, [""])})
+    assert "Strip of a" not in html
+
+
+def test_frames_are_counted_by_their_flags() -> None:
+    assert count_frames(["", "lost;gap", "lost"]) == "3 frames: 2 without the edge, 1 gap"
+    assert count_frames([]) == "0 frames"
+
+
+def test_what_a_user_wrote_is_escaped() -> None:
+    html = page(recordings={"a": recording(notes=[EVIL], image=EVIL)})
+    assert EVIL not in html
