@@ -30,7 +30,7 @@ from vinetrack.laboratory.campaign import PAPER_B, PAPER_N, damping_values, pape
 from vinetrack.laboratory.nature import BASE, Nature
 from vinetrack.laboratory.tracks import VirtualTrial, grow
 from vinetrack.model.model import Model, base_model, make_model
-from vinetrack.motion.damping import fit_laws
+from vinetrack.motion.damping import fit_laws, mark_half_steady
 from vinetrack.motion.summary import summarise_trial
 from vinetrack.settings import RunSettings
 
@@ -64,7 +64,8 @@ def measure(seed: int, nature: str) -> list[dict[str, object]]:
 def analyse(grown: list[VirtualTrial], model: Model | None = None) -> pd.DataFrame:
     """The points of the damping fit."""
     settings, model = RunSettings(), model or base_model()
-    return pd.DataFrame([dict(summarise_trial(t.stated, t.track, settings, model).point) for t in grown])
+    points = pd.DataFrame([dict(summarise_trial(t.stated, t.track, settings, model).point) for t in grown])
+    return mark_half_steady(points)
 
 
 def _fits(points: pd.DataFrame, seed: int, label: str) -> list[dict[str, object]]:

@@ -31,6 +31,9 @@ FEWEST_PER_VINE = 3
 LEAST_FORCE_RATIO = 1.2
 """Largest over smallest force that a vine must span for its slope to mean anything: below, 1 % of P is 0.1 of n."""
 
+LEAST_STEADY_SHARE = 0.5
+"""Part of a condition's trials that must be steady for any of them to enter a fit."""
+
 FEWEST_FOR_RESAMPLING = 10
 """Below, resamples repeat so few points that their spread says little: intervals come from Student's t."""
 
@@ -75,6 +78,30 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
     literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
     literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
     return fits | {"paper": fit_damping(literal, resamples=resamples, seed=seed)["log_log"]}
+
+
+def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
+    """Take out conditions of which less than half of the trials are steady; `used` and `reason` say so.
+
+    At the pressure where a vine only just reaches a steady speed within its length, the slower trials pass and the
+    faster do not: those that pass have too large a B, and so has the top of the fit.
+
+    Parameters
+    ----------
+    points
+        A row a trial, with `condition`, `eligible`, `used` and `reason`.
+    """
+    eligible = points[points["eligible"]]
+    share = eligible.groupby("condition", sort=False)["used"].mean()
+    few = points["condition"].isin(share[(share > 0) & (share < LEAST_STEADY_SHARE)].index) & points["used"]
+    words = [
+        f"only {share[condition]:.0%} of the trials of this condition are steady: the slower ones"
+        for condition in points.loc[few, "condition"]
+    ]
+    marked = points.copy()
+    marked.loc[few, "reason"] = words
+    marked.loc[few, "used"] = False
+    return marked
 
 
 def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:

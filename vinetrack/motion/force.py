@@ -52,11 +52,11 @@ def steady_force(
     travel_m = np.maximum(kinematics.lead_position_m[inside] - release.lead_position_m, 0.0)
     pressure_Pa, sigma_Pa, source = _window_pressure(trial, track, kinematics, release, window, model, inside)
     mass_kg = float(np.mean(trial.moving_mass_kg(travel_m)))
-    own_m_s2 = GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
+    weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
     if window.rule == "quasi_steady":
-        own_m_s2 -= window.drift * window.x_ss_m_s / (window.to_s - window.from_s)
+        weight_N -= trial.travel_ratio * mass_kg * window.drift * window.x_ss_m_s / (window.to_s - window.from_s)
     return SteadyForce(
-        force_N=(pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + trial.travel_ratio * mass_kg * own_m_s2,
+        force_N=(pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N,
         sigma_N=sigma_Pa * trial.area_m2,
         yield_sigma_N=trial.yield_pressure_sigma_Pa * trial.area_m2,
         paper_N=(trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2,

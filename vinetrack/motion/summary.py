@@ -163,6 +163,7 @@ def _point(trial: Trial, window: Window | None, paper: Window, force: SteadyForc
     return {
         "trial": trial.name,
         "vine": trial.vine,
+        "condition": trial.condition,
         "diameter_mm": trial.diameter_m * 1e3,
         "thickness_um": trial.thickness_m * 1e6,
         "pressure_kPa": trial.pressure_Pa / 1e3,

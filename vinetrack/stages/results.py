@@ -63,6 +63,7 @@ STEADY_COLUMNS = (
 POINT_COLUMNS = (
     "trial",
     "vine",
+    "condition",
     "diameter_mm",
     "thickness_um",
     "pressure_kPa",

@@ -121,13 +121,16 @@ def gather(experiment: Experiment, folder: Path) -> pd.DataFrame:
     ResultsError
         If a trial has not been analysed.
     """
+    from vinetrack.motion.damping import mark_half_steady
+
     results = Results(folder)
     found = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
     rows = {name: content["row"] for name, content in found.items()}
     rows |= {name: bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
     table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
     write_csv(results.steady, _frame([row for content in found.values() for row in content["windows"]], STEADY_COLUMNS))
-    write_csv(results.points, _frame([c["point"] for c in found.values() if c["point"]], POINT_COLUMNS))
+    points = _frame([c["point"] for c in found.values() if c["point"]], POINT_COLUMNS)
+    write_csv(results.points, mark_half_steady(points))
     write_csv(results.trials, table)
     for row in table.itertuples():
         log.info("%s: %s %s", row.trial, row.status, row.reason)
