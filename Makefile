@@ -15,7 +15,7 @@ demo: $(STAMP)  ## the shipped demonstration, from trial sheet to results/demo/r
 	@$(BIN)/snakemake --cores $(CORES)
 
 test: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(CORES)
 
 lint: $(STAMP)  ## style, types and the workflow's formatting
 	$(BIN)/ruff check .
