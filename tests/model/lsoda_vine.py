@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -32,18 +33,29 @@ def vine_trial(name: str, pressure_kPa: float, diameter_mm: float = 24.0, **more
 
 
 def grown_position(
-    trial: Trial, time_s: np.ndarray, B: float, n: float = N_TRUE, pressure_gain: float = 1.0
+    trial: Trial,
+    time_s: np.ndarray,
+    B: float,
+    n: float = N_TRUE,
+    pressure_gain: float = 1.0,
+    pressure_along: Callable[[float], float] | None = None,
 ) -> np.ndarray:
-    """Lead position at times since release, NaN beyond 96 % of the length; x and ẋ are those of the tail."""
+    """Lead position at times since release, NaN beyond 96 % of the length; x and ẋ are those of the tail.
+
+    `pressure_along` gives the gauge pressure by lead position, in place of the set one.
+    """
     area = math.pi * trial.diameter_m**2 / 4
     film = trial.film_density_kg_m3 * math.pi * trial.diameter_m * trial.thickness_m
-    drive = 0.5 * (trial.pressure_Pa * pressure_gain - trial.yield_pressure_Pa) * area
+
+    def drive(x: float) -> float:
+        pressure_Pa = trial.pressure_Pa if pressure_along is None else pressure_along(x / 2)
+        return 0.5 * (pressure_Pa * pressure_gain - trial.yield_pressure_Pa) * area
 
     def rate(_t: float, state: np.ndarray) -> list[float]:
         x, v = state
         mass = film * trial.length_m - 0.5 * film * x + trial.payload_kg
         gravity = 9.81 * math.cos(trial.growth_angle_rad)
-        return [v, (drive - 0.5 * B * max(v, 0.0) ** n) / mass + gravity]
+        return [v, (drive(x) - 0.5 * B * max(v, 0.0) ** n) / mass + gravity]
 
     def end(_t: float, state: np.ndarray) -> float:
         return float(state[0] - 2 * 0.96 * trial.length_m)

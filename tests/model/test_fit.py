@@ -298,3 +298,34 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 def test_an_unknown_attribute_of_the_package_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="fitt"):
         vt.fitt  # noqa: B018
+
+
+def test_a_model_that_lacks_something_keeps_sense_and_is_put_right_by_what_it_lacks() -> None:
+    draw = np.random.default_rng(21)
+    pairs = []
+    for P in (14, 18, 24, 30):
+        for k in range(2):
+            trial = replace(vine_trial(f"lossy{P}_{k}", P), vine="v", chamber_m3=3.7e-3)
+            pairs.append((trial, depleting_track(trial, 1.25, draw)))
+    poor = vt.fit(vt.base_model(), pairs)
+    assert 0.2 < poor["n"].value < 0.6
+    assert poor.chi2_per_dof > 100
+    good = vt.refit(poor, poor.model + vt.effects.reservoir_depletion)
+    assert abs(good["gamma"].value - 1.25) < 3 * good["gamma"].sigma
+    assert good["gamma"].sigma < 0.03
+    assert good.chi2_per_dof == pytest.approx(1.0, abs=0.15)
+    assert good.log_likelihood > poor.log_likelihood + 100
+
+
+def depleting_track(trial: Trial, gamma: float, draw: np.random.Generator) -> Track:
+    """The vine of the other tests on a chamber that empties into it, by the gas law in absolute pressure."""
+    area = math.pi * trial.diameter_m**2 / 4
+
+    def pressure_Pa(travel_m: float) -> float:
+        volume_ratio = trial.chamber_m3 / (trial.chamber_m3 + area * max(travel_m, 0.0))
+        return (trial.pressure_Pa + 101_325.0) * volume_ratio**gamma - 101_325.0
+
+    time_s = np.arange(3000) / FPS
+    position = grown_position(trial, time_s - 0.02, B_TRUE[24.0], pressure_along=pressure_Pa)
+    seen = np.isfinite(position)
+    return as_track(time_s[seen], position[seen] + NOISE_M * draw.standard_normal(int(seen.sum())))

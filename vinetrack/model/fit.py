@@ -27,8 +27,8 @@ from vinetrack.model.model import Model, Value
 from vinetrack.model.sensitivity import Predictor
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.solve import MOST_ITERATIONS, Held, Solution, chi2_per_dof, first_state, make_frame, solve
-from vinetrack.model.starts import candidates
-from vinetrack.records import Track
+from vinetrack.model.starts import align, candidates, first_own
+from vinetrack.records import Floats, Track
 
 if TYPE_CHECKING:
     from vinetrack.experiment import Experiment
@@ -39,8 +39,7 @@ POOR_FIT = 3.0
 """χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried."""
 
 MOST_STARTS = 3
-ITERATIONS_TO_CONFIRM = 20
-"""For a second start where the first settled but fits poorly: most often physics is missing, and no start helps."""
+ITERATIONS_ONCE_MORE = 25
 
 
 def fit(
@@ -111,25 +110,48 @@ def _held(spreads: tuple[float, float] | None, noise: tuple[float, float] | None
 
 def _solve_from_scratch(predictor: Predictor, held: Held) -> Solution:
     """The best of the solutions from the likeliest starts; the first will do where it explains the data."""
-    found: list[tuple[float, Solution]] = []
+    found: list[Solution] = []
     reason = ""
     for _, theta, own in candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]:
-        frame = make_frame(predictor, own)
         try:
-            most = MOST_ITERATIONS if not any(one.converged for _, one in found) else ITERATIONS_TO_CONFIRM
-            state = first_state(predictor.data, theta, own)
-            solution = solve(predictor, frame, state, held, most_iterations=most)
+            found.append(_solve_from(predictor, theta, own, held))
         except SimulationError as error:
             reason = str(error)
             continue
-        part = marginal(solution.grams, frame, solution.state)
-        found.append((deviance(part, frame, solution.state, solution.state.spread), solution))
-        settled = [one for _, one in found if one.converged]
-        if settled and (len(found) > 1 or not chi2_per_dof(predictor, solution) > POOR_FIT):
+        if found[-1].converged:
             break
     if not found:
         raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
-    return min(found, key=lambda one: one[0])[1]
+    return _or_once_more(predictor, min(found, key=_deviance), held)
+
+
+def _solve_from(
+    predictor: Predictor, theta: Floats, own: Floats, held: Held, most_iterations: int = MOST_ITERATIONS
+) -> Solution:
+    """Solve with the noise and the spreads that are assumed before anything is fitted."""
+    frame = make_frame(predictor, own)
+    return solve(predictor, frame, first_state(predictor.data, theta, own), held, most_iterations=most_iterations)
+
+
+def _or_once_more(predictor: Predictor, solution: Solution, held: Held) -> Solution:
+    """A solution that fits poorly, or the better one found from its numbers with the noise of the tracks once more.
+
+    Slow misfit taken for correlated noise is a solution of its own kind, and can hide that the numbers could do better.
+    """
+    if not chi2_per_dof(predictor, solution) > POOR_FIT:
+        return solution
+    try:
+        theta = solution.state.theta
+        own, _ = align(predictor.data, predictor, theta, first_own(predictor.data))
+        again = _solve_from(predictor, theta, own, held, most_iterations=ITERATIONS_ONCE_MORE)
+    except SimulationError:
+        return solution
+    return min((solution, again), key=_deviance)
+
+
+def _deviance(solution: Solution) -> float:
+    part = marginal(solution.grams, solution.frame, solution.state)
+    return deviance(part, solution.frame, solution.state, solution.state.spread)
 
 
 def refit(
@@ -166,7 +188,6 @@ def refit(
     shared = {name: how for name, how in before.options["shared"].items() if _belongs(name, names)}
     layout = make_layout(model, data, fixed=kept["fixed"], free=kept["free"], shared=shared)
     predictor = Predictor(layout, data)
-    frame = replace(make_frame(predictor, old.own), own_centre=before.solution.frame.own_centre)
     theta = layout.start
     values = {number.name: number.value for number in before.numbers}
     for k, number in enumerate(layout.free):
@@ -174,9 +195,15 @@ def refit(
             theta[k] = number.inside(float(np.clip(values[number.name], number.lower, number.upper)))
     held = Held(old.spread if hold_spreads else None, (old.rho, old.variance) if hold_noise else None)
     try:
-        solution = solve(predictor, frame, replace(old, theta=theta), held, warm=True)
+        if before.chi2_per_dof > POOR_FIT:
+            own, _ = align(data, predictor, theta, first_own(data))
+            solution = _solve_from(predictor, theta, own, held)
+        else:
+            frame = replace(make_frame(predictor, old.own), own_centre=before.solution.frame.own_centre)
+            solution = solve(predictor, frame, replace(old, theta=theta), held, warm=True)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
+    solution = _or_once_more(predictor, solution, held)
     return assemble(predictor, solution, before.left_out, {**kept, "shared": shared, "held": held}, profile=profile)
 
 

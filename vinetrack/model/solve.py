@@ -31,6 +31,10 @@ SETTLED_DECREASE = 1e-2
 """A step that promises less than this of −2 ln L moves every number by under a twentieth of its error."""
 
 SETTLED_SPREAD = 0.02
+EARLY_ITERATIONS, MOST_EARLY, FAR_OFF = 3, 9, 1e3
+"""Spreads and the correlation of the noise stay those first assumed for three steps, and on while a step still promises
+more than this of −2 ln L: what is only not yet fitted must not pass for noise or scatter."""
+
 FIRST_SPREADS = (0.01, 0.03)
 EXACT_PART = 2e-6
 """Least noise, as part of a trial's travel: the integrator is no better."""
@@ -149,13 +153,16 @@ def solve(
         state = replace(state, spread=held.spread)
     if held.noise is not None:
         state = replace(state, rho=held.noise[0], variance=held.noise[1])
-    damping, converged, iteration = (0.0 if warm else 1e-3), False, 0
+    damping, converged, iteration, promised = (0.0 if warm else 1e-3), False, 0, math.inf
+    early = not warm
     columns = predictor.linearise(state.theta, state.own)
     grams = _products(predictor, columns)
     for iteration in range(1, most_iterations + 1):
-        early = not warm and iteration <= 3
+        near = promised < FAR_OFF or iteration > MOST_EARLY
+        search = early and iteration > EARLY_ITERATIONS and near
+        early = early and not search
         before = state
-        state = _update_variances(predictor, frame, grams, state, can, held, early=early, search=iteration == 4)
+        state = _update_variances(predictor, frame, grams, state, can, held, early=early, search=search)
         moved = _variances_moved(before, state)
         step, own_change, promised = newton_step(grams, frame, state, damping)
         if promised < SETTLED_DECREASE and moved < SETTLED_SPREAD and not early:
