@@ -24,6 +24,7 @@ from vinetrack.video.edge_state import (
     repicture,
     residuals,
 )
+from vinetrack.video.ending import growth_end
 from vinetrack.video.mend import ASTRAY_PX, mend_jumps
 from vinetrack.video.strip import Strip
 from vinetrack.video.tip_shape import ASSUMED_EXPOSURE, find_exposure, find_shape
@@ -77,6 +78,8 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
         Where nothing in the strip changes as a passing front does.
     """
     path, passed = _first_path(strip)
+    passed = passed[0], growth_end(strip, path, passed)
+    path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = _first_state(strip, path, exposure)
     for _ in range(3):
