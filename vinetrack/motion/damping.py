@@ -121,8 +121,8 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
     -------
     dict
         `log_log` and `both_axes`, each with `n`, `n_95` (from resampling whole trials), `n_95_total` (with the stated
-        errors of yield pressures and scale too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number of
-        trials), `covariance` of n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (how it
+        errors of yield pressures and scale too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number
+        of trials), `covariance` of n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (how it
         was found), `left_out`, and `refused`: None, or why there is no fit.
     """
     kept, left_out = _admit(points)

@@ -27,12 +27,17 @@ limit.
 """
 
 LARGEST_CHANGE = 0.3
-"""Largest change of speed across a window: the mean of ẋⁿ is off the power of the mean by n(n−1)/24 of its square, 0.09 %."""
+"""Largest change of speed across a window.
+
+It puts the mean of ẋⁿ off the power of the mean by n(n−1)/24 of its square, 0.09 %.
+"""
 
 LAST_FRACTION = 0.95
 """Part of the length up to which the mass of a bare vine is known well enough."""
 
 PARTS = 3
+FEWEST_POINTS = 4 * PARTS
+"""A quadratic in each part, with a point to spare."""
 TRIED = 6
 
 
@@ -67,11 +72,8 @@ def quasi_steady_window(
     lowest = max(start_fraction, 1 - LARGEST_CHANGE) * velocity[first]
     beyond = np.flatnonzero((velocity[first:] < lowest) | (travel_m[first:] > LAST_FRACTION * trial.length_m))
     last = first + int(beyond[0]) - 1 if beyond.size else velocity.size - 1
-    fewest = max(PARTS * 4, int(kinematics.window_points[first]) + 2)
-    if last - first + 1 < fewest:
-        reason = (
-            f"{max(last - first + 1, 0)} points between the highest speed and the end are too few; {fewest} are needed"
-        )
+    if last - first + 1 < FEWEST_POINTS:
+        reason = f"{max(last - first + 1, 0)} points between the highest speed and the end are too few; {FEWEST_POINTS} are needed"
         return Window("quasi_steady", False, reason)
     mass_kg = trial.moving_mass_kg(np.maximum(travel_m, 0.0))
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
@@ -81,15 +83,15 @@ def quasi_steady_window(
     candidates = sorted(itertools.combinations(ends.tolist(), 2), key=lambda ends: ends[0] - ends[1])
     worst = math.inf
     for a, b in candidates:
-        if b - a + 1 < fewest:
+        if b - a + 1 < FEWEST_POINTS:
             break
         inertia = _largest_inertia(time_s, position_m, kinematics, share_N, force_N, a, b)
         worst = min(worst, inertia)
         if inertia <= INERTIA_LIMIT:
             window = judge(time_s, position_m, kinematics, a, b, "quasi_steady")
             reason = (
-                f"keeps up with a known pressure over {window.n_points} points: speed changes by {100 * window.drift:.2g} %,"
-                f" inertia at most {100 * inertia:.2g} % of the force"
+                f"keeps up with a known pressure over {window.n_points} points: speed changes by"
+                f" {100 * window.drift:.2g} %, inertia at most {100 * inertia:.2g} % of the force"
             )
             return replace(window, accepted=True, reason=reason)
     return Window("quasi_steady", False, f"inertia takes at least {100 * worst:.2g} % of the force in every window")
