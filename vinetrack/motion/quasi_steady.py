@@ -73,7 +73,8 @@ def quasi_steady_window(
     beyond = np.flatnonzero((velocity[first:] < lowest) | (travel_m[first:] > LAST_FRACTION * trial.length_m))
     last = first + int(beyond[0]) - 1 if beyond.size else velocity.size - 1
     if last - first + 1 < FEWEST_POINTS:
-        reason = f"{max(last - first + 1, 0)} points between the highest speed and the end are too few; {FEWEST_POINTS} are needed"
+        points = max(last - first + 1, 0)
+        reason = f"{points} points between the highest speed and the end are too few; {FEWEST_POINTS} are needed"
         return Window("quasi_steady", False, reason)
     mass_kg = trial.moving_mass_kg(np.maximum(travel_m, 0.0))
     weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
