@@ -6,6 +6,7 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -287,6 +288,27 @@ def test_an_experiment_without_a_usable_trial_is_refused() -> None:
 def test_an_unknown_parameter_is_refused_with_a_suggestion(campaign: Campaign) -> None:
     with pytest.raises(vt.FitError, match=r"'b'.*eversion_damping\.B"):
         vt.fit(vt.base_model(), campaign[1], fixed=("b",))
+
+
+def test_an_experiment_folder_is_fitted_as_it_stands(campaign: Campaign, tmp_path: Path) -> None:
+    fit, pairs, _ = campaign
+    lines = ["trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa"]
+    for trial, track in pairs:
+        table = np.column_stack([track.time_s, track.lead_position_m])
+        np.savetxt(tmp_path / f"{trial.name}.csv", table, "%.9f", ",", header="time_s,position_m", comments="")
+        sizes = (trial.diameter_m * 1e3, trial.thickness_m * 1e6, trial.length_m * 1e3, trial.pressure_Pa / 1e3, 3)
+        lines.append(",".join([trial.name, f"{trial.name}.csv", *(f"{size:g}" for size in sizes)]))
+    (tmp_path / "trials.csv").write_text("\n".join(lines), encoding="utf-8")
+    again = vt.fit(vt.base_model(), tmp_path, profile=False)
+    assert not again.left_out
+    assert abs(again["n"].value - fit["n"].value) < 0.1 * fit["n"].sigma
+
+
+def test_two_yield_pressures_stated_for_one_vine_are_two_numbers() -> None:
+    pairs, _ = small_campaign(seed=5, replicates=1)
+    four = [(replace(t, vine="v", yield_pressure_Pa=3e3 if k < 2 else 3.1e3), x) for k, (t, x) in enumerate(pairs[:4])]
+    fit = vt.fit(vt.base_model(), four, profile=False)
+    assert [n.vine for n in fit.numbers if n.symbol == "P_y"] == ["v, 3 kPa", "v, 3.1 kPa"]
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:

@@ -208,6 +208,8 @@ def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[Free],
     numbers: list[Free] = []
     places: dict[tuple[str, float], int] = {}
     column = np.full(len(data), -1)
+    stated = {(item.trial.vine, round(item.trial.yield_pressure_Pa, 3)) for item in data}
+    several = {vine for vine, _ in stated if sum(vine == other for other, _ in stated) > 1}
     for i, item in enumerate(data):
         trial = item.trial
         sigma_Pa, stated_Pa = trial.yield_pressure_sigma_Pa, trial.yield_pressure_Pa
@@ -219,7 +221,7 @@ def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[Free],
             numbers.append(
                 Free(
                     key=YIELD_PRESSURE,
-                    vine=trial.vine,
+                    vine=f"{trial.vine}, {stated_Pa / 1e3:g} kPa" if trial.vine in several else trial.vine,
                     symbol="P_y",
                     unit="Pa",
                     start=stated_Pa,

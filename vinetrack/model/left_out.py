@@ -57,8 +57,9 @@ def _prepared(trial: Trial, track: Track) -> FitTrial:
 
 def _known_yield(found: Fit, item: FitTrial) -> FitTrial:
     """The trial with the yield pressure that the fit found for its vine, where it found one."""
+    stated = f"{item.trial.vine}, {item.trial.yield_pressure_Pa / 1e3:g} kPa"
     for number in found.numbers:
-        if number.key == YIELD_PRESSURE and number.vine == item.trial.vine:
+        if number.key == YIELD_PRESSURE and number.vine in (item.trial.vine, stated):
             return replace(item, trial=replace(item.trial, yield_pressure_Pa=number.value))
     return item
 
