@@ -279,6 +279,12 @@ def test_a_trial_that_never_moves_is_left_out_and_named(campaign: Campaign) -> N
     assert "still" in str(fit)
 
 
+def test_a_trial_that_moves_below_its_yield_pressure_is_left_out_and_named(campaign: Campaign) -> None:
+    odd = replace(campaign[1][0][0], name="odd", pressure_Pa=1.5e3, pressure_sigma_Pa=15.0)
+    fit = vt.fit(vt.base_model(), [*campaign[1], (odd, campaign[1][0][1])], profile=False)
+    assert "1.5 kPa, lies below the yield pressure, 3 kPa" in fit.left_out["odd"]
+
+
 def test_an_experiment_without_a_usable_trial_is_refused() -> None:
     short = as_track(np.arange(3) / FPS, np.arange(3.0))
     with pytest.raises(vt.FitError, match="No trial can be fitted: a: 3 usable points"):

@@ -78,7 +78,8 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     Raises
     ------
     FitError
-        Fewer than five usable points, times that do not increase, or a leading edge that never moves.
+        Fewer than five usable points, times that do not increase, a leading edge that never moves, or one that moves
+        although its pressure cannot do it.
     """
     usable = track.usable & ~_nearing_end(trial, track)
     time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
@@ -88,6 +89,11 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     if np.any(steps <= 0):
         raise FitError("its times do not increase: sort the rows or drop repeated ones")
     noise_m, correlation = position_noise(time_s, position_m)
+    if track.pressure_Pa is None and _undriven(trial):
+        raise FitError(
+            f"its pressure, {trial.pressure_Pa / 1e3:g} kPa, lies below the yield pressure,"
+            f" {trial.yield_pressure_Pa / 1e3:g} kPa, yet it moves: correct the sheet"
+        )
     moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
     if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
         raise FitError("its leading edge never moves forward beyond its noise")
@@ -107,6 +113,12 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         correlation=correlation,
         trace=trace,
     )
+
+
+def _undriven(trial: Trial) -> bool:
+    """Whether no error that the sheet admits lets the pressure move a bare vine; gravity alone may move a payload."""
+    room_Pa = 3 * (np.nan_to_num(trial.pressure_sigma_Pa) + np.nan_to_num(trial.yield_pressure_sigma_Pa))
+    return trial.travel_ratio != 1 and trial.payload_kg == 0 and trial.pressure_Pa + room_Pa < trial.yield_pressure_Pa
 
 
 def _nearing_end(trial: Trial, track: Track) -> NDArray[np.bool_]:
