@@ -96,7 +96,7 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     return _finish(strip, state, fit, exposure, passed)
 
 
-def outline(strip: Strip, parts: int = 8) -> tuple[float, float, float]:
+def outline(strip: Strip, parts: int = 12) -> tuple[float, float, float]:
     """Centreline of what the front leaves behind: shift of its begin and slope (px a px) across, and half width, px.
 
     From the contrast by row in `parts` stretches along the way: a given axis two degrees off would otherwise cut the
@@ -108,18 +108,40 @@ def outline(strip: Strip, parts: int = 8) -> tuple[float, float, float]:
         Where nothing in the strip changes as a passing front does.
     """
     path, passed = _first_path(strip)
-    pictures = _first_state(strip, path, ASSUMED_EXPOSURE).pictures
+    passed = passed[0], growth_end(strip, path, passed)
+    pictures = _first_state(strip, np.minimum(path, passed[1]), ASSUMED_EXPOSURE).pictures
     power = (pictures[0] - pictures[1]).astype(float)[:, passed[0] : passed[1]] ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
-    middles, halves, places = [], [], []
+    sides, places = [], []
     for piece in np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12))):
         profile = np.sqrt(np.minimum(power[:, piece], 9 * np.median(power[:, piece]) + 1e3).mean(axis=1))
-        inside = np.flatnonzero(profile > max(0.35 * float(np.quantile(profile, 0.75)), 0.25 * float(profile.max())))
-        middles.append(0.5 * (rows[inside[0]] + rows[inside[-1]]))
-        halves.append(0.5 * (rows[inside[-1]] - rows[inside[0]]))
+        low, high = _bright_run(profile - max(0.4 * float(np.quantile(profile, 0.75)), 0.25 * float(profile.max())))
+        sides.append((rows[0] + low, rows[0] + high))
         places.append(passed[0] + float(piece.mean()))
-    slope, begin = _robust_line(np.array(places), np.array(middles))
-    return begin, slope, float(np.median(halves)) + 1.5
+    side, place = np.array(sides), np.array(places)
+    width = side[:, 1] - side[:, 0]
+    alike = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
+    slope, begin = _robust_line(place[alike], side[alike].mean(axis=1))
+    return begin, slope, float(np.median(width)) / 2 + 1.5
+
+
+def _bright_run(excess: Floats) -> tuple[float, float]:
+    """Where the run of greatest sum begins and ends, to a fraction of a row: short gaps and glints do not end it."""
+    best, total, start, found = -np.inf, 0.0, 0, (0, len(excess) - 1)
+    for i, value in enumerate(excess):
+        if total <= 0:
+            total, start = 0.0, i
+        total += value
+        if total > best:
+            best, found = total, (start, i)
+    return _crossing(excess, found[0], -1), _crossing(excess, found[1], 1)
+
+
+def _crossing(excess: Floats, row: int, outwards: int) -> float:
+    """Where the line from `row` to its neighbour outwards meets zero; `row` itself at the border."""
+    if not 0 <= row + outwards < len(excess) or excess[row] <= 0:
+        return float(row)
+    return float(row + outwards * excess[row] / (excess[row] - min(excess[row + outwards], 0.0)))
 
 
 def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:

@@ -44,20 +44,25 @@ def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
             resting = resting + 1 if step < 0.3 else 0
             far = max(1.3 * step, step + 1.5)
             low, high = (near - far, near + 0.8) if sense < 0 else (near - 0.8, near + far)
-            inside = low <= out[t, 0] <= high
-            if not np.isfinite(near) or (inside and (out[t, 2] <= bad or resting > LONG_REST)):
+            inside, faint = low <= out[t, 0] <= high, out[t, 3] < FAINTEST - 1
+            if not np.isfinite(near) or (inside and (out[t, 2] <= bad or resting > LONG_REST) and not faint):
                 continue
             better = _best_between(strip, state, t, low, high, 1 if resting > LONG_REST else 9)
             if inside:
-                if better is not None and better[2] < out[t, 2]:
+                if better is not None and (faint or better[2] < out[t, 2]):
                     out[t] = better
-            elif _may_be_gap(out[t, 0] - near, step) and out[t, 2] <= bad and (better is None or better[2] > out[t, 2]):
+            elif _may_be_gap(out[t, 0] - near, step) and not faint and _is_better(out[t], better, bad):
                 continue
             elif better is None:
                 out[t] = (float(np.clip(np.nan_to_num(out[t, 0], nan=near), low, high)), ASTRAY_PX, 4 * bad, 0, 0, 0)
             else:
                 out[t] = better
     return out
+
+
+def _is_better(found: Floats, other: Floats | None, bad: float) -> bool:
+    """Whether a fit is good, and better than another."""
+    return bool(found[2] <= bad) and (other is None or bool(other[2] > found[2]))
 
 
 def _may_be_gap(stride: float, step: float) -> bool:

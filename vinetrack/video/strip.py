@@ -167,6 +167,8 @@ def _steady(
             strength = float(np.median(np.abs(fit[:, 2:]))), float(np.median(sd))
             if not np.isfinite(strength[1]) or strength[0] < max(SHAKE_FLOOR_PX, 2.5 * strength[1]):
                 break
+            if not _halves_agree(views, basis):
+                break
             steadied = True
         shift = shift + np.clip(fit[:, 2:], -1.5, 1.5)
         if turn == 1:
@@ -176,6 +178,23 @@ def _steady(
             break
     gain = np.clip(fit[:, 0], 0.2, 5.0)
     return unit / gain, -fit[:, 1] * unit / gain, shift, steadied
+
+
+def _halves_agree(views: list[NDArray[Any]], basis: list[NDArray[np.float32]]) -> bool:
+    """Whether the near and the far half of the bands tell of the same shift along the axis: a shaken camera moves both.
+
+    A door, a shadow or a mirror image of the tip that passes moves one after the other.
+    """
+    columns = views[0].shape[2]
+    parts = []
+    for low, high in ((0, columns // 2), (columns // 2, columns)):
+        own = [part.reshape(4, -1, columns - 2)[:, :, low : high - 2].reshape(4, -1) for part in basis]
+        parts.append(_register([view[:, :, low:high] for view in views], own))
+    (first, first_sd), (second, second_sd) = parts
+    apart = np.abs(first[:, 2] - second[:, 2])
+    both = np.abs(first[:, 2] + second[:, 2])
+    doubt = 2 * float(np.median(first_sd + second_sd))
+    return float(np.median(apart)) < max(0.7 * float(np.median(both)), doubt)
 
 
 def _basis(reference: NDArray[Any]) -> NDArray[np.float32]:

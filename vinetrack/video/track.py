@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 5
+CENTRINGS = 3
+"""Times the strip may be cut anew: what lay outside the first shows only in the second."""
+OFF_CENTRE_PX = 0.8
+"""Tilt of the axis, over its length, or shift that is left alone: the tip's rows then lag by under a tenth of it."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +186,11 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
             edge, sigma = track_arrival(strip)
             return strip, _Edge(edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames, 2.0)
         strip = cut_strip(luma, squared(axis), 1.3 * half + 3)
-        strip = _centred(luma, strip, *outline(strip))
+        for _ in range(CENTRINGS):
+            before = strip
+            strip = _centred(luma, strip, *outline(strip))
+            if strip is before:
+                break
         front = track_edge(strip, exposure_frames)
     except ValueError as error:
         raise RecordingError(str(error)) from error
@@ -209,13 +217,14 @@ def _centred(luma: NDArray[Any], strip: Strip, shift: float, slope: float, half:
     A given axis keeps its ends' places along itself: only what lies across is corrected.
     """
     tilt = slope * strip.axis.length_px
+    middle = shift + tilt / 2
     room = (strip.values.shape[1] - 1) / 2 - half - 3
-    if abs(shift) + abs(tilt) / 2 < 2.0 and 0 <= room < 0.3 * half + 6:
+    if abs(middle) + abs(tilt) / 2 < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
         return strip
     start = strip.axis.points(np.array(0.0), shift)
     stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
     turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
-    return recut(strip, luma, squared(turned), half * 1.1 + 3)
+    return recut(strip, luma, squared(turned), half * 1.15 + 5)
 
 
 def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
