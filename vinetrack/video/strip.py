@@ -191,10 +191,10 @@ def _halves_agree(views: list[NDArray[Any]], basis: list[NDArray[np.float32]]) -
         own = [part.reshape(4, -1, columns - 2)[:, :, low : high - 2].reshape(4, -1) for part in basis]
         parts.append(_register([view[:, :, low:high] for view in views], own))
     (first, first_sd), (second, second_sd) = parts
-    apart = np.abs(first[:, 2] - second[:, 2])
-    both = np.abs(first[:, 2] + second[:, 2])
+    apart, both = np.abs(first[:, 2] - second[:, 2]), np.abs(first[:, 2] + second[:, 2])
+    most = apart + both >= np.quantile(apart + both, 0.75)
     doubt = 2 * float(np.median(first_sd + second_sd))
-    return float(np.median(apart)) < max(0.7 * float(np.median(both)), doubt)
+    return float(np.mean(apart[most])) < max(0.7 * float(np.mean(both[most])), doubt)
 
 
 def _basis(reference: NDArray[Any]) -> NDArray[np.float32]:
