@@ -55,7 +55,7 @@ rule recording:
         plan.result("analysed", "{trial}.json"),
         [
             report(
-                plan.result("figures", "strip_{trial}." + form),
+                plan.result("figures", f"strip_{{trial}}.{form}"),
                 caption="vinetrack/report/captions/strip.rst",
                 category="Recordings",
                 labels={"trial": "{trial}", "format": form},

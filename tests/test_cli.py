@@ -115,6 +115,7 @@ def test_one_unforeseen_fault_fails_its_trial_alone(tmp_path: Path, monkeypatch:
     folder = experiment(tmp_path / "v")
     done = run("tracks", folder, tmp_path / "r", "--log", tmp_path / "t.log")
     assert done.exit_code == 0
-    assert "1 trials, 1 failed" in done.output
+    assert "a: could not be analysed" in done.output
+    assert "1 trials, 1 failed" in run("gather", folder, tmp_path / "r").output
     assert "ZeroDivisionError: unforeseen" in (tmp_path / "t.log").read_text()
     assert "a fault of the program" in (tmp_path / "r" / "trials.csv").read_text()

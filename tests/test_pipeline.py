@@ -241,6 +241,7 @@ def stages(experiment: Path, results: Path) -> dict[str, dict[str, str]]:
     runner = CliRunner()
     for arguments in (
         ["tracks", str(experiment), str(results)],
+        ["gather", str(experiment), str(results)],
         ["damping", str(results), "--settings", '{"damping": {"resamples": 200}}'],
         ["figures", str(experiment), str(results), "--settings", '{"figures": {"dpi": 50}}'],
         ["report", str(experiment), str(results)],

@@ -36,7 +36,7 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
         aspect = min(max(picture.shape[0] / picture.shape[1] for _, picture in tracking.pictures), 2.2)
         pictures_in = 7.2 / len(tracking.pictures) * aspect + 0.35
         fig = Figure(figsize=(7.2, 3.9 + pictures_in), layout="constrained")
-        above, below = fig.subfigures(2, 1, height_ratios=[3.9, pictures_in])
+        above, below = np.asarray(fig.subfigures(2, 1, height_ratios=[3.9, pictures_in]))
         above.patch.set_alpha(0)
         below.patch.set_alpha(0)
         ax = above.add_subplot()
@@ -64,7 +64,14 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
         ax.plot(edge[shown], time_ms[shown], "x", color=SKY, markersize=4, markeredgewidth=1.1, label=label)
     ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)")
     ax.grid(visible=False)
-    top = ax.secondary_xaxis(-0.17, functions=(lambda px: 1e3 * m_per_px * px, lambda mm: mm / (1e3 * m_per_px)))
+
+    def in_mm(px: Any) -> Any:
+        return 1e3 * m_per_px * px
+
+    def in_px(mm: Any) -> Any:
+        return mm / (1e3 * m_per_px)
+
+    top = ax.secondary_xaxis(-0.17, functions=(in_mm, in_px))
     top.set_xlabel("along the growth axis (mm)")
     legend_above(ax, 2)
     ax.set_title(title, loc="right", fontsize=10, color=MUTED, fontweight="normal")

@@ -42,6 +42,11 @@ def main(arguments: list[str] | None = None) -> None:
     for folder in {trial.stated.track.parent for trial in measured if trial.stated.track is not None}:
         write_tracks([trial for trial in measured if trial.stated.track and trial.stated.track.parent == folder], folder)
     if filmed:
+        n_frames = sum(trial.track.time_s.size for trial in filmed)
+        print(
+            f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames. The first takes longest.",
+            flush=True,
+        )
         content: dict[str, Any] = yaml.safe_load(given.nature.read_text(encoding="utf-8"))
         _film(experiment, filmed, make_filming(content.get("filming", {})), nature.seed, given.processes)
     if given.truth is not None:

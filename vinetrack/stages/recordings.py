@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.stages.results import Results, read_json
+from vinetrack.stages.results import Results, read_json, read_result
 from vinetrack.stages.tracks import INTERNAL_FAULT, analyse, failed_row, write_empty
 from vinetrack.tables import write_bytes, write_json
 
@@ -35,7 +35,13 @@ def analyse_recording(experiment: Experiment, name: str, folder: Path, settings:
     if fault:
         log.error("trial %s:\n%s", name, fault)
     log.info("%s: %s", name, reason or "analysed")
-    return f"{name}: failed: {reason}" if reason else f"{name}: tracked."
+    return f"{name}: failed: {reason}" if reason else f"{name}: {_counted(results, name)}."
+
+
+def _counted(results: Results, name: str) -> str:
+    """How many frames of a trial show where the edge was, in words."""
+    track = read_result(results.track(name))
+    return f"edge known in {int(track['lead_position_m'].notna().sum())} of {len(track)} frames"
 
 
 def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: RunSettings) -> tuple[str, str]:
