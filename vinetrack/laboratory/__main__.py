@@ -40,7 +40,9 @@ def main(arguments: list[str] | None = None) -> None:
     filmed = [trial for trial in grown if trial.stated.video is not None]
     measured = [trial for trial in grown if trial.stated.track is not None]
     for folder in {trial.stated.track.parent for trial in measured if trial.stated.track is not None}:
-        write_tracks([trial for trial in measured if trial.stated.track and trial.stated.track.parent == folder], folder)
+        write_tracks(
+            [trial for trial in measured if trial.stated.track and trial.stated.track.parent == folder], folder
+        )
     if filmed:
         n_frames = sum(trial.track.time_s.size for trial in filmed)
         print(
