@@ -53,7 +53,8 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
     small = strip[::step_rows, ::step_columns]
     time_ms = 1e3 * track.time_s
     dark, light = np.nanpercentile(small, [1, 99])
-    extent = (0.0, float(strip.shape[1]), float(time_ms[-1]), float(time_ms[0]))
+    half_ms = 0.5 * float(np.median(np.diff(time_ms)))
+    extent = (-0.5, strip.shape[1] - 0.5, float(time_ms[-1]) + half_ms, float(time_ms[0]) - half_ms)
     ax.imshow(small, aspect="auto", extent=extent, cmap="gray", vmin=dark, vmax=light, interpolation="nearest")
     edge, odd = track.edge_px, flagged(track.flag)
     fine = ~odd & np.isfinite(edge)
