@@ -84,6 +84,7 @@ POINT_COLUMNS = (
 TEXT_COLUMNS = frozenset(
     {"trial", "vine", "condition", "status", "reason", "steady_rule", "rule", "flag", "pressure_source"}
 )
+COUNT_COLUMNS = frozenset({"n_frames", "points"})
 TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used"})
 
 

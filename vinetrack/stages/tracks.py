@@ -16,6 +16,7 @@ import numpy as np
 from vinetrack.records import Kinematics, Track, Trial, Window
 from vinetrack.stages.pool import map_trials
 from vinetrack.stages.results import (
+    COUNT_COLUMNS,
     KINEMATICS_COLUMNS,
     POINT_COLUMNS,
     STEADY_COLUMNS,
@@ -142,8 +143,9 @@ def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame
     import pandas as pd
 
     frame = pd.DataFrame(rows, columns=list(columns))
-    numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS]
-    return frame.astype(dict.fromkeys(numbers, float))
+    counts = [column for column in columns if column in COUNT_COLUMNS]
+    numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS | COUNT_COLUMNS]
+    return frame.astype(dict.fromkeys(numbers, float) | dict.fromkeys(counts, "Int64"))
 
 
 def model_of(experiment: Experiment) -> Model:
