@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 5
+GROWN_TOLERANCE = 0.03
+"""Part of a vine's length by which travel and length may differ, for the vine to have grown whole."""
 CENTRINGS = 3
 """Times the strip may be cut anew: what lay outside the first shows only in the second."""
 OFF_CENTRE_PX = 0.8
@@ -124,7 +126,10 @@ def track_frames(
     )  # fmt: skip
     if verdict.last_moving < 0:
         raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
-    notes = [*frames.notes, *verdict.notes, *_ending(luma, verdict, found.edge_px, name)]
+    scale = trial.m_per_px if m_per_px is None else m_per_px
+    notes = [*frames.notes, *verdict.notes]
+    if not _is_grown(found.edge_px, verdict, trial.length_m / scale):
+        notes += _ending(luma, verdict, found.edge_px, name)
     if not orderly:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
@@ -273,6 +278,16 @@ def _repeated(strip: Strip, edge_px: Floats) -> NDArray[np.bool_]:
         stands = abs(edge_px[i] - edge_px[i - 1]) < 0.1 * usual_step
         repeated[i] = usual_step > 2.0 and stands and change[i] < 0.15 * usual
     return repeated
+
+
+def _is_grown(edge_px: Floats, verdict: Judgement, length_px: float) -> bool:
+    """Whether the edge stops where the whole vine has grown, as it should; no where its length or rest is unknown."""
+    if verdict.last_moving < 0 or not np.isfinite(length_px):
+        return False
+    rest, end = edge_px[: verdict.first_moving], edge_px[verdict.last_moving + 1 :]
+    if not (np.isfinite(rest).any() and np.isfinite(end).any()):
+        return False
+    return bool(abs((np.nanmedian(end) - np.nanmedian(rest)) / length_px - 1) < GROWN_TOLERANCE)
 
 
 def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str) -> list[str]:
