@@ -1,0 +1,260 @@
+"""A filmed experiment from recordings to the report: those that can be read are right, the others say why.
+
+The truth is the motion that the virtual laboratory's camera filmed; the analysis sees files alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import numpy as np
+import pandas as pd
+import pytest
+from test_pipeline import read_rows, snakemake
+from typer.testing import CliRunner
+
+from vinetrack.cli import app
+from vinetrack.experiment import read_experiment
+from vinetrack.laboratory.camera import Camera
+from vinetrack.laboratory.filming import Filming, film, picture_target
+from vinetrack.laboratory.nature import Nature
+from vinetrack.laboratory.render import Truth
+from vinetrack.laboratory.targets import Target
+from vinetrack.laboratory.tracks import grow
+
+HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa"
+SHARED = "capture_fps: 1069\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"
+BOARD = (
+    "calibration: {kind: charuco, image: calibration/board.png, squares: [14, 5], square_mm: 15, marker_mm: 11, "
+    "dictionary: DICT_4X4_100}\n"
+)
+NATURE = Nature(
+    values={"eversion_damping.n": 0.37, "eversion_damping.B": {"12mm-100um-140mm": 1.83}},
+    damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411,
+)  # fmt: skip
+TARGET = Target(squares=(14, 5), square_m=0.015, marker_m=0.011)
+WARPED = Camera(m_per_px=2.4e-4, k1=-0.08, tilt_y_deg=0.8)
+PLAIN = Camera(m_per_px=2.4e-4)
+GOOD = {"p30": 30, "p36": 36, "p42": 42}
+BAD = ("part", "beheaded", "letter", "gone")
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """Results folder, the rows of its trials.csv, what was filmed, and what Snakemake printed."""
+
+    results: Path
+    rows: dict[str, dict[str, str]]
+    truth: dict[str, Truth]
+    said: subprocess.CompletedProcess[str]
+
+
+def write_sheet(folder: Path, pressures_kPa: dict[str, int], settings: str) -> None:
+    rows = [f"{name},videos/{name}.mp4,12,100,140,{kPa}" for name, kPa in pressures_kPa.items()]
+    (folder / "trials.csv").write_text("\n".join([HEADER, *rows, ""]))
+    (folder / "experiment.yaml").write_text(SHARED + settings)
+
+
+def film_all(folder: Path, pressures_kPa: dict[str, int], camera: Camera) -> dict[str, Truth]:
+    """Grow and film trials of these pressures into an experiment folder; the truth of each."""
+    (folder / "videos").mkdir(parents=True)
+    write_sheet(folder, pressures_kPa, BOARD)
+    filming = Filming(camera=camera, target=TARGET)
+    picture_target(filming, folder / "calibration" / "board.png", seed=5)
+    grown = grow(read_experiment(folder, strict=True).trials, NATURE)
+    return {trial.stated.name: film(trial, filming, trial.stated.video, 40 + i) for i, trial in enumerate(grown)}
+
+
+def without_index(path: Path, out: Path) -> None:
+    """The same recording as cameras write it, index last, and cut off before it."""
+    with av.open(str(path)) as source, av.open(str(out), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                target.mux(packet)
+    out.write_bytes(out.read_bytes()[: int(0.8 * out.stat().st_size)])
+
+
+def add_bad_ones(folder: Path) -> None:
+    videos = folder / "videos"
+    whole = (videos / "p36.mp4").read_bytes()
+    (videos / "part.mp4").write_bytes(whole[: int(0.75 * len(whole))])
+    without_index(videos / "p36.mp4", videos / "beheaded.mp4")
+    (videos / "letter.mp4").write_text("Dear all, the recording is attached.\n" * 20)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    workdir = tmp_path_factory.mktemp("filmed")
+    truth = film_all(workdir / "vines", GOOD, WARPED)
+    add_bad_ones(workdir / "vines")
+    write_sheet(workdir / "vines", GOOD | dict.fromkeys(BAD, 36), BOARD)
+    done = snakemake(workdir, "--cores", "2", "--config", "experiment=vines", "damping={resamples: 200}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    results = workdir / "results" / "vines"
+    return Filmed(results, read_rows(results / "trials.csv"), truth, done)
+
+
+def errors_px(results: Path, name: str, truth: Truth) -> np.ndarray:
+    """Tracked minus true position while the edge moves, the median taken off (origins are arbitrary), and stated error.
+
+    Shape (n_moving, 2), px.
+    """
+    track = pd.read_csv(results / "tracks" / f"{name}.csv")
+    true_m = truth.lead_position_m[: len(track)]
+    moving = np.gradient(true_m) > 0.05 * PLAIN.m_per_px
+    error_m = (track["lead_position_m"].to_numpy() - true_m)[moving]
+    assert np.isfinite(error_m).all(), "a moving frame is lost"
+    stated_m = track["lead_position_sigma_m"].to_numpy()[moving]
+    return np.column_stack([error_m - np.median(error_m), stated_m]) / PLAIN.m_per_px
+
+
+def spread_px(found: np.ndarray) -> float:
+    """Standard deviation of errors that are stated to be below half a pixel, as most must be.
+
+    In the first moving frames the door still swings before the edge, and their stated errors say so.
+    """
+    sure = found[:, 1] < 0.5
+    assert sure.mean() > 0.8
+    return float(found[sure, 0].std())
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize("name", GOOD)
+def test_a_good_recording_is_tracked_within_a_third_of_a_pixel(filmed: Filmed, name: str) -> None:
+    assert filmed.rows[name]["status"] in ("ok", "warning")
+    found = errors_px(filmed.results, name, filmed.truth[name])
+    assert spread_px(found) < 0.35
+    assert (np.abs(found[:, 0]) < 6 * found[:, 1]).all()
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize("name", GOOD)
+def test_the_board_gives_the_scale_of_the_axis_within_a_thousandth(filmed: Filmed, name: str) -> None:
+    track = pd.read_csv(filmed.results / "tracks" / f"{name}.csv")
+    seen = np.isfinite(track["lead_position_m"].to_numpy())
+    slope = np.polyfit(filmed.truth[name].lead_position_m[seen], track["lead_position_m"][seen], 1)[0]
+    assert slope == pytest.approx(1, abs=1e-3)
+    assert 0 < float(filmed.rows[name]["scale_rel_sigma"]) < 1e-3
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("beheaded", "beheaded.mp4: cut short: the index that is written last is missing"),
+        ("letter", "letter.mp4: not a video"),
+        ("gone", "gone.mp4: there is no such file"),
+    ],
+)
+def test_a_recording_that_cannot_be_read_fails_with_its_sentence(filmed: Filmed, name: str, words: str) -> None:
+    assert filmed.rows[name]["status"] == "failed"
+    assert words in filmed.rows[name]["reason"]
+    assert words in (filmed.results / "report.html").read_text(encoding="utf-8")
+    assert len((filmed.results / "tracks" / f"{name}.csv").read_text().splitlines()) == 1
+
+
+@pytest.mark.pipeline
+def test_a_recording_without_its_end_gives_what_is_there_and_says_so(filmed: Filmed) -> None:
+    row = filmed.rows["part"]
+    assert row["status"] == "warning"
+    assert "cut short or damaged" in row["reason"]
+    whole = filmed.truth["p36"]
+    assert 30 < float(row["n_frames"]) < whole.time_s.size
+    assert spread_px(errors_px(filmed.results, "part", whole)) < 0.35
+
+
+@pytest.mark.pipeline
+def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> None:
+    page = (filmed.results / "report.html").read_text(encoding="utf-8")
+    for name in (*GOOD, "part"):
+        assert f'aria-label="Strip of {name} with its tracked edge"' in page
+        assert (filmed.results / "figures" / f"strip_{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert "ChArUco board" in page
+    assert "kept apart from the random error" in page
+    assert filmed.said.stdout.strip().splitlines()[-1] == "Report: results/vines/report.html"
+
+
+@pytest.mark.pipeline
+def test_provenance_has_the_hashes_of_recordings_and_calibration_picture(filmed: Filmed) -> None:
+    inputs = json.loads((filmed.results / "provenance.json").read_text())["inputs"]
+    assert len(inputs["videos/p36.mp4"]) == len(inputs["calibration/board.png"]) == 64
+    assert inputs["videos/gone.mp4"] == "missing"
+
+
+@pytest.mark.pipeline
+def test_check_says_of_the_same_folder_what_is_wrong(filmed: Filmed) -> None:
+    done = CliRunner().invoke(app, ["check", str(filmed.results.parents[1] / "vines")], catch_exceptions=False)
+    assert done.exit_code == 1
+    lines = done.output.splitlines()
+    assert [next(name for name in BAD if f"trial {name}" in line) for line in lines] == [
+        "gone", "beheaded", "letter", "part",
+    ]  # fmt: skip
+    assert [line.split(":")[0] for line in lines] == ["error"] * 3 + ["warning"]
+
+
+@pytest.fixture(scope="module")
+def plainly_filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Truth]:
+    """One recording through a camera without distortion or tilt, for scales that know of neither."""
+    folder = tmp_path_factory.mktemp("plain") / "vine"
+    return folder, film_all(folder, {"p36": 36}, PLAIN)["p36"]
+
+
+def run_stages(folder: Path, results: Path, trial: str, *more: str) -> dict[str, str]:
+    """Stages by their own commands, in this process; the row of the one trial."""
+    stages = [["recording", folder, trial, results], ["gather", folder, results]]
+    stages += [[stage, results] if stage == "damping" else [stage, folder, results] for stage in more]
+    for arguments in stages:
+        done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    return read_rows(results / "trials.csv")[trial]
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize(
+    ("settings", "rel_sigma"),
+    [
+        ("calibration: {kind: two_points, from_px: [100, 60], to_px: [600, 60], length_mm: 120}\n", 0.5 * 2**0.5 / 500),
+        ("calibration: {kind: mm_per_px, mm_per_px: 0.24}\n", np.nan),
+        ("mm_per_px: 0.24\n", np.nan),
+    ],
+    ids=["two_points", "mm_per_px", "column"],
+)
+def test_a_scale_that_is_given_serves_as_well(
+    plainly_filmed: tuple[Path, Truth], tmp_path: Path, settings: str, rel_sigma: float
+) -> None:
+    folder, truth = plainly_filmed
+    write_sheet(folder, {"p36": 36}, settings)
+    row = run_stages(folder, tmp_path, "p36")
+    assert float(row["mm_per_px"]) == pytest.approx(0.24, rel=1e-9)
+    assert float(row["scale_rel_sigma"]) == pytest.approx(rel_sigma, rel=1e-9, nan_ok=True)
+    assert spread_px(errors_px(tmp_path, "p36", truth)) < 0.35
+
+
+REAL = os.environ.get("VINETRACK_REAL_DATA", "")
+
+
+@pytest.mark.real
+@pytest.mark.skipif(not REAL, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
+def test_a_falling_ball_gives_g_through_the_whole_chain(tmp_path: Path) -> None:
+    folder = tmp_path / "fall"
+    folder.mkdir()
+    shutil.copy(Path(REAL) / "freefall_1000fps" / "freefall.mp4", folder)
+    (folder / "trials.csv").write_text(
+        "trial,video,diameter_mm,travel_ratio,mm_per_px,capture_fps\nball,freefall.mp4,20,1,0.27307,1000\n"
+    )
+    row = run_stages(folder, tmp_path / "results", "ball", "damping", "figures", "report")
+    assert row["status"] != "failed", row["reason"]
+    track = pd.read_csv(tmp_path / "results" / "tracks" / "ball.csv", keep_default_na=False)
+    flags = track["flag"].str.split(";")
+    falling = ~flags.map({"before_release", "lost", "rejected", "duplicate", "after_end"}.intersection).astype(bool)
+    assert falling.sum() > 150
+    time_s, fallen_m = (track.loc[falling, name].astype(float) for name in ("time_s", "lead_position_m"))
+    assert 9.5 < 2 * np.polyfit(time_s, fallen_m, 2)[0] < 9.7
