@@ -1,0 +1,30 @@
+"""A vine that stops where its length ends has grown; one that stops elsewhere is spoken of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinetrack.video.judge import Judgement
+from vinetrack.video.track import _is_grown
+
+EDGE_PX = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
+
+
+def verdict(first_moving: int = 10, last_moving: int = 49) -> Judgement:
+    slot = np.arange(EDGE_PX.size)
+    return Judgement(np.full(slot.size, "", dtype="<U64"), slot, (), first_moving, last_moving)
+
+
+@pytest.mark.parametrize(("length_px", "grown"), [(400, True), (405, True), (395, True), (430, False), (370, False)])
+def test_travel_is_held_against_the_length(length_px: float, grown: bool) -> None:
+    assert _is_grown(EDGE_PX, verdict(), length_px) is grown
+
+
+@pytest.mark.parametrize("judged", [verdict(first_moving=0), verdict(last_moving=EDGE_PX.size - 1), verdict(-1, -1)])
+def test_without_rest_or_end_nobody_knows(judged: Judgement) -> None:
+    assert not _is_grown(EDGE_PX, judged, 400.0)
+
+
+def test_without_a_length_or_scale_nobody_knows() -> None:
+    assert not _is_grown(EDGE_PX, verdict(), np.nan)
