@@ -67,7 +67,7 @@ rule recording:
     wildcard_constraints:
         trial=plan.one_of(plan.filmed),
     params:
-        code=code_hash("tracks"),
+        code=code_hash("recording"),
         unwatched=plan.unwatched,
         experiment=plan.experiment,
         results=plan.results,

@@ -162,3 +162,34 @@ def test_a_slash_at_the_end_of_the_path_changes_no_stage(tmp_path: Path) -> None
     with_slash, without = (make_plan({"experiment": path}, tmp_path) for path in (folder + "/", folder))
     assert with_slash.stage_settings() == without.stage_settings()
     assert (with_slash.experiment, with_slash.results) == (without.experiment, without.results)
+
+
+def test_a_strip_drawn_otherwise_reruns_recordings_and_no_tracks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "strip.py").write_text("x = 1\n")
+    monkeypatch.setattr(workflow, "PACKAGE", tmp_path)
+    recording, tracks = code_hash("recording"), code_hash("tracks")
+    (tmp_path / "figures" / "strip.py").write_text("x = 2\n")
+    assert code_hash("recording") != recording
+    assert code_hash("tracks") == tracks
+
+
+def test_a_recording_depends_on_its_own_file_the_sheets_and_the_target(tmp_path: Path) -> None:
+    folder = tmp_path / "v"
+    folder.mkdir()
+    (folder / "trials.csv").write_text(
+        "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
+        "a,a.mp4,12,100,300,20,3\nb,b.mp4,12,100,300,20,3\n"
+    )
+    (folder / "experiment.yaml").write_text(
+        "capture_fps: 1000\ncalibration: {kind: checkerboard, image: c.png, squares: [5, 5], square_mm: 5}\n"
+    )
+    for name in ("a.mp4", "c.png"):
+        (folder / name).write_bytes(b"x")
+    plan = make_plan({"experiment": str(folder)}, tmp_path)
+    shared = tuple(str(folder / name) for name in ("trials.csv", "experiment.yaml", "c.png"))
+    assert plan.filmed == {"a": (*shared, str(folder / "a.mp4")), "b": shared}
+    assert plan.tracked == ()
+    assert str(folder / "a.mp4") not in plan.track_inputs

@@ -35,8 +35,10 @@ CAMPAIGN_FIGURES = {
 SHARED_FILES = ("trials.csv", "experiment.yaml")
 
 _INTAKE = ("records.py", "constants.py", "tables.py", "columns.py", "sheet.py", "naming.py", "experiment.py")
+_ANALYSIS = (*_INTAKE, "settings.py", "stages/tracks.py", "stages/results.py", "video", "motion", "effects", "model")
 STAGE_CODE = {
-    "tracks": (*_INTAKE, "settings.py", "stages", "video", "motion", "effects", "model"),
+    "recording": (*_ANALYSIS, "stages/recordings.py", "figures/strip.py", "figures/style.py"),
+    "tracks": (*_ANALYSIS, "stages/pool.py"),
     "gather": ("tables.py", "stages"),
     "damping": ("tables.py", "stages", "motion"),
     "figures": ("tables.py", "stages", "figures"),

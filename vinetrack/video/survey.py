@@ -42,7 +42,7 @@ def survey(experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
         try:
             opened[trial] = recording = inspect_recording(trial.video or Path())
             found = _judge(trial, recording)
-        except RecordingError as error:
+        except (RecordingError, OSError) as error:
             found = [_unusable(error, trial.video.name if trial.video else "")]
         problems += [replace(problem, trial=trial.name) for problem in found]
     return problems + _judge_scale(experiment.settings, experiment.folder, opened)
@@ -139,7 +139,7 @@ def _inside(axis: Axis, recording: Recording) -> bool:
     return all(-0.5 <= x <= recording.width - 0.5 and -0.5 <= y <= recording.height - 0.5 for x, y in ends)
 
 
-def _unusable(error: RecordingError, name: str) -> Problem:
+def _unusable(error: Exception, name: str) -> Problem:
     message, _, remedy = str(error).removeprefix(f"{name}: ").rpartition("; ")
     words = f"cannot be used: {message or remedy}"
     return Problem(message=words, column="video", value=name, remedy=remedy if message else "")
