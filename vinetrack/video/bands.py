@@ -18,6 +18,35 @@ Floats = NDArray[np.float64]
 BANDS = 4
 """Bands across: enough to tell who errs, few enough that each still finds the edge."""
 FEWEST_ROWS = 4
+OUTLYING = 2.0
+"""A band further off than this many median distances counts as that far: its pixels hardly counted in the fit."""
+HABIT_PX = 50.0
+"""Growth over which a lead or lag of one band is its habit: longer than film's grain, shorter than a sway."""
+HABIT_FRAMES = 7
+NEIGHBOURS = 1
+"""Frames on each side over which the disagreement is averaged: four bands alone say little."""
+
+
+def disagreement(strip: Strip, state: State, edge: Floats, core: NDArray[np.bool_]) -> Floats:
+    """Error of the edge by how far the bands disagree, shape (n_frames,), px; zeros where there is one band only.
+
+    The weighted mean of K independent bands errs by Σ w (y − ȳ)² / ((K − 1) Σ w). What a band is ahead or behind
+    for long in the `core` frames is the shape of the tip, not an error.
+    """
+    edges, sigmas = band_fits(strip, state, edge)
+    if edges.shape[1] < 2:
+        return np.zeros(len(edge))
+    off = np.nan_to_num(edges - edge[:, None])
+    off = off - _habit(off, edge, np.flatnonzero(core))
+    weight = np.where(np.isfinite(sigmas), 1 / (np.nan_to_num(sigmas, nan=1.0) ** 2 + 1e-4), 1e-4)
+    middle = np.median(off, axis=1, keepdims=True)
+    reach = OUTLYING * np.median(np.abs(off - middle), axis=1, keepdims=True) + 0.05
+    off = middle + np.clip(off - middle, -reach, reach)
+    total = weight.sum(axis=1)
+    mean = (weight * off).sum(axis=1) / total
+    variance = (weight * (off - mean[:, None]) ** 2).sum(axis=1) / (off.shape[1] - 1) / total
+    width = 2 * NEIGHBOURS + 1
+    return np.asarray(np.sqrt(np.convolve(np.pad(variance, NEIGHBOURS, mode="edge"), np.ones(width) / width, "valid")))
 
 
 def band_fits(strip: Strip, state: State, edge: Floats) -> tuple[Floats, Floats]:
@@ -43,3 +72,14 @@ def band_fits(strip: Strip, state: State, edge: Floats) -> tuple[Floats, Floats]
         edges.append(fit[:, 0])
         sigmas.append(fit[:, 1])
     return np.stack(edges, axis=1), np.stack(sigmas, axis=1)
+
+
+def _habit(off: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
+    """Median lead of each band over the core frames within HABIT_PX, or the nearest few, shape (n_frames, n_bands)."""
+    out = np.empty_like(off)
+    fewest = min(HABIT_FRAMES, len(core))
+    for t in range(len(edge)):
+        far = np.abs(edge[core] - edge[t])
+        near = far <= max(HABIT_PX, float(np.partition(far, fewest - 1)[fewest - 1]))
+        out[t] = np.median(off[core[near]], axis=0)
+    return out

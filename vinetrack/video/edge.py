@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
+from vinetrack.video.bands import disagreement
 from vinetrack.video.edge_state import (
     CLEAR_PX,
     State,
@@ -25,18 +26,24 @@ from vinetrack.video.edge_state import (
     residuals,
 )
 from vinetrack.video.ending import growth_end
-from vinetrack.video.mend import ASTRAY_PX, mend_jumps
+from vinetrack.video.mend import ASTRAY_PX, FAINTEST, mend_jumps
 from vinetrack.video.strip import Strip
-from vinetrack.video.tip_shape import ASSUMED_EXPOSURE, find_exposure, find_shape
+from vinetrack.video.tip_shape import ASSUMED_EXPOSURE, OPTICAL_BLUR_PX, find_exposure, find_shape
 
 Floats = NDArray[np.float64]
 
-START_PX = 0.2
+START_PX = 0.15
 """Error near the start, where background is seen briefly or never."""
 START_REACH_PX = 25.0
 """Growth over which that error falls to 1/e."""
-DOOR_PX = 0.8
-"""What is added to that where a door crosses everything before the start and the picture departs from the model."""
+DOOR_PX = 0.25
+"""What is added to that where a door crosses everything before the start."""
+SETTLED_PX = 0.2
+"""Largest change of any moving edge from one round to the next at which they are done."""
+UNFIT = 4.0
+"""Factor of the bands' disagreement where no blur within reason fits: all rows err together then."""
+HIDDEN = 3.2
+"""Misfit, in units of the noise and in usual ones, above which something else stands there: the edge is a guess, and none where it is faint."""
 EVIDENCE_CLIP = 2.5
 """Widths beyond which a pixel is as unlike film (or background) as can be."""
 
@@ -45,8 +52,8 @@ EVIDENCE_CLIP = 2.5
 class EdgeFit:
     """Leading edge in strip pixels, all arrays of shape (n_frames,).
 
-    `edge_px` at mid-exposure, `sigma_px` its random error, `start_sigma_px` what is to be
-    added in square near the start (see START_PX), `misfit` the mean squared residual in units of the noise
+    `edge_px` at mid-exposure, `sigma_px` its random error by the likelihood, `apart_sigma_px` what is to be added to
+    it in square: by the disagreement of bands, and near the start (see START_PX). `misfit` is the mean squared residual in units of the noise
     (1 is perfect), `amplitude` its contrast relative to that of the pixels it passes; `contrast` is their mean signed
     contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far each row of the tip lags behind
     its foremost point; `passed` the first and last column passed.
@@ -54,7 +61,7 @@ class EdgeFit:
 
     edge_px: Floats
     sigma_px: Floats
-    start_sigma_px: Floats
+    apart_sigma_px: Floats
     misfit: Floats
     amplitude: Floats
     contrast: Floats
@@ -71,6 +78,8 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     ----------
     exposure_frames
         Exposure over frame period; NaN to estimate it from the blur.
+    rounds
+        At least so many, at most three times as many until the edges settle.
 
     Raises
     ------
@@ -86,13 +95,16 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
         path = _second_path(strip, state, passed)
         state = repicture(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
     fit = fit_edges(strip, state)
-    for turn in range(rounds):
+    for turn in range(3 * rounds):
+        before = fit[:, 0]
         state = _restate(strip, state, fit, exposure)
         if turn == 1 and not np.isfinite(exposure_frames):
             exposure = find_exposure(strip, state, fit)
         if turn < 3:
             state = find_shape(strip, state, fit, turn == 0)
         fit = mend_jumps(strip, state, fit_edges(strip, state))
+        if turn >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < SETTLED_PX:
+            break
     return _finish(strip, state, fit, exposure, passed)
 
 
@@ -282,6 +294,10 @@ def _finish(strip: Strip, state: State, fit: Floats, exposure: float, passed: tu
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX)
-    trouble = np.clip((strain**2 - 1.3) / 1.5, 0.0, 1.0)
-    doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state) * trouble) * near_start
-    return EdgeFit(edge, sigma, doubt, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)
+    doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state)) * near_start
+    apart = disagreement(strip, state, edge_now, core) * (1 - 0.5 * near_start)
+    apart = np.hypot(apart * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), doubt)
+    other = (fit[:, 2] > HIDDEN) & (strain**2 > HIDDEN)
+    hidden = other & (fit[:, 2] > 1.12 * HIDDEN) | (fit[:, 3] < 0.1 - FAINTEST) & (fit[:, 2] > HIDDEN / 2)
+    apart = np.where(hidden, 2 * ASTRAY_PX, np.where(other, np.hypot(apart, ASTRAY_PX), apart))
+    return EdgeFit(edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)

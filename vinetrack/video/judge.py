@@ -17,18 +17,22 @@ Bools = NDArray[np.bool_]
 
 LOST_SIGMA_PX = 4.0
 """A point known no better than this is no point."""
-FLOOR_PX = 0.08
-"""Errors that wander with film and background over many frames do not show as roughness: measured 0.05-0.12 px."""
+FLOOR_PX = 0.05
+"""Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands: 0.03-0.07 px."""
 STEP_RATIO = 1.6
 """A step this many times its neighbours is no acceleration: a frame is missing."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Flags (n_frames,), time slots (n_frames,) as mended, and sentences for a person."""
+    """Flags (n_frames,), time slots (n_frames,) as mended, and sentences for a person.
+
+    `departure_px`, shape (n_frames,), is how far a point lies off its neighbours' curve where no error explains it.
+    """
 
     flag: NDArray[np.str_]
     slot: NDArray[np.int_]
+    departure_px: Floats
     notes: tuple[str, ...]
     first_moving: int
     last_moving: int
@@ -128,7 +132,8 @@ def judge(
     if copies.any():
         which = int(np.flatnonzero(copies)[0])
         notes.append(f"{int(copies.sum())} frames repeat the one before them and are dropped, first frame {which}")
-    outlying = _outliers(y, sigma_px, first, last)
+    departure = _departures(y, sigma_px, first, last)
+    outlying = departure > 0
     for i in range(n):
         parts = (
             "before_release" if i < first else "",
@@ -144,12 +149,16 @@ def judge(
         notes.append(
             f"the leading edge is lost in {int(missing.sum())} moving frames, first frame {np.flatnonzero(missing)[0]}"
         )
-    return Judgement(np.array(flags, dtype=np.str_), slot, tuple(notes), first, last)
+    return Judgement(np.array(flags, dtype=np.str_), slot, departure, tuple(notes), first, last)
 
 
-def _outliers(y: Floats, sigma_px: Floats, first: int, last: int) -> Bools:
-    """Moving points more than 6 sigma and 1 px from a parabola through their two neighbours on each side."""
-    out = np.zeros(len(y), dtype=bool)
+def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
+    """Distance of moving points from a parabola through their two neighbours on each side, shape (n_frames,), px.
+
+    Zero where it is less than 6 sigma or 1 px. At the end, where something may fly on: from the line through the
+    three before.
+    """
+    out = np.zeros(len(y))
     for i in range(max(first, 2), min(last, len(y) - 3) + 1):
         around = y[[i - 2, i - 1, i + 1, i + 2]]
         if not np.all(np.isfinite(around)) or not np.isfinite(y[i]):
@@ -157,7 +166,14 @@ def _outliers(y: Floats, sigma_px: Floats, first: int, last: int) -> Bools:
         expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
         bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
         spread = 1.4 * float(np.max(sigma_px[i - 2 : i + 3]))
-        out[i] = abs(y[i] - expected) > max(6 * spread, 1.0, bend)
+        far = abs(y[i] - expected)
+        out[i] = far if far > max(6 * spread, 1.0, bend) else 0.0
+    for i in range(max(first + 4, last - 2), last + 1):
+        before = y[i - 4 : i]
+        ahead = y[i] - 2 * before[-1] + before[-2]
+        roughness = float(np.max(np.abs(np.diff(before, 2))))
+        if np.isfinite(ahead) and ahead > max(6 * sigma_px[i], 2.0, 0.5 * (before[-1] - before[-2]), 4 * roughness):
+            out[i:last + 1] = np.maximum(out[i:last + 1], ahead)
     return out
 
 

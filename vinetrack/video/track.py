@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vinetrack.records import Track, Trial
 from vinetrack.video.axis import Axis, find_axis, is_orderly
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
-from vinetrack.video.judge import Judgement, calibrated_sigma, judge
+from vinetrack.video.judge import LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
 if TYPE_CHECKING:
@@ -25,6 +25,10 @@ GROWN_TOLERANCE = 0.03
 """Part of a vine's length by which travel and length may differ, for the vine to have grown whole."""
 CENTRINGS = 3
 """Times the strip may be cut anew: what lay outside the first shows only in the second."""
+APART_PX = 1.0
+"""Bands of the edge that disagree by more cannot all be its own."""
+STEADIED_PX = 0.1
+"""Error of a camera's shake taken off by what stands still: measured 0.1-0.15 px, mostly of its slow part."""
 OFF_CENTRE_PX = 0.8
 """Tilt of the axis, over its length, or shift that is left alone: the tip's rows then lag by under a tenth of it."""
 
@@ -57,7 +61,7 @@ class _Edge:
     blur_px: float
     exposure_frames: float
     reach_px: float
-    start_sigma_px: Floats | float = 0.0
+    apart_sigma_px: Floats | float = 0.0
 
 
 def track_recording(
@@ -118,12 +122,13 @@ def track_frames(
     repeated = _repeated(strip, found.edge_px)
     moving = np.gradient(found.edge_px) > 0.3 if len(kept) > 1 else np.ones(len(kept), bool)
     sigma = calibrated_sigma(found.edge_px, found.sigma_px, moving & np.isfinite(found.edge_px))
-    sigma = np.hypot(sigma, found.start_sigma_px)
+    sigma = np.hypot(sigma, np.hypot(found.apart_sigma_px, STEADIED_PX if strip.steadied else 0.0))
     end_px = strip.axis.length_px - found.reach_px
     verdict = judge(
         found.edge_px, sigma, frames.slot[kept], unsure=found.unsure, damaged=frames.damaged[kept],
         repeated=repeated, end_px=end_px,
     )  # fmt: skip
+    sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
     if verdict.last_moving < 0:
         raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
     scale = trial.m_per_px if m_per_px is None else m_per_px
@@ -202,7 +207,7 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
     reach = 3 * front.blur_px + 1
     return strip, _Edge(
         front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames, reach,
-        front.start_sigma_px,
+        front.apart_sigma_px,
     )  # fmt: skip
 
 
@@ -236,6 +241,7 @@ def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
     """Frames whose neighbourhood does not look like the edge elsewhere."""
     usual = float(np.nanmedian(fit.misfit))
     odd = (fit.amplitude < 0.6) | (fit.amplitude > 1.5) | (fit.misfit > 6 * max(usual, 0.3))
+    odd |= fit.apart_sigma_px > APART_PX
     return np.asarray(odd | (fit.sigma_px > np.maximum(1.0, 5 * np.nanmedian(fit.sigma_px))))
 
 
