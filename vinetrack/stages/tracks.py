@@ -139,13 +139,15 @@ def gather(experiment: Experiment, folder: Path) -> pd.DataFrame:
 
 
 def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame:
-    """Rows as a table of these columns; a number that JSON could not hold is NaN again."""
+    """Rows as a table of these columns, without rows too; a number that JSON could not hold is NaN again."""
     import pandas as pd
 
     frame = pd.DataFrame(rows, columns=list(columns))
     counts = [column for column in columns if column in COUNT_COLUMNS]
+    truths = [column for column in columns if column in TRUTH_COLUMNS]
     numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS | COUNT_COLUMNS]
-    return frame.astype(dict.fromkeys(numbers, float) | dict.fromkeys(counts, "Int64"))
+    kinds = dict.fromkeys(numbers, "float") | dict.fromkeys(counts, "Int64") | dict.fromkeys(truths, "bool")
+    return frame.astype(kinds)
 
 
 def model_of(experiment: Experiment) -> Model:
