@@ -19,6 +19,7 @@ FLOORS = (
     {"sheet", "experiment", "video"},
     {"effects"},
     {"model", "motion"},
+    {"diagnosis"},
     {"laboratory"},
     {"provenance", "figures"},
     {"report"},

@@ -12,7 +12,7 @@ from vinetrack.effects import EffectError
 from vinetrack.model.assemble import trial_fit
 from vinetrack.model.fit_data import FitError, FitTrial, Pairs, prepare_trial
 from vinetrack.model.free import YIELD_PRESSURE, Layout
-from vinetrack.model.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.model.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.starts import align, first_own
 from vinetrack.model.whitened import all_products, at_correlation
@@ -23,17 +23,26 @@ if TYPE_CHECKING:
 
 MOST_STEPS = 20
 SETTLED_FRAMES = 1e-3
+FEWEST_AT_REST = 5
+"""Frames before the motion that tell where a vine started, to half the noise of one."""
 
 
-def predict_trials(found: Fit, pairs: Pairs) -> list[TrialFit]:
-    """Trials with their own release and origin, deviations zero; see `vinetrack.model.fit.predict`."""
+def predict_trials(found: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[TrialFit]:
+    """Trials with their own release and origin, deviations zero; see `vinetrack.model.fit.predict`.
+
+    With `from_rest` the origin is where a vine is seen at rest before it moves, and release (and the origin where no
+    rest was filmed) are where the root mean square is least. Else both weigh errors with the correlation that the fit
+    found, which where a model fails is nearly 1, and leaves the origin to the misfit.
+    """
+    if from_rest:
+        found = replace(found, noise_correlation=0.0)
     data = [_known_yield(found, _prepared(trial, track)) for trial, track in pairs]
     layout = _nothing_free(found, data)
     predictor = Predictor(layout, data)
     nothing = np.empty(0)
     try:
         own, _ = align(data, predictor, nothing, first_own(data))
-        own = _settle(found, predictor, own)
+        own = _settle(found, predictor, own, from_rest)
         columns = predictor.linearise(nothing, own)
         moved = predictor.run(predictor.jobs(nothing, own))
     except SimulationError as error:
@@ -77,11 +86,17 @@ def _square(columns: Sequence[Floats], data: Sequence[FitTrial], rho: float) -> 
     return at_correlation(all_products(columns, [item.first for item in data]), rho)
 
 
-def _settle(found: Fit, predictor: Predictor, own: Floats) -> Floats:
+def _settle(found: Fit, predictor: Predictor, own: Floats, from_rest: bool) -> Floats:
     """Newton's steps in release and origin, no longer than two frames."""
     frames = np.array([item.frame_s for item in predictor.data])
+    held = np.array([from_rest and item.n_rest >= FEWEST_AT_REST for item in predictor.data], dtype=bool)
+    own = own.copy()
+    for i, item in enumerate(predictor.data):
+        if held[i]:
+            own[i, ORIGIN] = np.mean(item.lead_position_m[: item.n_rest])
     for _ in range(MOST_STEPS):
         square = _square(predictor.linearise(np.empty(0), own), predictor.data, found.noise_correlation)
+        square[held, ORIGIN, :] = square[held, :, ORIGIN] = 0.0
         step = np.einsum("nij,nj->ni", np.linalg.pinv(square[:, :2, :2], hermitian=True), square[:, :2, -1])
         step[:, RELEASE] = np.clip(step[:, RELEASE], -2 * frames, 2 * frames)
         own = own.copy()

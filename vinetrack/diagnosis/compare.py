@@ -1,0 +1,219 @@
+"""Model against measurement, condition by condition, beside what repeated trials differ by.
+
+A trial's prediction has a release and an origin of its own and nothing else: its pressure and B deviate by nothing, as
+for a trial that was left out of the fit. The origin is where the vine is seen at rest; the release, and the origin
+where no rest was filmed, are where the root mean square is least. Replicates are laid on their mean in the same way: so
+a model that lacks nothing comes out at the floor, at a ratio of 1.
+
+The two errors are those of the paper's Table II (Alvarez et al., 2025): of the position over the whole growth, and of
+the final speed of the leading edge. A model whose vines stop and start again is followed through every stop, but the
+corners of such a motion may lie a frame apart in model and measurement, and its replicates are then no mere shifts of
+each other: their floor takes that for scatter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinetrack.diagnosis.replicates import Replicates, first_that_counts, replicates_of
+from vinetrack.model.fit_data import Pairs
+from vinetrack.model.fit_result import Fit, TrialFit
+from vinetrack.model.left_out import predict_trials
+from vinetrack.model.simulate import simulate_many
+from vinetrack.motion.efficiency import lead_velocity_at
+from vinetrack.motion.velocity import estimate_kinematics
+from vinetrack.records import Floats, Kinematics, Track
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COMPARISON_COLUMNS = (
+    "model",
+    "condition",
+    "rms_position_m",
+    "rms_final_velocity_m_s",
+    "replicate_floor_m",
+    "ratio",
+    "worst_at_s",
+    "worst_at_m",
+)
+TRAJECTORY_COLUMNS = (
+    "trial",
+    "time_s",
+    "lead_position_m",
+    "model_position_m",
+    "replicates_mean_m",
+    "replicates_sigma_m",
+)
+
+FINAL_AT_FRACTION = 0.95
+"""Of the length, or of as much of it as was seen: a bare vine's speed has a meaning only with the place it is taken."""
+
+LASTS = 3.0
+"""How many times longer than the recording the model is followed, to get where the measurement got."""
+
+SMOOTHED_SHARE = 0.05
+"""Of the growth's duration, over which the misfit is averaged to find where it is worst: one frame's noise is not."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """`table` has a row a condition, columns `COMPARISON_COLUMNS`.
+
+    `trajectories` gives each condition's trials and what the model says of them, columns `TRAJECTORY_COLUMNS`: since
+    release, from the origin. `trials` are the predictions.
+    """
+
+    table: pd.DataFrame
+    trajectories: Mapping[str, pd.DataFrame]
+    trials: tuple[TrialFit, ...]
+
+
+def compare(
+    found: Fit,
+    pairs: Pairs,
+    *,
+    kinematics: Mapping[str, Kinematics] | None = None,
+    final_at_fraction: float = FINAL_AT_FRACTION,
+) -> Comparison:
+    """Hold a fitted model against the trials of an experiment.
+
+    Parameters
+    ----------
+    pairs
+        Trials and tracks; trials that the fit did not use are passed over.
+    kinematics
+        By name of trial, where they are known already; else they are estimated from the tracks.
+    final_at_fraction
+        Fraction of the length at which the final speed is taken; where less was seen, the same fraction of that.
+
+    Raises
+    ------
+    FitError
+        If the model cannot be followed.
+    """
+    import pandas as pd
+
+    fitted = {trial.name for trial in found.trials}
+    chosen = [(trial, track) for trial, track in pairs if trial.name in fitted]
+    predicted = predict_trials(found, chosen, from_rest=True)
+    tracks = {trial.name: track for trial, track in chosen}
+    errors = final_speed_errors(found, predicted, tracks, kinematics or {}, final_at_fraction)
+    rows, trajectories = [], {}
+    for condition in dict.fromkeys(trial.trial.condition for trial in predicted):
+        members = [trial for trial in predicted if trial.trial.condition == condition]
+        together = replicates_of(members)
+        rows.append(
+            {
+                "model": "+".join(found.model.names),
+                "condition": condition,
+                **position_errors(members, together),
+                "rms_final_velocity_m_s": _rms([errors[trial.name] for trial in members]),
+            }
+        )
+        trajectories[condition] = trajectory_table(members, together)
+    return Comparison(pd.DataFrame(rows, columns=list(COMPARISON_COLUMNS)), trajectories, tuple(predicted))
+
+
+def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[str, float]:
+    """Errors of position of one condition while it moves: every trial counts alike, however many frames it has."""
+    squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
+    rms_m = math.sqrt(float(np.mean(squares)))
+    floor_m = together.floor_m
+    worst_at_s, worst_at_m = _worst(together)
+    return {
+        "rms_position_m": rms_m,
+        "replicate_floor_m": floor_m,
+        "ratio": rms_m / floor_m if floor_m > 0 else math.nan,
+        "worst_at_s": worst_at_s,
+        "worst_at_m": worst_at_m,
+    }
+
+
+def _worst(together: Replicates) -> tuple[float, float]:
+    """Time since release and growth where the replicates' mean, a little smoothed, is farthest from the model."""
+    moving = (together.time_s >= together.begin_s) & (together.present > 0)
+    if not moving.any():
+        return math.nan, math.nan
+    misfit_m, time_s = together.mean_residual_m[moving], together.time_s[moving]
+    half = int(SMOOTHED_SHARE * misfit_m.size / 2)
+    total = np.concatenate([[0.0], np.cumsum(misfit_m)])
+    low = np.maximum(np.arange(misfit_m.size) - half, 0)
+    high = np.minimum(np.arange(misfit_m.size) + half + 1, misfit_m.size)
+    worst = int(np.argmax(np.abs((total[high] - total[low]) / (high - low))))
+    return float(time_s[worst]), float((together.model_m[moving] + misfit_m)[worst])
+
+
+def final_speed_errors(
+    found: Fit,
+    predicted: Sequence[TrialFit],
+    tracks: Mapping[str, Track],
+    kinematics: Mapping[str, Kinematics],
+    at_fraction: float = FINAL_AT_FRACTION,
+) -> dict[str, float]:
+    """Model minus measurement of the leading edge's final speed, m/s, by name of trial; both at the same place.
+
+    A model that never gets there has stopped: its speed there is 0. NaN where the measurement gives none.
+    """
+    times = [LASTS * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
+    traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
+    moved = simulate_many(found.model, [t.trial for t in predicted], times, traces=traces)
+    errors = {}
+    for trial, time_s, run in zip(predicted, times, moved, strict=True):
+        known = kinematics.get(trial.name) or estimate_kinematics(
+            tracks[trial.name], travel_ratio=trial.trial.travel_ratio
+        )
+        travel_m = known.lead_position_m - trial.origin_m
+        seen_m = float(np.max(trial.lead_position_m)) - trial.origin_m
+        length_m = trial.trial.length_m
+        place_m = at_fraction * (min(length_m, seen_m) if math.isfinite(length_m) else seen_m)
+        measured = lead_velocity_at(travel_m, known.lead_velocity_m_s, place_m)
+        said = lead_velocity_at(run.observed_position_m, np.gradient(run.observed_position_m, time_s), place_m)
+        errors[trial.name] = (said if math.isfinite(said) else 0.0) - measured
+    return errors
+
+
+def _trace_since_release(track: Track, release_s: float) -> tuple[Floats, Floats] | None:
+    if track.pressure_Pa is None:
+        return None
+    known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
+    return track.time_s[known] - release_s, track.pressure_Pa[known]
+
+
+def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.DataFrame:
+    """One condition's trials and the model, since release and from the origin, columns `TRAJECTORY_COLUMNS`.
+
+    `replicates_mean_m` is the mean of the replicates then, `replicates_sigma_m` their standard deviation.
+    """
+    import pandas as pd
+
+    mean_m = together.model_m + together.mean_residual_m
+    sigma_m = np.sqrt(together.variance_m2)
+    parts = []
+    for trial in trials:
+        time_s = trial.time_s - trial.release_s
+        k = np.clip(np.rint((time_s - together.time_s[0]) / _step(together.time_s)).astype(int), 0, mean_m.size - 1)
+        columns = (
+            trial.name,
+            time_s,
+            trial.lead_position_m - trial.origin_m,
+            trial.predicted_position_m - trial.origin_m,
+            mean_m[k],
+            sigma_m[k],
+        )
+        parts.append(pd.DataFrame(dict(zip(TRAJECTORY_COLUMNS, columns, strict=True))))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _step(time_s: Floats) -> float:
+    return float(time_s[1] - time_s[0]) if time_s.size > 1 else 1.0
+
+
+def _rms(values: Sequence[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
