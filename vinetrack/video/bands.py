@@ -23,8 +23,10 @@ OUTLYING = 2.0
 HABIT_PX = 50.0
 """Growth over which a lead or lag of one band is its habit: longer than film's grain, shorter than a sway."""
 HABIT_FRAMES = 7
-NEIGHBOURS = 1
-"""Frames on each side over which the disagreement is averaged: four bands alone say little."""
+NEIGHBOURS = 2
+"""Frames on each side of which the median disagreement is taken: four bands alone say little, one glint nothing."""
+MEDIAN_TO_MEAN = 1.27
+"""Mean over median of χ² with three degrees of freedom."""
 
 
 def disagreement(strip: Strip, state: State, edge: Floats, core: NDArray[np.bool_]) -> Floats:
@@ -45,8 +47,9 @@ def disagreement(strip: Strip, state: State, edge: Floats, core: NDArray[np.bool
     total = weight.sum(axis=1)
     mean = (weight * off).sum(axis=1) / total
     variance = (weight * (off - mean[:, None]) ** 2).sum(axis=1) / (off.shape[1] - 1) / total
-    width = 2 * NEIGHBOURS + 1
-    return np.asarray(np.sqrt(np.convolve(np.pad(variance, NEIGHBOURS, mode="edge"), np.ones(width) / width, "valid")))
+    padded = np.pad(variance, NEIGHBOURS, mode="edge")
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1), axis=1)
+    return np.asarray(np.sqrt(MEDIAN_TO_MEAN * usual))
 
 
 def band_fits(strip: Strip, state: State, edge: Floats) -> tuple[Floats, Floats]:

@@ -19,6 +19,7 @@ from vinetrack.video.edge_state import (
     CLEAR_PX,
     State,
     blur_lengths,
+    clear_of_start,
     core_frames,
     fit_edges,
     moving_frames,
@@ -53,10 +54,10 @@ class EdgeFit:
     """Leading edge in strip pixels, all arrays of shape (n_frames,).
 
     `edge_px` at mid-exposure, `sigma_px` its random error by the likelihood, `apart_sigma_px` what is to be added to
-    it in square: by the disagreement of bands, and near the start (see START_PX). `misfit` is the mean squared residual in units of the noise
-    (1 is perfect), `amplitude` its contrast relative to that of the pixels it passes; `contrast` is their mean signed
-    contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far each row of the tip lags behind
-    its foremost point; `passed` the first and last column passed.
+    it in square: by the disagreement of bands, and near the start (see START_PX). `misfit` is the mean squared
+    residual in units of the noise (1 is perfect), `amplitude` the contrast relative to that of the pixels it passes;
+    `contrast` is their mean signed contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far
+    each row of the tip lags behind its foremost point; `passed` the first and last column passed.
     """
 
     edge_px: Floats
@@ -297,7 +298,17 @@ def _finish(strip: Strip, state: State, fit: Floats, exposure: float, passed: tu
     doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state)) * near_start
     apart = disagreement(strip, state, edge_now, core) * (1 - 0.5 * near_start)
     apart = np.hypot(apart * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), doubt)
-    other = (fit[:, 2] > HIDDEN) & (strain**2 > HIDDEN)
-    hidden = other & (fit[:, 2] > 1.12 * HIDDEN) | (fit[:, 3] < 0.1 - FAINTEST) & (fit[:, 2] > HIDDEN / 2)
-    apart = np.where(hidden, 2 * ASTRAY_PX, np.where(other, np.hypot(apart, ASTRAY_PX), apart))
+    apart = _hidden(fit, strain**2, edge_now, apart)
     return EdgeFit(edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)
+
+
+def _hidden(fit: Floats, strain: Floats, edge: Floats, apart: Floats) -> Floats:
+    """Errors `apart` made larger where a door still stands before the tip, shape (n_frames,), px.
+
+    Then the edge is a guess, and none at all where the picture is quite another or hardly any contrast is left.
+    """
+    near = edge < clear_of_start(edge) + 0.5 * CLEAR_PX
+    other, odd = fit[:, 2] > HIDDEN, fit[:, 2] > HIDDEN / 2
+    covered = near & (other & (fit[:, 2] > 1.12 * HIDDEN) | odd & (fit[:, 3] < 0.1 - FAINTEST)) & (strain > 2)
+    guessed = near & (other & (strain > HIDDEN) | odd & (strain > 2) & (fit[:, 3] < -0.25))
+    return np.where(covered, 2 * ASTRAY_PX, np.where(guessed, np.hypot(apart, 0.7 * ASTRAY_PX), apart))

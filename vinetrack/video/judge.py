@@ -159,7 +159,7 @@ def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
     three before.
     """
     out = np.zeros(len(y))
-    for i in range(max(first, 2), min(last, len(y) - 3) + 1):
+    for i in range(max(first, 2), min(last, len(y) - 1) - 1):  # a dead stop is no departure
         around = y[[i - 2, i - 1, i + 1, i + 2]]
         if not np.all(np.isfinite(around)) or not np.isfinite(y[i]):
             continue
@@ -173,7 +173,7 @@ def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
         ahead = y[i] - 2 * before[-1] + before[-2]
         roughness = float(np.max(np.abs(np.diff(before, 2))))
         if np.isfinite(ahead) and ahead > max(6 * sigma_px[i], 2.0, 0.5 * (before[-1] - before[-2]), 4 * roughness):
-            out[i:last + 1] = np.maximum(out[i:last + 1], ahead)
+            out[i : last + 1] = np.maximum(out[i : last + 1], ahead)
     return out
 
 
