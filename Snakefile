@@ -143,6 +143,32 @@ rule damping:
         "vinetrack damping {params.results:q} --settings {params.settings:q} --log {log:q}"
 
 
+rule model:
+    """The model in use fitted to all trajectories, held against them, and audited for what it leaves out."""
+    input:
+        plan.sheets,
+        plan.own_effects,
+        plan.per_trial("tracks", ".csv"),
+        plan.per_trial("kinematics", ".csv"),
+        plan.result("damping.json"),
+    output:
+        plan.result("fit.json"),
+        plan.result("comparison.csv"),
+        plan.result("model_check.csv"),
+        plan.result("audit.csv"),
+        directory(plan.result("comparison")),
+    log:
+        plan.result("logs", "model.log"),
+    params:
+        code=code_hash("model"),
+        unwatched=plan.unwatched,
+        experiment=plan.experiment,
+        results=plan.results,
+        settings=plan.stage_settings("final_at_fraction"),
+    shell:
+        "vinetrack model {params.experiment:q} {params.results:q} --settings {params.settings:q} --log {log:q}"
+
+
 rule trial_figures:
     """Position, speed and steady stretches of every trial."""
     input:
@@ -180,6 +206,8 @@ rule campaign_figures:
         plan.result("damping_points.csv"),
         plan.result("damping.json"),
         plan.result("scaling.json"),
+        plan.result("comparison.csv"),
+        plan.result("comparison"),
     output:
         [
             report(
@@ -208,6 +236,9 @@ rule report_page:
         plan.inputs,
         plan.figure_files(),
         plan.result("steady.csv"),
+        plan.result("fit.json"),
+        plan.result("comparison.csv"),
+        plan.result("audit.csv"),
     output:
         plan.result("report.html"),
         plan.result("provenance.json"),

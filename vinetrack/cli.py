@@ -93,6 +93,16 @@ def effects(
             typer.echo(line)
 
 
+@app.command()
+def compare(results: ResultsPath) -> None:
+    """The model against the measurement of every condition, beside what repeated trials differ by."""
+    with _sentences(None):
+        from vinetrack.stages.model import comparison_lines
+
+        for line in comparison_lines(results):
+            typer.echo(line)
+
+
 @app.command(rich_help_panel="Stages of the workflow")
 def recording(
     experiment: ExperimentPath,
@@ -146,6 +156,17 @@ def damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = 
         from vinetrack.stages.damping import fit_law
 
         typer.echo(headline(fit_law(results, _run_settings(settings).damping)))
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def model(experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+    """The model in use fitted to the tracks: fit.json, comparison.csv, model_check.csv, audit.csv."""
+    with _sentences(log):
+        from vinetrack.stages.model import comparison_lines, fit_model
+
+        fit_model(_read(experiment), results, _run_settings(settings))
+        for line in comparison_lines(results):
+            typer.echo(line)
 
 
 @app.command(rich_help_panel="Stages of the workflow")

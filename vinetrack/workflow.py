@@ -29,6 +29,8 @@ CAMPAIGN_FIGURES = {
     "exponents": "Exponent and coefficients",
     "scaling": "Coefficient and size",
     "overview": "All trials",
+    "model_comparison": "Model and measurement",
+    "model_residuals": "What the model leaves",
 }
 """Figures of a whole experiment, by file name, with the label Snakemake's own report gives them."""
 
@@ -41,6 +43,7 @@ STAGE_CODE = {
     "tracks": (*_ANALYSIS, "stages/pool.py"),
     "gather": ("tables.py", "stages"),
     "damping": ("tables.py", "stages", "motion"),
+    "model": (*_INTAKE, "settings.py", "stages", "video", "motion", "effects", "model", "diagnosis"),
     "figures": ("tables.py", "stages", "figures"),
     "report": ("tables.py", "stages", "provenance.py", "figures", "report"),
     "laboratory": ("effects", "model", "laboratory"),
@@ -70,6 +73,11 @@ class Plan:
     def sheets(self) -> list[str]:
         """The trial sheet and, where there is one, the settings beside it."""
         return [path.as_posix() for path in self.inputs if path.name in SHARED_FILES]
+
+    @property
+    def own_effects(self) -> list[str]:
+        """Files of the user's own effects."""
+        return [path.as_posix() for path in self.inputs if path.suffix == ".py"]
 
     @property
     def recordings(self) -> list[str]:
@@ -155,7 +163,8 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
     trials = tuple(name for name in experiment.names if name not in experiment.left_out)
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
     present = (path for path in files if path is not None and (is_demo or path.exists()))
-    shared = [path for name in SHARED_FILES if (path := folder / name).exists()]
+    own = (folder / path for path in experiment.settings.effects)
+    shared = [path for path in (*(folder / name for name in SHARED_FILES), *own) if path.exists()]
     target = getattr(experiment.settings.calibration, "image", None)
     targets = [folder / target] if target is not None and (is_demo or (folder / target).exists()) else []
     inputs = dict.fromkeys([*shared, *targets, *present])

@@ -66,6 +66,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     """Draw the figures of the whole experiment."""
     from vinetrack.figures.damping_law import draw_damping_law
     from vinetrack.figures.exponents import draw_exponents
+    from vinetrack.figures.model_comparison import draw_model_comparison, draw_model_residuals
     from vinetrack.figures.overview import draw_overview
     from vinetrack.figures.scaling import draw_scaling
     from vinetrack.figures.style import METHOD_NAMES
@@ -79,11 +80,15 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     }
     in_fit = [vine for method in METHOD_NAMES for vine in damping[method]["vines"]]
     points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
+    compared = label_conditions(read_result(results.comparison), described)
+    trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
     drawings: dict[str, Figure] = {
         "damping_law": draw_damping_law(points, damping),
         "exponents": draw_exponents(damping),
         "scaling": draw_scaling(read_json(results.scaling)),
         "overview": draw_overview(described, moved),
+        "model_comparison": draw_model_comparison(compared, trajectories),
+        "model_residuals": draw_model_residuals(compared, trajectories),
     }
     for name, figure in drawings.items():
         _write(figure, partial(results.figure, name), settings)
@@ -128,3 +133,14 @@ def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.Da
         labels.append(", ".join([f"{1e3 * trial.diameter_m:g} mm", *parts[1:]]))
         pressures.append(1e-3 * trial.pressure_Pa)
     return trials.assign(condition_label=labels, pressure_kPa=pressures)
+
+
+def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
+    """`comparison.csv` with the vine and the short label of each condition, vines together, pressure rising."""
+    first = described.drop_duplicates("condition").set_index("condition")
+    vines = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
+    known = comparison[comparison["condition"].isin(first.index)]
+    of = first.loc[known["condition"]]
+    table = known.assign(vine=of["vine"].to_numpy(), condition_label=of["condition_label"].to_numpy())
+    order = sorted(range(len(table)), key=lambda i: (vines[table["vine"].iloc[i]], of["pressure_kPa"].iloc[i]))
+    return table.iloc[order].reset_index(drop=True)

@@ -82,7 +82,21 @@ POINT_COLUMNS = (
     "reason",
 )
 TEXT_COLUMNS = frozenset(
-    {"trial", "vine", "condition", "status", "reason", "steady_rule", "rule", "flag", "pressure_source"}
+    {
+        "trial",
+        "vine",
+        "condition",
+        "status",
+        "reason",
+        "steady_rule",
+        "rule",
+        "flag",
+        "pressure_source",
+        "model",
+        "term",
+        "size",
+        "note",
+    }
 )
 COUNT_COLUMNS = frozenset({"n_frames", "points"})
 TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used"})
@@ -122,6 +136,30 @@ class Results:
     def scaling(self) -> Path:
         """How B grows with the size of the vine."""
         return self.folder / "scaling.json"
+
+    @property
+    def comparison(self) -> Path:
+        """Model against measurement, one row a condition."""
+        return self.folder / "comparison.csv"
+
+    @property
+    def model_check(self) -> Path:
+        """B and n of steady windows beside those of whole trajectories."""
+        return self.folder / "model_check.csv"
+
+    @property
+    def audit(self) -> Path:
+        """What the model leaves out, weighed along the motion of each trial."""
+        return self.folder / "audit.csv"
+
+    @property
+    def fit(self) -> Path:
+        """The model in use, fitted to the trajectories."""
+        return self.folder / "fit.json"
+
+    def trajectories(self, condition: str) -> Path:
+        """The trials of one condition and what the model says of them."""
+        return result_file(self.folder / "comparison", condition, ".csv")
 
     @property
     def provenance(self) -> Path:

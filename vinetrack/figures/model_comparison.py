@@ -1,0 +1,127 @@
+"""Model and measurement, one small panel a condition: positions against time, or what is left against growth."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.figures.style import INK, MUTED, blank, look, rows, vine_styles
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MAX_PANELS = 60
+_MAX_POINTS_IN_ALL = 12_000  # keeps the SVG under a megabyte, with 200 trials too
+_WIDTH_IN = 11.0
+_NOTHING = "The model in use was not fitted, so there is nothing to hold against the measurement."
+
+Drawing = Callable[["Axes", "pd.DataFrame", str, int], None]
+
+
+def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
+    """Draw positions since release: replicates, their band, and the model.
+
+    Parameters
+    ----------
+    comparison : one row a condition with `condition, condition_label, vine, rms_position_m, ratio`.
+    trajectories : by condition, `trial, time_s, lead_position_m, model_position_m, replicates_mean_m,
+        replicates_sigma_m`.
+    """
+    return _panels(comparison, trajectories, _draw_positions, "time since release (ms)", "growth (mm)")
+
+
+def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
+    """Draw measurement minus model against growth; parameters as for `draw_model_comparison`."""
+    return _panels(comparison, trajectories, _draw_residuals, "growth (mm)", "measurement − model (mm)")
+
+
+def _panels(
+    comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame], draw: Drawing, x_label: str, y_label: str
+) -> Figure:
+    from matplotlib.figure import Figure
+
+    shown = [row for row in rows(comparison) if row.condition in trajectories][:MAX_PANELS]
+    if not shown:
+        return blank(_NOTHING)
+    n_columns = _columns(len(shown))
+    n_rows = math.ceil(len(shown) / n_columns)
+    n_trials = sum(trajectories[row.condition]["trial"].nunique() for row in shown)
+    n_points = min(max(_MAX_POINTS_IN_ALL // n_trials, 25), 150)
+    styles = vine_styles([row.vine for row in shown])
+    with look():
+        font = 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
+        panel_in = min(_WIDTH_IN / n_columns, 6.0)
+        row_in = min(max(0.78 * panel_in, 1.35), 3.6)
+        fig = Figure(figsize=(n_columns * panel_in, n_rows * row_in + 0.95), layout="constrained")
+        axes = fig.subplots(n_rows, n_columns, squeeze=False)
+        for ax, row in zip(axes.flat, shown, strict=False):
+            draw(ax, trajectories[row.condition], styles[row.vine].colour, n_points)
+            _label(ax, row, trajectories[row.condition]["trial"].nunique(), font)
+        for ax in axes.flat[len(shown) :]:
+            ax.set_visible(False)
+        fig.supxlabel(x_label, fontsize=11)
+        fig.supylabel(y_label, fontsize=11)
+        title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
+        wrapped = textwrap.fill(title, int(n_columns * panel_in * 11))
+        fig.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
+    return fig
+
+
+def _columns(n_panels: int) -> int:
+    """Enough columns that the page is not much taller than wide, and never more than eight."""
+    return min(max(math.ceil(math.sqrt(1.3 * n_panels)), 1), 8) if n_panels > 3 else n_panels
+
+
+def _label(ax: Axes, row: Any, n_trials: int, font: float) -> None:
+    ax.set_title(str(row.condition_label), fontsize=font, fontweight="normal", pad=3)
+    times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
+    words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {n_trials}"
+    ax.text(0.98, 0.04, words, transform=ax.transAxes, ha="right", va="bottom", fontsize=font - 1.5, color=MUTED)
+    ax.tick_params(labelsize=font - 0.5, colors=INK)
+    ax.locator_params(nbins=4)
+
+
+def _moving(table: pd.DataFrame, n_points: int) -> list[pd.DataFrame]:
+    """Each trial from a little before its release, thinned to what a small panel can show."""
+    parts = []
+    for _, part in table.groupby("trial", sort=False):
+        begin_s = -0.08 * max(float(part["time_s"].max()), 0.0)
+        kept = part[part["time_s"] >= begin_s]
+        parts.append(kept.iloc[:: max(len(kept) // n_points, 1)])
+    return parts
+
+
+def _longest(parts: list[pd.DataFrame]) -> pd.DataFrame:
+    return max(parts, key=lambda part: float(part["time_s"].iloc[-1]))
+
+
+def _draw_positions(ax: Axes, table: pd.DataFrame, colour: str, n_points: int) -> None:
+    parts = _moving(table, n_points)
+    longest = _longest(parts)
+    time_ms, mean_mm, sigma_mm = (
+        1e3 * longest[name].to_numpy(dtype=float) for name in ("time_s", "replicates_mean_m", "replicates_sigma_m")
+    )
+    ax.fill_between(time_ms, mean_mm - sigma_mm, mean_mm + sigma_mm, color=colour, alpha=0.22, lw=0)
+    for part in parts:
+        ax.plot(1e3 * part["time_s"], 1e3 * part["lead_position_m"], color=colour, lw=0.8)
+    ax.plot(1e3 * longest["time_s"], 1e3 * longest["model_position_m"], color=INK, lw=1.5, ls=(0, (4, 2)))
+
+
+def _draw_residuals(ax: Axes, table: pd.DataFrame, colour: str, n_points: int) -> None:
+    parts = _moving(table, n_points)
+    longest = _longest(parts)
+    growth_mm, sigma_mm = (
+        1e3 * longest[name].to_numpy(dtype=float) for name in ("replicates_mean_m", "replicates_sigma_m")
+    )
+    order = np.argsort(growth_mm)
+    ax.fill_between(growth_mm[order], -sigma_mm[order], sigma_mm[order], color=colour, alpha=0.22, lw=0)
+    ax.axhline(0, color=INK, lw=1.0, ls=(0, (4, 2)))
+    for part in parts:
+        left_mm = 1e3 * (part["lead_position_m"] - part["model_position_m"])
+        ax.plot(1e3 * part["lead_position_m"], left_mm, color=colour, lw=0.9)
