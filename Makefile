@@ -11,7 +11,7 @@ help:  ## this list
 
 venv: $(STAMP)  ## .venv with the locked version of everything, extras included
 
-demo: $(STAMP)  ## the shipped demonstration, from trial sheet to results/demo/report.html
+demo: $(STAMP)  ## 24 recordings, made in the virtual laboratory on first use, to results/demo/report.html
 	@$(BIN)/snakemake --cores $(CORES)
 
 test: $(STAMP)  ## all tests
