@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.style import INK, MUTED, blank, look, rows, vine_styles
+from vinetrack.figures.style import INK, MUTED, blank, fitting_size, look, rows, vine_styles
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,7 +62,7 @@ def _panels(
         axes = fig.subplots(n_rows, n_columns, squeeze=False)
         for ax, row in zip(axes.flat, shown, strict=False):
             draw(ax, trajectories[row.condition], styles[row.vine].colour, n_points)
-            _label(ax, row, trajectories[row.condition]["trial"].nunique(), font)
+            _label(ax, row, trajectories[row.condition]["trial"].nunique(), font, 72 * (panel_in - 0.45), draw)
         for ax in axes.flat[len(shown) :]:
             ax.set_visible(False)
         fig.supxlabel(x_label, fontsize=11)
@@ -78,21 +78,27 @@ def _columns(n_panels: int) -> int:
     return min(max(math.ceil(math.sqrt(1.3 * n_panels)), 1), 8) if n_panels > 3 else n_panels
 
 
-def _label(ax: Axes, row: Any, n_trials: int, font: float) -> None:
-    ax.set_title(str(row.condition_label), fontsize=font, fontweight="normal", pad=3)
+def _label(ax: Axes, row: Any, n_trials: int, font: float, width_pt: float, draw: Drawing) -> None:
+    label = str(row.condition_label)
+    size = fitting_size(label, width_pt, font, bold=False)
+    ax.set_title(label, fontsize=size, fontweight="normal", pad=3)
     times = f" ({row.ratio:.2g}×)" if math.isfinite(row.ratio) else ""
     words = f"rms {1e3 * row.rms_position_m:.2g} mm{times}\nN = {n_trials}"
-    ax.text(0.98, 0.04, words, transform=ax.transAxes, ha="right", va="bottom", fontsize=font - 1.5, color=MUTED)
+    # Growth leaves the upper left empty; residuals may go anywhere, and have room made for them below.
+    x, y, side, height = (0.98, 0.03, "right", "bottom") if draw is _draw_residuals else (0.03, 0.97, "left", "top")
+    ax.text(x, y, words, transform=ax.transAxes, ha=side, va=height, fontsize=font - 1.5, color=MUTED)
     ax.tick_params(labelsize=font - 0.5, colors=INK)
     ax.locator_params(nbins=4)
 
 
 def _moving(table: pd.DataFrame, n_points: int) -> list[pd.DataFrame]:
-    """Each trial from a little before its release, thinned to what a small panel can show."""
+    """Each trial from a little before model or measurement moves, thinned to what a small panel can show."""
     parts = []
     for _, part in table.groupby("trial", sort=False):
-        begin_s = -0.08 * max(float(part["time_s"].max()), 0.0)
-        kept = part[part["time_s"] >= begin_s]
+        time_s, growth_m = (part[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
+        first_s = min(0.0, float(np.min(time_s[growth_m >= 0.01 * np.max(growth_m)])))
+        begin_s = first_s - 0.05 * (time_s[-1] - first_s)
+        kept = part[time_s >= begin_s]
         parts.append(kept.iloc[:: max(len(kept) // n_points, 1)])
     return parts
 
@@ -125,3 +131,5 @@ def _draw_residuals(ax: Axes, table: pd.DataFrame, colour: str, n_points: int) -
     for part in parts:
         left_mm = 1e3 * (part["lead_position_m"] - part["model_position_m"])
         ax.plot(1e3 * part["lead_position_m"], left_mm, color=colour, lw=0.9)
+    low, high = ax.get_ylim()
+    ax.set_ylim(low - 0.35 * (high - low), high)  # room for the words below
