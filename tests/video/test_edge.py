@@ -64,9 +64,7 @@ def test_edge_of(name, changes, sd_px, bias_px):
     error, stated = errors(plan, tracking, scene)
     assert error.std() < sd_px
     assert abs(error.mean()) < bias_px
-    # Stated errors grow where a door is seen to swing, whether or not it hides the tip: then they may be cautious.
-    cautious = 0.3 if changes.get("door") else 0.4
-    assert cautious < error.std() / np.sqrt(np.mean(stated**2)) < 2.0
+    assert 0.5 < error.std() / np.sqrt(np.mean(stated**2)) < 2.0
 
 
 @pytest.mark.parametrize("angle", [90.0, 180.0, 200.0])
@@ -99,7 +97,7 @@ def test_compressed_as_cameras_do(tmp_path):
     tracking = track_recording(trial(plan, video=path))
     error, stated = errors(plan, tracking, scene)
     assert error.std() < 0.2
-    assert 0.4 < error.std() / np.sqrt(np.mean(stated**2)) < 2.0
+    assert 0.5 < error.std() / np.sqrt(np.mean(stated**2)) < 2.0
     assert tracking.kymograph.shape[0] == len(scene.frames)
     assert len(tracking.pictures) == 3
 

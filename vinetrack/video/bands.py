@@ -6,6 +6,7 @@ Film, tail, glints and a swinging door touch one band and not another; what misl
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +64,7 @@ def band_fits(strip: Strip, state: State, edge: Floats) -> tuple[Floats, Floats]
     cuts = np.searchsorted(np.cumsum(said) / said.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
     limits = np.concatenate([[0], cuts, [rows]])
     edges, sigmas = [], []
-    for low, high in zip(limits[:-1], limits[1:], strict=True):
+    for low, high in pairwise(limits):
         if high - low < FEWEST_ROWS:
             continue
         part = replace(strip, values=np.ascontiguousarray(strip.values[:, low:high]))

@@ -33,18 +33,18 @@ from vinetrack.video.tip_shape import ASSUMED_EXPOSURE, OPTICAL_BLUR_PX, find_ex
 
 Floats = NDArray[np.float64]
 
-START_PX = 0.15
+START_PX = 0.08
 """Error near the start, where background is seen briefly or never."""
 START_REACH_PX = 25.0
 """Growth over which that error falls to 1/e."""
-DOOR_PX = 0.25
-"""What is added to that where a door crosses everything before the start."""
+DOOR_PX = 0.4
+"""What is added to that where a door crosses everything before the start and the picture departs from the model."""
 SETTLED_PX = 0.2
 """Largest change of any moving edge from one round to the next at which they are done."""
 UNFIT = 4.0
 """Factor of the bands' disagreement where no blur within reason fits: all rows err together then."""
 HIDDEN = 3.2
-"""Misfit, in units of the noise and in usual ones, above which something else stands there: the edge is a guess, and none where it is faint."""
+"""Misfit, in units of the noise and in usual ones, above which something else stands there and the edge is a guess."""
 EVIDENCE_CLIP = 2.5
 """Widths beyond which a pixel is as unlike film (or background) as can be."""
 
@@ -295,7 +295,9 @@ def _finish(strip: Strip, state: State, fit: Floats, exposure: float, passed: tu
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX)
-    doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state)) * near_start
+    close = (near_start > 0.1) & moving_frames(state.edge) & np.isfinite(strain)
+    trouble = float(np.clip((np.mean(strain[close] ** 2) - 1) / 0.7, 0, 1)) if close.any() else 0.0
+    doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state) * trouble) * near_start
     apart = disagreement(strip, state, edge_now, core) * (1 - 0.5 * near_start)
     apart = np.hypot(apart * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), doubt)
     apart = _hidden(fit, strain**2, edge_now, apart)
