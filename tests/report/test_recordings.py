@@ -35,6 +35,12 @@ def test_strip_and_motion_stand_side_by_side_and_the_motion_once() -> None:
     assert not Tags(html).wrong
 
 
+def test_how_edge_and_scale_were_found_is_said_where_there_are_recordings() -> None:
+    html = page(recordings={"a": recording()})
+    assert "<h3>Edge</h3>" in html
+    assert "<h3>Edge</h3>" not in page()
+
+
 def test_an_experiment_of_tracks_has_neither_section() -> None:
     html = page()
     assert "Recordings" not in html
@@ -59,14 +65,8 @@ def test_recordings_of_one_target_share_a_row_and_its_largest_error() -> None:
 
 
 def test_a_scale_of_the_sheet_has_an_unknown_error_and_a_row_for_each_value() -> None:
-    own = {
-        "kind": "sheet",
-        "image": None,
-        "scale_rel_sigma": None,
-        "reprojection_px": None,
-        "n_corners": 0,
-        "notes": [],
-    }
+    own: dict[str, object] = dict.fromkeys(("image", "scale_rel_sigma", "reprojection_px"))
+    own |= {"kind": "sheet", "n_corners": 0, "notes": []}
     table = calibration_table({"a": recording(**own, mm_per_px=0.3), "b": recording(**own, mm_per_px=0.4)})
     assert [(row["trials"], row["error"], row["reprojection"]) for row in table] == [
         ("a", "unknown", "–"),

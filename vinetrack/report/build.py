@@ -11,6 +11,7 @@ from vinetrack.figures.numbers import number, with_error
 from vinetrack.figures.style import RULE_NAMES, rows
 from vinetrack.report.recordings import (
     LARGEST_SVG_BYTES,
+    METHODS,
     SHARED_ERROR,
     Recording,
     calibration_table,
@@ -89,7 +90,7 @@ def build_report(content: ReportContent) -> str:
         n_strips_left_out=content.n_strips_left_out,
         calibrations=calibration_table(content.recordings),
         shared_error=SHARED_ERROR,
-        methods=methods(settings),
+        methods=[*(METHODS if content.recordings else ()), *methods(settings)],
         references=REFERENCES,
         settings=sorted(_flat(settings)),
         provenance=content.provenance,

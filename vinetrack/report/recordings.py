@@ -33,6 +33,22 @@ SHARED_ERROR = (
     "wider intervals of B include it (a scale that is off by ε moves ln B by n·ε), and n does not depend on it."
 )
 
+METHODS = (
+    (
+        "Edge",
+        "A straight strip along the axis of growth is cut from every frame and freed of flicker and shake by what "
+        "stands still beside the vine. A pixel that the vine covers changes once: its brightness before and after and "
+        "the place of the edge in every frame are found in turns, the edge by maximum likelihood from a step blurred "
+        "by optics and by its own motion, at mid-exposure. Time is the number of the frame over the rate of capture.",
+    ),
+    (
+        "Scale",
+        "Positions along the axis go through a camera with radial distortion that looks at a tilted plane, fitted to "
+        "the corners of the target; without a target, through one number.",
+    ),
+)
+"""How recordings were measured, as (heading, paragraph) pairs."""
+
 
 @dataclass(frozen=True)
 class Recording:
