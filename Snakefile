@@ -238,7 +238,7 @@ rule report_page:
         plan.result("steady.csv"),
         plan.result("fit.json"),
         plan.result("comparison.csv"),
-        plan.result("audit.csv"),
+        plan.result("model_check.csv"),
     output:
         plan.result("report.html"),
         plan.result("provenance.json"),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.numbers import number, with_error
 from vinetrack.figures.style import RULE_NAMES, rows
+from vinetrack.report.model import ModelResult, model_section
 from vinetrack.report.recordings import (
     LARGEST_SVG_BYTES,
     METHODS,
@@ -22,6 +23,9 @@ from vinetrack.report.words import REFERENCES, exponent_table, headline, methods
 
 if TYPE_CHECKING:
     import pandas as pd
+
+MODEL_FIGURES = ("model_comparison", "model_residuals")
+"""Figures that stand in the section on the model, not among the others."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,7 @@ class ReportContent:
     trial_figures: Mapping[str, str] = field(default_factory=dict)
     recordings: Mapping[str, Recording] = field(default_factory=dict)
     n_strips_left_out: int = 0
+    model: ModelResult | None = None
 
 
 def build_report(content: ReportContent) -> str:
@@ -72,6 +77,7 @@ def build_report(content: ReportContent) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((folder / "report.html").read_text(encoding="utf-8"))
     settings = content.provenance.get("settings") or {}
+    figures = [_figure(figure) for figure in content.figures if len(figure.svg) <= LARGEST_SVG_BYTES]
     return template.render(
         name=content.name,
         style=Markup((folder / "report.css").read_text(encoding="utf-8")),
@@ -80,7 +86,9 @@ def build_report(content: ReportContent) -> str:
         exponents=exponent_table(content.damping),
         without_law=without_law(content.damping),
         vines=vine_table(content.damping),
-        figures=[_figure(figure) for figure in content.figures if len(figure.svg) <= LARGEST_SVG_BYTES],
+        figures=[figure for figure in figures if figure["key"] not in MODEL_FIGURES],
+        model=model_section(content.model),
+        model_figures=[figure for figure in figures if figure["key"] in MODEL_FIGURES],
         trials=[_trial(row, content) for row in rows(content.trials)],
         recordings=[
             recording_entry(row.trial, content.recordings[row.trial], row, content.trial_figures.get(row.trial, ""))

@@ -22,6 +22,8 @@ FIGURES = {
     "exponents": ("The exponent and the coefficients, by both methods", "damping.json"),
     "scaling": ("How damping grows with size", "scaling.json"),
     "overview": ("All trials at a glance", "trials.csv"),
+    "model_comparison": ("Model and measurement", "comparison.csv"),
+    "model_residuals": ("What the model leaves", "comparison.csv"),
 }
 MAX_TRIAL_PICTURES = 60
 """With more trials their figures stay files beside the report: at 0.1 MB each the page would not open at once."""
@@ -36,6 +38,7 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
         If a stage before this one has not run.
     """
     from vinetrack.report.build import ReportContent, build_report
+    from vinetrack.report.model import ModelResult
 
     results = Results(folder)
     inputs = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace) if path]
@@ -60,6 +63,7 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
         trial_figures=_trial_figures(results, drawn) if few else {},
         recordings={name: _recording(results, name, few) for name in filmed},
         n_strips_left_out=0 if few else len(filmed),
+        model=ModelResult(read_json(results.fit), read_result(results.comparison), read_result(results.model_check)),
     )
     page = build_report(content)
     write_json(results.provenance, provenance)
@@ -72,6 +76,7 @@ def _drawn(results: Results) -> list[str]:
     damping, scaling = read_json(results.damping), read_json(results.scaling)
     empty = set() if any(damping[method]["vines"] for method in METHOD_NAMES) else {"exponents"}
     empty |= set() if scaling["isometric"] or scaling["thickness"] else {"scaling"}
+    empty |= {"model_comparison", "model_residuals"} if read_json(results.fit)["refused"] else set()
     return [name for name in FIGURES if name not in empty]
 
 

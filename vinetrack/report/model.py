@@ -1,0 +1,120 @@
+"""The model in use against the measurement, as the report shows it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.figures.numbers import number, with_error
+from vinetrack.figures.style import rows
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+READABLE = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
+"""Units that read better another way: name and factor."""
+
+EXPLAINED = (
+    "The model in use is fitted to the positions of all trials at once. Each trial is then predicted with a release "
+    "and an origin of its own, at the nominal pressure and the vine's B: what is left is the error of position. What "
+    "replicates differ by is the floor that no model can go below; a ratio near 1 leaves nothing to find. Final speeds "
+    "of the leading edge are compared at the same growth."
+)
+
+
+@dataclass(frozen=True)
+class ModelResult:
+    """`fit.json`, `comparison.csv` and `model_check.csv` of a results folder."""
+
+    fit: Mapping[str, Any]
+    comparison: pd.DataFrame
+    check: pd.DataFrame
+
+
+def model_section(result: ModelResult | None) -> dict[str, Any] | None:
+    """Everything the page says of the model, as text; None where no model was fitted or refused."""
+    if result is None:
+        return None
+    fit = result.fit
+    return {
+        "names": " + ".join(fit["model"]),
+        "refused": fit.get("refused") or "",
+        "explained": EXPLAINED,
+        "verdict": verdict(result.comparison),
+        "numbers": [_number(entry) for entry in fit.get("numbers", [])],
+        "spreads": [_spread(name, spread) for name, spread in (fit.get("spreads") or {}).items()],
+        "messages": list(fit.get("messages", [])),
+        "left_out": [f"{name}: {reason}" for name, reason in (fit.get("left_out") or {}).items()],
+        "warnings": list(fit.get("warnings", [])),
+        "conditions": [_condition(row) for row in rows(result.comparison)],
+        "check": [_check(row) for row in rows(result.check)],
+    }
+
+
+def verdict(comparison: pd.DataFrame) -> str:
+    """How far the model is off, in a sentence; blank without a condition."""
+    if not len(comparison):
+        return ""
+    worst = comparison.sort_values("rms_position_m").iloc[-1]
+    sentence = (
+        f"Over {_conditions(len(comparison))} the model is off by {number(1e3 * _rms(comparison['rms_position_m']))} mm"
+    )
+    known = comparison[comparison["replicate_floor_m"] > 0]
+    if len(known):
+        sentence += f", where replicates differ by {number(1e3 * _rms(known['replicate_floor_m']))} mm"
+    return (
+        f"{sentence} (root mean square). Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, "
+        f"most of all after {number(1e3 * worst['worst_at_m'])} mm of growth."
+    )
+
+
+def _conditions(count: int) -> str:
+    return "one condition" if count == 1 else f"{count} conditions"
+
+
+def _rms(values: pd.Series) -> float:
+    return math.sqrt(float((values**2).mean()))
+
+
+def _number(entry: Mapping[str, Any]) -> dict[str, str]:
+    unit, factor = READABLE.get(entry["unit"], (entry["unit"], 1.0))
+    low, high = (None if entry[key] is None else factor * entry[key] for key in ("low_95", "high_95"))
+    known = low is not None and high is not None
+    return {
+        "symbol": entry["symbol"],
+        "vine": entry["vine"],
+        "parameter": entry["parameter"],
+        "value": with_error(factor * entry["value"], None if entry["sigma"] is None else factor * entry["sigma"]),
+        "interval": f"{number(low)} to {number(high)}" if known else "open",
+        "unit": unit,
+    }
+
+
+def _spread(name: str, spread: Mapping[str, Any]) -> str:
+    how = "" if spread["estimated"] else ", held"
+    return f"{name} {number(100 * spread['value'], 2)} %{how}"
+
+
+def _condition(row: Any) -> dict[str, str]:
+    return {
+        "condition": row.condition,
+        "rms": number(1e3 * row.rms_position_m),
+        "floor": number(1e3 * row.replicate_floor_m),
+        "ratio": number(row.ratio, 2),
+        "speed": number(row.rms_final_velocity_m_s),
+        "worst_ms": number(1e3 * row.worst_at_s),
+        "worst_mm": number(1e3 * row.worst_at_m),
+    }
+
+
+def _check(row: Any) -> dict[str, str]:
+    return {
+        "vine": row.vine,
+        "n_steady": number(row.n_steady),
+        "n_trajectory": number(row.n_trajectory),
+        "B_steady": number(row.B_steady),
+        "B_trajectory": number(row.B_trajectory),
+        "z": number(row.z, 2),
+    }
