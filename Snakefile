@@ -38,11 +38,12 @@ if plan.is_demo:
             plan.recordings,
         log:
             plan.result("logs", "recordings.log"),
+        threads: 4  # scaled down to the cores that are given
         params:
             code=code_hash("laboratory"),
             folder=plan.experiment,
         shell:
-            "python -m vinetrack.laboratory {params.folder:q} 2>&1 | tee {log:q}"
+            "python -m vinetrack.laboratory {params.folder:q} --processes {threads} 2>&1 | tee {log:q}"
 
 
 rule recording:
