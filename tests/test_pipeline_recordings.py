@@ -207,11 +207,9 @@ def plainly_filmed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Trut
     return folder, film_all(folder, {"p36": 36}, PLAIN)["p36"]
 
 
-def run_stages(folder: Path, results: Path, trial: str, *more: str) -> dict[str, str]:
-    """Stages by their own commands, in this process; the row of the one trial."""
-    stages = [["recording", folder, trial, results], ["gather", folder, results]]
-    stages += [[stage, results] if stage == "damping" else [stage, folder, results] for stage in more]
-    for arguments in stages:
+def measured(folder: Path, results: Path, trial: str) -> dict[str, str]:
+    """Two stages by their own commands, in this process; the row of the one trial."""
+    for arguments in (["recording", folder, trial, results], ["gather", folder, results]):
         done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
         assert done.exit_code == 0, done.output
     return read_rows(results / "trials.csv")[trial]
@@ -232,7 +230,7 @@ def test_a_scale_that_is_given_serves_as_well(
 ) -> None:
     folder, truth = plainly_filmed
     write_sheet(folder, {"p36": 36}, settings)
-    row = run_stages(folder, tmp_path, "p36")
+    row = measured(folder, tmp_path, "p36")
     assert float(row["mm_per_px"]) == pytest.approx(0.24, rel=1e-9)
     assert float(row["scale_rel_sigma"]) == pytest.approx(rel_sigma, rel=1e-9, nan_ok=True)
     assert spread_px(errors_px(tmp_path, "p36", truth)) < 0.35
@@ -250,9 +248,11 @@ def test_a_falling_ball_gives_g_through_the_whole_chain(tmp_path: Path) -> None:
     (folder / "trials.csv").write_text(
         "trial,video,diameter_mm,travel_ratio,mm_per_px,capture_fps\nball,freefall.mp4,20,1,0.27307,1000\n"
     )
-    row = run_stages(folder, tmp_path / "results", "ball", "damping", "figures", "report")
+    done = snakemake(tmp_path, "--cores", "2", "--config", "experiment=fall")
+    assert done.returncode == 0, done.stdout + done.stderr
+    row = read_rows(tmp_path / "results" / "fall" / "trials.csv")["ball"]
     assert row["status"] != "failed", row["reason"]
-    track = pd.read_csv(tmp_path / "results" / "tracks" / "ball.csv", keep_default_na=False)
+    track = pd.read_csv(tmp_path / "results" / "fall" / "tracks" / "ball.csv", keep_default_na=False)
     flags = track["flag"].str.split(";")
     falling = ~flags.map({"before_release", "lost", "rejected", "duplicate", "after_end"}.intersection).astype(bool)
     assert falling.sum() > 150
