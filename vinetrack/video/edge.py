@@ -37,11 +37,11 @@ START_PX = 0.08
 """Error near the start, where background is seen briefly or never."""
 START_REACH_PX = 25.0
 """Growth over which that error falls to 1/e."""
-DOOR_PX = 0.4
+DOOR_PX = 0.5
 """What is added to that where a door crosses everything before the start and the picture departs from the model."""
 SETTLED_PX = 0.2
 """Largest change of any moving edge from one round to the next at which they are done."""
-UNFIT = 4.0
+UNFIT = 3.0
 """Factor of the bands' disagreement where no blur within reason fits: all rows err together then."""
 HIDDEN = 3.2
 """Misfit, in units of the noise and in usual ones, above which something else stands there and the edge is a guess."""

@@ -17,8 +17,8 @@ Bools = NDArray[np.bool_]
 
 LOST_SIGMA_PX = 4.0
 """A point known no better than this is no point."""
-FLOOR_PX = 0.05
-"""Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands: 0.03-0.07 px."""
+FLOOR_PX = 0.04
+"""Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands: 0.03-0.06 px."""
 STEP_RATIO = 1.6
 """A step this many times its neighbours is no acceleration: a frame is missing."""
 
@@ -155,8 +155,9 @@ def judge(
 def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
     """Distance of moving points from a parabola through their two neighbours on each side, shape (n_frames,), px.
 
-    Zero where it is less than 6 sigma or 1 px. At the end, where something may fly on: from the line through the
-    three before.
+    Zero where it is less than 6 sigma or 1 px. At the start, where a door may hide the tip at rest: by how much the
+    first step is longer than those that follow. At the end, where something may fly on: from the line through the two
+    points before.
     """
     out = np.zeros(len(y))
     for i in range(max(first, 2), min(last, len(y) - 1) - 1):  # a dead stop is no departure
@@ -168,6 +169,10 @@ def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
         spread = 1.4 * float(np.max(sigma_px[i - 2 : i + 3]))
         far = abs(y[i] - expected)
         out[i] = far if far > max(6 * spread, 1.0, bend) else 0.0
+    for i in range(max(first - 1, 1), min(first + 2, len(y) - 2)):
+        leap, later = y[i] - y[i - 1], 0.5 * (y[i + 2] - y[i])
+        if np.isfinite(leap - later) and leap > 1.2 * later + max(sigma_px[i], 0.5):
+            out[:i] = np.maximum(out[:i], leap - 0.5 * later)
     for i in range(max(first + 4, last - 2), last + 1):
         before = y[i - 4 : i]
         ahead = y[i] - 2 * before[-1] + before[-2]

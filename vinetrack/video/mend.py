@@ -14,6 +14,8 @@ Floats = NDArray[np.float64]
 
 ASTRAY_PX = 3.0
 """Error stated where nothing like the edge is found where the motion leads."""
+ASTRAY_MISFIT = 1.4
+"""How much worse a fit may be that agrees with its neighbours than one that does not."""
 FAINTEST = 0.5
 """An edge of less than this much of its contrast is another thing's."""
 LONG_REST = 8
@@ -57,6 +59,26 @@ def mend_jumps(strip: Strip, state: State, fit: Floats) -> Floats:
                 out[t] = (float(np.clip(np.nan_to_num(out[t, 0], nan=near), low, high)), ASTRAY_PX, 4 * bad, 0, 0, 0)
             else:
                 out[t] = better
+    return _smoothed_out(strip, state, out, moving, bad)
+
+
+def _smoothed_out(strip: Strip, state: State, fit: Floats, moving: NDArray[np.int_], bad: float) -> Floats:
+    """Bad fits that stray from a parabola through two neighbours on each side, sought again where it leads.
+
+    A good fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
+    """
+    out = fit.copy()
+    for t in moving[2:-2]:
+        around = out[[t - 2, t - 1, t + 1, t + 2], 0]
+        expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
+        bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
+        far = abs(out[t, 0] - expected)
+        if not np.isfinite(far) or out[t, 2] <= bad or far < max(1.5, bend):
+            continue
+        reach = max(2.0, 0.3 * far)
+        better = _best_between(strip, state, int(t), expected - reach, expected + reach, 9)
+        if better is not None and better[2] < ASTRAY_MISFIT * out[t, 2]:
+            out[t] = better
     return out
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vinetrack.records import Track, Trial
 from vinetrack.video.axis import Axis, find_axis, is_orderly
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
-from vinetrack.video.judge import LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
+from vinetrack.video.judge import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
 if TYPE_CHECKING:
@@ -122,7 +122,9 @@ def track_frames(
     repeated = _repeated(strip, found.edge_px)
     moving = np.gradient(found.edge_px) > 0.3 if len(kept) > 1 else np.ones(len(kept), bool)
     sigma = calibrated_sigma(found.edge_px, found.sigma_px, moving & np.isfinite(found.edge_px))
-    sigma = np.hypot(sigma, np.hypot(found.apart_sigma_px, STEADIED_PX if strip.steadied else 0.0))
+    # Roughness and the bands' disagreement tell of the same noise; the larger one also of what the other is blind to.
+    sigma = np.maximum(sigma, np.hypot(found.apart_sigma_px, FLOOR_PX))
+    sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
     end_px = strip.axis.length_px - found.reach_px
     verdict = judge(
         found.edge_px, sigma, frames.slot[kept], unsure=found.unsure, damaged=frames.damaged[kept],
