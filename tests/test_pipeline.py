@@ -174,6 +174,7 @@ def test_both_rules_are_reported_for_every_trial(campaign: tuple) -> None:
 def test_every_figure_is_there_as_png_and_svg(campaign: tuple) -> None:
     figures = campaign[0] / "figures"
     names = ["damping_law", "exponents", "scaling", "overview", "trial_d12_0", "trial_torn"]
+    names += ["model_comparison", "model_residuals"]
     for name in names:
         assert (figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert "<svg" in (figures / f"{name}.svg").read_text(encoding="utf-8")
@@ -243,6 +244,7 @@ def stages(experiment: Path, results: Path) -> dict[str, dict[str, str]]:
         ["tracks", str(experiment), str(results)],
         ["gather", str(experiment), str(results)],
         ["damping", str(results), "--settings", '{"damping": {"resamples": 200}}'],
+        ["model", str(experiment), str(results)],
         ["figures", str(experiment), str(results), "--settings", '{"figures": {"dpi": 50}}'],
         ["report", str(experiment), str(results)],
     ):
