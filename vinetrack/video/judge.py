@@ -5,7 +5,7 @@ Works on positions alone, in pixels by frame; who measured them does not matter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +32,10 @@ class Judgement:
 
     flag: NDArray[np.str_]
     slot: NDArray[np.int_]
-    departure_px: Floats
     notes: tuple[str, ...]
     first_moving: int
     last_moving: int
+    departure_px: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: float = 0.5) -> Floats:
@@ -149,7 +149,7 @@ def judge(
         notes.append(
             f"the leading edge is lost in {int(missing.sum())} moving frames, first frame {np.flatnonzero(missing)[0]}"
         )
-    return Judgement(np.array(flags, dtype=np.str_), slot, departure, tuple(notes), first, last)
+    return Judgement(np.array(flags, dtype=np.str_), slot, tuple(notes), first, last, departure)
 
 
 def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
