@@ -329,6 +329,7 @@ run("tracks", experiment, results)
 if "gather" in stages:
     run("gather", experiment, results)
 run("damping", results)
+run("model", experiment, results)
 run("figures", experiment, results, "--of", "campaign")
 
 from vinetrack.experiment import read_experiment
