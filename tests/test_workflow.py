@@ -193,3 +193,10 @@ def test_a_recording_depends_on_its_own_file_the_sheets_and_the_target(tmp_path:
     assert plan.filmed == {"a": (*shared, str(folder / "a.mp4")), "b": shared}
     assert plan.tracked == ()
     assert str(folder / "a.mp4") not in plan.track_inputs
+
+
+def test_a_users_own_effect_is_an_input_of_the_run(tmp_path: Path) -> None:
+    folder = experiment(tmp_path / "v")
+    (folder / "experiment.yaml").write_text("effects: [brush.py]\n")
+    (folder / "brush.py").write_text("")
+    assert make_plan({"experiment": str(folder)}, tmp_path).own_effects == [(folder / "brush.py").as_posix()]

@@ -140,7 +140,9 @@ def _fitted(
     from vinetrack.model.fit import fit
     from vinetrack.stages.tracks import model_of
 
-    found = fit(model_of(experiment), pairs)
+    model = model_of(experiment)
+    # A falling body has nothing else to find: its g tries the whole chain, from the recording to the fit.
+    found = fit(model, pairs, free=("gravity.g",) if model.names == ("gravity",) else ())
     return found, compare(found, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
 
 
