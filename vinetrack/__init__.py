@@ -5,6 +5,7 @@
     experiment = vt.read_experiment("my_experiment")
     fit = vt.fit(vt.base_model(), experiment)
     print(fit)
+    print(vt.compare(fit, experiment).table)
     print(vt.refit(fit, fit.model + vt.effects.reservoir_depletion))
 
 Whatever is named here is loaded when it is first used.
@@ -21,6 +22,7 @@ _HOMES = {
     "FitError": "vinetrack.model.fit",
     "Model": "vinetrack.model.model",
     "base_model": "vinetrack.model.model",
+    "compare": "vinetrack.diagnosis.compare",
     "fit": "vinetrack.model.fit",
     "make_model": "vinetrack.model.model",
     "predict": "vinetrack.model.fit",

@@ -145,6 +145,10 @@ def test_a_model_that_lacks_nothing_stands_at_the_floor(true_model: Comparison) 
     assert table["ratio"].max() < 2.0
 
 
+def test_it_stands_at_the_front_door() -> None:
+    assert vt.compare is compare
+
+
 def test_the_table_has_a_row_a_condition_and_the_columns_of_the_file(true_model: Comparison) -> None:
     assert tuple(true_model.table.columns) == COMPARISON_COLUMNS
     assert len(true_model.table) == 8

@@ -16,12 +16,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vinetrack.diagnosis.replicates import Replicates, first_that_counts, replicates_of
-from vinetrack.model.fit_data import Pairs
+from vinetrack.model.fit_data import Pairs, pairs_of
 from vinetrack.model.fit_result import Fit, TrialFit
 from vinetrack.model.left_out import predict_trials
 from vinetrack.model.simulate import simulate_many
@@ -31,6 +32,8 @@ from vinetrack.records import Floats, Kinematics, Track
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from vinetrack.experiment import Experiment
 
 COMPARISON_COLUMNS = (
     "model",
@@ -76,8 +79,9 @@ class Comparison:
 
 def compare(
     found: Fit,
-    pairs: Pairs,
+    experiment: Experiment | Path | str | Pairs,
     *,
+    tracks: Mapping[str, Track] | None = None,
     kinematics: Mapping[str, Kinematics] | None = None,
     final_at_fraction: float = FINAL_AT_FRACTION,
 ) -> Comparison:
@@ -85,8 +89,10 @@ def compare(
 
     Parameters
     ----------
-    pairs
-        Trials and tracks; trials that the fit did not use are passed over.
+    experiment
+        An experiment or its folder, or pairs of trial and track; trials that the fit did not use are passed over.
+    tracks
+        Tracks by name of trial, where the experiment brings recordings.
     kinematics
         By name of trial, where they are known already; else they are estimated from the tracks.
     final_at_fraction
@@ -96,14 +102,16 @@ def compare(
     ------
     FitError
         If the model cannot be followed.
+    ExperimentError
+        If the experiment cannot be read.
     """
     import pandas as pd
 
     fitted = {trial.name for trial in found.trials}
-    chosen = [(trial, track) for trial, track in pairs if trial.name in fitted]
+    chosen = [(trial, track) for trial, track in pairs_of(experiment, tracks)[0] if trial.name in fitted]
     predicted = predict_trials(found, chosen, from_rest=True)
-    tracks = {trial.name: track for trial, track in chosen}
-    errors = final_speed_errors(found, predicted, tracks, kinematics or {}, final_at_fraction)
+    measured = {trial.name: track for trial, track in chosen}
+    errors = final_speed_errors(found, predicted, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}
     for condition in dict.fromkeys(trial.trial.condition for trial in predicted):
         members = [trial for trial in predicted if trial.trial.condition == condition]
