@@ -66,5 +66,5 @@ def _difference(strip: Strip, columns: NDArray[np.int_], arrival: NDArray[np.int
 def _mean(strip: Strip, frames: slice, columns: NDArray[np.int_]) -> NDArray[np.float32]:
     """Mean brightness of some columns over some frames, shape (n_across, n_columns)."""
     values = strip.values[frames][:, :, columns].astype(np.float32)
-    values = values * strip.scale[frames, None, None] + strip.offset[frames, None, None]
-    return np.asarray(values.mean(axis=0), dtype=np.float32)
+    level = values * strip.scale[frames, None, None] + strip.offset[frames, None, None]
+    return np.asarray(level.mean(axis=0), dtype=np.float32)
