@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -46,3 +47,19 @@ def test_its_effect_is_explained_by_the_command_it_names(experiment: Path) -> No
     done = CliRunner().invoke(app, ["effects", "spring_line", "--experiment", str(experiment)])
     assert done.exit_code == 0, done.output
     assert "stiffness of the line" in done.output
+
+
+def test_its_effect_goes_through_every_stage_and_stands_in_the_provenance(experiment: Path, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    for arguments in (
+        ["tracks", experiment, results],
+        ["gather", experiment, results],
+        ["damping", results],
+        ["model", experiment, results],
+        ["figures", experiment, results, "--settings", '{"figures": {"dpi": 50}}'],
+        ["report", experiment, results],
+    ):
+        done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    assert "spring_line" in json.loads((results / "fit.json").read_text())["model"]
+    assert "spring_line.py" in json.loads((results / "provenance.json").read_text())["inputs"]

@@ -78,3 +78,12 @@ def test_without_a_fit_the_figure_says_so(draw) -> None:  # type: ignore[no-unty
 def test_a_campaign_of_many_conditions_is_cut_at_what_can_be_read() -> None:
     fig = draw_model_comparison(*campaign(MAX_PANELS + 5, n_trials=1))
     assert sum(ax.get_visible() for ax in fig.axes) == MAX_PANELS
+
+
+@pytest.mark.parametrize("draw", DRAWINGS)
+def test_a_trial_that_ends_before_its_origin_is_drawn_too(draw) -> None:  # type: ignore[no-untyped-def]
+    """A model that fails badly may put the origin anywhere where no rest was filmed."""
+    table, trajectories = campaign(1)
+    behind = {name: frame.assign(lead_position_m=frame["lead_position_m"] - 1) for name, frame in trajectories.items()}
+    (ax,) = draw(table, behind).axes
+    assert len(ax.lines) == 3

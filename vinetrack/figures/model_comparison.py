@@ -96,7 +96,8 @@ def _moving(table: pd.DataFrame, n_points: int) -> list[pd.DataFrame]:
     parts = []
     for _, part in table.groupby("trial", sort=False):
         time_s, growth_m = (part[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
-        first_s = min(0.0, float(np.min(time_s[growth_m >= 0.01 * np.max(growth_m)])))
+        begun = growth_m >= growth_m[0] + 0.01 * (np.max(growth_m) - growth_m[0])
+        first_s = min(0.0, float(np.min(time_s[begun])))
         begin_s = first_s - 0.05 * (time_s[-1] - first_s)
         kept = part[time_s >= begin_s]
         parts.append(kept.iloc[:: max(len(kept) // n_points, 1)])

@@ -44,6 +44,7 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
     inputs = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace) if path]
     target = getattr(experiment.settings.calibration, "image", None)
     inputs += [experiment.folder / target] if target is not None else []
+    inputs += [experiment.folder / path for path in experiment.settings.effects]
     shared = [path for name in ("trials.csv", "experiment.yaml") if (path := experiment.folder / name).exists()]
     provenance = describe_run(
         experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model
