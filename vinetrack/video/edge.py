@@ -312,5 +312,10 @@ def _hidden(fit: Floats, strain: Floats, edge: Floats, apart: Floats) -> Floats:
     near = edge < clear_of_start(edge) + 0.5 * CLEAR_PX
     other, odd = fit[:, 2] > HIDDEN, fit[:, 2] > HIDDEN / 2
     covered = near & (other & (fit[:, 2] > 1.12 * HIDDEN) | odd & (fit[:, 3] < 0.1 - FAINTEST)) & (strain > 2)
+    if covered.sum() > 1:
+        # A door leaves, it does not come: what stood before it was hidden too.
+        earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
+        covered |= earlier & moving_frames(edge)
+        apart = np.where(earlier, np.hypot(apart, ASTRAY_PX), apart)
     guessed = near & (other & (strain > HIDDEN) | odd & (strain > 2) & (fit[:, 3] < -0.25))
     return np.where(covered, 2 * ASTRAY_PX, np.where(guessed, np.hypot(apart, 0.7 * ASTRAY_PX), apart))
