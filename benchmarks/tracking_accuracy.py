@@ -4,8 +4,8 @@
 
 Sets: `demo` like the shipped demonstration, `hard` one recording of each harder preset of the virtual laboratory at a
 camera's bit rate, `plain` drawn by other code (tests/video/plain_scene.py). Constants of the tracker were tuned on
-seeds 1-9; seeds 101-108, 151-158 and 301-308 were looked at along the way; the tables that count are of seeds 401 and up, which
-no constant has seen.
+seeds 1-9; seeds 101-108, 151-158 and 301-308 were looked at along the way; the tables that count are of seeds 401 and
+up, which no constant has seen.
 
 SD: of tracked minus true position over moving frames, bias its mean (an origin is free in every analysis; the shape
 of the tip decides it); stated: root mean square of the stated errors; pull: SD over stated. Lost: moving frames
