@@ -124,3 +124,9 @@ def test_the_floors_name_every_room() -> None:
 def test_a_snakefile_has_rules_only() -> None:
     text = (ROOT / "Snakefile").read_text(encoding="utf-8")
     assert not [line for line in text.splitlines() if line.startswith(("def ", "class ", "    def "))]
+
+
+def test_no_two_test_files_share_a_name() -> None:
+    """Pytest imports test files by their name alone: the second of two would not be run."""
+    names = [path.name for path in (ROOT / "tests").rglob("*.py")]
+    assert sorted(names) == sorted(set(names))
