@@ -10,8 +10,8 @@ Error      largest difference of position at any frame, over the length grown, f
 LSODA      `solve_ivp(method="LSODA")` on plain floats, stopped by an event at the end of growth, at the same frames.
            For each trial the cheapest of a grid of rtol and atol whose error is no more than ours, or than 10⁻⁶ if
            ours is less. Once more with a right-hand side compiled by numba, the same settings.
-Ours       one by one through `simulate`, with all that Python does around it; all at once in `simulate_many`; and in
-           two threads of half the trials each (the kernel lets go of Python's lock).
+Ours       one by one through `simulate`, with all that Python does around it; COPIES of every trial in one call of
+           `simulate_many`; and the same laid out once by `prepare` and run again, as a fit does: in one thread, in two.
 
 Times are the best of several repeats, all in one run on one machine.
 """
@@ -23,7 +23,6 @@ import itertools
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,13 +37,14 @@ from vine_reference import G, masses, reference
 
 from vinetrack.laboratory.campaign import CAPTURE_FPS, PAPER_B, PAPER_N, Vine, paper_damping, paper_payload
 from vinetrack.model.model import base_model
-from vinetrack.model.simulate import simulate, simulate_many
+from vinetrack.model.simulate import prepare, simulate, simulate_many
 from vinetrack.records import Trial
 
 FAST_B = 3.3
 RELATIVE = 10.0 ** np.arange(-4, -11.5, -0.5)
 ABSOLUTE = (1e-1, 1e-2, 1e-4, 1e-6)
 """atol of LSODA over its rtol."""
+COPIES = 10
 TARGET = 1e-6
 
 
@@ -133,11 +133,6 @@ def cheapest(case: Case, limit: float, repeats: int) -> tuple[float, float, floa
     return min(timed) if timed else None
 
 
-def in_threads(cases: list[Case], work: Callable[[list[Case]], object]) -> None:
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(work, (cases[::2], cases[1::2])))
-
-
 def main() -> None:
     """Run and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -160,8 +155,8 @@ def main() -> None:
             parameters=values[len(chosen), chosen[0].trial.name],
         )
 
-    halves = [cases, cases[::2], cases[1::2]]
-    values = {(len(part), part[0].trial.name): rows(part) for part in halves}
+    many = cases * COPIES
+    values = {(len(part), part[0].trial.name): rows(part) for part in (cases, many)}
     lines = []
     print(f"{'trial':26}{'frames':>7}{'error':>10}{'steps':>6}{'ours µs':>9}{'LSODA µs':>10}{'error':>10}{'rtol':>9}"
           f"{'atol':>9}{'compiled':>10}{'ratio':>7}")  # fmt: skip
@@ -179,10 +174,11 @@ def main() -> None:
               f"{1e6 * found[0]:10.0f}{found[1]:10.1e}{found[2]:9.1e}{found[3]:9.1e}{1e6 * quick:10.0f}"
               f"{found[0] / alone:7.0f}", flush=True)  # fmt: skip
     table = np.array(lines)
-    all_at_once = best_of(10 * repeats, lambda: together(cases)) / len(cases)
-    threads = best_of(10 * repeats, lambda: in_threads(cases, together)) / len(cases)
-    few = [Case(c.trial, c.B, c.end_s, c.times_s[-1:], c.tail_m[-1:]) for c in cases]
-    end_only = best_of(10 * repeats, lambda: together(few)) / len(cases)
+    all_at_once = best_of(repeats, lambda: together(many)) / len(many)
+    named = [case.trial for case in many]
+    batch = prepare(model, named, [case.times_s for case in many], parameters=rows(many))
+    one_thread = best_of(2 * repeats, lambda: batch.run(threads=1)) / len(many)
+    two_threads = best_of(2 * repeats, lambda: batch.run(threads=2)) / len(many)
     plain, compiled = table[:, 2].mean(), table[:, 3].mean()
     errors = table[:, 0]
     most, usual = errors.max(), np.median(errors)
@@ -190,9 +186,9 @@ def main() -> None:
     print(f"mean over {len(cases)} trials, µs a trajectory: LSODA {1e6 * plain:.0f}, compiled {1e6 * compiled:.0f}")
     for words, seconds in (
         ("one by one", table[:, 1].mean()),
-        ("all in one call", all_at_once),
-        ("all, two threads", threads),
-        ("all in one call, last frame only", end_only),
+        (f"{len(many)} in one call", all_at_once),
+        ("the same prepared, one thread", one_thread),
+        ("the same prepared, two threads", two_threads),
     ):
         print(
             f"ours, {words:34}{1e6 * seconds:8.1f} µs {1 / seconds:10.0f} a second {plain / seconds:7.0f} × LSODA"

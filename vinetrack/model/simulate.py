@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence, Sized
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +25,9 @@ of the distance travelled on every trial of the paper's protocol (`benchmarks/in
 STATUS = ("running", "ended", "stalled", "too hard")
 
 _NOTHING = State(*(math.nan,) * len(State._fields))
+
+SMALLEST_SHARE = 64
+"""Trials, about a millisecond of work, below which another thread costs more than it saves."""
 
 Trace = tuple[Floats, Floats]
 """Times since release, s, and gauge pressures, Pa, measured there."""
@@ -99,6 +104,90 @@ def simulate_many(
     `parameters`, shape (n_trials, n_parameters) in the order of `model.parameter_names`, gives every trial values of
     its own in place of the model's.
     """
+    batch = prepare(model, trials, times_s, traces=traces, parameters=parameters)
+    out, ends = batch.run(relative_tolerance)
+    rows = itertools.pairwise(batch.starts)
+    return [_trajectory(trials[i], batch.times_s[i], out[a:b], ends[i]) for i, (a, b) in enumerate(rows)]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Many trials laid out for the compiled kernel: prepared once, run as often as one likes.
+
+    Trial i has rows `starts[i]:starts[i + 1]` of the answer. `thetas`, shape (n_trials, n_parameters), may be replaced
+    between runs as long as no effect changes between none and some.
+    """
+
+    integrate_many: Callable[..., None]
+    times_s: list[Floats]
+    starts: NDArray[np.int64]
+    times: Floats
+    on: NDArray[np.bool_]
+    rigs: Floats
+    thetas: Floats
+    trace_starts: NDArray[np.int64]
+    trace_time: Floats
+    trace_pressure: Floats
+    bend_starts: NDArray[np.int64]
+    bends: Floats
+    kinks: Floats
+    stops: Floats
+
+    def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
+        """Integrate every trial.
+
+        Parameters
+        ----------
+        threads
+            Threads to share the trials among, by default one for every 64 trials and no more than there are cores:
+            the kernel runs outside the interpreter's lock.
+
+        Returns
+        -------
+        out : array, shape (n_times, 4): x, v, a of the tail, position of the leading edge as the camera reports it
+        ends : array, shape (n_trials, 5): status, end time, end speed, number of steps, first slack
+        """
+        count = self.starts.size - 1
+        out, ends = np.empty((self.times.size, 4)), np.empty((count, 5))
+        threads = threads or max(1, min(os.cpu_count() or 1, count // SMALLEST_SHARE))
+        edges = np.linspace(0, count, threads + 1).astype(int).tolist()
+        if threads == 1:
+            self._part(0, count, relative_tolerance, out, ends)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(lambda ab: self._part(ab[0], ab[1], relative_tolerance, out, ends), itertools.pairwise(edges)))
+        return out, ends
+
+    def _part(self, a: int, b: int, relative_tolerance: float, out: Floats, ends: Floats) -> None:
+        """Trials a to b, each into its own rows of `out` and `ends`."""
+        self.integrate_many(
+            self.starts[a : b + 1],
+            self.times,
+            self.on[a:b],
+            self.rigs[a:b],
+            self.thetas[a:b],
+            self.trace_starts[a : b + 1],
+            self.trace_time,
+            self.trace_pressure,
+            self.bend_starts[a : b + 1],
+            self.bends,
+            self.kinks[a:b],
+            self.stops[a:b],
+            relative_tolerance,
+            out,
+            ends[a:b],
+        )
+
+
+def prepare(
+    model: Model,
+    trials: Sequence[Trial],
+    times_s: Sequence[Floats],
+    *,
+    traces: Sequence[Trace | None] | None = None,
+    parameters: Floats | None = None,
+) -> Batch:
+    """Lay out trials for the compiled kernel; arguments as those of `simulate_many`."""
     traces = traces or [None] * len(trials)
     check_needs(model, *trials)
     rigs = np.array([rig_of(trial) for trial in trials], dtype=float).reshape(len(trials), len(Rig._fields))
@@ -106,40 +195,34 @@ def simulate_many(
         of_vine = {vine: model.parameters_for(vine) for vine in {trial.vine for trial in trials}}
         parameters = np.array([of_vine[trial.vine] for trial in trials])
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(len(trials), len(model.parameter_names))
-    starts = np.concatenate([[0], np.cumsum([len(times) for times in times_s])]).astype(np.int64)
-    trace_starts = np.concatenate([[0], np.cumsum([0 if t is None else len(t[0]) for t in traces])]).astype(np.int64)
-    bends = [[(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends] for trial in trials]
-    bend_starts = np.concatenate([[0], np.cumsum([len(rows) for rows in bends])]).astype(np.int64)
     given = [trace for trace in traces if trace is not None]
-    trace_time = np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0)
-    trace_pressure = np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0)
+    bends = [[(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends] for trial in trials]
     on = effects_on(model, thetas)
     kinks, stops = _limits(model, rigs, thetas, on, trials)
     given_times = [np.asarray(t, dtype=float) for t in times_s]
     true_times = _true_times(model, rigs, thetas, on, given_times)
-    times = np.concatenate(true_times) if true_times else np.empty(0)
-    out, ends = np.empty((times.size, 4)), np.empty((len(trials), 5))
     tail_free = any(rig[Rig._fields.index("tail_free")] for rig in rigs)
-    kernel(model.effects, bool(tail_free)).integrate_many(
-        starts,
-        times,
-        on,
-        rigs,
-        thetas,
-        trace_starts,
-        trace_time,
-        trace_pressure,
-        bend_starts,
-        np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
-        kinks,
-        stops,
-        relative_tolerance,
-        out,
-        ends,
+    return Batch(
+        integrate_many=kernel(model.effects, bool(tail_free)).integrate_many,
+        times_s=given_times,
+        starts=_starts(given_times),
+        times=np.concatenate(true_times) if true_times else np.empty(0),
+        on=on,
+        rigs=rigs,
+        thetas=thetas,
+        trace_starts=_starts([() if trace is None else trace[0] for trace in traces]),
+        trace_time=np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0),
+        trace_pressure=np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0),
+        bend_starts=_starts(bends),
+        bends=np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
+        kinks=kinks,
+        stops=stops,
     )
-    return [
-        _trajectory(trials[i], given_times[i], out[a:b], ends[i]) for i, (a, b) in enumerate(itertools.pairwise(starts))
-    ]
+
+
+def _starts(parts: Sequence[Sized]) -> NDArray[np.int64]:
+    """Where each part begins when all are laid end to end, and where the last ends, shape (n_parts + 1,)."""
+    return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
 
 
 def _limits(
@@ -208,9 +291,11 @@ def _trajectory(trial: Trial, times_s: Floats, out: Floats, end: Floats) -> Traj
 
 
 __all__ = [
+    "Batch",
     "SimulationError",
     "Trajectory",
     "check_needs",
+    "prepare",
     "rig_of",
     "simulate",
     "simulate_many",
