@@ -155,7 +155,10 @@ class Batch:
             self._part(0, count, relative_tolerance, out, ends)
         else:
             with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(lambda ab: self._part(ab[0], ab[1], relative_tolerance, out, ends), itertools.pairwise(edges)))
+                rest = relative_tolerance, out, ends
+                shares = [pool.submit(self._part, a, b, *rest) for a, b in itertools.pairwise(edges)]
+                for share in shares:
+                    share.result()
         return out, ends
 
     def _part(self, a: int, b: int, relative_tolerance: float, out: Floats, ends: Floats) -> None:
