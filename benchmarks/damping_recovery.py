@@ -11,7 +11,8 @@ yield       the stated yield pressure of each vine is off by 0.2 kPa (standard d
 reservoir   a chamber of 1 L that nothing refills, adiabatic; once analysed with the set pressure, once with a
 measured trace
 
-Seeds 0–99 were used while the steady rule and the fits were built; seeds from 1000 score.
+Seeds 0–99 were used while the steady rule and the fits were built. Those from 1000 to 1519 had been looked at when
+the rule on half-steady conditions was chosen; seeds from 5000 score.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--campaigns", type=int, default=500)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--first-seed", type=int, default=1000)
+    parser.add_argument("--first-seed", type=int, default=5000)
     parser.add_argument("--natures", nargs="+", choices=NATURES, default=list(NATURES))
     parser.add_argument("--rows", type=Path, help="keep a row a campaign and fit here, and go on from what it holds")
     given = parser.parse_args()

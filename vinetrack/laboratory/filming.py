@@ -6,7 +6,6 @@ recording can be held against it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -91,8 +90,3 @@ def picture_target(filming: Filming, path: Path, seed: int = 0) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
-
-
-def total_frames(grown: Sequence[VirtualTrial]) -> int:
-    """Frames that filming these trials takes."""
-    return sum(int(trial.track.time_s.size) for trial in grown)

@@ -59,10 +59,15 @@ def steady_force(
         force_N=(pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N,
         sigma_N=sigma_Pa * trial.area_m2,
         yield_sigma_N=trial.yield_pressure_sigma_Pa * trial.area_m2,
-        paper_N=(trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2,
+        paper_N=paper_force_N(trial),
         window_pressure_Pa=pressure_Pa,
         pressure_source=source,
     )
+
+
+def paper_force_N(trial: Trial) -> float:
+    """Force by the published rule, (P − P_y)A with the set pressure and without weight, N."""
+    return (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
 
 
 def known_pressure(trial: Trial, track: Track, kinematics: Kinematics, release: Release, model: Model) -> Floats | None:

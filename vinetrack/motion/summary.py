@@ -9,7 +9,14 @@ from dataclasses import dataclass
 from vinetrack.effects import EffectError
 from vinetrack.model.model import Model
 from vinetrack.motion.efficiency import energy_efficiency, lead_velocity_at
-from vinetrack.motion.force import SteadyForce, known_pressure, steady_force, why_not_force, why_not_in_fit
+from vinetrack.motion.force import (
+    SteadyForce,
+    known_pressure,
+    paper_force_N,
+    steady_force,
+    why_not_force,
+    why_not_in_fit,
+)
 from vinetrack.motion.quasi_steady import quasi_steady_window
 from vinetrack.motion.release import Release, find_release, flag_rest
 from vinetrack.motion.steady import gated_window, paper_window, user_window
@@ -175,7 +182,7 @@ def _point(trial: Trial, window: Window | None, paper: Window, force: SteadyForc
         "yield_force_sigma_N": force.yield_sigma_N if force else nan,
         "pressure_source": force.pressure_source if force else "",
         "x_ss_paper_m_s": paper.x_ss_m_s if paper.accepted else nan,
-        "force_paper_N": (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2,
+        "force_paper_N": paper_force_N(trial),
         "eligible": not why_not_in_fit(trial),
         "used": not reason,
         "reason": reason,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from vinetrack.records import Floats, Trial
+from numpy.typing import NDArray
+
+from vinetrack.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
@@ -55,6 +56,10 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     recording = inspect_recording(trial.video)
     capture_fps = capture_rate(trial, recording.capture_fps)
     calibration = _calibration(trial, settings, folder, recording.width, recording.height)
+    if calibration is None and not math.isfinite(trial.m_per_px):
+        raise RecordingError(
+            f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
+        )
     frames = read_frames(recording)
     m_per_px, rel_sigma, position_m = trial.m_per_px, math.nan, None
     axis = _given_axis(settings, m_per_px if calibration is None else calibration.m_per_px)
@@ -62,27 +67,11 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
         axis = axis or _found_axis(frames.luma, trial)
         along = calibration.along(axis.from_px, axis.to_px)
         m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
-    elif not math.isfinite(m_per_px):
-        raise RecordingError(
-            f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
-        )
-    tracking = _tracked(frames, trial, capture_fps, axis, m_per_px, position_m, calibration)
-    return Measurement(tracking, m_per_px, rel_sigma, calibration)
-
-
-def _tracked(
-    frames: object,
-    trial: Trial,
-    capture_fps: float,
-    axis: Axis | None,
-    m_per_px: float,
-    position_m: Callable[[Floats], Floats] | None,
-    calibration: PlaneCalibration | None,
-) -> Tracking:
-    tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)  # type: ignore[arg-type]
+    tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
     # What is to be said of a scale that was merely given belongs to the experiment, not to each of its trials.
     notes = calibration.notes if calibration is not None and math.isfinite(calibration.reprojection_px) else ()
-    return replace(tracking, track=replace(tracking.track, notes=(*tracking.track.notes, *notes)))
+    tracking = replace(tracking, track=replace(tracking.track, notes=(*tracking.track.notes, *notes)))
+    return Measurement(tracking, m_per_px, rel_sigma, calibration)
 
 
 def _calibration(
@@ -106,8 +95,8 @@ def _given_axis(settings: ExperimentSettings, m_per_px: float) -> Axis | None:
     return Axis((from_x, from_y), (to_x, to_y), width_px)
 
 
-def _found_axis(luma: object, trial: Trial) -> Axis:
+def _found_axis(luma: NDArray[Any], trial: Trial) -> Axis:
     try:
-        return find_axis(luma)  # type: ignore[arg-type]
+        return find_axis(luma)
     except RecordingError as error:
         raise RecordingError(f"{trial.video.name if trial.video else trial.name}: {error}") from error
