@@ -1,0 +1,180 @@
+"""What a diagnosis says, in the shape of `diagnosis.json`.
+
+A diagnosis is a list of rounds. Each takes a model, asks of every candidate whether it is missing, and gives one of
+five verdicts; while the verdict is `missing` the effect is added and the next round asks again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.model.fit_result import Fit, Number
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
+    "adequate",
+    "missing",
+    "ambiguous",
+    "artefact",
+    "unexplained",
+)
+
+REFITTED, SCREENED, NOT_TESTABLE = STATUSES = ("refitted", "screened", "not testable here")
+"""How much is known of a candidate: its own fit, only what the sensitivities predict, or why these data are blind."""
+
+DROPPED_FRAMES = "dropped_frames"
+"""Stands in an answer set where frames are missing from a recording: a fault of the measurement without a formula."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect held against the data: a row of the ranking.
+
+    `delta_chi2` is by how much −2 ln L falls when it is added (predicted from sensitivities where only `screened`), and
+    `sigma` what that is worth in standard deviations for the numbers it brings. `numbers` are its sizes with errors
+    and 95 % intervals. `largest` maps each parameter to the largest size that could still hide, one-sided 95 %.
+    `reason` says in words why it is not testable, or not plausible, or another's limit.
+    """
+
+    effect: str
+    kind: str
+    status: str
+    delta_chi2: float = math.nan
+    sigma: float = math.nan
+    numbers: tuple[Number, ...] = ()
+    plausible: bool = True
+    in_answer_set: bool = False
+    reason: str = ""
+    largest: Mapping[str, float] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """As an entry of `ranking`."""
+        return {
+            "effect": self.effect,
+            "kind": self.kind,
+            "status": self.status,
+            "delta_chi2": self.delta_chi2,
+            "sigma": self.sigma,
+            "numbers": [number_entry(number) for number in self.numbers],
+            "plausible": self.plausible,
+            "in_answer_set": self.in_answer_set,
+            "reason": self.reason,
+            "largest": dict(self.largest),
+        }
+
+
+@dataclass(frozen=True)
+class Round:
+    """One model questioned.
+
+    `ranking` has the best candidate first, those not testable last. `cosines` tells how alike what two candidates do
+    to the trajectories looks once all that is fitted anyway is taken away: names, and a matrix in their order.
+    `fit` is that of the model, `fits` those of the hypotheses by name of effect.
+    """
+
+    model: tuple[str, ...]
+    verdict: str
+    answer_set: tuple[str, ...]
+    ranking: tuple[Candidate, ...]
+    explanation: str
+    cosine_names: tuple[str, ...] = ()
+    cosines: Sequence[Sequence[float]] = ()
+    fit: Fit | None = None
+    fits: Mapping[str, Fit] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """As an entry of `rounds`."""
+        return {
+            "model": list(self.model),
+            "verdict": self.verdict,
+            "answer_set": list(self.answer_set),
+            "explanation": self.explanation,
+            "ranking": [candidate.to_json() for candidate in self.ranking],
+            "cosines": {"effects": list(self.cosine_names), "matrix": [list(row) for row in self.cosines]},
+        }
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole answer. Printed, it is what a person reads on the terminal.
+
+    `effects` are those added, in order; `fits` the model the user came with and every one after it. `drift` holds a row
+    a drifting parameter, `ladder` the errors before and after (None where not computed), `next_experiment` what
+    to do now where something is tied.
+    """
+
+    rounds: tuple[Round, ...]
+    effects: tuple[str, ...]
+    explanation: str
+    fits: tuple[Fit, ...] = ()
+    verdict_override: str = ""
+    ladder: pd.DataFrame | None = None
+    drift: Sequence[Mapping[str, Any]] = ()
+    where: Sequence[str] = ()
+    next_experiment: Mapping[str, Any] | None = None
+    missing_force: Mapping[str, Any] | None = None
+    notes: Sequence[str] = ()
+
+    @property
+    def verdict(self) -> str:
+        """About the model the user came with."""
+        return self.verdict_override or self.rounds[0].verdict
+
+    @property
+    def final_verdict(self) -> str:
+        """About the model with everything added."""
+        return self.rounds[-1].verdict
+
+    @property
+    def answer_set(self) -> tuple[str, ...]:
+        """Every hypothesis that the data cannot exclude for the first effect that is missing."""
+        return self.rounds[0].answer_set
+
+    @property
+    def fit(self) -> Fit:
+        """The last model fitted."""
+        return self.fits[-1]
+
+    def to_json(self) -> dict[str, Any]:
+        """As `diagnosis.json` holds it; numbers in SI units."""
+        return {
+            "verdict": self.verdict,
+            "effects": list(self.effects),
+            "answer_set": list(self.answer_set),
+            "explanation": self.explanation,
+            "final_verdict": self.final_verdict,
+            "rounds": [one.to_json() for one in self.rounds],
+            "parameters": [number_entry(number) for number in self.fit.numbers] if self.fits else [],
+            "cosines": self.rounds[0].to_json()["cosines"],
+            "where": list(self.where),
+            "drift": [dict(row) for row in self.drift],
+            "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
+            "missing_force": None if self.missing_force is None else dict(self.missing_force),
+            "notes": list(self.notes),
+        }
+
+    def __str__(self) -> str:
+        from vinetrack.diagnosis.words import printed
+
+        return printed(self)
+
+
+def number_entry(number: Number) -> dict[str, Any]:
+    """A fitted number as files hold it, SI."""
+    return {
+        "parameter": number.key,
+        "vine": number.vine,
+        "symbol": number.symbol,
+        "unit": number.unit,
+        "value": number.value,
+        "sigma": number.sigma,
+        "low_95": number.low,
+        "high_95": number.high,
+        "interval": number.method,
+        "bound": number.bound,
+    }
