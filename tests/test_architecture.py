@@ -14,7 +14,7 @@ PACKAGE = ROOT / "vinetrack"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    {"constants", "records", "problems"},
+    {"constants", "published", "records", "problems"},
     {"tables", "yamlfile", "columns", "naming", "settings"},
     {"sheet", "experiment", "video"},
     {"effects"},

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vinetrack import published
 from vinetrack.naming import with_names
 from vinetrack.records import Trial
 
-CAPTURE_FPS = 1069.0
-PAPER_B = {1: 0.57, 2: 1.83, 3: 4.54, 4: 6.44}
-PAPER_N = 0.37
-PAPER_CHAMBER_M3 = 3.7e-3
+CAPTURE_FPS = published.CAPTURE_FPS
+PAPER_B = {vine.scale: vine.B for vine in published.VINES}
+PAPER_N = published.N
 
 
 @dataclass(frozen=True)
