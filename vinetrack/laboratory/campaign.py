@@ -17,8 +17,8 @@ from vinetrack.naming import with_names
 from vinetrack.records import Trial
 
 CAPTURE_FPS = published.CAPTURE_FPS
-PAPER_B = {vine.scale: vine.B for vine in published.VINES}
-PAPER_N = published.N
+PAPER_B = published.DAMPING_B
+PAPER_N = published.EXPONENT
 
 
 @dataclass(frozen=True)
