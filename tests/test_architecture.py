@@ -16,21 +16,23 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = (
     {"constants", "published", "records", "problems"},
     {"tables", "yamlfile", "columns", "naming", "settings"},
-    {"sheet", "experiment", "video"},
+    {"sheet", "experiment", "planned", "video"},
     {"effects"},
     {"model", "motion"},
+    {"design"},
     {"diagnosis"},
     {"laboratory"},
     {"provenance", "figures"},
     {"report"},
     {"stages"},
+    {"explorer"},
     {"workflow"},
-    {"cli"},
+    {"cli", "cli_design"},
 )
 """From the ground up; a room may use its own floor and those below. `experiment` looks into tracks (video)."""
 
 HEAVY = {"matplotlib", "cv2", "skimage", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
-HEAVY_AT_IMPORT = {"model", "effects", "motion", "laboratory", "video", "diagnosis", "explorer"}
+HEAVY_AT_IMPORT = {"model", "effects", "motion", "laboratory", "video", "diagnosis", "explorer", "design"}
 """Rooms that compute: whoever imports them wants what they stand on. All others must start at once."""
 
 
