@@ -14,7 +14,7 @@ PACKAGE = ROOT / "vinetrack"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 FLOORS = (
-    {"constants", "published", "records", "problems"},
+    {"constants", "published", "records", "problems", "terminal"},
     {"tables", "yamlfile", "columns", "naming", "settings"},
     {"sheet", "experiment", "planned", "video"},
     {"effects"},
@@ -27,7 +27,7 @@ FLOORS = (
     {"stages"},
     {"explorer"},
     {"workflow"},
-    {"cli", "cli_design"},
+    {"cli", "cli_design", "cli_explore"},
 )
 """From the ground up; a room may use its own floor and those below. `experiment` looks into tracks (video)."""
 

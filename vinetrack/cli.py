@@ -7,6 +7,8 @@ log, where the traceback is.
 from __future__ import annotations
 
 import logging
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,12 +63,13 @@ def check(experiment: ExperimentPath) -> None:
     """Check the sheet, settings, tracks and videos, in seconds, before any work."""
     with _sentences(None):
         from vinetrack.experiment import check_experiment, format_problems
+        from vinetrack.terminal import severity_first
         from vinetrack.video.survey import survey
         from vinetrack.workflow import find_experiment
 
         problems = check_experiment(find_experiment(experiment), survey)
         for line in format_problems(problems):
-            typer.echo(line)
+            typer.echo(severity_first(line))
         if any(problem.severity == "error" for problem in problems):
             raise typer.Exit(1)
         if not problems:
@@ -243,6 +246,10 @@ def _sentences(log: Path | None) -> Iterator[None]:
         _stop("\n".join(format_problems(error.problems)))
     except KeyboardInterrupt:
         _stop("Stopped; what was finished is kept.")
+    except BrokenPipeError:
+        # Whoever reads (`| head`) has seen enough; Python would complain once more when it closes the pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(1) from None
     except Exception as error:
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if type(error).__name__ in ("ResultsError", "EffectError", "TableError"):
@@ -252,7 +259,9 @@ def _sentences(log: Path | None) -> Iterator[None]:
 
 
 def _stop(message: str) -> None:
-    typer.echo(message, err=True)
+    from vinetrack.terminal import severity_first
+
+    typer.echo("\n".join(severity_first(line, sys.stderr) for line in message.splitlines()), err=True)
     raise typer.Exit(1)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from vinetrack.effects._base import KINDS, Effect, Parameter
+from vinetrack.terminal import table
 
 _HEAD = ("name", "kind", "parameters")
 
@@ -19,11 +20,9 @@ def listing(effects: Iterable[Effect], own: Mapping[str, Effect] | None = None) 
         entries.append(
             (effect.name, f"{effect.kind}, own" if effect in mine else effect.kind, parameters, effect.formula)
         )
-    widths = [max(len(row[i]) for row in [_HEAD, *entries]) for i in range(2)]
-    lines = [f"{_HEAD[0]:<{widths[0]}}  {_HEAD[1]:<{widths[1]}}  {_HEAD[2]}"]
-    for name, kind, parameters, formula in entries:
-        lines += [f"{name:<{widths[0]}}  {kind:<{widths[1]}}  {parameters}", f"    {formula}"]
-    return lines
+    head, *lines = table([entry[:3] for entry in entries], _HEAD)
+    below = [f"    {entry[3]}" for entry in entries]
+    return [head, *(line for pair in zip(lines, below, strict=True) for line in pair)]
 
 
 def explanation(effect: Effect) -> list[str]:
@@ -43,11 +42,8 @@ def explanation(effect: Effect) -> list[str]:
 
 def _parameter_table(effect: Effect) -> list[str]:
     head = ("symbol", "unit", "default", "bounds", "plausible", "no size at", "one for", "meaning")
-    rows = [head, *(_cells(effect, parameter) for parameter in effect.parameters)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    return [
-        "  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
+    rows = [_cells(effect, parameter) for parameter in effect.parameters]
+    return table(rows, head, indent="  ", align="<" * len(head))
 
 
 def _cells(effect: Effect, p: Parameter) -> tuple[str, ...]:

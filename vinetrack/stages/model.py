@@ -246,15 +246,12 @@ def comparison_lines(folder: Path) -> list[str]:
         If the model has not been fitted there.
     """
     from vinetrack.figures.style import rows
+    from vinetrack.terminal import table as aligned
 
     results = Results(folder)
     content, table = read_json(results.fit), read_result(results.comparison)
     if content["refused"]:
         return [f"{' + '.join(content['model'])} was not fitted: {content['refused']}"]
-    head = (
-        ("condition", "rms position", "replicates", "ratio", "rms final speed", "worst at", ""),
-        ("", "mm", "mm", "", "m/s", "ms", "mm"),
-    )
     body = [
         (
             str(row.condition),
@@ -267,10 +264,8 @@ def comparison_lines(folder: Path) -> list[str]:
         )
         for row in rows(table)
     ]
-    widths = [max(len(row[k]) for row in (*head, *body)) for k in range(len(head[0]))]
-    lines = [
-        "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in (*head, *body)
-    ]
+    head = ("condition", "rms position", "replicates", "ratio", "rms final speed", "worst at", "")
+    lines = aligned(body, head, ("", "mm", "mm", "", "m/s", "ms", "mm"), align="<>>>>>>")
     return [" + ".join(content["model"]), *lines, *(f"! {message}" for message in content["messages"])]
 
 

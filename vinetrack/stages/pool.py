@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import TypeVar
 
+from vinetrack.terminal import progress
+
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
@@ -22,14 +24,11 @@ def map_trials(
 
     `function` and items travel to other processes, so both must be picklable.
     """
-    from tqdm import tqdm
-
-    bar = {"total": len(items), "desc": label, "unit": "trial", "disable": not sys.stderr.isatty(), "leave": True}
     if n_workers < 2 or len(items) < SMALLEST_POOL:
-        yield from tqdm(map(function, items), **bar)
+        yield from progress(map(function, items), label, total=len(items))
         return
     # Workers that start as copies are ready at once; where the system cannot copy, they import what they need.
     method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
     chunk = max(len(items) // (8 * n_workers), 1)
     with ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context(method)) as pool:
-        yield from tqdm(pool.map(function, items, chunksize=chunk), **bar)
+        yield from progress(pool.map(function, items, chunksize=chunk), label, total=len(items))

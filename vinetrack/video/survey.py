@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.problems import Problem
 from vinetrack.records import Trial
 from vinetrack.settings import Axis, ExperimentSettings
+from vinetrack.terminal import progress
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.track import FEWEST_FRAMES, capture_rate
 
@@ -38,7 +39,7 @@ def survey(experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
     """
     problems: list[Problem] = []
     opened: dict[Trial, Recording] = {}
-    for trial in trials:
+    for trial in progress(list(trials), "recordings", unit="recording"):
         try:
             opened[trial] = recording = inspect_recording(trial.video or Path())
             found = _judge(trial, recording)

@@ -1,0 +1,219 @@
+"""What a person sees on the terminal: aligned tables with units, bars with the time left, colour where it is wanted.
+
+Bars go to standard error and show on a terminal only; what is piped, logged or run by a workflow stays plain. Colour
+is for a terminal that has not declined it (https://no-color.org).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import threading
+import unicodedata
+from collections.abc import Iterable, Iterator, Sequence, Sized
+from types import TracebackType
+from typing import Any, Generic, TextIO, TypeVar
+
+Item = TypeVar("Item")
+
+SHOWS_AFTER_S = 0.5
+"""What is done by then needs no bar; what takes two seconds has had one for most of them."""
+
+GAP = "  "
+CODES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "blue": "34", "cyan": "36"}
+SEVERITIES = {"error": "red", "warning": "yellow"}
+
+_STYLED = re.compile(r"\x1b\[[0-9;]*m")
+_NUMBER = re.compile(
+    r"[<>~≤≥≈]?\s*[+\-−±×]?\s*\d[\d.,]*(?:[eE][+\-−]?\d+)?\s*[%×]?(?:\s*±\s*[\d.,]+(?:[eE][+\-]?\d+)?)?"
+)
+_NOTHING = frozenset({"", "–", "-", "—", "nan", "open"})
+
+
+def colour_wanted(stream: TextIO | None = None) -> bool:
+    """Whether a stream, by default standard output, is a terminal that wants colour."""
+    stream = stream or sys.stdout
+    if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return False
+    return stream.isatty()
+
+
+def styled(text: str, *styles: str, stream: TextIO | None = None) -> str:
+    """The text in these styles (see `CODES`) where the stream wants colour, else as it is."""
+    if not styles or not text or not colour_wanted(stream):
+        return text
+    return f"\x1b[{';'.join(CODES[style] for style in styles)}m{text}\x1b[0m"
+
+
+def severity_first(line: str, stream: TextIO | None = None) -> str:
+    """A line of `format_problems` with its first word in the colour of how bad it is."""
+    word, colon, rest = line.partition(":")
+    return styled(word, SEVERITIES[word], "bold", stream=stream) + colon + rest if word in SEVERITIES else line
+
+
+def width(text: str) -> int:
+    """Columns that a text takes on a terminal: styles and combining marks take none, wide characters two."""
+    plain = _STYLED.sub("", text)
+    return sum(
+        0 if unicodedata.combining(char) else 2 if unicodedata.east_asian_width(char) in "WF" else 1 for char in plain
+    )
+
+
+def table(
+    rows: Iterable[Sequence[object]],
+    header: Sequence[str] = (),
+    units: Sequence[str] = (),
+    *,
+    indent: str = "",
+    align: str = "",
+) -> list[str]:
+    """Rows as lines of aligned columns: numbers to the right, words to the left.
+
+    Parameters
+    ----------
+    rows
+        Cells of each row, as many in each; what is no text is written by `str`.
+    header, units
+        Names of the columns and, on a line of their own, their units.
+    align
+        A letter a column, `<` or `>`, in place of what the cells look like.
+
+    >>> table([("a", "1.5"), ("b", "12.0")], header=("trial", "rms"), units=("", "mm"))
+    ['trial   rms', '         mm', 'a       1.5', 'b      12.0']
+    """
+    body = [[str(cell) for cell in row] for row in rows]
+    above = [list(line) for line in (header, units) if line]
+    lines = [*above, *body]
+    if not lines:
+        return []
+    count = max(map(len, lines))
+    lines = [line + [""] * (count - len(line)) for line in lines]
+    sides = align or "".join(
+        ">" if _is_numeric([line[k] for line in lines[len(above) :]]) else "<" for k in range(count)
+    )
+    widths = [max(width(line[k]) for line in lines) for k in range(count)]
+    return [(indent + GAP.join(map(_padded, line, widths, sides))).rstrip() for line in lines]
+
+
+def _padded(cell: str, columns: int, side: str) -> str:
+    room = " " * (columns - width(cell))
+    return room + cell if side == ">" else cell + room
+
+
+def _is_numeric(cells: Sequence[str]) -> bool:
+    """Whether a column holds numbers, or marks where there is none."""
+    known = [cell for cell in (_STYLED.sub("", cell).strip() for cell in cells) if cell not in _NOTHING]
+    return bool(known) and all(_NUMBER.fullmatch(cell) for cell in known)
+
+
+class Progress(Generic[Item]):
+    """A bar with the time left, or where the end is unknown the time that has gone: see `progress`."""
+
+    def __init__(self, items: Iterable[Item] | None, total: int | None, description: str, unit: str) -> None:
+        from tqdm import tqdm
+
+        self._items = items
+        known = {"bar_format": None if total is not None else "{desc}: {n_fmt} {unit} [{elapsed}{postfix}]"}
+        self._bar: Any = tqdm(
+            total=total,
+            desc=description,
+            unit=unit,
+            delay=SHOWS_AFTER_S,
+            disable=not sys.stderr.isatty(),
+            dynamic_ncols=True,
+            leave=False,
+            file=sys.stderr,
+            **known,
+        )
+
+    def advance(self, count: int = 1) -> None:
+        """So many more are done."""
+        self._bar.update(count)
+
+    def reach(self, done: int) -> None:
+        """So many are done in all."""
+        self._bar.update(done - self._bar.n)
+
+    def say(self, words: str) -> None:
+        """Show what is being done right now behind the bar."""
+        self._bar.set_postfix_str(words, refresh=False)
+
+    def __iter__(self) -> Iterator[Item]:
+        with self:
+            for item in self._items or ():
+                yield item
+                self.advance()
+
+    def __enter__(self) -> Progress[Item]:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.close()
+
+
+def progress(
+    work: Iterable[Item] | int, description: str, *, total: int | None = None, unit: str = "trial"
+) -> Progress[Item]:
+    """A bar on standard error, on a terminal only, for what takes longer than half a second.
+
+    Parameters
+    ----------
+    work
+        Things to go through, or how many steps there will be. Where nobody knows, see `waiting`.
+    description
+        What is being done, a word or two.
+    total
+        How many there will be, for an iterable that cannot tell.
+
+    >>> [item for item in progress(["a", "b"], "trials")]
+    ['a', 'b']
+    >>> with progress(3, "effects", unit="effect") as bar:
+    ...     bar.advance()
+    """
+    if isinstance(work, int):
+        return Progress(None, work, description, unit)
+    known = len(work) if total is None and isinstance(work, Sized) else total
+    return Progress(work, known, description, unit)
+
+
+class waiting:  # noqa: N801 - used as a context, like a function
+    """Show that something goes on whose length nobody knows: a sign of life and the time that has gone.
+
+    >>> with waiting("compiling the model"):
+    ...     pass
+    """
+
+    SIGNS = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
+    STEP_S = 0.1
+
+    def __init__(self, description: str) -> None:
+        self.description = description
+        self._done = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> waiting:
+        if sys.stderr.isatty():
+            self._thread = threading.Thread(target=self._turn, daemon=True)
+            self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._done.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _turn(self) -> None:
+        turns = 0
+        while not self._done.wait(self.STEP_S):
+            turns += 1
+            gone_s = turns * self.STEP_S
+            if gone_s >= SHOWS_AFTER_S:
+                sign = self.SIGNS[turns % len(self.SIGNS)]
+                print(f"\r{sign} {self.description} … {gone_s:.0f} s", end="", file=sys.stderr, flush=True)
+        if turns * self.STEP_S >= SHOWS_AFTER_S:
+            print("\r\x1b[2K", end="", file=sys.stderr, flush=True)
