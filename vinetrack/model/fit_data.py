@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,7 +53,7 @@ class FitTrial:
     correlation: float
     trace: tuple[Floats, Floats] | None = None
 
-    @property
+    @cached_property
     def frame_s(self) -> float:
         """Spacing of the points, s."""
         return float(np.median(np.diff(self.time_s)))
