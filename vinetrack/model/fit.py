@@ -54,6 +54,7 @@ def fit(
     spreads: tuple[float, float] | None = None,
     noise: tuple[float, float] | None = None,
     profile: bool = True,
+    host: Model | None = None,
 ) -> Fit:
     """Fit a model to all trials of an experiment.
 
@@ -76,6 +77,8 @@ def fit(
         Standard deviation of a position, m, and its lag-one correlation, in place of their estimates.
     profile
         Whether intervals near a bound are found by profile, which costs a few refits each.
+    host
+        A larger model whose compiled form serves this one and every `refit` that follows: nothing is compiled anew.
 
     Raises
     ------
@@ -95,7 +98,7 @@ def fit(
     fixed, free = tuple(fixed), tuple(free)
     options = {"fixed": fixed, "free": free, "shared": dict(shared or {})}
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
-    predictor = Predictor(layout, data)
+    predictor = Predictor(layout, data, host)
     held = _held(spreads, noise, data)
     solution = _solve_from_scratch(predictor, held)
     return assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
@@ -187,7 +190,8 @@ def refit(
     }
     shared = {name: how for name, how in before.options["shared"].items() if _belongs(name, names)}
     layout = make_layout(model, data, fixed=kept["fixed"], free=kept["free"], shared=shared)
-    predictor = Predictor(layout, data)
+    host = before.predictor.host
+    predictor = Predictor(layout, data, host if host is not None and set(model.names) <= set(host.names) else None)
     theta = layout.start
     values = {number.name: number.value for number in before.numbers}
     for k, number in enumerate(layout.free):

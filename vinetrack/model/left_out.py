@@ -38,7 +38,7 @@ def predict_trials(found: Fit, pairs: Pairs, *, from_rest: bool = False) -> list
         found = replace(found, noise_correlation=0.0)
     data = [_known_yield(found, _prepared(trial, track)) for trial, track in pairs]
     layout = _nothing_free(found, data)
-    predictor = Predictor(layout, data)
+    predictor = Predictor(layout, data, found.predictor.host)
     nothing = np.empty(0)
     try:
         own, _ = align(data, predictor, nothing, first_own(data))

@@ -136,6 +136,26 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
     return on
 
 
+def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
+    """Parameters of a model as those of a larger one that holds it, shape (n_trials, n_parameters of the host).
+
+    What the model lacks stands at its `zero`.
+
+    Raises
+    ------
+    EffectError
+        If the host lacks an effect of the model.
+    """
+    lacking = [name for name in model.names if name not in host]
+    if lacking:
+        raise EffectError(f"The host model has no effect {', '.join(lacking)}.")
+    zeros = [number for effect in host.effects for number in effect.zero]
+    wider = np.tile(np.array(zeros, dtype=float), (len(parameters), 1))
+    places = [host.parameter_names.index(name) for name in model.parameter_names]
+    wider[:, places] = parameters
+    return wider
+
+
 def asked(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]]:
     """The functions of a hook in the order in which they are asked: place of the effect, function, its parameters."""
     found = [

@@ -15,6 +15,7 @@ import numpy as np
 
 from vinetrack.model.fit_data import FitTrial
 from vinetrack.model.free import DAMPING, YIELD_PRESSURE, Layout
+from vinetrack.model.model import Model
 from vinetrack.model.simulate import Trajectory, simulate_many
 from vinetrack.records import Floats, Trial
 
@@ -46,11 +47,11 @@ class Predictor:
     """Simulates the trials of a fit.
 
     `feels_pressure` and `feels_damping`, shape (n_trials,), tell which trials have a pressure that may deviate (it was
-    set, not measured) and a B.
+    set, not measured) and a B. `host` is a larger model whose compiled form serves this one.
     """
 
-    def __init__(self, layout: Layout, data: Sequence[FitTrial]) -> None:
-        self.layout, self.data = layout, data
+    def __init__(self, layout: Layout, data: Sequence[FitTrial], host: Model | None = None) -> None:
+        self.layout, self.data, self.host = layout, data, host
         model = layout.model
         self.damping_column = model.parameter_names.index(DAMPING) if DAMPING in model.parameter_names else -1
         driven = "pressure_drive" in model
@@ -77,6 +78,7 @@ class Predictor:
                 for item, job in zip(data, jobs, strict=True)
             ],
             parameters=np.array([job.row for job in jobs]).reshape(len(jobs), -1),
+            host=self.host,
         )
 
     def jobs(self, theta: Floats, own: Floats) -> list[Job]:

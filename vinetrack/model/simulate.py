@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.effects import Rig, State
 from vinetrack.model.kernel import kernel
-from vinetrack.model.model import Model, asked, effects_on
+from vinetrack.model.model import Model, asked, effects_on, hosted
 from vinetrack.model.rig import check_needs, rig_of
 from vinetrack.records import Floats, Trial
 
@@ -97,14 +97,16 @@ def simulate_many(
     *,
     traces: Sequence[Trace | None] | None = None,
     parameters: Floats | None = None,
+    host: Model | None = None,
     relative_tolerance: float = RELATIVE_TOLERANCE,
 ) -> list[Trajectory]:
     """`simulate` for many trials in one call of the compiled kernel.
 
     `parameters`, shape (n_trials, n_parameters) in the order of `model.parameter_names`, gives every trial values of
-    its own in place of the model's.
+    its own in place of the model's. A `host` is a larger model whose compiled form serves this one: its other effects
+    rest.
     """
-    batch = prepare(model, trials, times_s, traces=traces, parameters=parameters)
+    batch = prepare(model, trials, times_s, traces=traces, parameters=parameters, host=host)
     out, ends = batch.run(relative_tolerance)
     rows = itertools.pairwise(batch.starts)
     return [_trajectory(trials[i], batch.times_s[i], out[a:b], ends[i]) for i, (a, b) in enumerate(rows)]
@@ -189,8 +191,15 @@ def prepare(
     *,
     traces: Sequence[Trace | None] | None = None,
     parameters: Floats | None = None,
+    host: Model | None = None,
 ) -> Batch:
-    """Lay out trials for the compiled kernel; arguments as those of `simulate_many`."""
+    """Lay out trials for the compiled kernel; arguments as those of `simulate_many`.
+
+    Raises
+    ------
+    EffectError
+        If a trial lacks what an effect needs, or the host does not hold the model.
+    """
     traces = traces or [None] * len(trials)
     check_needs(model, *trials)
     rigs = np.array([rig_of(trial) for trial in trials], dtype=float).reshape(len(trials), len(Rig._fields))
@@ -200,7 +209,12 @@ def prepare(
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(len(trials), len(model.parameter_names))
     given = [trace for trace in traces if trace is not None]
     bends = [[(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends] for trial in trials]
-    on = effects_on(model, thetas)
+    if host is not None and host.names != model.names:
+        resting = np.array([name not in model for name in host.names])
+        model, thetas = host, hosted(host, model, thetas)
+        on = effects_on(model, thetas) & ~resting
+    else:
+        on = effects_on(model, thetas)
     kinks, stops = _limits(model, rigs, thetas, on, trials)
     given_times = [np.asarray(t, dtype=float) for t in times_s]
     true_times = _true_times(model, rigs, thetas, on, given_times)

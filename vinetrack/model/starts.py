@@ -133,6 +133,7 @@ def align(data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Fl
             for item, job in zip(data, jobs, strict=True)
         ],
         parameters=np.array([job.row for job in jobs]).reshape(len(jobs), -1),
+        host=predictor.host,
     )
     best, misfit = own.copy(), np.zeros(len(data))
     for i, (item, (time_s, y)) in enumerate(zip(data, thin, strict=True)):
