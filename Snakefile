@@ -115,6 +115,7 @@ rule gather:
         plan.per_trial("analysed", ".json"),
     output:
         plan.result("trials.csv"),
+        plan.result("conditions.csv"),
         plan.result("steady.csv"),
         plan.result("damping_points.csv"),
     log:
@@ -123,14 +124,16 @@ rule gather:
         code=code_hash("gather"),
         experiment=plan.experiment,
         results=plan.results,
+        settings=plan.stage_settings("final_at_fraction", "efficiency_at_mm"),
     shell:
-        "vinetrack gather {params.experiment:q} {params.results:q} --log {log:q}"
+        "vinetrack gather {params.experiment:q} {params.results:q} --settings {params.settings:q} --log {log:q}"
 
 
 rule damping:
-    """The damping law, its intervals, and how it grows with size."""
+    """The damping law, its intervals, and how damping, speed and efficiency go with size."""
     input:
         plan.result("damping_points.csv"),
+        plan.result("conditions.csv"),
     output:
         plan.result("damping.json"),
         plan.result("scaling.json"),

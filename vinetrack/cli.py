@@ -142,12 +142,14 @@ def tracks(
 
 
 @app.command(rich_help_panel="Stages of the workflow")
-def gather(experiment: ExperimentPath, results: ResultsPath, log: LogPath = None) -> None:
-    """What every trial gave, as trials.csv, steady.csv and damping_points.csv."""
+def gather(
+    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
+) -> None:
+    """What every trial gave, as trials.csv, conditions.csv, steady.csv and damping_points.csv."""
     with _sentences(log):
         from vinetrack.stages.tracks import gather as gather_trials
 
-        table = gather_trials(_read(experiment), results)
+        table = gather_trials(_read(experiment), results, _run_settings(settings))
         typer.echo(f"{len(table)} trials, {int((table['status'] == 'failed').sum())} failed.")
 
 

@@ -41,7 +41,7 @@ _ANALYSIS = (*_INTAKE, "settings.py", "stages/tracks.py", "stages/results.py", "
 STAGE_CODE = {
     "recording": (*_ANALYSIS, "stages/recordings.py", "figures/strip.py", "figures/style.py"),
     "tracks": (*_ANALYSIS, "stages/pool.py"),
-    "gather": ("tables.py", "stages"),
+    "gather": (*_INTAKE, "stages", "motion"),
     "damping": ("tables.py", "stages", "motion"),
     "model": (*_INTAKE, "settings.py", "stages", "video", "motion", "effects", "model", "diagnosis"),
     "figures": ("tables.py", "stages", "figures"),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vinetrack.motion.efficiency import energy_efficiency, lead_velocity_at
+from vinetrack.motion.efficiency import efficiency_shares, energy_efficiency, lead_velocity_at
 from vinetrack.records import Trial
 
 VINE = Trial(
@@ -66,3 +66,45 @@ def test_without_work_there_is_no_efficiency(trial: Trial, travel_m: float) -> N
 
 def test_an_unknown_velocity_has_no_efficiency() -> None:
     assert math.isnan(energy_efficiency(VINE, 0.15, math.nan))
+
+
+@pytest.mark.parametrize(("diameter_m", "share"), [(0.012, 0.1816), (0.018, 0.0807)])
+def test_the_weight_of_the_payload_works_beside_the_gas(diameter_m: float, share: float) -> None:
+    """35.6 g × 9.81 m/s² × 0.3 m = 0.10477 J, beside 34 kPa × 0.15 m × 113.10 or 254.47 mm² = 0.57679 or 1.29777 J."""
+    no_film = replace(VINE, diameter_m=diameter_m, thickness_m=1e-12)
+    assert efficiency_shares(no_film, 0.15).weight == pytest.approx(share, rel=1e-3)
+
+
+def test_the_weight_of_the_film_shrinks_as_it_runs_out() -> None:
+    """Film of 4.5239 g/m, 0.3 m of it: x = 0.3 m of tail travel leave half, so that 1.01788 g work on the average."""
+    bare = replace(VINE, payload_kg=0.0)
+    work_J = 1.017876e-3 * 9.81 * 0.3
+    assert efficiency_shares(bare, 0.15).weight == pytest.approx(work_J / (34e3 * 1.130973e-4 * 0.15), rel=1e-5)
+
+
+def test_film_that_has_run_out_weighs_nothing_more() -> None:
+    """With c = λ a bare vine is empty half-way: beyond, its weight has done all its work, ½ λ L²."""
+    printed = replace(VINE, payload_kg=0.0, mass_loss="as_printed")
+    work_J = 0.5 * printed.linear_density_kg_m * 0.3**2 * 9.81
+    gas_J = 34e3 * VINE.area_m2 * 0.25
+    assert efficiency_shares(printed, 0.25).weight == pytest.approx(work_J / gas_J, rel=1e-12)
+
+
+@pytest.mark.parametrize(("angle_deg", "factor"), [(0, 1.0), (60, 0.5), (90, 0.0), (180, -1.0)])
+def test_only_growth_downwards_is_helped_by_the_weight(angle_deg: float, factor: float) -> None:
+    tilted = replace(VINE, growth_angle_rad=math.radians(angle_deg))
+    assert efficiency_shares(tilted, 0.15).weight == pytest.approx(
+        factor * efficiency_shares(VINE, 0.15).weight, abs=1e-12
+    )
+
+
+def test_the_payload_is_most_of_what_moves() -> None:
+    """0.679 g of film are left beside 35.6 g."""
+    assert efficiency_shares(VINE, 0.15).payload == pytest.approx(35.6 / 36.2786, rel=1e-4)
+    assert efficiency_shares(replace(VINE, payload_kg=0.0), 0.15).payload == 0
+
+
+def test_without_mass_or_work_there_are_no_shares() -> None:
+    empty = replace(VINE, payload_kg=0.0)
+    assert math.isnan(efficiency_shares(empty, 0.3).payload)
+    assert math.isnan(efficiency_shares(replace(VINE, pressure_Pa=0.0), 0.15).weight)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
+from vinetrack.constants import GRAVITY_M_S2
 from vinetrack.records import Floats, Trial
 
 
@@ -35,3 +37,37 @@ def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: flo
         return math.nan
     tail_velocity_m_s = trial.travel_ratio * lead_velocity_m_s
     return float(0.5 * trial.moving_mass_kg(lead_travel_m) * tail_velocity_m_s**2 / work_J)
+
+
+class EfficiencyShares(NamedTuple):
+    """What turns an efficiency ½ m(x) ẋ² / (P₀ A y) into its variants: all are the same speed, counted differently.
+
+    `payload` is the payload's part of the moving mass, so that efficiency × `payload` counts the payload alone;
+    `weight` the work of the weight over that of the gas, so that efficiency / (1 + `weight`) counts both as spent.
+    """
+
+    payload: float
+    weight: float
+
+
+def efficiency_shares(trial: Trial, lead_travel_m: float) -> EfficiencyShares:
+    """The payload's share of the moving mass, and the weight's share of the work, after `lead_travel_m` of growth.
+
+    The weight works on tail and payload along the tail's own travel x = r·y: g cosθ ∫ m dx, the third term of Eq. (2)
+    of Alvarez et al. (2025). NaN where there is no mass, or no work.
+    """
+    mass_kg = float(trial.moving_mass_kg(lead_travel_m))
+    gas_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m
+    weight_J = GRAVITY_M_S2 * math.cos(trial.growth_angle_rad) * _mass_along(trial, trial.travel_ratio * lead_travel_m)
+    return EfficiencyShares(
+        payload=trial.payload_kg / mass_kg if mass_kg > 0 else math.nan,
+        weight=weight_J / gas_J if gas_J > 0 else math.nan,
+    )
+
+
+def _mass_along(trial: Trial, tail_travel_m: float) -> float:
+    """∫ m(x) dx from the release, kg·m: the film runs out in a straight line, until none is left."""
+    film_kg = trial.linear_density_kg_m * (trial.length_m if math.isfinite(trial.length_m) else 0.0)
+    loss_kg_m = trial.mass_loss_kg_m
+    until_m = min(tail_travel_m, film_kg / loss_kg_m) if loss_kg_m > 0 else tail_travel_m
+    return trial.payload_kg * tail_travel_m + film_kg * until_m - 0.5 * loss_kg_m * until_m**2

@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
-    """Fit the damping law to `damping_points.csv` and write `damping.json` and `scaling.json`.
+    """Fit the damping law to `damping_points.csv` and write `damping.json`, and `scaling.json` with `conditions.csv`.
 
     Returns
     -------
@@ -28,9 +28,10 @@ def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
 
     from vinetrack.motion.damping import fit_laws
     from vinetrack.motion.scaling import fit_scaling
+    from vinetrack.motion.trends import fit_trends
 
     damping = fit_laws(points, resamples=settings.resamples, seed=settings.seed)
-    write_json(results.scaling, fit_scaling(damping))
+    write_json(results.scaling, fit_scaling(damping) | fit_trends(read_result(results.conditions)))
     write_json(results.damping, damping)
     for method, fit in damping.items():
         log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))

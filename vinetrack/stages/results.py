@@ -128,6 +128,11 @@ class Results:
         return self.folder / "damping_points.csv"
 
     @property
+    def conditions(self) -> Path:
+        """What each condition gave, its replicates put together."""
+        return self.folder / "conditions.csv"
+
+    @property
     def damping(self) -> Path:
         """The damping law by both methods."""
         return self.folder / "damping.json"

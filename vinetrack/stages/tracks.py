@@ -109,8 +109,8 @@ def analyse(
     return "", ""
 
 
-def gather(experiment: Experiment, folder: Path) -> pd.DataFrame:
-    """Put what every trial gave into `trials.csv`, `steady.csv` and `damping_points.csv`.
+def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
+    """Put what every trial gave into `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`.
 
     Returns
     -------
@@ -122,6 +122,7 @@ def gather(experiment: Experiment, folder: Path) -> pd.DataFrame:
     ResultsError
         If a trial has not been analysed.
     """
+    from vinetrack.motion.conditions import condition_table
     from vinetrack.motion.damping import mark_half_steady
 
     results = Results(folder)
@@ -132,6 +133,8 @@ def gather(experiment: Experiment, folder: Path) -> pd.DataFrame:
     write_csv(results.steady, _frame([row for content in found.values() for row in content["windows"]], STEADY_COLUMNS))
     points = _frame([c["point"] for c in found.values() if c["point"]], POINT_COLUMNS)
     write_csv(results.points, mark_half_steady(points))
+    places = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
+    write_csv(results.conditions, condition_table(table, experiment.trials, **places))
     write_csv(results.trials, table)
     for row in table.itertuples():
         log.info("%s: %s %s", row.trial, row.status, row.reason)
