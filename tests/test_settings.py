@@ -93,6 +93,19 @@ def test_every_kind_of_calibration(tmp_path: Path, text: str) -> None:
     assert settings.axis.to_px == (5.0, 1.0)
 
 
+def test_limits_of_the_next_experiment_are_ranges_and_choices(tmp_path: Path) -> None:
+    text = "{pressure_kPa: 7:40, payload_g: [0, 50], diameter_mm: [24, 12], chamber_l: 3.7, growth_angle_deg: 0:180}"
+    limits = read(tmp_path, f"limits: {text}\n").limits
+    assert (limits.pressure_kPa, limits.payload_g) == ((7.0, 40.0), (0.0, 50.0))
+    assert (limits.diameter_mm, limits.chamber_l) == ((12.0, 24.0), (3.7,))
+    assert limits.growth_angle_deg == (0.0, 45.0, 90.0, 135.0, 180.0)
+    assert (limits.thickness_um, limits.trials, limits.hoop_stress_MPa) == (None, 4, 7.8)
+
+
+def test_a_range_of_sizes_is_looked_at_in_equal_ratios(tmp_path: Path) -> None:
+    assert read(tmp_path, "limits: {thickness_um: 50:200}\n").limits.thickness_um == (50.0, 70.7, 100.0, 141.0, 200.0)
+
+
 def test_an_unknown_key_suggests_the_nearest(tmp_path: Path) -> None:
     (problem,) = problems_of(tmp_path, "strict: true\npresure_kPa: 28\n")
     assert (problem.column, problem.line, problem.file) == ("presure_kPa", 2, "experiment.yaml")
@@ -158,6 +171,15 @@ def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
         ("axis: 3", "should be a group of keys"),
         ("axis: {from_px: [1, 1], to_px: [1, 1]}", "same point"),
         ("calibration: {kind: mm_per_px, mm_per_px: 0}", "greater than 0"),
+        ("limits: {pressure_kPa: 7}", "write low:high"),
+        ("limits: {pressure_kPa: 40:7}", "write the lower value first"),
+        ("limits: {payload_g: 0:1e6}", "above 100000 g"),
+        ("limits: {pressure_kPa: 7000:9000}", "7000 Pa is 7 kPa"),
+        ("limits: {diameter_mm: [0.012]}", "0.012 metres is 12 mm"),
+        ("limits: {thickness_um: []}", "name at least one value"),
+        ("limits: {chamber_l: [[1, 2]]}", "numbers alone"),
+        ("limits: {trials: 0}", "greater than or equal to 1"),
+        ("limits: {presure_kPa: 1:2}", "did you mean pressure_kPa?"),
         (
             "calibration: {kind: charuco, image: a, squares: [5, 5], square_mm: 5, marker_mm: 5, dictionary: DICT_A}",
             "markers lie inside",

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from vinetrack.columns import COLUMNS, SHARED, CellError, read_cell
+from vinetrack.columns import COLUMNS, SHARED, CellError, Column, read_cell
 from vinetrack.problems import ExperimentError, Problem
 from vinetrack.records import Bend
 from vinetrack.yamlfile import YamlDocument, read_yaml
@@ -107,6 +107,85 @@ class Charuco(_Strict):
 Calibration = Annotated[Charuco | Checkerboard | TwoPoints | MmPerPx, Field(discriminator="kind")]
 
 
+class Limits(_Strict):
+    """Which further trials could be made, for the next experiment; None where the trials so far are the guide.
+
+    Pressure and payload are ranges (`7:40` or two numbers); the others are what there is to choose from: one value, a
+    list, or a range, of which five values are looked at. `trials` is how many can be afforded, `hoop_stress_MPa` what
+    the film is trusted to hold.
+    """
+
+    trials: Annotated[Count, Field(ge=1, le=24)] = 4
+    pressure_kPa: tuple[float, float] | None = None
+    payload_g: tuple[float, float] | None = None
+    diameter_mm: tuple[float, ...] | None = None
+    thickness_um: tuple[float, ...] | None = None
+    length_mm: tuple[float, ...] | None = None
+    chamber_l: tuple[float, ...] | None = None
+    inlet_mm: tuple[float, ...] | None = None
+    growth_angle_deg: tuple[float, ...] | None = None
+    hoop_stress_MPa: Positive = 7.8
+
+    @field_validator("pressure_kPa", "payload_g", mode="before")
+    @classmethod
+    def _range(cls, value: Any, info: Any) -> Any:
+        return value if value is None else _read_range(COLUMNS[info.field_name], value)
+
+    @field_validator(
+        "diameter_mm", "thickness_um", "length_mm", "chamber_l", "inlet_mm", "growth_angle_deg", mode="before"
+    )
+    @classmethod
+    def _values(cls, value: Any, info: Any) -> Any:
+        column = COLUMNS[info.field_name]
+        if isinstance(value, str) and ":" in value:
+            low, high = _read_range(column, value)
+            return tuple(sorted({low, *(float(f"{step:.3g}") for step in _steps(low, high)), high}))
+        if isinstance(value, list | tuple):
+            if not value:
+                raise ValueError("is empty: name at least one value, or remove the key")
+            return tuple(sorted({_read_limit(column, one) for one in value}))
+        return value if value is None else (_read_limit(column, value),)
+
+
+def _read_range(column: Column, value: Any) -> tuple[float, float]:
+    """Lowest and highest from `low:high` or two numbers, judged as cells of the column."""
+    parts = value.split(":") if isinstance(value, str) else value
+    if not isinstance(parts, list | tuple) or len(parts) != 2:
+        raise ValueError("is not a range: write low:high, such as 7:40")
+    low, high = (_read_limit(column, part) for part in parts)
+    if low > high:
+        raise ValueError("ends below where it begins: write the lower value first")
+    return low, high
+
+
+def _steps(low: float, high: float) -> list[float]:
+    """Three values between two others, in equal ratios where both are positive."""
+    parts = (0.25, 0.5, 0.75)
+    return [low ** (1 - part) * high**part if low > 0 else low + (high - low) * part for part in parts]
+
+
+def _read_limit(column: Column, value: Any) -> float:
+    """One value, judged as a cell of the column."""
+    if isinstance(value, bool | list | tuple | dict):
+        raise ValueError("holds something that is not a number: write numbers alone")
+    return float(str(_as_cell(column, value)))
+
+
+def _as_cell(column: Column, value: Any) -> Any:
+    """A value as the sheet's cell would be read.
+
+    Raises
+    ------
+    ValueError
+        If the column does not allow it, with the remedy behind a colon.
+    """
+    try:
+        return read_cell(column, str(value).strip())
+    except CellError as error:
+        remedy = error.remedy or (f"allowed is {error.allowed}" if error.allowed else "")
+        raise ValueError(f"{error.message}: {remedy}") from None
+
+
 class ExperimentSettings(_Strict):
     """What all trials of an experiment share. Values keep the unit in their name; None where not given.
 
@@ -143,6 +222,7 @@ class ExperimentSettings(_Strict):
     strict: bool = False
     axis: Axis | None = None
     calibration: Calibration | None = None
+    limits: Limits = Limits()
 
     @field_validator(*SHARED, mode="before")
     @classmethod
@@ -153,11 +233,7 @@ class ExperimentSettings(_Strict):
             return value
         if isinstance(value, bool | list | dict):
             raise ValueError("is not a single value: write one, as in the sheet")
-        try:
-            return read_cell(column, str(value).strip())
-        except CellError as error:
-            remedy = error.remedy or (f"allowed is {error.allowed}" if error.allowed else "")
-            raise ValueError(f"{error.message}: {remedy}") from None
+        return _as_cell(column, value)
 
     @field_validator("model", "candidates", "effects")
     @classmethod
