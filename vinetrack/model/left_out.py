@@ -7,12 +7,21 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.effects import EffectError
 from vinetrack.model.assemble import trial_fit
 from vinetrack.model.fit_data import FitError, FitTrial, Pairs, prepare_trial
 from vinetrack.model.free import YIELD_PRESSURE, Layout
-from vinetrack.model.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.model.sensitivity import (
+    DAMPING_DEVIATION,
+    ORIGIN,
+    OWN,
+    PRESSURE,
+    RELEASE,
+    RELEASE_STEP_FRAMES,
+    Predictor,
+)
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.starts import align, first_own
 from vinetrack.model.whitened import all_products, at_correlation
@@ -34,23 +43,30 @@ def predict_trials(found: Fit, pairs: Pairs, *, from_rest: bool = False) -> list
     rest was filmed) are where the root mean square is least. Else both weigh errors with the correlation that the fit
     found, which where a model fails is nearly 1, and leaves the origin to the misfit.
     """
-    if from_rest:
-        found = replace(found, noise_correlation=0.0)
-    data = [_known_yield(found, _prepared(trial, track)) for trial, track in pairs]
-    layout = _nothing_free(found, data)
-    predictor = Predictor(layout, data, found.predictor.host)
+    return predict_prepared(found, [_prepared(trial, track) for trial, track in pairs], from_rest=from_rest)
+
+
+def predict_prepared(found: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
+    """As `predict_trials`, for trials that were laid out for a fit already.
+
+    Raises
+    ------
+    FitError
+        If a vine was not in the fit and B is one per vine, or the model cannot be followed.
+    """
+    data = [_known_yield(found, item) for item in data]
+    predictor = Predictor(_nothing_free(found, data), data, found.predictor.host)
+    rho = 0.0 if from_rest else found.noise_correlation
+    variance = found.noise_m**2 * (1 - rho**2)
     nothing = np.empty(0)
     try:
         own, _ = align(data, predictor, nothing, first_own(data))
-        own = _settle(found, predictor, own, from_rest)
-        columns = predictor.linearise(nothing, own)
+        own, square = _settle(predictor, own, rho, from_rest)
         moved = predictor.run(predictor.jobs(nothing, own))
     except SimulationError as error:
         raise FitError(f"The model cannot be followed: {error}") from error
-    rho, variance = found.noise_correlation, found.noise_m**2 * (1 - found.noise_correlation**2)
-    square = _square(columns, data, rho) / variance
     sigma = np.zeros((len(data), OWN))
-    sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square[:, :2, :2], hermitian=True)))
+    sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square / variance, hermitian=True)))
     return [
         trial_fit(item, own[i], sigma[i], moved[i].observed_position_m, moved[i].lead_velocity_m_s, rho, variance)
         for i, item in enumerate(data)
@@ -82,26 +98,47 @@ def _nothing_free(found: Fit, data: Sequence[FitTrial]) -> Layout:
     return Layout(found.model, (), (), np.zeros((len(data), 0), dtype=int), base)
 
 
-def _square(columns: Sequence[Floats], data: Sequence[FitTrial], rho: float) -> Floats:
-    return at_correlation(all_products(columns, [item.first for item in data]), rho)
+def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> tuple[Floats, Floats]:
+    """Newton's steps in release and origin, no longer than two frames; the own numbers, and their information.
 
-
-def _settle(found: Fit, predictor: Predictor, own: Floats, from_rest: bool) -> Floats:
-    """Newton's steps in release and origin, no longer than two frames."""
-    frames = np.array([item.frame_s for item in predictor.data])
-    held = np.array([from_rest and item.n_rest >= FEWEST_AT_REST for item in predictor.data], dtype=bool)
-    own = own.copy()
-    for i, item in enumerate(predictor.data):
-        if held[i]:
-            own[i, ORIGIN] = np.mean(item.lead_position_m[: item.n_rest])
-    for _ in range(MOST_STEPS):
-        square = _square(predictor.linearise(np.empty(0), own), predictor.data, found.noise_correlation)
-        square[held, ORIGIN, :] = square[held, :, ORIGIN] = 0.0
-        step = np.einsum("nij,nj->ni", np.linalg.pinv(square[:, :2, :2], hermitian=True), square[:, :2, -1])
-        step[:, RELEASE] = np.clip(step[:, RELEASE], -2 * frames, 2 * frames)
-        own = own.copy()
-        own[:, :2] += step
-        if np.all(np.abs(step[:, RELEASE]) < SETTLED_FRAMES * frames):
-            break
+    A trial that has settled is left alone: it costs as much to simulate as one that has not.
+    """
+    data = predictor.data
+    frames = np.array([item.frame_s for item in data])
+    held = np.array([from_rest and item.n_rest >= FEWEST_AT_REST for item in data], dtype=bool)
+    own, square = own.copy(), np.zeros((len(data), 2, 2))
     own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-    return own
+    for i in np.flatnonzero(held):
+        own[i, ORIGIN] = np.mean(data[i].lead_position_m[: data[i].n_rest])
+    moving = np.arange(len(data))
+    for _ in range(MOST_STEPS):
+        sums = _sums(predictor, own, moving, rho)
+        square[moving] = sums[:, :2, :2]
+        sums[held[moving], ORIGIN, :] = sums[held[moving], :, ORIGIN] = 0.0
+        step = np.einsum("nij,nj->ni", np.linalg.pinv(sums[:, :2, :2], hermitian=True), sums[:, :2, -1])
+        reach = 2 * frames[moving]
+        step[:, RELEASE] = np.clip(step[:, RELEASE], -reach, reach)
+        own[moving, :2] += step
+        moving = moving[np.abs(step[:, RELEASE]) >= SETTLED_FRAMES * frames[moving]]
+        if not moving.size:
+            break
+    return own, square
+
+
+def _sums(predictor: Predictor, own: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
+    """Whitened products of [release, origin, residual] of some trials, shape (n_rows, 3, 3)."""
+    jobs = predictor.jobs(np.empty(0), own)
+    later = [row for row in rows.tolist() if not predictor.plain_release[row]]
+    steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in later}
+    moved = predictor.run(
+        [jobs[row] for row in rows] + [replace(jobs[k], release_s=own[k, RELEASE] + steps[k]) for k in later]
+    )
+    shifted = dict(zip(later, moved[rows.size :], strict=True))
+    columns = []
+    for row, plain in zip(rows.tolist(), moved, strict=False):
+        answer = -plain.lead_velocity_m_s
+        if row in shifted:
+            answer = (shifted[row].observed_position_m - plain.observed_position_m) / steps[row]
+        residual = predictor.data[row].lead_position_m - own[row, ORIGIN] - plain.observed_position_m
+        columns.append(np.column_stack([answer, np.ones_like(answer), residual]))
+    return at_correlation(all_products(columns, [predictor.data[row].first for row in rows]), rho)
