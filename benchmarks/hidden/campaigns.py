@@ -1,0 +1,281 @@
+"""From a kind and a seed to the pairs of trial and track that an analysis gets, and the truth that it does not."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hidden import kinds as catalogue
+from hidden.designs import Setting, Wants, design
+from hidden.kinds import EFFECTS, OUTSIDERS, Scene
+from hidden.kinds import Hidden as Change
+from hidden.motion import Floats, Physics, Tube, follow
+from hidden.nuisances import Nuisances, draw_nuisances, noise, regime, scatter
+from vinetrack.naming import with_names
+from vinetrack.records import Bend, Track, Trial
+
+MOST_FRAMES = 1500
+FEWEST_MOVING = 12
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is hidden in a campaign.
+
+    `effects` are names of the catalogue, `outsider` something that no catalogue has, `values` the true parameters as
+    `effect.parameter`, SI; `B` by vine, `physics` everything that acted, `change` what was wrong with the measurement.
+    `visible` is whether what was hidden shows in a pressure trace already, and so is not missing from the model.
+    """
+
+    kind: str
+    seed: int
+    effects: tuple[str, ...]
+    outsider: str
+    values: Mapping[str, float]
+    B: Mapping[str, float]
+    n: float
+    physics: Physics
+    change: Change
+    nuisances: Nuisances
+    dropped_frames: Mapping[str, int]
+    release_s: Mapping[str, float]
+
+    @property
+    def in_trace(self) -> bool:
+        """Whether a measured pressure already holds all that was hidden."""
+        known = {"reservoir_depletion", "supply_refill", "leak"}
+        return math.isfinite(self.nuisances.trace_sigma_kPa) and bool(self.effects) and set(self.effects) <= known
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """One campaign: `pairs` for `vinetrack.fit`, and the truth."""
+
+    kind: str
+    seed: int
+    pairs: tuple[tuple[Trial, Track], ...]
+    truth: Truth
+
+
+def make(kind: str, seed: int) -> Hidden:
+    """The campaign of this kind and seed; the same ones give the same numbers.
+
+    Raises
+    ------
+    KeyError
+        If there is no such kind; see `hidden.KINDS`.
+    """
+    if kind not in catalogue.KINDS:
+        raise KeyError(kind)
+    for attempt in range(50):
+        draw = np.random.default_rng([zlib.crc32(kind.encode()), seed, attempt])
+        found = _attempt(kind, seed, draw)
+        if found is not None:
+            return found
+    raise RuntimeError(f"No campaign of kind {kind} moves with seed {seed}.")
+
+
+def _parts(kind: str) -> tuple[tuple[str, ...], str, str]:
+    """Hidden effects, outsider and null regime (or other prefix) of a kind."""
+    prefix, _, name = kind.rpartition(":")
+    if prefix == "outsider":
+        return (), name, ""
+    if prefix == "null":
+        return (), "", name
+    if prefix == "frames":
+        return (), "", ""
+    return tuple(name.split("+")), "", ""
+
+
+def _wants(names: tuple[str, ...], outsider: str, kind: str) -> Wants:
+    parts = [EFFECTS[name][1] for name in names] + ([OUTSIDERS[outsider][1]] if outsider else [])
+    return Wants(
+        payload=True if any(part.payload for part in parts) else None,
+        chamber=any(part.chamber for part in parts),
+        inlet=any(part.inlet for part in parts),
+        bends=kind.startswith("bends:"),
+        vines=2 if len(names) > 1 else 1,
+        fast=any(part.fast for part in parts),
+        trials=(8, 12) if kind == "null:few_trials" else (24, 48),
+    )
+
+
+def _nuisances(kind: str, regime_name: str, draw: np.random.Generator) -> Nuisances:
+    how = regime(regime_name, draw) if regime_name else draw_nuisances(draw)
+    if kind.startswith("trace:"):
+        how = replace(how, trace_sigma_kPa=0.1)
+    if kind == "frames:dropped":
+        how = replace(how, dropped=float(draw.uniform(0.1, 0.5)))
+    return how
+
+
+def _attempt(kind: str, seed: int, draw: np.random.Generator) -> Hidden | None:
+    """One campaign, or None where too few of its trials move."""
+    names, outsider, regime_name = _parts(kind)
+    settings = design(draw, _wants(names, outsider, kind))
+    how = _nuisances(kind, regime_name, draw)
+    scene = Scene.of(settings)
+    makers = [EFFECTS[name][0] for name in names] + ([OUTSIDERS[outsider][0]] if outsider else [])
+    change = _joined([maker(draw, scene) for maker in makers])
+    stated = _stated(settings, how, change, draw)
+    physics = Physics(B=1.0, n=settings[0].vine.n, **change.physics)
+    if "tail_stretch" in names:
+        how = replace(how, sees_end=False)
+    pairs: list[tuple[Trial, Track]] = []
+    release, dropped = {}, {}
+    draws_B, draws_P = (scatter(draw, how.scatter_shape, len(settings)) for _ in range(2))
+    for i, (setting, (trial, tube)) in enumerate(zip(settings, stated, strict=True)):
+        true = physics._replace(B=setting.vine.B * max(1 + how.damping_scatter * draws_B[i], 0.2))
+        tube = tube._replace(pressure=tube.pressure * (1 + how.pressure_scatter * draws_P[i]))
+        measured = _film(trial, tube, true, change, how, draw)
+        if measured is not None:
+            track, release[trial.name], dropped[trial.name] = measured
+            pairs.append((trial, track))
+    if len(pairs) < 0.8 * len(settings):
+        return None
+    truth = Truth(
+        kind=kind,
+        seed=seed,
+        effects=names,
+        outsider=outsider,
+        values=change.values,
+        B={trial.vine: setting.vine.B for setting, (trial, _) in zip(settings, stated, strict=True)},
+        n=physics.n,
+        physics=physics,
+        change=change,
+        nuisances=how,
+        dropped_frames={name: count for name, count in dropped.items() if count},
+        release_s=release,
+    )
+    return Hidden(kind, seed, tuple(pairs), truth)
+
+
+def _joined(changes: list[Change]) -> Change:
+    """All changes at once."""
+    out = Change()
+    for one in changes:
+        out = Change(
+            {**out.physics, **one.physics},
+            {**out.values, **one.values},
+            *(
+                getattr(out, name) + getattr(one, name)
+                for name in ("pressure_gain", "pressure_offset_Pa", "diameter", "scale", "bow_per_m", "clock")
+            ),
+        )
+    return out
+
+
+def _stated(
+    settings: list[Setting], how: Nuisances, change: Change, draw: np.random.Generator
+) -> list[tuple[Trial, Tube]]:
+    """What the sheet says of each trial, and what is true of it before it scatters."""
+    vines = dict.fromkeys(one.vine for one in settings)
+    yields = {vine: how.yield_sigma_kPa * float(np.clip(draw.standard_normal(), -2, 2)) for vine in vines}
+    payloads = {load: 1 + how.payload_error * draw.uniform(-1, 1) for load in {one.payload_g for one in settings}}
+    sets = {}
+    for one in settings:
+        key = one.vine, one.pressure_kPa, one.payload_g
+        if key not in sets:
+            sets[key] = one.pressure_kPa + how.rounding_kPa * draw.uniform(-0.5, 0.5)
+    trials, tubes = [], []
+    for i, one in enumerate(settings):
+        set_kPa = sets[one.vine, one.pressure_kPa, one.payload_g]
+        trial = _trial(one, f"t{i + 1:02d}", how.rounding_kPa * round(set_kPa / how.rounding_kPa))
+        gain = 1 + change.pressure_gain
+        tube = Tube(
+            pressure=1e3 * set_kPa * gain + change.pressure_offset_Pa,
+            yield_pressure=1e3 * (one.vine.yield_kPa + yields[one.vine]) * gain,
+            diameter=trial.diameter_m * (1 + change.diameter),
+            thickness=trial.thickness_m,
+            length=trial.length_m,
+            payload=trial.payload_kg * payloads[one.payload_g],
+            cosine=math.cos(math.radians(one.angle_deg)),
+            chamber=one.chamber_l / 1e3 if math.isfinite(one.chamber_l) else math.inf,
+            inlet_area=math.pi * (one.inlet_mm / 1e3) ** 2 / 4 if math.isfinite(one.inlet_mm) else math.inf,
+            has_bends=float(bool(one.bends_mm)),
+        )
+        trials.append(trial)
+        tubes.append(tube)
+    return list(zip(with_names(trials), tubes, strict=True))
+
+
+def _trial(one: Setting, name: str, pressure_kPa: float) -> Trial:
+    """The row of the sheet, in SI."""
+    return Trial(
+        name=name,
+        capture_fps=one.capture_hz,
+        diameter_m=one.vine.diameter_mm / 1e3,
+        thickness_m=one.vine.thickness_um / 1e6,
+        length_m=one.vine.length_mm / 1e3,
+        pressure_Pa=1e3 * pressure_kPa,
+        pressure_sigma_Pa=10 * pressure_kPa,
+        yield_pressure_Pa=1e3 * one.vine.yield_kPa,
+        yield_pressure_sigma_Pa=200.0,
+        payload_kg=one.payload_g / 1e3,
+        growth_angle_rad=math.radians(one.angle_deg),
+        chamber_m3=one.chamber_l / 1e3,
+        inlet_m=one.inlet_mm / 1e3,
+        bends=tuple(Bend(*(mm / 1e3 for mm in bend)) for bend in one.bends_mm),
+    )
+
+
+def _film(
+    trial: Trial, tube: Tube, physics: Physics, change: Change, how: Nuisances, draw: np.random.Generator
+) -> tuple[Track, float, int] | None:
+    """What camera and gauge make of one trial: track, release on its clock, frames lost; None where it hardly moves."""
+    step_s = 1 / trial.capture_fps
+    resting = int(draw.integers(how.rest_frames[0], how.rest_frames[1] + 1))
+    if draw.uniform() < how.without_rest:
+        resting = -int(draw.integers(0, 4))
+    release_s = (resting - 1 + float(draw.uniform())) * step_s
+    times = np.arange(MOST_FRAMES) * step_s
+    # A clock that is wrong by ε shows (1 + ε) t: the frames themselves are that much closer.
+    true_times = times / (1 + change.clock) - release_s / (1 + change.clock)
+    bends = np.array([(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]).reshape(-1, 3)
+    out, ended_s = follow(true_times, tube, physics, bends)
+    stop = _last_frame(out, true_times, ended_s, tube, how, draw)
+    moving = np.flatnonzero(out[:stop, 1] > 0)
+    if moving.size < FEWEST_MOVING or out[stop - 1, 1] < 0.25 * tube.length:
+        return None
+    y = out[:stop, 0]
+    position = y * (1 + change.bow_per_m * y) * (1 + change.scale)
+    position = position + float(draw.uniform(-0.05, 0.05)) + noise(draw, how, stop)
+    keep = np.ones(stop, dtype=bool)
+    lost = 0
+    if draw.uniform() < how.dropped:
+        lost = int(draw.integers(1, 4))
+        at = int(draw.integers(moving[0] + 4, max(moving[-1] - 4 - lost, moving[0] + 5)))
+        keep[at : at + lost] = False
+    return _track(times[: keep.sum()], position[keep], out[:stop, 3][keep], how, draw), release_s, lost
+
+
+def _last_frame(
+    out: Floats, times: Floats, ended_s: float, tube: Tube, how: Nuisances, draw: np.random.Generator
+) -> int:
+    """How many frames were kept: to the end of growth and a little more, or to somewhere before it."""
+    part, cut, after = float(draw.uniform(0.8, 0.97)), float(draw.uniform(0.35, 0.7)), int(draw.integers(3, 9))
+    if draw.uniform() < how.cut_short:
+        part = cut
+    elif how.sees_end and math.isfinite(ended_s):
+        return min(times.size, int(np.searchsorted(times, ended_s)) + after)
+    stop = int(np.searchsorted(out[:, 1], part * tube.length))
+    halted = np.flatnonzero((times > 0) & (out[:, 2] <= 0))
+    return min(stop, int(halted[0]) + 30 if halted.size else times.size, times.size)
+
+
+def _track(time_s: Floats, position_m: Floats, pressure_Pa: Floats, how: Nuisances, draw: np.random.Generator) -> Track:
+    gauge = None
+    if math.isfinite(how.trace_sigma_kPa):
+        gauge = pressure_Pa + 1e3 * how.trace_sigma_kPa * draw.standard_normal(pressure_Pa.size)
+    return Track(
+        time_s=time_s,
+        lead_position_m=position_m,
+        lead_position_sigma_m=np.full(time_s.size, math.nan),
+        flag=np.full(time_s.size, "", dtype="<U32"),
+        edge_px=np.full(time_s.size, math.nan),
+        pressure_Pa=gauge,
+    )
