@@ -108,7 +108,7 @@ def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> t
     held = np.array([from_rest and item.n_rest >= FEWEST_AT_REST for item in data], dtype=bool)
     own, square = own.copy(), np.zeros((len(data), 2, 2))
     own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-    for i in np.flatnonzero(held):
+    for i in np.flatnonzero(held).tolist():
         own[i, ORIGIN] = np.mean(data[i].lead_position_m[: data[i].n_rest])
     moving = np.arange(len(data))
     for _ in range(MOST_STEPS):
