@@ -25,6 +25,7 @@ from lsoda_vine import (
 
 import vinetrack as vt
 from vinetrack.model.fit_result import Fit
+from vinetrack.model.solve import Step
 from vinetrack.records import Track, Trial
 
 Campaign = tuple[Fit, list[tuple[Trial, Track]], list[dict[str, float]]]
@@ -357,3 +358,18 @@ def depleting_track(trial: Trial, gamma: float, draw: np.random.Generator) -> Tr
     position = grown_position(trial, time_s - 0.02, B_TRUE[24.0], pressure_along=pressure_Pa)
     seen = np.isfinite(position)
     return as_track(time_s[seen], position[seen] + NOISE_M * draw.standard_normal(int(seen.sum())))
+
+
+def test_whoever_watches_is_told_of_every_step_and_may_end_the_fit() -> None:
+    pairs, _ = small_campaign(seed=31)
+    steps: list[Step] = []
+    found = vt.fit(vt.base_model(), pairs, watch=steps.append)
+    assert [step.iteration for step in steps][-1] == found.iterations
+    assert steps[-1].values == pytest.approx({number.name: number.value for number in found.numbers}, rel=1e-6)
+    assert steps[-1].promised < 1e-2
+
+    def enough(_: Step) -> None:
+        raise TimeoutError
+
+    with pytest.raises(TimeoutError):
+        vt.refit(found, watch=enough)

@@ -26,7 +26,16 @@ from vinetrack.model.mixed import deviance, marginal
 from vinetrack.model.model import Model, Value
 from vinetrack.model.sensitivity import Predictor
 from vinetrack.model.simulate import SimulationError
-from vinetrack.model.solve import MOST_ITERATIONS, Held, Solution, chi2_per_dof, first_state, make_frame, solve
+from vinetrack.model.solve import (
+    MOST_ITERATIONS,
+    Held,
+    Solution,
+    Watch,
+    chi2_per_dof,
+    first_state,
+    make_frame,
+    solve,
+)
 from vinetrack.model.starts import align, candidates, first_own
 from vinetrack.records import Floats, Track
 
@@ -55,6 +64,7 @@ def fit(
     noise: tuple[float, float] | None = None,
     profile: bool = True,
     host: Model | None = None,
+    watch: Watch | None = None,
 ) -> Fit:
     """Fit a model to all trials of an experiment.
 
@@ -79,6 +89,8 @@ def fit(
         Whether intervals near a bound are found by profile, which costs a few refits each.
     host
         A larger model whose compiled form serves this one and every `refit` that follows: nothing is compiled anew.
+    watch
+        Told of every step of the iterations; what it raises ends the fit.
 
     Raises
     ------
@@ -100,7 +112,7 @@ def fit(
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
     predictor = Predictor(layout, data, host)
     held = _held(spreads, noise, data)
-    solution = _solve_from_scratch(predictor, held)
+    solution = _solve_from_scratch(predictor, held, watch)
     return assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
 
 
@@ -111,13 +123,13 @@ def _held(spreads: tuple[float, float] | None, noise: tuple[float, float] | None
     return Held(spreads, (rho, np.full(len(data), sigma_m**2 * (1 - rho**2))))
 
 
-def _solve_from_scratch(predictor: Predictor, held: Held) -> Solution:
+def _solve_from_scratch(predictor: Predictor, held: Held, watch: Watch | None) -> Solution:
     """The best of the solutions from the likeliest starts; the first will do where it explains the data."""
     found: list[Solution] = []
     reason = ""
     for _, theta, own in candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]:
         try:
-            found.append(_solve_from(predictor, theta, own, held))
+            found.append(_solve_from(predictor, theta, own, held, watch=watch))
         except SimulationError as error:
             reason = str(error)
             continue
@@ -125,18 +137,24 @@ def _solve_from_scratch(predictor: Predictor, held: Held) -> Solution:
             break
     if not found:
         raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
-    return _or_once_more(predictor, min(found, key=_deviance), held)
+    return _or_once_more(predictor, min(found, key=_deviance), held, watch)
 
 
 def _solve_from(
-    predictor: Predictor, theta: Floats, own: Floats, held: Held, most_iterations: int = MOST_ITERATIONS
+    predictor: Predictor,
+    theta: Floats,
+    own: Floats,
+    held: Held,
+    *,
+    most_iterations: int = MOST_ITERATIONS,
+    watch: Watch | None = None,
 ) -> Solution:
     """Solve with the noise and the spreads that are assumed before anything is fitted."""
-    frame = make_frame(predictor, own)
-    return solve(predictor, frame, first_state(predictor.data, theta, own), held, most_iterations=most_iterations)
+    state = first_state(predictor.data, theta, own)
+    return solve(predictor, make_frame(predictor, own), state, held, most_iterations=most_iterations, watch=watch)
 
 
-def _or_once_more(predictor: Predictor, solution: Solution, held: Held) -> Solution:
+def _or_once_more(predictor: Predictor, solution: Solution, held: Held, watch: Watch | None) -> Solution:
     """A solution that fits poorly, or the better one found from its numbers with the noise of the tracks once more.
 
     Slow misfit taken for correlated noise is a solution of its own kind, and can hide that the numbers could do better.
@@ -146,7 +164,7 @@ def _or_once_more(predictor: Predictor, solution: Solution, held: Held) -> Solut
     try:
         theta = solution.state.theta
         own, _ = align(predictor.data, predictor, theta, first_own(predictor.data))
-        again = _solve_from(predictor, theta, own, held, most_iterations=ITERATIONS_ONCE_MORE)
+        again = _solve_from(predictor, theta, own, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
     except SimulationError:
         return solution
     return min((solution, again), key=_deviance)
@@ -167,6 +185,7 @@ def refit(
     hold_spreads: bool = False,
     hold_noise: bool = False,
     profile: bool = False,
+    watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
 
@@ -178,6 +197,8 @@ def refit(
         Values of parameters to begin from, of a new effect above all: a time constant begun at zero stays there.
     hold_spreads, hold_noise
         Keep spreads and noise of the fit instead of estimating them again.
+    watch
+        Told of every step of the iterations; what it raises ends the fit.
     """
     model = model or before.model
     known = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
@@ -201,13 +222,13 @@ def refit(
     try:
         if before.chi2_per_dof > POOR_FIT:
             own, _ = align(data, predictor, theta, first_own(data))
-            solution = _solve_from(predictor, theta, own, held)
+            solution = _solve_from(predictor, theta, own, held, watch=watch)
         else:
             frame = replace(make_frame(predictor, old.own), own_centre=before.solution.frame.own_centre)
-            solution = solve(predictor, frame, replace(old, theta=theta), held, warm=True)
+            solution = solve(predictor, frame, replace(old, theta=theta), held, warm=True, watch=watch)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
-    solution = _or_once_more(predictor, solution, held)
+    solution = _or_once_more(predictor, solution, held, watch)
     return assemble(predictor, solution, before.left_out, {**kept, "shared": shared, "held": held}, profile=profile)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,10 +52,15 @@ FEWEST_TO_SPARE = 3
 
 @dataclass(frozen=True)
 class Held:
-    """What a fit is told instead of finding it: spreads of pressure and B, correlation and variances of the noise."""
+    """What a fit is told instead of finding it: spreads of pressure and B, correlation and variances of the noise.
+
+    `correlation` alone leaves the size of the noise to be found: what a model misses then counts as noise, but not as
+    slow noise, which could explain anything.
+    """
 
     spread: tuple[float, float] | None = None
     noise: tuple[float, Floats] | None = None
+    correlation: float | None = None
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,19 @@ class Solution:
     estimable: tuple[bool, bool]
     converged: bool
     iterations: int
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where the iterations are: the numbers, SI, by name, and by how much the step just found lowers −2 ln L."""
+
+    iteration: int
+    values: Mapping[str, float]
+    promised: float
+
+
+Watch = Callable[[Step], None]
+"""Told of every step; what it raises ends the fit."""
 
 
 def make_frame(predictor: Predictor, own: Floats) -> Frame:
@@ -139,6 +157,7 @@ def solve(
     *,
     warm: bool = False,
     most_iterations: int = MOST_ITERATIONS,
+    watch: Watch | None = None,
 ) -> Solution:
     """Iterate to the end. `warm` says that the state is near it already.
 
@@ -153,6 +172,8 @@ def solve(
         state = replace(state, spread=held.spread)
     if held.noise is not None:
         state = replace(state, rho=held.noise[0], variance=held.noise[1])
+    if held.correlation is not None:
+        state = replace(state, rho=held.correlation)
     damping, converged, iteration, promised = (0.0 if warm else 1e-3), False, 0, math.inf
     early = not warm
     columns = predictor.linearise(state.theta, state.own)
@@ -165,6 +186,8 @@ def solve(
         state = _update_variances(predictor, frame, grams, state, can, held, early=early, search=search)
         moved = _variances_moved(before, state)
         step, own_change, promised = newton_step(grams, frame, state, damping)
+        if watch is not None:
+            watch(_step_report(predictor, state, iteration, promised))
         if promised < SETTLED_DECREASE and moved < SETTLED_SPREAD and not early:
             converged = True
             break
@@ -179,6 +202,11 @@ def solve(
         columns = predictor.linearise(state.theta, state.own)
         grams = _products(predictor, columns)
     return Solution(state, frame, grams, tuple(columns), can, converged, iteration)
+
+
+def _step_report(predictor: Predictor, state: State, iteration: int, promised: float) -> Step:
+    values = predictor.layout.values(state.theta).tolist()
+    return Step(iteration, dict(zip([number.name for number in predictor.layout.free], values, strict=True)), promised)
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
@@ -210,7 +238,8 @@ def _update_variances(
 ) -> State:
     """Noise and spreads anew; while the trajectories are still far off only the size of what is left."""
     if held.noise is None:
-        rho, variance = estimate_noise(grams, frame, state, state.rho if early else None)
+        known = state.rho if early or held.correlation is not None else None
+        rho, variance = estimate_noise(grams, frame, state, known)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
     if not early and any(can):
         spread = estimate_spreads(marginal(grams, frame, state), frame, state, can, search=search)
@@ -291,4 +320,4 @@ def cost(predictor: Predictor, frame: Frame, state: State) -> float:
     return float(np.sum(trial_costs(predictor, frame, state))) + shared_penalty(frame, state)
 
 
-__all__ = ["Held", "Solution", "cost", "estimable", "first_state", "make_frame", "solve"]
+__all__ = ["Held", "Solution", "Step", "Watch", "cost", "estimable", "first_state", "make_frame", "solve"]
