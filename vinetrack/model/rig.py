@@ -55,6 +55,12 @@ _COLUMN_OF_FIELD = {
 }
 
 
+def stated(column: str, trial: Trial) -> bool:
+    """Whether the sheet gives a trial a number other than zero in this column."""
+    value = getattr(trial, _COLUMN_OF_FIELD.get(column, column), math.nan)
+    return not isinstance(value, float) or (math.isfinite(value) and value != 0)
+
+
 def check_needs(model: Model, *trials: Trial) -> None:
     """Refuse trials that lack what an effect of the model needs.
 

@@ -68,16 +68,20 @@ class Predictor:
 
     def run(self, jobs: Sequence[Job]) -> list[Trajectory]:
         """Simulate at the instants of each job's trial."""
+        return self.run_as(self.layout.model, jobs, np.array([job.row for job in jobs]).reshape(len(jobs), -1))
+
+    def run_as(self, model: Model, jobs: Sequence[Job], rows: Floats) -> list[Trajectory]:
+        """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials."""
         data = [self.data[job.trial] for job in jobs]
         return simulate_many(
-            self.layout.model,
+            model,
             [_varied(item.trial, job) for item, job in zip(data, jobs, strict=True)],
             [item.time_s - job.release_s for item, job in zip(data, jobs, strict=True)],
             traces=[
                 None if item.trace is None else (item.trace[0] - job.release_s, item.trace[1])
                 for item, job in zip(data, jobs, strict=True)
             ],
-            parameters=np.array([job.row for job in jobs]).reshape(len(jobs), -1),
+            parameters=rows,
             host=self.host,
         )
 

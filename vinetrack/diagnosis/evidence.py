@@ -1,0 +1,171 @@
+"""What refits say: by how much each hypothesis is better, what it needs for that, and whether that can be believed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.diagnosis.hypotheses import is_plausible
+from vinetrack.diagnosis.screen import FEWEST_CLUSTERS, Products, eliminated
+from vinetrack.effects import Effect
+from vinetrack.model.fit_result import Fit, Number
+from vinetrack.records import Floats
+
+ANSWER_SET = 9.0
+"""Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
+
+LIMIT_DISTANCE = 4.0
+"""Squared distance, in units of the noise, below which what two hypotheses predict is the same curve."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One hypothesis refitted: the effects it adds to a fit, its own fit, and what came of it.
+
+    `delta_chi2` is the fall of −2 ln L from the fit without them, `sigma` that in standard deviations, brought down
+    where trials scatter more than the model of the noise says.
+    """
+
+    effects: tuple[Effect, ...]
+    fit: Fit
+    delta_chi2: float
+    sigma: float
+    plausible: bool
+    reason: str
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects it adds."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def numbers(self) -> tuple[Number, ...]:
+        """Its sizes; numbers that move no trajectory are left out."""
+        return tuple(
+            number
+            for number in self.fit.numbers
+            if number.key.split(".")[0] in self.names and math.isfinite(number.sigma)
+        )
+
+
+def weigh(before: Fit, effects: Sequence[Effect], after: Fit) -> Evidence:
+    """Hold a refit against the fit without the effects."""
+    fall = 2 * (after.log_likelihood - before.log_likelihood)
+    ratio = _robust_ratio(after, [effect.name for effect in effects])
+    plausible, reason = belief(effects, after)
+    return Evidence(
+        effects=tuple(effects),
+        fit=after,
+        delta_chi2=fall,
+        sigma=math.copysign(math.sqrt(abs(fall)), fall) / ratio,
+        plausible=plausible,
+        reason=reason,
+    )
+
+
+def belief(effects: Sequence[Effect], after: Fit) -> tuple[bool, str]:
+    """Whether an experimenter would believe the sizes, and why not."""
+    for effect in effects:
+        for parameter in effect.parameters:
+            for number in after.numbers:
+                if number.key != f"{effect.name}.{parameter.name}" or not math.isfinite(number.sigma):
+                    continue
+                if not is_plausible(parameter, number.value, number.sigma):
+                    low, high = parameter.plausible or (math.nan, math.nan)
+                    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+                    return False, (
+                        f"it would need {number.symbol} = {number.value:.3g}{unit}; plausible is {low:.3g} to {high:.3g}"
+                    )
+    return True, ""
+
+
+def robust_covariance(found: Fit) -> tuple[Floats, Floats]:
+    """Covariance of the free numbers as the fit holds them, from the noise model and from the scatter of trials."""
+    solution = found.solution
+    frame, state = solution.frame, solution.state
+    sums = Products(solution.grams, solution.columns[0].shape[1] - 5, 0)
+    blocks = eliminated(sums, found, state)
+    p, size = sums.n_keys, frame.prior_mean.size
+    square = np.zeros((size + 1, size + 1))
+    np.add.at(square, (frame.index[:, :, None], frame.index[:, None, :]), blocks[:, :p, :p])
+    square = square[:size, :size] + np.diag(frame.prior_precision)
+    live = np.flatnonzero((np.diag(square) > 0) & np.array([not math.isfinite(n.bound) for n in found.numbers]))
+    scale = 1 / np.sqrt(np.diag(square)[live])
+    inverse = np.zeros_like(square)
+    inverse[np.ix_(live, live)] = (
+        np.linalg.pinv(square[np.ix_(live, live)] * scale[:, None] * scale, rcond=1e-11, hermitian=True)
+        * scale[:, None]
+        * scale
+    )
+    single = np.zeros((len(blocks), size + 1))
+    for i, row in enumerate(blocks[:, :p, p]):
+        np.add.at(single[i], frame.index[i], row)
+    single = single[:, :size] - single[:, :size].mean(axis=0)
+    trials = len(blocks)
+    meat = single.T @ single * trials / max(trials - live.size, 1)
+    # The prior's information does not scatter from trial to trial, yet it is uncertain all the same.
+    meat += np.diag(frame.prior_precision)
+    return inverse, inverse @ meat @ inverse
+
+
+def _robust_ratio(after: Fit, names: Sequence[str]) -> float:
+    """How much larger the error of an effect's size is by the scatter of trials than by the noise model; at least 1."""
+    if len(after.trials) < FEWEST_CLUSTERS:
+        return 1.0
+    plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in robust_covariance(after))
+    mine = [k for k, number in enumerate(after.numbers) if number.key.split(".")[0] in names and plain[k] > 0]
+    return max([1.0, *(float(robust[k] / plain[k]) for k in mine)])
+
+
+def distance(one: Fit, other: Fit) -> float:
+    """Squared distance of what two fits predict, in units of the noise of the first, its correlation counted."""
+    rho = one.noise_correlation
+    total = 0.0
+    for a, b, variance in zip(one.trials, other.trials, one.solution.state.variance, strict=True):
+        gap = a.predicted_position_m - b.predicted_position_m
+        total += float(np.sum((gap[1:] - rho * gap[:-1]) ** 2) + (1 - rho**2) * gap[0] ** 2) / float(variance)
+    return total
+
+
+def count(found: Fit) -> int:
+    """Free numbers that move anything."""
+    return sum(math.isfinite(number.sigma) for number in found.numbers)
+
+
+def answer_set(hypotheses: Sequence[Evidence]) -> tuple[list[Evidence], dict[str, str]]:
+    """Hypotheses that cannot be excluded, best first, and for those set aside the reason in words, by their names.
+
+    Set aside are those that hold a simpler one as a limit and are no better by 9 than it, and those that need a size
+    beyond belief where another does not.
+    """
+    best = max(one.fit.log_likelihood for one in hypotheses)
+    near = [one for one in hypotheses if 2 * (best - one.fit.log_likelihood) <= ANSWER_SET]
+    near.sort(key=lambda one: -one.fit.log_likelihood)
+    aside: dict[str, str] = {}
+    kept = []
+    for one in near:
+        simpler = [
+            other
+            for other in near
+            if count(other.fit) < count(one.fit)
+            and 2 * (one.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET
+            and (_contains(one, other) or distance(other.fit, one.fit) < LIMIT_DISTANCE)
+        ]
+        if simpler:
+            aside["+".join(one.names)] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
+        else:
+            kept.append(one)
+    believed = [one for one in kept if one.plausible]
+    if believed and len(believed) < len(kept):
+        aside |= {"+".join(one.names): one.reason for one in kept if not one.plausible}
+        kept = believed
+    return kept, aside
+
+
+def _contains(one: Evidence, other: Evidence) -> bool:
+    """Whether an effect of one says that it contains that of the other."""
+    replaced = {name for effect in one.effects for name in effect.replaces}
+    return bool(replaced & set(other.names))

@@ -1,0 +1,212 @@
+"""The ladder of errors: what every added effect did to them, in sample and on what a model had not seen.
+
+All errors are those of `vinetrack.diagnosis.compare`: a trial has a release and an origin of its own and nothing else,
+the origin is where the vine was seen at rest, and every trial counts alike. They differ only in what the model was
+fitted to: to everything; to everything but the condition that is predicted, each in turn; to everything but the
+highest pressure of each vine. The floor is what replicates differ by. Where it is most of the error, the error itself
+hardly falls when the model gets better: the excess √(rms² − floor²) does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinetrack.diagnosis.replicates import first_that_counts, replicates_of
+from vinetrack.model.fit_data import FitError
+from vinetrack.model.fit_result import Fit, TrialFit
+from vinetrack.model.left_out import predict_prepared
+from vinetrack.model.subset import fit_subset
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LADDER_COLUMNS = (
+    "model",
+    "added",
+    "rms_in_sample_m",
+    "rms_left_out_m",
+    "rms_highest_pressure_m",
+    "floor_m",
+    "excess_left_out_m",
+)
+MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
+
+MOST_ITERATIONS = 6
+"""A fit without one condition begins beside its end, and settles in two or three."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Predictions of trials, and for those that cannot be predicted the reason, by name of trial."""
+
+    trials: tuple[TrialFit, ...]
+    not_predicted: Mapping[str, str]
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the position errors while something moves, every trial alike; NaN where there is none."""
+        squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in self.trials]
+        return math.sqrt(float(np.mean(squares))) if squares else math.nan
+
+    @property
+    def floor_m(self) -> float:
+        """What replicates differ by, over all conditions that have any; NaN where none has."""
+        conditions = dict.fromkeys(trial.trial.condition for trial in self.trials)
+        squares, counts = [], []
+        for condition in conditions:
+            members = [trial for trial in self.trials if trial.trial.condition == condition]
+            floor_m = replicates_of(members).floor_m
+            if math.isfinite(floor_m):
+                squares.append(floor_m**2)
+                counts.append(len(members))
+        return math.sqrt(float(np.average(squares, weights=counts))) if squares else math.nan
+
+
+def ladder(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
+    """Errors of the model that the user came with and of every one after it.
+
+    Parameters
+    ----------
+    fits
+        Fits of the models in order, all to the same trials.
+    added
+        What each added to the one before; blank for the first.
+
+    Returns
+    -------
+    DataFrame
+        A row a model, columns `LADDER_COLUMNS`. `attrs["notes"]` holds sentences about what could not be predicted.
+
+    Raises
+    ------
+    FitError
+        If a model cannot be followed.
+    """
+    import pandas as pd
+
+    rows, notes = [], []
+    for found, name in zip(fits, added, strict=True):
+        row, said = ladder_row(found, name)
+        rows.append(row)
+        notes += [note for note in said if note not in notes]
+    table = pd.DataFrame(rows, columns=list(LADDER_COLUMNS))
+    table.attrs["notes"] = notes
+    return table
+
+
+def ladder_row(found: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
+    """The row of one model, and sentences about what could not be predicted."""
+    inside, outside, highest = in_sample(found), left_out(found), highest_pressure(found)
+    floor_m = inside.floor_m
+    row: dict[str, object] = {
+        "model": "+".join(found.model.names),
+        "added": added,
+        "rms_in_sample_m": inside.rms_m,
+        "rms_left_out_m": outside.rms_m,
+        "rms_highest_pressure_m": highest.rms_m,
+        "floor_m": floor_m,
+        "excess_left_out_m": excess(outside.rms_m, floor_m),
+    }
+    return row, [*_notes("left-out conditions", outside), *_notes("the left-out highest pressure", highest)]
+
+
+def excess(rms_m: float, floor_m: float) -> float:
+    """√(rms² − floor²), 0 where the error is below the floor; NaN where there is no floor."""
+    return math.sqrt(max(rms_m**2 - floor_m**2, 0.0)) if math.isfinite(rms_m + floor_m) else math.nan
+
+
+def in_sample(found: Fit) -> Errors:
+    """Predictions of the trials that the model was fitted to."""
+    return Errors(tuple(predict_prepared(found, found.predictor.data, from_rest=True)), {})
+
+
+def left_out(found: Fit) -> Errors:
+    """Predictions of every condition by the model fitted to all the others."""
+    conditions = dict.fromkeys(trial.trial.condition for trial in found.trials)
+    parts = [
+        _without(found, [trial.trial.condition == condition for trial in found.trials]) for condition in conditions
+    ]
+    return _together(parts)
+
+
+def highest_pressure(found: Fit) -> Errors:
+    """Predictions of each vine's highest pressure by the model fitted to all lower ones."""
+    highest: dict[str, float] = {}
+    for one in found.trials:
+        trial = one.trial
+        highest[trial.vine] = max(highest.get(trial.vine, -math.inf), trial.pressure_Pa)
+    return _without(found, [trial.trial.pressure_Pa >= highest[trial.trial.vine] for trial in found.trials])
+
+
+def _without(found: Fit, gone: Sequence[bool]) -> Errors:
+    """Predictions of the trials that are `gone` by the model fitted to the rest."""
+    data = [item for item, out in zip(found.predictor.data, gone, strict=True) if out]
+    try:
+        rest = fit_subset(
+            found,
+            [not out for out in gone],
+            hold_spreads=True,
+            hold_noise=True,
+            most_iterations=MOST_ITERATIONS,
+        )
+    except FitError as error:
+        return Errors((), {item.trial.name: str(error) for item in data})
+    alone = {item.trial.vine for item in data} - {trial.trial.vine for trial in rest.trials}
+    alone = {vine for vine in alone if _has_numbers_of_its_own(found, vine)}
+    known = [item for item in data if item.trial.vine not in alone]
+    lost = {
+        item.trial.name: f"no other condition of the vine {item.trial.vine} says what its numbers are"
+        for item in data
+        if item.trial.vine in alone
+    }
+    predicted = predict_prepared(rest, known, from_rest=True) if known else []
+    return Errors(tuple(predicted), lost)
+
+
+def _has_numbers_of_its_own(found: Fit, vine: str) -> bool:
+    return any(number.vine == vine and number.key in found.model.parameter_names for number in found.numbers)
+
+
+def _together(parts: Sequence[Errors]) -> Errors:
+    return Errors(
+        tuple(trial for part in parts for trial in part.trials),
+        {name: why for part in parts for name, why in part.not_predicted.items()},
+    )
+
+
+def _notes(what: str, errors: Errors) -> list[str]:
+    reasons: dict[str, int] = {}
+    for reason in errors.not_predicted.values():
+        reasons[reason] = reasons.get(reason, 0) + 1
+    return [
+        f"The error on {what} leaves out {count} trial{'s' if count > 1 else ''}: {reason}."
+        for reason, count in reasons.items()
+    ]
+
+
+def moved(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
+    """How the numbers moved along the ladder: a row a number of each model, columns `MOVED_COLUMNS`, SI."""
+    import pandas as pd
+
+    rows = [
+        (
+            "+".join(found.model.names),
+            name,
+            number.key,
+            number.vine,
+            number.symbol,
+            number.unit,
+            number.value,
+            number.sigma,
+            number.low,
+            number.high,
+        )
+        for found, name in zip(fits, added, strict=True)
+        for number in found.numbers
+    ]
+    return pd.DataFrame(rows, columns=list(MOVED_COLUMNS))

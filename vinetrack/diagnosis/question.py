@@ -1,0 +1,146 @@
+"""One fit questioned: is anything missing, and what could it be, without a single refit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vinetrack.diagnosis.answers import Answers, answers_of
+from vinetrack.diagnosis.hypotheses import Shape, plausible_range, shapes_of
+from vinetrack.diagnosis.screen import (
+    Products,
+    Scores,
+    Structure,
+    family_threshold,
+    linear_gains,
+    products_of,
+    scores_of,
+    structure_of,
+)
+from vinetrack.effects import Effect
+from vinetrack.model.fit_result import Fit
+from vinetrack.model.solve import track_correlation
+from vinetrack.records import Floats
+
+FIRST_LEVEL, LATER_LEVEL = 3e-3, 1e-4
+"""Chance at which nothing missing may be taken for something by the best of all candidates; once an effect was added
+the gate is stricter, for a pair of effects can imitate what no catalogue holds."""
+
+FAR_OFF = 4.0
+"""χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
+
+TESTABLE_SIGMAS = 3.0
+"""An effect whose largest plausible size would show by less than this cannot be tested here."""
+
+ONE_SIDED_95 = 1.645
+
+
+@dataclass(frozen=True)
+class Questions:
+    """What a fit leaves, held against every candidate. Arrays have shape (n_shapes,), see `Answers`."""
+
+    found: Fit
+    effects: tuple[Effect, ...]
+    answers: Answers
+    sums: Products
+    scores: Scores
+    structure: Structure
+    level: float
+
+    @cached_property
+    def possible(self) -> Floats:
+        """z of every shape where its size can have that sign, 0 where it cannot, always positive."""
+        z = self.scores.z
+        signs = np.array(self.signs)
+        return np.where(signs == 0, np.abs(z), np.maximum(z * signs, 0.0))
+
+    @property
+    def signs(self) -> list[int]:
+        """1 or −1 where physics fixes the sign of a shape's size."""
+        return [shape.size.sign if shape.effect.parameters else 1 for shape in self.answers.shapes]
+
+    @cached_property
+    def threshold(self) -> float:
+        """z that the best of all shapes exceeds by chance with probability `level`; Student's t for few trials."""
+        from scipy.stats import norm, t
+
+        normal = family_threshold(self.scores.cosines, self.signs, self.level)
+        return float(t.isf(norm.sf(normal), max(self.scores.degrees, 3.0)))
+
+    @property
+    def far_off(self) -> bool:
+        """Whether the fit misses more than any noise could."""
+        return self.found.chi2_per_dof > FAR_OFF
+
+    @property
+    def something(self) -> bool:
+        """Whether anything is missing, known or not."""
+        return bool(
+            self.far_off
+            or self.structure.p < 0.1 * self.level
+            or (self.possible.size and self.possible.max() > self.threshold)
+        )
+
+    @cached_property
+    def gains(self) -> tuple[Floats, Floats]:
+        """Fall of −2 ln L that each shape promises, and the size it is promised for."""
+        if self.far_off:
+            return linear_gains(self.found, self.sums, track_correlation(self.found.predictor.data))
+        signs, size = np.array(self.signs), self.scores.size
+        right = (signs == 0) | (size * signs > 0)
+        return np.where(right, self.scores.score * size, 0.0), size
+
+    def of(self, name: str) -> list[int]:
+        """Places of an effect's shapes, the most promising first."""
+        gains = self.gains[0]
+        places = [i for i, effect in enumerate(self.answers.effects) if effect == name]
+        return sorted(places, key=lambda i: -gains[i])
+
+    def promise(self, name: str) -> float:
+        """The largest fall of −2 ln L that any shape of an effect promises."""
+        places = self.of(name)
+        return float(self.gains[0][places[0]]) if places else 0.0
+
+    def best_z(self, name: str) -> tuple[float, int]:
+        """Largest z of an effect and the place of its shape; 0 and −1 where it is silent."""
+        places = [i for i, effect in enumerate(self.answers.effects) if effect == name]
+        if not places:
+            return 0.0, -1
+        place = max(places, key=lambda i: self.possible[i])
+        return float(self.possible[place]), place
+
+    def cosine(self, one: str, other: str) -> float:
+        """Largest |cosine| between shapes of two effects."""
+        a = [i for i, effect in enumerate(self.answers.effects) if effect == one]
+        b = [i for i, effect in enumerate(self.answers.effects) if effect == other]
+        return float(np.max(np.abs(self.scores.cosines[np.ix_(a, b)]), initial=0.0))
+
+    def largest(self, effect: Effect) -> tuple[dict[str, float], bool]:
+        """The largest sizes that could hide, one-sided 95 %, and whether a plausible one would show at all."""
+        places = [i for i, name in enumerate(self.answers.effects) if name == effect.name]
+        if not places or not effect.parameters:
+            return {}, bool(places)
+        # The shape that shows least: whatever form the effect has, it is no larger than this.
+        place = max(places, key=lambda i: self.scores.sigma[i])
+        size, sigma = float(self.scores.size[place]), float(self.scores.sigma[place])
+        parameter = self.answers.shapes[place].size
+        top = max(abs(bound - parameter.zero) for bound in plausible_range(parameter))
+        key = f"{effect.name}.{parameter.name}"
+        if not math.isfinite(sigma) or top < TESTABLE_SIGMAS * self.scores.sigma[places].min():
+            return {}, False
+        if parameter.sign:
+            return {key: parameter.zero + parameter.sign * (max(parameter.sign * size, 0.0) + ONE_SIDED_95 * sigma)}, True
+        return {key: parameter.zero + math.copysign(abs(size) + ONE_SIDED_95 * sigma, size)}, True
+
+
+def question(found: Fit, effects: Sequence[Effect], level: float) -> Questions:
+    """Question a fit about these effects."""
+    effects = tuple(effect for effect in effects if effect.name not in found.model)
+    shapes: list[Shape] = [shape for effect in effects for shape in shapes_of(effect)]
+    answers = answers_of(found, shapes)
+    sums = products_of(found, answers)
+    return Questions(found, effects, answers, sums, scores_of(found, sums), structure_of(found), level)

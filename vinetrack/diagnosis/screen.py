@@ -1,0 +1,277 @@
+"""Score tests: what every candidate could explain of what a fit leaves, by linear algebra alone.
+
+About a fitted model, measured minus predicted positions of trial i are r_i = X_i Δθ + C_i a + Z_i u_i + e_i, with C_i
+the answers to the candidates' sizes a (`vinetrack.diagnosis.answers`). Release, origin and the deviations of pressure
+and B of every trial are integrated out, the free numbers projected off. What remains of a candidate has a score, an
+information, and a cosine with every other.
+
+The information is taken twice: from the noise and spreads of the fit, and from how much the scores of single trials
+scatter (White, Econometrica 48, 817, 1980, with trials as clusters), which holds whatever the noise within a trial is
+like. Tests go by the larger error of the two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.diagnosis.answers import Answers, answers_of
+from vinetrack.diagnosis.hypotheses import Shape, probe
+from vinetrack.model.fit_result import Fit
+from vinetrack.model.mixed import State, own_prior
+from vinetrack.model.sensitivity import OWN
+from vinetrack.model.whitened import at_correlation, products
+from vinetrack.records import Floats
+
+FEWEST_CLUSTERS = 8
+"""Trials from which their scatter says more than the model of the noise."""
+
+BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
+SHARE_LEFT = 1e-4
+"""Part of its information that a shape must keep once everything else is fitted, to count as a shape of its own."""
+
+
+@dataclass(frozen=True)
+class Products:
+    """Sums of products of all columns of a fit and of answers: own numbers, keys, residual, shapes; see `whitened`."""
+
+    grams: Floats
+    n_keys: int
+    n_shapes: int
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What is left of each shape beside the fit, shape (n_shapes,) or squared, per unit of its size.
+
+    `score` and `information`, with those of single trials `scores`, shape (n_trials, n_shapes); `sigma` is the error of
+    a size, the larger of the two kinds.
+    """
+
+    score: Floats
+    information: Floats
+    scores: Floats
+    robust: Floats
+    degrees: float
+
+    @property
+    def size(self) -> Floats:
+        """One-step estimate of every size, alone; 0 where the data say nothing."""
+        diagonal = np.diag(self.information)
+        return np.where(diagonal > 0, self.score / np.maximum(diagonal, 1e-300), 0.0)
+
+    @property
+    def sigma(self) -> Floats:
+        """Its standard error; infinite where the data say nothing."""
+        diagonal = np.maximum(np.diag(self.information), 1e-300)
+        plain = 1 / np.sqrt(diagonal)
+        robust = np.sqrt(np.diag(self.robust)) / diagonal
+        return np.where(np.diag(self.information) > 0, np.maximum(plain, robust), math.inf)
+
+    @property
+    def z(self) -> Floats:
+        """Sizes in standard errors."""
+        return self.size / self.sigma
+
+    @property
+    def cosines(self) -> Floats:
+        """How alike the shapes are, −1 to 1, shape (n_shapes, n_shapes)."""
+        root = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
+        return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
+
+
+def products_of(found: Fit, answers: Answers) -> Products:
+    """All sums of products that the tests need."""
+    columns = found.solution.columns
+    grams = np.stack(
+        [
+            products(np.column_stack([own, more]), item.first)
+            for own, more, item in zip(columns, answers.columns, found.predictor.data, strict=True)
+        ]
+    )
+    return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes))
+
+
+def scores_of(found: Fit, sums: Products, state: State | None = None) -> Scores:
+    """Scores at a fit, or with the noise and spreads of another `state`."""
+    solution = found.solution
+    frame, state = solution.frame, state or solution.state
+    blocks = eliminated(sums, found, state)
+    p, size = sums.n_keys, frame.prior_mean.size
+    index = frame.index
+    X, r, C = slice(0, p), p, slice(p + 1, p + 1 + sums.n_shapes)
+    square = np.zeros((size + 1, size + 1))
+    np.add.at(square, (index[:, :, None], index[:, None, :]), blocks[:, X, X])
+    square = square[:size, :size] + np.diag(frame.prior_precision)
+    slope = np.zeros(size + 1)
+    np.add.at(slope, index, blocks[:, X, r])
+    slope = slope[:size] - frame.prior_precision * (state.theta - frame.prior_mean)
+    cross = np.zeros((size + 1, sums.n_shapes))
+    np.add.at(cross, index, blocks[:, X, C])
+    cross = cross[:size]
+    moving = np.flatnonzero(frame.free & (np.diag(square) > 0) & ~_pressed(found))
+    inverse = np.zeros_like(square)
+    scale = 1 / np.sqrt(np.diag(square)[moving])
+    even = square[np.ix_(moving, moving)] * scale[:, None] * scale
+    inverse[np.ix_(moving, moving)] = np.linalg.pinv(even, rcond=1e-11, hermitian=True) * scale[:, None] * scale
+    lever, step = inverse @ cross, inverse @ slope
+    total = blocks[:, C, C].sum(axis=0)
+    information = total - cross.T @ lever
+    # What rounding leaves of a shape that the free numbers imitate exactly is nothing.
+    gone = np.diag(information) < 1e-9 * np.maximum(np.diag(total), 1e-300)
+    information[gone, :] = information[:, gone] = 0.0
+    padded_lever = np.vstack([lever, np.zeros((1, sums.n_shapes))])[index]
+    padded_step = np.append(step, 0.0)[index]
+    left = blocks[:, :, r].copy()
+    left -= np.einsum("nqk,nk->nq", blocks[:, :, X], padded_step)
+    single = left[:, C] - np.einsum("nkj,nk->nj", padded_lever, left[:, X])
+    single[:, gone] = 0.0
+    trials = len(single)
+    degrees = max(trials - moving.size, 1)
+    # The priors' part of the score belongs to no trial; centring takes it, and what else all share, out of the scatter.
+    centred = single - single.mean(axis=0)
+    robust = centred.T @ centred * trials / max(degrees, 1)
+    if trials < FEWEST_CLUSTERS:
+        robust = np.zeros_like(robust)
+    score = blocks[:, C, r].sum(axis=0) - cross.T @ step
+    score[gone] = 0.0
+    return Scores(score, information, single, robust, float(degrees))
+
+
+def _pressed(found: Fit) -> NDArray[np.bool_]:
+    """Numbers at a bound, which cannot give way."""
+    return np.array([math.isfinite(number.bound) for number in found.numbers], dtype=bool)
+
+
+def eliminated(sums: Products, found: Fit, state: State) -> Floats:
+    """Products of keys, residual and shapes in units of the noise, each trial's own numbers integrated out."""
+    frame = found.solution.frame
+    white = at_correlation(sums.grams, state.rho) / state.variance[:, None, None]
+    put_back = np.broadcast_to(np.eye(white.shape[1]), white.shape).copy()
+    residual = OWN + sums.n_keys
+    for column in (2, 3):
+        put_back[:, column, residual] = state.own[:, column]
+    white = np.swapaxes(put_back, 1, 2) @ white @ put_back
+    precision = own_prior(frame, state)[1]
+    own = white[:, :OWN, :OWN] + precision[:, :, None] * np.eye(OWN)
+    scale = 1 / np.sqrt(np.einsum("nkk->nk", own))
+    even = own * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(OWN)
+    side = scale[:, :, None] * white[:, :OWN, OWN:]
+    return np.asarray(white[:, OWN:, OWN:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(even, side))
+
+
+def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
+    """How far −2 ln L would fall with each shape, and at which size, if everything were linear.
+
+    The noise is as correlated as in the tracks, of whatever size is left: where a model is far off, the noise of its fit
+    has taken in what it misses, and says nothing of what is missing.
+    """
+    state = found.solution.state
+    points = found.solution.frame.points
+    total = points.sum()
+    variance = state.variance
+    for _ in range(4):
+        trial_state = State(state.theta, state.own, (0.01, 0.03), rho, variance)
+        scores = scores_of(found, sums, trial_state)
+        rest = _rest(found, sums, trial_state)
+        variance = np.full_like(variance, float(np.mean(variance)) * max(rest / total, 1e-6))
+    diagonal = np.maximum(np.diag(scores.information), 1e-300)
+    fall = np.where(np.diag(scores.information) > 0, scores.score**2 / diagonal, 0.0)
+    left = np.maximum(rest - fall, 1e-3 * rest)
+    return np.asarray(total * np.log(rest / left)), scores.size
+
+
+def _rest(found: Fit, sums: Products, state: State) -> float:
+    """Sum of squares that the fit's own numbers leave, with the priors' part."""
+    frame = found.solution.frame
+    blocks = eliminated(sums, found, state)
+    p, size = sums.n_keys, frame.prior_mean.size
+    square = np.zeros((size + 1, size + 1))
+    np.add.at(square, (frame.index[:, :, None], frame.index[:, None, :]), blocks[:, :p, :p])
+    square = square[:size, :size] + np.diag(frame.prior_precision)
+    slope = np.zeros(size + 1)
+    np.add.at(slope, frame.index, blocks[:, :p, p])
+    away = state.theta - frame.prior_mean
+    slope = slope[:size] - frame.prior_precision * away
+    step = np.linalg.lstsq(square, slope, rcond=1e-11)[0]
+    whole = blocks[:, p, p].sum() + float(np.sum(frame.prior_precision * away**2))
+    return max(float(whole - step @ slope), 1e-9 * float(whole))
+
+
+def probe_shapes(found: Fit) -> list[Shape]:
+    """Bumps of force along the growth, over speed and over time, with and without a factor P."""
+    longest_s = max(float(trial.time_s[-1] - trial.release_s) for trial in found.trials)
+    fastest = max(
+        trial.trial.travel_ratio * float(np.quantile(trial.predicted_velocity_m_s, 0.98)) for trial in found.trials
+    )
+    lengths = [trial.trial.length_m for trial in found.trials]
+    reaches = [float(np.max(trial.lead_position_m) - trial.origin_m) for trial in found.trials]
+    reach = max(
+        grown / length if math.isfinite(length) and length > 0 else grown
+        for grown, length in zip(reaches, lengths, strict=True)
+    )
+    varied = len({round(trial.trial.pressure_Pa, 1) for trial in found.trials}) > 1
+    shapes = []
+    for kind, count, top in ((0, BUMPS_ALONG, reach), (1, BUMPS_SPEED, fastest), (2, BUMPS_TIME, longest_s)):
+        centres = (np.arange(count) + 0.5) / count * top
+        for centre in centres:
+            for offset in (0, 3) if varied and kind == 0 else (0,):
+                shapes.append(Shape(probe(), (float(kind + offset), float(centre), 0.6 * top / count), 1e-3))
+    return shapes
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What probes find: χ² of their scores for `degrees` of freedom, its upper tail `p`, and that as a `z`."""
+
+    chi2: float
+    degrees: int
+    p: float
+    z: float
+
+
+def structure_of(found: Fit) -> Structure:
+    """Whether anything that a smooth force could explain is left beside a fit.
+
+    All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
+    """
+    from scipy.stats import f as fisher
+    from scipy.stats import norm
+
+    answers = answers_of(found, probe_shapes(found))
+    if not answers.shapes:
+        return Structure(0.0, 0, 1.0, 0.0)
+    scores = scores_of(found, products_of(found, answers))
+    root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
+    live = np.diag(scores.information) > 0
+    information = (scores.information / root[:, None] / root)[np.ix_(live, live)]
+    score = (scores.score / root)[live]
+    values, vectors = np.linalg.eigh(information)
+    keep = values > SHARE_LEFT * values.max(initial=0.0)
+    along = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
+    single = (scores.scores / root)[:, live] @ vectors[:, keep] / np.sqrt(values[keep])
+    spread = np.var(single, axis=0) * len(single) * len(single) / scores.degrees
+    robust = spread if len(single) >= FEWEST_CLUSTERS else np.ones_like(along)
+    chi2 = float(np.sum(along**2 / np.maximum(1.0, robust)))
+    degrees = int(np.count_nonzero(keep))
+    p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0
+    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))))
+
+
+def family_threshold(cosines: Floats, signs: Sequence[int], level: float, draws: int = 40_000) -> float:
+    """The z that the largest of correlated scores exceeds with this probability where nothing is missing.
+
+    Candidates are correlated and some have one sign only: sixteen may act like four.
+    """
+    count = len(signs)
+    if not count:
+        return 0.0
+    values, vectors = np.linalg.eigh(cosines)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    normal = np.random.default_rng(20).standard_normal((draws, count)) @ root.T
+    sided = np.where(np.array(signs) == 0, np.abs(normal), normal * np.array(signs))
+    return float(np.quantile(sided.max(axis=1), 1 - level))

@@ -1,0 +1,190 @@
+"""Fits of hypotheses: a quick climb on a part of the trials, then a fit to all of them.
+
+A climb takes one trial of every condition, spreads as a batch of vines shows them, and noise as correlated as in the
+tracks: so it is guided by what a hypothesis misses. Left free, correlation and spreads would take that in and hold the
+fit where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.diagnosis.hypotheses import Shape
+from vinetrack.effects import Effect
+from vinetrack.model.fit import refit
+from vinetrack.model.fit_data import FitError, FitTrial
+from vinetrack.model.fit_result import Fit
+from vinetrack.model.free import YIELD_PRESSURE, Layout, make_layout
+from vinetrack.model.mixed import deviance, marginal
+from vinetrack.model.model import Value
+from vinetrack.model.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
+from vinetrack.model.simulate import SimulationError
+from vinetrack.model.solve import Held, first_state, make_frame, solve, track_correlation
+from vinetrack.model.starts import align
+from vinetrack.records import Floats
+
+CLIMB_SPREADS = (0.01, 0.03)
+FIRST_ITERATIONS, MORE_ITERATIONS = 4, 10
+MOST_CLIMBED = 14
+"""Trials of a climb: one of every condition, no more than this."""
+
+HOPELESS = 0.5
+"""A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far."""
+
+
+@dataclass(frozen=True)
+class Climb:
+    """Where a climb ended: −2 ln L on its trials and the values to begin a full fit from."""
+
+    effects: tuple[Effect, ...]
+    deviance: float
+    values: Mapping[str, Value]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects that were added."""
+        return tuple(effect.name for effect in self.effects)
+
+
+class Slope:
+    """Climbs from one fit, all on the same trials, so that their deviances can be held against each other."""
+
+    def __init__(self, found: Fit) -> None:
+        self.found = found
+        self.chosen = one_of_each(found.predictor.data)
+        self.data = [found.predictor.data[i] for i in self.chosen]
+        self.correlation = track_correlation(self.data)
+
+    def climb(
+        self, effects: Sequence[Effect], start: Mapping[str, Value], *, iterations: int, align_first: bool = True
+    ) -> Climb | None:
+        """Fit with these effects added from `start`; None where the start cannot be followed."""
+        model = self.found.model
+        for effect in effects:
+            model = model + effect
+        fitted = self.found.model.values
+        model = model.with_values({**fitted, **start})
+        layout = make_layout(model, self.data, fixed=self._fixed(model.parameter_names), shared={})
+        predictor = Predictor(layout, self.data, self.found.predictor.host)
+        own = self.found.solution.state.own[self.chosen].copy()
+        own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+        held = Held(spread=CLIMB_SPREADS, correlation=self.correlation)
+        try:
+            theta = layout.start
+            if align_first:
+                own, _ = align(self.data, predictor, theta, own)
+            frame = make_frame(predictor, own)
+            state = first_state(self.data, theta, own)
+            solution = solve(predictor, frame, state, held, warm=True, most_iterations=iterations)
+            part = marginal(solution.grams, solution.frame, solution.state)
+        except (SimulationError, FitError, np.linalg.LinAlgError):
+            return None
+        level = deviance(part, solution.frame, solution.state, CLIMB_SPREADS, restricted=False)
+        return Climb(tuple(effects), level, _values(layout, solution.state.theta)) if math.isfinite(level) else None
+
+    def _fixed(self, names: Iterable[str]) -> tuple[str, ...]:
+        held = self.found.options["fixed"]
+        return tuple(name for name in held if name in names or any(name == full.split(".")[1] for full in names))
+
+
+def _values(layout: Layout, theta: Floats) -> dict[str, Value]:
+    """Parameters by name, those of single vines as mappings; yield pressures have priors and find their way."""
+    found: dict[str, Value] = {}
+    for number, value in zip(layout.free, layout.values(theta), strict=True):
+        if number.key == YIELD_PRESSURE:
+            continue
+        if number.vine:
+            former = found.get(number.key, {})
+            assert isinstance(former, dict)
+            found[number.key] = {**former, number.vine: float(value)}
+        else:
+            found[number.key] = float(value)
+    return found
+
+
+def one_of_each(data: Sequence[FitTrial]) -> list[int]:
+    """Places of one trial of every condition, the one with the most points; spread evenly where there are too many."""
+    best: dict[str, int] = {}
+    for i, item in enumerate(data):
+        condition = item.trial.condition
+        if condition not in best or item.time_s.size > data[best[condition]].time_s.size:
+            best[condition] = i
+    places = sorted(best.values())
+    if len(places) <= MOST_CLIMBED:
+        return places
+    vines = {data[i].trial.vine for i in places}
+    take = [places[k] for k in np.unique(np.linspace(0, len(places) - 1, MOST_CLIMBED).round().astype(int))]
+    lacking = vines - {data[i].trial.vine for i in take}
+    return sorted({*take, *(next(i for i in places if data[i].trial.vine == vine) for vine in lacking)})
+
+
+def start_of(shape: Shape, size: float) -> dict[str, Value]:
+    """Values of an effect's parameters to begin from: the predicted size brought inside what is possible."""
+    effect = shape.effect
+    if not effect.parameters:
+        return {}
+    parameter = shape.size
+    low, high = parameter.bounds
+    if shape.whole:
+        size = shape.step
+    elif parameter.plausible is not None:
+        # A prediction far beyond belief is a straight line drawn too far.
+        reach = 3 * max(abs(bound - parameter.zero) for bound in parameter.plausible)
+        size = float(np.clip(size, -reach, reach))
+    if parameter.sign * size < 0 or size == 0:
+        size = parameter.sign * abs(shape.step) or shape.step
+    values = (float(np.clip(parameter.zero + size, low, high)), *shape.rest)
+    return {
+        f"{effect.name}.{one.name}": value for one, value in zip(effect.parameters, values, strict=True)
+    }
+
+
+def best_climb(slope: Slope, starts: Sequence[tuple[Sequence[Effect], Mapping[str, Value]]], goal: float) -> Climb | None:
+    """The best of several starts of one hypothesis: each a few steps, the best of them on to the end.
+
+    One that stays far above `goal`, the best deviance of any hypothesis so far, is not followed further.
+    """
+    first = [
+        one
+        for effects, start in starts
+        if (one := slope.climb(effects, start, iterations=FIRST_ITERATIONS)) is not None
+    ]
+    if not first:
+        return None
+    best = min(first, key=lambda one: one.deviance)
+    points = sum(item.time_s.size for item in slope.data)
+    if best.deviance - goal > HOPELESS * points:
+        return best
+    for _ in range(3):
+        again = slope.climb(best.effects, best.values, iterations=MORE_ITERATIONS)
+        if again is None or again.deviance > best.deviance - 0.1:
+            break
+        best = again
+    return best
+
+
+def full_fit(found: Fit, climb: Climb) -> Fit | None:
+    """The hypothesis fitted to all trials from where its climb ended; None where it cannot be followed."""
+    model = found.model
+    for effect in climb.effects:
+        model = model + effect
+    try:
+        return refit(found, model, start=climb.values)
+    except (FitError, SimulationError, np.linalg.LinAlgError):
+        return None
+
+
+def starts_of(shapes: Iterable[tuple[Shape, float]]) -> list[tuple[Sequence[Effect], Mapping[str, Value]]]:
+    """Starts of one effect from its shapes and the sizes predicted for them."""
+    seen, starts = set(), []
+    for shape, size in shapes:
+        start = start_of(shape, size)
+        key = tuple(round(float(value), 12) for value in start.values())  # type: ignore[arg-type]
+        if key not in seen:
+            seen.add(key)
+            starts.append(((shape.effect,), start))
+    return starts
