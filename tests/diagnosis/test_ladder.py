@@ -1,0 +1,156 @@
+"""The ladder of errors on campaigns grown in the virtual laboratory. Seeds 31 to 34; nothing was tuned on them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import vinetrack as vt
+from vinetrack.diagnosis.compare import compare
+from vinetrack.diagnosis.ladder import (
+    LADDER_COLUMNS,
+    MOVED_COLUMNS,
+    excess,
+    highest_pressure,
+    in_sample,
+    ladder,
+    left_out,
+    moved,
+)
+from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
+from vinetrack.laboratory.nature import BASE, Nature
+from vinetrack.laboratory.tracks import grow
+from vinetrack.model.fit_result import Fit
+from vinetrack.naming import with_names
+from vinetrack.records import Track, Trial
+
+Pairs = list[tuple[Trial, Track]]
+DEPLETION = "reservoir_depletion"
+
+
+def grown(seed: int, *effects: str, scales: Sequence[int] = (2, 4), replicates: int = 3, **more: float) -> Pairs:
+    """Vines at four pressures each on a chamber of 3.7 L that nothing refills."""
+    trials = [
+        replace(trial, chamber_m3=3.7e-3)
+        for scale in scales
+        for trial in campaign(isometric_vine(scale), (24, 30, 38, 48), replicates, prefix=f"R{scale}_")
+    ]
+    trials = list(with_names(trials))
+    nature = Nature(effects=(*BASE, *effects), values={**damping_values(trials), **more}, seed=seed)
+    return [(one.stated, one.track) for one in grow(trials, nature)]
+
+
+@pytest.fixture(scope="module")
+def pairs() -> Pairs:
+    return grown(31, DEPLETION)
+
+
+@pytest.fixture(scope="module")
+def fits(pairs: Pairs) -> tuple[Fit, Fit]:
+    before = vt.fit(vt.base_model(), pairs, profile=False)
+    return before, vt.refit(before, before.model + vt.effects.reservoir_depletion)
+
+
+def with_the_truth(pairs: Pairs) -> Fit:
+    """The model that the vines were grown with, no number of it fitted."""
+    model = vt.base_model() + vt.effects.reservoir_depletion
+    truth = model.with_values(damping_values([trial for trial, _ in pairs]) | {f"{DEPLETION}.gamma": 1.4})
+    held = ["eversion_damping.B", "eversion_damping.n", f"{DEPLETION}.gamma", "P_y"]
+    return vt.fit(truth, pairs, fixed=held, profile=False)
+
+
+def test_the_error_falls_to_that_of_the_truth_when_what_is_missing_is_added(
+    fits: tuple[Fit, Fit], pairs: Pairs
+) -> None:
+    table = ladder(fits, ["", DEPLETION])
+    assert tuple(table.columns) == LADDER_COLUMNS
+    assert table["added"].tolist() == ["", DEPLETION]
+    before, after = (table.iloc[k] for k in range(2))
+    for column in ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m"):
+        assert before[column] > 1.8 * after[column]
+    assert after["rms_left_out_m"] < 1.25 * in_sample(with_the_truth(pairs)).rms_m
+    assert before["excess_left_out_m"] > 3 * after["excess_left_out_m"]
+    assert table.attrs["notes"] == []
+
+
+def test_on_conditions_left_out_the_right_effect_is_within_a_tenth_of_the_truth_itself() -> None:
+    """Over four campaigns: in one of them, the scatter of 24 trials alone moves either by a tenth."""
+    squares = []
+    for seed in range(31, 35):
+        pairs = grown(seed, DEPLETION)
+        found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, pairs, profile=False)
+        squares.append((left_out(found).rms_m ** 2, in_sample(with_the_truth(pairs)).rms_m ** 2))
+    outside, truth = np.sqrt(np.mean(squares, axis=0))
+    assert outside < 1.1 * truth
+
+
+def test_what_is_held_in_advance_errs_alike_in_and_out_of_sample(pairs: Pairs) -> None:
+    truth = with_the_truth(pairs)
+    assert left_out(truth).rms_m == pytest.approx(in_sample(truth).rms_m, rel=1e-6)
+
+
+def test_in_sample_error_and_floor_are_those_of_the_comparison(fits: tuple[Fit, Fit], pairs: Pairs) -> None:
+    table = compare(fits[0], pairs).table
+    errors = in_sample(fits[0])
+    assert errors.rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
+    assert errors.floor_m == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
+
+
+def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vine(fits: tuple[Fit, Fit]) -> None:
+    names = sorted(trial.name for trial in fits[1].trials)
+    assert sorted(trial.name for trial in left_out(fits[1]).trials) == names
+    assert sorted(trial.name for trial in highest_pressure(fits[1]).trials) == [name for name in names if "48" in name]
+
+
+def test_a_trial_left_out_has_no_deviation_of_its_own(fits: tuple[Fit, Fit]) -> None:
+    assert {(one.pressure_deviation, one.damping_deviation) for one in left_out(fits[0]).trials} == {(0.0, 0.0)}
+
+
+def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pairs) -> None:
+    single = [pair for pair in pairs if pair[0].name.startswith("R2") or "_38kPa" in pair[0].name]
+    found = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, single, profile=False)
+    table = ladder([found], [""])
+    assert len(left_out(found).not_predicted) == 3
+    assert math.isfinite(table["rms_left_out_m"].iloc[0])
+    assert any("left-out conditions leaves out 3 trials" in note and "24mm" in note for note in table.attrs["notes"])
+
+
+def test_of_a_single_condition_nothing_can_be_left_out(pairs: Pairs) -> None:
+    found = vt.fit(vt.base_model(), pairs[:3], fixed=["n"], profile=False)
+    table = ladder([found], [""])
+    assert math.isfinite(table["rms_in_sample_m"].iloc[0])
+    assert math.isnan(table["rms_left_out_m"].iloc[0])
+    assert math.isnan(table["excess_left_out_m"].iloc[0])
+    assert table.attrs["notes"]
+
+
+def test_without_replicates_there_is_no_floor(pairs: Pairs) -> None:
+    found = vt.fit(vt.base_model(), pairs[::3], profile=False)
+    assert math.isnan(in_sample(found).floor_m)
+    assert math.isnan(ladder([found], [""])["excess_left_out_m"].iloc[0])
+
+
+def test_the_excess_is_what_the_floor_leaves_of_the_error() -> None:
+    assert excess(5.0, 3.0) == 4.0
+    assert excess(1.0, 3.0) == 0.0
+    assert math.isnan(excess(1.0, math.nan))
+
+
+def test_b_and_n_come_home_along_the_ladder(fits: tuple[Fit, Fit]) -> None:
+    table = moved(fits, ["", DEPLETION])
+    assert tuple(table.columns) == MOVED_COLUMNS
+    n = table[table["parameter"] == "eversion_damping.n"]
+    away = np.abs(n["value"].to_numpy() - 0.37)
+    assert away[1] < 0.01 < 0.03 < away[0]
+    assert len(table) == sum(len(one.numbers) for one in fits)
+
+
+def test_a_model_of_24_trials_takes_less_than_a_second_and_a_half(fits: tuple[Fit, Fit]) -> None:
+    begin = time.process_time()
+    ladder(fits, ["", DEPLETION])
+    assert (time.process_time() - begin) / 2 < 1.5
