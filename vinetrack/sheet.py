@@ -98,7 +98,7 @@ def _judge_name(row: Row) -> None:
 def judge_row(row: Row, folder: Path) -> None:
     """Judge a row as a whole: paths that lead out, and values that contradict each other."""
     _judge_paths(row, folder)
-    _judge_wall(row)
+    judge_wall(row)
     fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
     # 2 % allows for rounding of both; a shutter that stays open longer than its frame does not exist.
     if exposure > 1.02e6 / fps:
@@ -160,7 +160,7 @@ def _has_dng_frames(folder: Path, video: str) -> bool:
         return False
 
 
-def _judge_wall(row: Row) -> None:
+def judge_wall(row: Row) -> None:
     """Refuse a wall that no tube of this diameter can have."""
     diameter, thickness = row.values.get("diameter_mm", math.nan), row.values.get("thickness_um", math.nan)
     if thickness / 1000 > diameter / 4:

@@ -258,7 +258,7 @@ def _fallen_pressure(model: Model, motion: Motion, neglected: dict[str, dict[str
         shares.append(1 - float(np.min(left)) / pressure)
     if shares[1] > PRESSURE_SHARE:
         yield (
-            f"the reservoir of {1e3 * motion.trial.chamber_m3:.1f} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "
+            f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "
             f"(fast) of its gauge pressure while the vine grows, above {PRESSURE_SHARE:.0%}, unless a supply refills "
             "it; add reservoir_depletion or supply_refill to the model, or measure the pressure"
         )

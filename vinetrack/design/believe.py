@@ -1,0 +1,320 @@
+"""Beliefs made: from a fit, from what a person says, from guesses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vinetrack import published
+from vinetrack.design import guess
+from vinetrack.design.beliefs import PRESSURE, YIELD, Belief, Draws, Move, Size, Uncertainty, wanted_model
+from vinetrack.design.from_fit import FitNumbers, nearest_vine, same_vine, yield_place
+from vinetrack.effects import BASE_EFFECTS, Effect
+from vinetrack.model.fit_data import FitError
+from vinetrack.model.free import DAMPING, EXPONENT
+from vinetrack.model.model import Model
+from vinetrack.naming import with_names
+from vinetrack.records import Trial
+
+FARTHEST_SCATTER = 20.0
+"""Standard deviations at which a draw of Student's t is cut: a factor ten of B, beyond all vines."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a person says of the numbers, in place of any other source; NaN where nothing.
+
+    `B_error` is relative, `n_error` absolute, both standard deviations. `effects` are further effects of the model
+    beside `model`, `sizes` their parameters where they are given; `spreads` those of pressure and B from trial to
+    trial, relative.
+    """
+
+    B: float = math.nan
+    B_error: float = 0.0
+    n: float = math.nan
+    n_error: float = 0.0
+    model: tuple[str, ...] = BASE_EFFECTS
+    effects: tuple[str, ...] = ()
+    sizes: Mapping[str, Size] = field(default_factory=dict)
+    own: Mapping[str, Effect] = field(default_factory=dict)
+    spreads: tuple[float, float] | None = None
+
+
+class _Making:
+    """A belief while it is put together."""
+
+    def __init__(self, trial: Trial, fit: FitNumbers | None) -> None:
+        self.trial = trial if trial.vine else with_names([trial])[0]
+        self.fit = fit
+        self.values: dict[str, float] = {}
+        self.origins: dict[str, str] = {}
+        self.uncertainties: list[Uncertainty] = []
+        self.notes: list[str] = []
+        self.drawn: dict[str, int] = {}
+        """Numbers that the fit gives, and where they stand in it."""
+
+    def know(self, name: str, value: float, origin: str) -> None:
+        self.values[name], self.origins[name] = value, origin
+
+    def doubt(self, name: str, words: str, key: str, move: Move) -> None:
+        self.uncertainties.append(Uncertainty(name, words, key, move))
+
+
+def believe(trial: Trial, said: Said | None = None, fit: FitNumbers | None = None) -> Belief:
+    """Put together what is believed of a trial.
+
+    Parameters
+    ----------
+    trial
+        The vine and its rig; a yield pressure of NaN is guessed, or taken from the fit.
+    said
+        Numbers that a person gives.
+    fit
+        Numbers of a fit, whose model is then the model.
+
+    Raises
+    ------
+    EffectError
+        If an effect of the model is unknown.
+    FitError
+        If the fit is not one of everting vines.
+    """
+    said = said or Said()
+    making = _Making(trial, fit)
+    model = wanted_model(fit.model if fit else said.model, said.effects, said.own)
+    if fit is not None and DAMPING not in fit.keys:
+        raise FitError(f"{fit.source} is not a fit of everting vines: it has no B to predict with.")
+    anchor = _anchor(making)
+    _damping(making, said, anchor)
+    _exponent(making, said)
+    _yield_pressure(making, anchor)
+    _further(making, said, model, anchor)
+    _from_fit(making)
+    _spreads(making, said)
+    values = {name: value for name, value in making.values.items() if name in model.parameter_names}
+    return Belief(
+        trial=replace(making.trial, yield_pressure_Pa=making.values[YIELD]),
+        model=model.with_values(values),
+        origins=making.origins,
+        uncertainties=tuple(making.uncertainties),
+        notes=tuple(making.notes),
+    )
+
+
+def _anchor(making: _Making) -> tuple[str, bool]:
+    """The vine of the fit that this one is taken for, and whether it is the same; blank where there is no fit."""
+    if making.fit is None:
+        return "", False
+    same = same_vine(making.fit, making.trial)
+    if same is not None:
+        return same, True
+    return nearest_vine(making.fit, making.trial) or "", False
+
+
+def _damping(making: _Making, said: Said, anchor: tuple[str, bool]) -> None:
+    vine, is_same = anchor
+    trial, fit = making.trial, making.fit
+    if math.isfinite(said.B):
+        making.know(DAMPING, said.B, "given")
+        if said.B_error > 0:
+            words = f"B is given to {100 * said.B_error:.2g} % (one standard deviation)"
+            making.doubt("error of B", words, f"B given|{trial.vine}", _scaled(DAMPING, said.B_error))
+        return
+    place = fit.place(DAMPING, vine) if fit else None
+    if fit is not None and place is not None:
+        making.drawn[DAMPING] = place
+        own = math.exp(float(fit.mean[place])) if fit.log[place] else float(fit.mean[place])
+        if is_same or fit.vines[place] == "":
+            making.know(DAMPING, own, f"fitted, {fit.source}")
+            return
+        size = fit.sizes()[vine]
+        factor = guess.guess_damping(trial.diameter_m, trial.thickness_m) / guess.guess_damping(*size)
+        making.know(DAMPING, own * factor, f"scaled from {vine} of {fit.source} as t·D^0.75: a guess")
+        making.notes.append(
+            f"no vine of {fit.source} has this diameter and wall: B is carried over from {vine} by a guess"
+        )
+        split = guess.split_leverage(trial.diameter_m, trial.thickness_m) - guess.split_leverage(*size)
+    elif scale := published.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m):
+        making.know(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
+        words = f"the error of the printed B is not printed; taken for {100 * guess.PRINTED_ERROR:.0f} %"
+        making.doubt("error of B", words, f"B printed|{trial.vine}", _scaled(DAMPING, guess.PRINTED_ERROR))
+        return
+    else:
+        making.know(
+            DAMPING,
+            guess.guess_damping(trial.diameter_m, trial.thickness_m),
+            "guess: 6.44 (t/200 µm)(D/24 mm)^0.75",
+        )
+        split = guess.split_leverage(trial.diameter_m, trial.thickness_m)
+    _doubt_guess(making, split)
+
+
+def _doubt_guess(making: _Making, split: float) -> None:
+    """Errors of the guessed law of B: the scatter of the printed values about it, and t against D."""
+    scatter = guess.damping_log_sigma(making.trial.diameter_m, making.trial.thickness_m)
+    words = (
+        f"the four printed B scatter by {100 * guess.damping_scatter():.0f} % about the guessed law, which at this "
+        f"size makes {100 * scatter:.0f} % (Student's t, {guess.SCATTER_DOF} degrees of freedom)"
+    )
+    making.doubt("guess of B", words, f"B scatter|{making.trial.vine}", _heavy(DAMPING, scatter))
+    if abs(split) > 1e-9:
+        words = (
+            f"what t and D do apart is not printed: exponents off by {guess.SPLIT_SIGMA:g} against each other, "
+            f"{100 * abs(split) * guess.SPLIT_SIGMA:.0f} % of B at this t/D"
+        )
+        making.doubt("t against D", words, "B split", _scaled(DAMPING, split * guess.SPLIT_SIGMA))
+
+
+def _exponent(making: _Making, said: Said) -> None:
+    if math.isfinite(said.n):
+        making.know(EXPONENT, said.n, "given")
+        if said.n_error > 0:
+            words = f"n is given to {said.n_error:.2g} (one standard deviation)"
+            making.doubt("error of n", words, "n given", _shifted(EXPONENT, said.n_error))
+        return
+    place = making.fit.place(EXPONENT) if making.fit else None
+    if making.fit is not None and place is not None:
+        making.drawn[EXPONENT] = place
+        making.know(EXPONENT, float(making.fit.mean[place]), f"fitted, {making.fit.source}")
+        return
+    sigma = guess.exponent_sigma()
+    making.know(EXPONENT, published.EXPONENT, f"printed, {published.SOURCE}")
+    words = f"n is known to {sigma:.2g}, from the printed R² of its fits"
+    making.doubt("error of n", words, "n printed", _shifted(EXPONENT, sigma))
+
+
+def _yield_pressure(making: _Making, anchor: tuple[str, bool]) -> None:
+    vine, is_same = anchor
+    trial, fit = making.trial, making.fit
+    place = yield_place(fit, vine, trial.yield_pressure_Pa) if fit and is_same else None
+    if fit is not None and place is not None and _agrees(fit, place, trial):
+        making.drawn[YIELD] = place
+        making.know(YIELD, float(fit.mean[place]), f"fitted, {fit.source}")
+    elif math.isfinite(trial.yield_pressure_Pa):
+        making.know(YIELD, trial.yield_pressure_Pa, "given")
+        sigma = trial.yield_pressure_sigma_Pa
+        if sigma > 0:
+            words = f"the yield pressure is stated to {sigma / 1e3:.2g} kPa"
+            making.doubt("stated P_y", words, f"P_y stated|{trial.vine}", _shifted(YIELD, sigma))
+    else:
+        making.know(YIELD, guess.YIELD_PRESSURE_PA, "guess: the one that is printed, for another vine")
+        words = (
+            f"the yield pressure is a guess: {published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine, nine of ten "
+            f"others within a factor {guess.YIELD_FACTOR:g} of it"
+        )
+        making.doubt("guess of P_y", words, "P_y guess", _scaled(YIELD, guess.yield_log_sigma()))
+
+
+def _agrees(fit: FitNumbers, place: int, trial: Trial) -> bool:
+    """Whether the sheet says nothing else of the yield pressure than the fit found."""
+    stated, sigma = trial.yield_pressure_Pa, trial.yield_pressure_sigma_Pa
+    room = 3 * math.hypot(sigma if sigma > 0 else 0.0, math.sqrt(fit.covariance[place, place]))
+    return not math.isfinite(stated) or abs(stated - float(fit.mean[place])) <= max(room, 1.0)
+
+
+def _further(making: _Making, said: Said, model: Model, anchor: tuple[str, bool]) -> None:
+    """Parameters of all other effects: as said, as fitted, or at their typical size."""
+    for effect in model:
+        for parameter in effect.parameters:
+            name = f"{effect.name}.{parameter.name}"
+            if name in making.values:
+                continue
+            size = said.sizes.get(name)
+            place = making.fit.place(name, anchor[0]) if making.fit else None
+            if size is not None:
+                making.know(name, size.middle, "given")
+                if size.high > size.low:
+                    words = f"{parameter.symbol} of {effect.name} evenly between {size.low:g} and {size.high:g}"
+                    making.doubt(f"{parameter.symbol} ({effect.name})", words, name, _even(name, size))
+            elif making.fit is not None and place is not None:
+                making.drawn[name] = place
+                making.know(name, float(making.fit.mean[place]), f"fitted, {making.fit.source}")
+            else:
+                fixed = "constant" if parameter.held else "typical size, without an error"
+                making.know(name, parameter.default, fixed)
+
+
+def _from_fit(making: _Making) -> None:
+    """The numbers that the fit gives, drawn together."""
+    fit = making.fit
+    if fit is None or not making.drawn:
+        return
+    names, places = list(making.drawn), list(making.drawn.values())
+    covariance = fit.covariance[np.ix_(places, places)]
+    log = fit.log[places]
+
+    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+        size = next(iter(draws.values())).size
+        off = draw.multivariate_normal(np.zeros(len(places)), covariance, size, method="svd")
+        moved = {
+            name: draws[name] * np.exp(off[:, k]) if log[k] else draws[name] + off[:, k] for k, name in enumerate(names)
+        }
+        return {**draws, **moved}
+
+    symbols = {DAMPING: "B", EXPONENT: "n", YIELD: "P_y"}
+    shown = ", ".join(symbols.get(name, name) for name in names)
+    words = f"{shown} as {fit.source} knows them, with their covariance ({fit.n_trials} trials)"
+    making.uncertainties.insert(0, Uncertainty("fitted numbers", words, "fit", move))
+    if fit.open:
+        making.notes.append(
+            f"{fit.source} leaves {', '.join(fit.open)} open: they stand at their values, without an error"
+        )
+
+
+def _spreads(making: _Making, said: Said) -> None:
+    """What differs from one trial to the next."""
+    fit, trial = making.fit, making.trial
+    stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else guess.PRESSURE_SPREAD
+    pressure = stated if math.isfinite(stated) else guess.PRESSURE_SPREAD
+    damping, origin = guess.DAMPING_SPREAD, "taken for"
+    if fit is not None and fit.spreads:
+        pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
+        origin = f"found in {fit.source}:"
+    if said.spreads is not None:
+        (pressure, damping), origin = said.spreads, "given:"
+    making.know(PRESSURE, trial.pressure_Pa, "set")
+    if pressure > 0:
+        words = f"pressure from trial to trial, {origin} {100 * pressure:.2g} %"
+        making.doubt("P from trial to trial", words, f"P trial|{trial.vine}", _relative(PRESSURE, pressure))
+    if damping > 0:
+        words = f"B from trial to trial, {origin} {100 * damping:.2g} %"
+        making.doubt("B from trial to trial", words, f"B trial|{trial.vine}", _scaled(DAMPING, damping))
+
+
+def _scaled(name: str, log_sigma: float) -> Move:
+    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+        return {**draws, name: draws[name] * np.exp(log_sigma * draw.standard_normal(draws[name].size))}
+
+    return move
+
+
+def _heavy(name: str, log_sigma: float) -> Move:
+    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+        t = np.clip(draw.standard_t(guess.SCATTER_DOF, draws[name].size), -FARTHEST_SCATTER, FARTHEST_SCATTER)
+        return {**draws, name: draws[name] * np.exp(log_sigma * t)}
+
+    return move
+
+
+def _shifted(name: str, sigma: float) -> Move:
+    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+        return {**draws, name: draws[name] + sigma * draw.standard_normal(draws[name].size)}
+
+    return move
+
+
+def _relative(name: str, sigma: float) -> Move:
+    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+        return {**draws, name: draws[name] * (1 + sigma * draw.standard_normal(draws[name].size))}
+
+    return move
+
+
+def _even(name: str, size: Size) -> Move:
+    def move(draws: Draws, draw: np.random.Generator) -> Draws:
+        return {**draws, name: draw.uniform(size.low, size.high, draws[name].size)}
+
+    return move
