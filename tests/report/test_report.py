@@ -15,7 +15,7 @@ from vinetrack.report.svg import inline_svg, speed_sparkline
 from vinetrack.report.words import headline, tally, without_law
 
 EVIL = "<script>alert('x')</script>&\"'"
-SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"/></defs><g id="g1" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></svg>'  # noqa: E501
+SVG = '<?xml version="1.0"?>\n<!-- c --><svg width="504pt" height="360pt" viewBox="0 0 504 360" xmlns="http://www.w3.org/2000/svg"><metadata>m</metadata><defs><style type="text/css">*{a:b}</style><clipPath id="p1"><rect x="0" y="0" width="9" height="9"/></clipPath></defs><g id="g1"><path d="M 0 0 L 5 5" clip-path="url(#p1)" style="fill: #20242a; stroke: #0072b2"/></g></svg>'  # noqa: E501
 
 
 def law(n_trials: int = 4, B: float = 2.0) -> dict:
@@ -203,7 +203,7 @@ def test_an_inlined_picture_follows_the_page_and_keeps_its_proportions() -> None
     assert "currentColor" in svg
     assert "var(--blue)" in svg
     assert 'viewBox="0 0 504 360"' in svg
-    assert 'id="law-g1"' in svg
+    assert 'id="law-p1"' in svg
     assert "url(#law-p1)" in svg
     assert 'aria-label="a &quot;law&quot;"' in svg
     for gone in ("<?xml", "<!--", "<metadata", "<style", 'height="360pt"'):

@@ -42,7 +42,7 @@ METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on bo
 METHOD_LINES = {"log_log": (0, (4, 2)), "both_axes": "-"}
 
 _RC: Any = {
-    "font.family": "DejaVu Sans",
+    "font.family": ["DejaVu Sans", "sans-serif"],
     "font.size": 11,
     "axes.titlesize": 11,
     "axes.titlelocation": "left",
@@ -69,7 +69,7 @@ _RC: Any = {
     "figure.facecolor": "none",
     "savefig.facecolor": "none",
     "svg.hashsalt": "vinetrack",
-    "svg.fonttype": "path",
+    "svg.fonttype": "none",
     "path.simplify": True,
 }
 

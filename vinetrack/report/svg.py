@@ -2,46 +2,35 @@
 
 from __future__ import annotations
 
-import re
 from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, VERMILLION
+from vinetrack.report.compact import compact_svg
 
 _THEMED = {
-    INK: "currentColor",
-    GRID: "var(--grid)",
-    MUTED: "var(--muted)",
-    PAPER: "var(--paper)",
-    BLUE: "var(--blue)",
-    VERMILLION: "var(--vermillion)",
-    GREEN: "var(--green)",
+    INK.lower(): "currentColor",
+    GRID.lower(): "var(--grid)",
+    MUTED.lower(): "var(--muted)",
+    PAPER.lower(): "var(--paper)",
+    BLUE.lower(): "var(--blue)",
+    VERMILLION.lower(): "var(--vermillion)",
+    GREEN.lower(): "var(--green)",
 }
-_REFERENCE = re.compile(r"""(\bid="|url\(#|href="#)""")
 
 
 def inline_svg(svg: str, prefix: str, description: str) -> str:
-    """Return an SVG file's root element, ready to stand in a page.
+    """Return an SVG file as an element ready to stand in a page.
 
     Neutral colours become the page's own, so that it follows a dark screen; identifiers get `prefix`, since several
-    pictures share one page; the size becomes that of the page's column. `description` is for those who cannot see it.
+    pictures share one page. `description` is for those who cannot see it. The page's style sheet sets the size by
+    `--wide`, at which text in the picture is as large as that of the page.
     """
-    root = svg[svg.index("<svg") :]
-    root = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>|<style[^>]*>.*?</style>", "", root, flags=re.DOTALL)
-    root = _REFERENCE.sub(lambda match: f"{match[0]}{prefix}-", root)
-    for colour, themed in _THEMED.items():
-        root = re.sub(re.escape(colour), themed, root, flags=re.IGNORECASE)
-    head, body = root.split(">", 1)
-    width = re.search(r'width="([\d.]+)pt"', head)
-    head = re.sub(r'\s(?:width|height|xmlns:xlink|version)="[^"]*"', "", head)
-    # A picture is shown at most a third larger than drawn: text in it then keeps in step with the page's.
-    size = f"max-width:{float(width[1]) * 1.33:.0f}px" if width else ""
-    label = escape(description, quote=True)
-    body = body.replace("xlink:href", "href")
-    body = re.sub(r">\s+<", "><", body).strip()
-    return f'{head} role="img" aria-label="{label}" style="{size}">{body}'
+    body, width_pt, height_pt = compact_svg(svg, prefix, _THEMED)
+    label, box = escape(description, quote=True), f"0 0 {width_pt:g} {height_pt:g}"
+    return f'<svg viewBox="{box}" role="img" aria-label="{label}" style="--wide:{1.33 * width_pt:.0f}px">{body}</svg>'
 
 
 def speed_sparkline(
