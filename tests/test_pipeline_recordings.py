@@ -177,6 +177,8 @@ def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> Non
     for name in (*GOOD, "part"):
         assert f'aria-label="Strip of {name} with its tracked edge"' in page
         assert (filmed.results / "figures" / f"strip_{name}.png").read_bytes().startswith(b"\x89PNG")
+    axis = json.loads((filmed.results / "analysed" / f"{GOOD[0]}.json").read_text())["axis"]
+    assert np.hypot(*np.subtract(axis["to_px"], axis["from_px"])) > 100
     assert "ChArUco board" in page
     assert "kept apart from the random error" in page
     assert filmed.said.stdout.strip().splitlines()[-1] == "Report: results/vines/report.html"

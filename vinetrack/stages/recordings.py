@@ -64,7 +64,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
             mm_per_px=1e3 * measurement.m_per_px,
             scale_rel_sigma=measurement.scale_rel_sigma,
         )
-        _add_calibration(results, trial.name, measurement, getattr(experiment.settings.calibration, "image", None))
+        _add_view(results, trial.name, measurement, getattr(experiment.settings.calibration, "image", None))
     except (RecordingError, TrackError) as error:
         reason, fault = str(error), ""
         write_empty(results, trial.name, failed_row(trial, reason))
@@ -75,8 +75,8 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     return reason, fault
 
 
-def _add_calibration(results: Results, name: str, measurement: Measurement, image: str | None) -> None:
-    """Add to the file of a trial what the scale of its recording rests on."""
+def _add_view(results: Results, name: str, measurement: Measurement, image: str | None) -> None:
+    """Add to the file of a trial what the scale of its recording rests on, and the axis its `edge_px` counts along."""
     found = measurement.calibration
     entry: dict[str, Any] = {
         "kind": "sheet" if found is None else found.kind,
@@ -88,8 +88,10 @@ def _add_calibration(results: Results, name: str, measurement: Measurement, imag
         "n_pictures": 0 if found is None else found.n_pictures,
         "notes": [] if found is None else found.notes,
     }
+    axis = measurement.tracking.axis
+    line = {"from_px": axis.from_px, "to_px": axis.to_px, "width_px": axis.width_px}
     path = results.analysed(name)
-    write_json(path, read_json(path) | {"calibration": entry})
+    write_json(path, read_json(path) | {"calibration": entry, "axis": line})
 
 
 def _draw(trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings) -> None:
