@@ -47,6 +47,66 @@ class TrialResult:
     point: Mapping[str, object]
 
 
+@dataclass(frozen=True)
+class Motion:
+    """What a track says of a trial whatever the model: its corrected track, motion, release, and windows by rule."""
+
+    trial: Trial
+    track: Track
+    kinematics: Kinematics
+    release: Release
+    windows: Mapping[str, Window]
+
+
+@dataclass(frozen=True)
+class Steadiness:
+    """Windows by rule under one model, the one whose numbers are reported, and the force in it (None: none)."""
+
+    windows: Mapping[str, Window]
+    chosen: Window | None
+    force: SteadyForce | None
+
+
+def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> Motion:
+    """Velocity, release and the windows that no model is asked for.
+
+    Raises
+    ------
+    TrialError
+        If fewer than five points say where the leading edge was.
+    """
+    usable = int(track.usable.sum())
+    if usable < FEWEST_POINTS:
+        raise TrialError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
+    track = correct_frames(track)
+    kinematics = estimate_kinematics(
+        track, travel_ratio=trial.travel_ratio, order=settings.velocity.order, kappa=settings.velocity.kappa
+    )
+    release = find_release(track, kinematics)
+    track = flag_rest(track, release)
+    return Motion(trial, track, kinematics, release, _windows(trial, track, kinematics, settings))
+
+
+def steadiness_under(motion: Motion, model: Model) -> Steadiness:
+    """The steady window of a trial and the force there, with the pressure along the way that a model gives.
+
+    Raises
+    ------
+    EffectError
+        If the model lacks what it needs of the trial.
+    """
+    trial, track, kinematics, release = motion.trial, motion.track, motion.kinematics, motion.release
+    windows = dict(motion.windows)
+    chosen = _chosen(windows)
+    if chosen is None and "user" not in windows and why_not_in_fit(trial) == "":
+        pressure_Pa = known_pressure(trial, track, kinematics, release, model)
+        if pressure_Pa is not None:
+            windows["quasi_steady"] = quasi_steady_window(trial, track, kinematics, release, pressure_Pa)
+            chosen = _chosen(windows)
+    force = steady_force(trial, track, kinematics, release, chosen, model) if chosen else None
+    return Steadiness(windows, chosen, force)
+
+
 def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Model) -> TrialResult:
     """Velocity, steady windows by every rule, force, final speed and efficiency of one trial.
 
@@ -60,28 +120,14 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
     TrialError
         If fewer than five points say where the leading edge was, or the model lacks what it needs of the trial.
     """
-    usable = int(track.usable.sum())
-    if usable < FEWEST_POINTS:
-        raise TrialError(f"{usable} usable points; at least {FEWEST_POINTS} are needed.")
-    track = correct_frames(track)
-    kinematics = estimate_kinematics(
-        track, travel_ratio=trial.travel_ratio, order=settings.velocity.order, kappa=settings.velocity.kappa
-    )
-    release = find_release(track, kinematics)
-    track = flag_rest(track, release)
-    windows = _windows(trial, track, kinematics, settings)
-    chosen = _chosen(windows)
+    motion = look_at_motion(trial, track, settings)
     try:
-        if chosen is None and "user" not in windows and why_not_in_fit(trial) == "":
-            pressure_Pa = known_pressure(trial, track, kinematics, release, model)
-            if pressure_Pa is not None:
-                windows["quasi_steady"] = quasi_steady_window(trial, track, kinematics, release, pressure_Pa)
-                chosen = _chosen(windows)
-        force = steady_force(trial, track, kinematics, release, chosen, model) if chosen else None
+        steady = steadiness_under(motion, model)
     except EffectError as error:
         raise TrialError(str(error)) from error
-    warnings = _warnings(track, release, windows)
-    notes = [*warnings, *([] if chosen else [f"no steady window: {windows['gated'].reason}"])]
+    track, kinematics, windows = motion.track, motion.kinematics, steady.windows
+    warnings = _warnings(track, motion.release, windows)
+    notes = [*warnings, *([] if steady.chosen else [f"no steady window: {windows['gated'].reason}"])]
     row = {
         "trial": trial.name,
         "vine": trial.vine,
@@ -92,10 +138,10 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         "mm_per_px": trial.m_per_px * 1e3,
         "scale_rel_sigma": math.nan,
         "noise_m": kinematics.noise_m,
-        **_steady_columns(chosen, windows["paper"], force),
-        **_end_columns(trial, kinematics, release, settings),
+        **_steady_columns(steady.chosen, windows["paper"], steady.force),
+        **_end_columns(trial, kinematics, motion.release, settings),
     }
-    return TrialResult(track, kinematics, release, windows, row, _point(trial, chosen, windows["paper"], force))
+    return TrialResult(track, kinematics, motion.release, windows, row, damping_point(trial, steady))
 
 
 def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSettings) -> dict[str, Window]:
@@ -164,7 +210,9 @@ def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, setting
     return {"final_lead_velocity_m_s": final, "efficiency": efficiency}
 
 
-def _point(trial: Trial, window: Window | None, paper: Window, force: SteadyForce | None) -> dict[str, object]:
+def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
+    """The row of a trial in the damping fit, with `used` and the `reason` if not."""
+    window, paper, force = steady.chosen, steady.windows["paper"], steady.force
     reason = why_not_in_fit(trial) or why_not_force(force)
     nan = math.nan
     return {
