@@ -28,22 +28,24 @@ rule all:
         plan.result("provenance.json"),
 
 
-if plan.is_demo:
+if plan.nature:
 
-    rule recordings:
-        """Make what the demonstration's trial sheet names, once, in the virtual laboratory."""
+    rule laboratory:
+        """Make what the sheet of a shipped experiment names, once, in the virtual laboratory."""
         input:
             plan.sheets,
         output:
-            plan.recordings,
+            plan.measurements,
         log:
-            plan.result("logs", "recordings.log"),
+            plan.result("logs", "laboratory.log"),
         threads: 4  # scaled down to the cores that are given
         params:
             code=code_hash("laboratory"),
             folder=plan.experiment,
+            nature=plan.nature,
         shell:
-            "python -m vinetrack.laboratory {params.folder:q} --processes {threads} 2>&1 | tee {log:q}"
+            "python -m vinetrack.laboratory {params.folder:q} --nature {params.nature:q} --processes {threads} 2>&1"
+            " | tee {log:q}"
 
 
 rule recording:
@@ -160,6 +162,7 @@ rule model:
         plan.result("comparison.csv"),
         plan.result("model_check.csv"),
         plan.result("audit.csv"),
+        plan.result("payload_model.csv"),
         directory(plan.result("comparison")),
     log:
         plan.result("logs", "model.log"),

@@ -12,6 +12,8 @@ from vinetrack import workflow
 from vinetrack.problems import ExperimentError
 from vinetrack.workflow import code_hash, find_experiment, make_plan, shell_prefix
 
+ROOT = Path(__file__).parents[1]
+
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
 
 
@@ -59,14 +61,23 @@ def test_the_shipped_demonstration_is_found_wherever_snakemake_is_run(
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     plan = make_plan({"experiment": "data/demo"}, tmp_path / "house")
-    assert plan.is_demo
+    assert plan.nature
+    assert plan.nature.name == "demo.yaml"
     assert plan.results == Path("results/demo")
-    assert plan.recordings == [str(tmp_path / "house" / "data" / "demo" / "a.csv")]
+    assert plan.measurements == [str(tmp_path / "house" / "data" / "demo" / "a.csv")]
 
 
-def test_another_experiment_is_no_demonstration(tmp_path: Path) -> None:
+def test_another_experiment_is_none_of_the_laboratory(tmp_path: Path) -> None:
     experiment(tmp_path / "data" / "demo")
-    assert not make_plan({"experiment": str(experiment(tmp_path / "v"))}, tmp_path).is_demo
+    assert make_plan({"experiment": str(experiment(tmp_path / "v"))}, tmp_path).nature is None
+
+
+def test_every_shipped_experiment_has_its_own_nature(tmp_path: Path) -> None:
+    for name in ("demo", "paper"):
+        plan = make_plan({"experiment": f"data/{name}", "results": str(tmp_path)}, ROOT)
+        assert plan.nature == ROOT / "vinetrack" / "laboratory" / f"{name}.yaml"
+        assert plan.published is (name == "paper")
+        assert all(Path(path).parent.name in ("videos", "calibration", "tracks") for path in plan.measurements)
 
 
 def test_a_missing_folder_names_the_one_that_was_probably_meant(tmp_path: Path) -> None:

@@ -111,11 +111,12 @@ class Limits(_Strict):
     """Which further trials could be made, for the next experiment; None where the trials so far are the guide.
 
     Pressure and payload are ranges (`7:40` or two numbers); the others are what there is to choose from: one value, a
-    list, or a range, of which five values are looked at. `trials` is how many can be afforded, `hoop_stress_MPa` what
-    the film is trusted to hold.
+    list, or a range, of which five values are looked at. `trials` is how many can be afforded, `new_vines` whether a
+    vine can be made for them, `hoop_stress_MPa` what the film is trusted to hold.
     """
 
     trials: Annotated[Count, Field(ge=1, le=24)] = 4
+    new_vines: bool = True
     pressure_kPa: tuple[float, float] | None = None
     payload_g: tuple[float, float] | None = None
     diameter_mm: tuple[float, ...] | None = None
@@ -223,6 +224,8 @@ class ExperimentSettings(_Strict):
     axis: Axis | None = None
     calibration: Calibration | None = None
     limits: Limits = Limits()
+    published: Literal["simulated", "measured"] | None = None
+    """Set the paper's numbers beside ours, whose trials were grown from its parameters, or filmed."""
 
     @field_validator(*SHARED, mode="before")
     @classmethod

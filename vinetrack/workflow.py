@@ -57,7 +57,9 @@ class Plan:
 
     `trials` are all that get files (those that failed at the sheet too, with empty ones); `filmed` those of them that
     come as recordings, each with its own inputs; `inputs` what all are read from; `unwatched` a fingerprint of inputs
-    that cannot stand in a rule; `is_demo` whether the recordings are made on first use by the virtual laboratory.
+    that cannot stand in a rule; `nature` what is true in a shipped virtual experiment, whose measurements are made on
+    first use by the virtual laboratory, and None in anybody's own; `published` whether the paper's numbers are set
+    beside those of this experiment.
     """
 
     experiment: Path
@@ -67,7 +69,8 @@ class Plan:
     inputs: tuple[Path, ...]
     unwatched: str
     settings: RunSettings
-    is_demo: bool
+    nature: Path | None
+    published: bool
 
     @property
     def sheets(self) -> list[str]:
@@ -80,8 +83,8 @@ class Plan:
         return [path.as_posix() for path in self.inputs if path.suffix == ".py"]
 
     @property
-    def recordings(self) -> list[str]:
-        """What the virtual laboratory makes of the demonstration's sheet."""
+    def measurements(self) -> list[str]:
+        """What the virtual laboratory makes of a shipped experiment's sheet: recordings and a target, or tracks."""
         return [path.as_posix() for path in self.inputs if path.name not in SHARED_FILES]
 
     def result(self, *parts: str) -> str:
@@ -152,21 +155,21 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
 
     paths = {key: str(config[key]) for key in ("experiment", "results") if config.get(key) is not None}
     settings = run_settings({**config, **paths})
-    demo = base / "data" / "demo"
     folder = Path(settings.experiment)
-    if not folder.exists() and settings.experiment == type(settings)().experiment:
-        folder = demo
-    is_demo = folder.exists() and demo.exists() and folder.samefile(demo)
+    if not folder.exists() and find_nature(base / folder, base):
+        folder = base / folder
+    nature = find_nature(folder, base)
+    is_virtual = nature is not None
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
     _refuse_braces(folder, results)
     trials = tuple(name for name in experiment.names if name not in experiment.left_out)
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
-    present = (path for path in files if path is not None and (is_demo or path.exists()))
+    present = (path for path in files if path is not None and (is_virtual or path.exists()))
     own = (folder / path for path in experiment.settings.effects)
     shared = [path for path in (*(folder / name for name in SHARED_FILES), *own) if path.exists()]
     target = getattr(experiment.settings.calibration, "image", None)
-    targets = [folder / target] if target is not None and (is_demo or (folder / target).exists()) else []
+    targets = [folder / target] if target is not None and (is_virtual or (folder / target).exists()) else []
     inputs = dict.fromkeys([*shared, *targets, *present])
     watched = tuple(path for path in inputs if not _has_brace(path))
     filmed = {
@@ -178,7 +181,29 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
         for trial in experiment.trials
         if trial.video is not None
     }
-    return Plan(folder, results, trials, filmed, watched, _fingerprint(inputs), settings, is_demo)
+    return Plan(
+        experiment=folder,
+        results=results,
+        trials=trials,
+        filmed=filmed,
+        inputs=watched,
+        unwatched=_fingerprint(inputs),
+        settings=settings,
+        nature=nature,
+        published=experiment.settings.published is not None,
+    )
+
+
+def find_nature(folder: Path, base: Path) -> Path | None:
+    """What is true in an experiment that is shipped with a sheet alone; None for a folder of anybody's own.
+
+    The virtual laboratory has a file for each folder of `data/` that it makes, by the same name.
+    """
+    for nature in sorted((PACKAGE / "laboratory").glob("*.yaml")):
+        shipped = base / "data" / nature.stem
+        if folder.exists() and shipped.exists() and folder.samefile(shipped):
+            return nature
+    return None
 
 
 def _has_brace(path: Path) -> bool:

@@ -1,26 +1,30 @@
 """Grow the trials of an experiment folder in the virtual laboratory and make what its sheet names.
 
     python -m vinetrack.laboratory data/demo [--nature FILE] [--truth FILE] [--processes N]
+    python -m vinetrack.laboratory data/paper --film FOLDER [--only PATTERN]
 
 Trials with a `video` are filmed, with the calibration picture that `experiment.yaml` names; those with a `track` are
-measured. The sheet says what is to be grown; `--nature` what is true and hidden (default: that of the demonstration).
-The truth is written only where `--truth` says, never inside the experiment.
+measured. The sheet says what is to be grown; `--nature` what is true and hidden (default: the file here that is called
+as the experiment's folder is, else that of the demonstration). `--film` makes an experiment of recordings of one whose
+trials are tracks: the same trials, or those whose names match a pattern such as 'fig4_*', before a camera. The truth is
+written only where `--truth` says, never inside the experiment.
 """
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import os
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from vinetrack.experiment import Experiment, read_experiment
 from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
 from vinetrack.laboratory.nature import read_nature
+from vinetrack.laboratory.refilm import before_the_camera
 from vinetrack.laboratory.tracks import VirtualTrial, grow, write_tracks, write_truth
 
 DEMO = Path(__file__).with_name("demo.yaml")
@@ -30,13 +34,26 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command described above."""
     parser = argparse.ArgumentParser(prog="python -m vinetrack.laboratory", description="Grow the trials of a sheet.")
     parser.add_argument("experiment", type=Path)
-    parser.add_argument("--nature", type=Path, default=DEMO)
+    parser.add_argument("--nature", type=Path)
     parser.add_argument("--truth", type=Path)
+    parser.add_argument("--film", type=Path, metavar="FOLDER")
+    parser.add_argument("--only", default="*", metavar="PATTERN")
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
     given = parser.parse_args(arguments)
     experiment = read_experiment(given.experiment, strict=True)
-    nature = read_nature(given.nature)
-    grown = grow(experiment.trials, nature)
+    path = given.nature or nature_of(experiment)
+    nature, content = read_nature(path), yaml.safe_load(path.read_text(encoding="utf-8"))
+    filming = make_filming(content.get("filming", {}))
+    chosen = [trial for trial in experiment.trials if fnmatch.fnmatch(trial.name, given.only)]
+    if not chosen:
+        parser.error(f"no trial of {given.experiment} matches {given.only!r}")
+    if given.film is not None:
+        try:
+            experiment = before_the_camera(experiment, [trial.name for trial in chosen], filming, given.film)
+        except ValueError as error:
+            parser.error(str(error))
+        chosen = list(experiment.trials)
+    grown = grow(chosen, nature)
     filmed = [trial for trial in grown if trial.stated.video is not None]
     measured = [trial for trial in grown if trial.stated.track is not None]
     for folder in {trial.stated.track.parent for trial in measured if trial.stated.track is not None}:
@@ -49,12 +66,17 @@ def main(arguments: list[str] | None = None) -> None:
             f"Filming {len(filmed)} trials in the virtual laboratory, {n_frames} frames. The first takes longest.",
             flush=True,
         )
-        content: dict[str, Any] = yaml.safe_load(given.nature.read_text(encoding="utf-8"))
-        _film(experiment, filmed, make_filming(content.get("filming", {})), nature.seed, given.processes)
+        _film(experiment, filmed, filming, nature.seed, given.processes)
     if given.truth is not None:
         write_truth(grown, nature, given.truth)
     n_frames = sum(trial.track.time_s.size for trial in grown)
     print(f"Grown in the virtual laboratory: {len(grown)} trials, {n_frames} frames.", flush=True)
+
+
+def nature_of(experiment: Experiment) -> Path:
+    """What is true in an experiment of this name, or else in the demonstration."""
+    own = Path(__file__).with_name(f"{experiment.name}.yaml")
+    return own if own.exists() else DEMO
 
 
 def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, seed: int, processes: int) -> None:

@@ -1,8 +1,9 @@
 """Campaigns: which vines are grown at which pressures with which payloads, how often.
 
-`paper_damping` and `paper_payload` are the published protocol: four isometric vines, about ten pressures each, four
-trials a pressure without payload; and the 24 mm vine with 35.6 g. Where the paper gives no number (lengths other than
-280 mm, the pressures themselves) ours are stated here.
+`paper_campaign` is everything the paper grew: four isometric vines at about ten pressures each, walls of one diameter,
+payloads, 24 kPa for all scales, efficiencies, the fast vine; four trials of each. Where the paper gives no number
+(lengths other than 280 and 400 mm, the pressures themselves, payloads other than 35.6 g, which walls) ours are stated
+here.
 """
 
 from __future__ import annotations
@@ -13,12 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack import published
+from vinetrack.design.guess import guess_damping
 from vinetrack.naming import with_names
 from vinetrack.records import Trial
 
 CAPTURE_FPS = published.CAPTURE_FPS
 PAPER_B = published.DAMPING_B
 PAPER_N = published.EXPONENT
+WALLS_UM = tuple(published.THICKNESS_UM.values())
+PAYLOADS_G = (10.0, 20.0, published.PAYLOAD_G, 50.0)
+EFFICIENCY_LENGTH_MM = 200.0
+"""Beyond the 150 mm at which the paper takes the efficiency."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +68,32 @@ def campaign(
     ]
 
 
+def paper_B(diameter_m: float, thickness_m: float) -> float:
+    """B of a vine of the paper's campaign, N·(s/m)ⁿ: what is printed, where it is.
+
+    Of a diameter of Table I with another wall it is in proportion to the wall, as Fig. 7B says ("linearly"), through
+    the printed one; of any other diameter it is our guess.
+    """
+    for scale, diameter_mm in published.DIAMETER_MM.items():
+        if abs(1e3 * diameter_m / diameter_mm - 1) < 0.01:
+            return PAPER_B[scale] * 1e6 * thickness_m / published.THICKNESS_UM[scale]
+    return guess_damping(diameter_m, thickness_m)
+
+
 def damping_pressures_kPa(scale: int, count: int = 10) -> np.ndarray:
-    """Pressures of the damping protocol for one scale, kPa, shape (count,), rounded to 0.1.
+    """Pressures of the damping protocol for one scale; see `steady_pressures_kPa`."""
+    return steady_pressures_kPa(isometric_vine(scale), count)
+
+
+def steady_pressures_kPa(of: Vine, count: int = 10) -> np.ndarray:
+    """Pressures at which a vine gets steady within its length, kPa, shape (count,), rounded to 0.1.
 
     The paper raises the pressure until speeds are still steady within the length of the vine. Lowest: 0.25 m/s of the
     tail, where a trial lasts a second; highest: 3.2 relaxation times (mass over slope of the damping) within the
     growth.
     """
-    vine, B = isometric_vine(scale).trial("", 1.0), PAPER_B[scale]
+    vine = of.trial("", 1.0)
+    B = paper_B(vine.diameter_m, vine.thickness_m)
     film_kg = vine.linear_density_kg_m * vine.length_m
     slowest = 0.25
     # x/x_relax = 2L / (v τ) with τ = m / (½ n B v^(n−1)), solved for v at 3.2.
@@ -93,13 +117,82 @@ def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
 
 def paper_payload(replicates: int = 4) -> list[Trial]:
     """The paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads."""
-    trials = campaign(isometric_vine(4), (7, 14, 28), replicates, payload_g=35.6, prefix="fig4_")
-    thinner = replace(isometric_vine(4), thickness_um=150.0)
-    for payload_g in (10.0, 20.0, 35.6, 50.0):
+    payload = published.PAYLOAD_G
+    trials = campaign(isometric_vine(4), published.POSITION_RMS_CM, replicates, payload_g=payload, prefix="fig4_")
+    thinner = replace(isometric_vine(4), thickness_um=published.FINAL_SPEED_THICKNESS_UM)
+    for payload_g in PAYLOADS_G:
         trials += campaign(
-            thinner, (14, 28, 41), replicates, payload_g=payload_g, prefix=f"fig5_{payload_g:g}g_".replace(".", "p")
+            thinner,
+            published.FINAL_SPEED_RMS_M_S,
+            replicates,
+            payload_g=payload_g,
+            prefix=f"fig5_{payload_g:g}g_".replace(".", "p"),
         )
     return list(with_names(trials))
+
+
+def paper_walls(replicates: int = 4, count: int = 8) -> list[Trial]:
+    """The paper's Fig. 7B: walls of 12 mm vines other than that of R = 2, which is among the scales."""
+    vines = [replace(isometric_vine(2), thickness_um=wall_um) for wall_um in WALLS_UM]
+    trials = [
+        trial
+        for vine in vines
+        if vine != isometric_vine(2)
+        for trial in campaign(
+            vine, steady_pressures_kPa(vine, count), replicates, prefix=f"fig7_{vine.thickness_um:g}um_"
+        )
+    ]
+    return list(with_names(trials))
+
+
+def paper_speed(replicates: int = published.REPLICATES) -> list[Trial]:
+    """The paper's Fig. 8: every scale at 24 kPa."""
+    pressures_kPa = (published.STEADY_SPEED_KPA,)
+    trials = [
+        trial
+        for scale in PAPER_B
+        for trial in campaign(isometric_vine(scale), pressures_kPa, replicates, prefix=f"fig8_R{scale}_")
+    ]
+    return list(with_names(trials))
+
+
+def paper_efficiency(replicates: int = published.REPLICATES) -> list[Trial]:
+    """The paper's Fig. 9: 12 and 18 mm vines with every wall at 34 kPa, with 35.6 g."""
+    pressures_kPa, payload_g = (published.EFFICIENCY_KPA,), published.PAYLOAD_G
+    vines = [
+        Vine(diameter_mm, wall_um, EFFICIENCY_LENGTH_MM)
+        for diameter_mm in published.EFFICIENCY_DIAMETERS_MM
+        for wall_um in WALLS_UM
+    ]
+    trials = [
+        trial
+        for vine in vines
+        for trial in campaign(
+            vine, pressures_kPa, replicates, payload_g, f"fig9_{vine.diameter_mm:g}mm_{vine.thickness_um:g}um_"
+        )
+    ]
+    return list(with_names(trials))
+
+
+def paper_campaign() -> list[Trial]:
+    """Everything the paper grew but its dye injector; the fast vine once, as there."""
+    fast = published.FAST_VINE
+    fastest = Vine(fast["diameter_mm"], fast["thickness_um"], fast["length_mm"])
+    trials = [
+        *paper_damping(),
+        *paper_walls(),
+        *paper_payload(),
+        *paper_speed(),
+        *paper_efficiency(),
+        *campaign(fastest, (fast["pressure_kPa"],), 1, prefix="fast_"),
+    ]
+    return list(with_names(trials))
+
+
+def paper_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
+    """True parameters for the vines of the paper's campaign: B by vine, to four digits, and the printed n."""
+    by_vine = {trial.vine: float(f"{paper_B(trial.diameter_m, trial.thickness_m):.4g}") for trial in trials}
+    return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}
 
 
 def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:

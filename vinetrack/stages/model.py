@@ -35,6 +35,8 @@ INTERNAL_FAULT = "a fault of the program, written down in the log of this stage"
 def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> dict[str, Any]:
     """Fit the model in use; write `comparison.csv`, `comparison/`, `model_check.csv`, `audit.csv` and `fit.json`.
 
+    `payload_model.csv` too: final speed against payload as the model has it.
+
     Returns
     -------
     dict
@@ -46,6 +48,7 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
         If a stage before this one has not run.
     """
     from vinetrack.diagnosis.compare import COMPARISON_COLUMNS
+    from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, payload_curves
     from vinetrack.model.audit import COLUMNS as AUDIT_COLUMNS
     from vinetrack.model.check import CHECK_COLUMNS
     from vinetrack.stages.results import empty_table
@@ -54,6 +57,7 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     damping = read_json(results.damping)
     pairs, kinematics = measured(experiment, results)
     tables = {results.comparison: COMPARISON_COLUMNS, results.model_check: CHECK_COLUMNS, results.audit: AUDIT_COLUMNS}
+    tables[results.payload_model] = CURVE_COLUMNS
     found: dict[Path, pd.DataFrame] = {}
     content: dict[str, Any] = {"model": list(experiment.settings.model), "refused": None}
     trajectories: dict[str, pd.DataFrame] = {}
@@ -61,11 +65,13 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
         fit, comparison = _fitted(experiment, pairs, kinematics, settings)
         checked, check_message = _checked(fit, damping)
         weighed = _audited(fit, comparison, pairs, kinematics)
+        curves = payload_curves(fit, settings.final_at_fraction)
     except Exception as error:
         content["refused"] = _reason(error)
     else:
         content |= fit_entry(fit, weighed.warnings, check_message)
         found = {results.comparison: comparison.table, results.model_check: checked, results.audit: weighed.table}
+        found[results.payload_model] = curves
         trajectories = dict(comparison.trajectories)
     for path, columns in tables.items():
         write_csv(path, found.get(path, empty_table(columns)))

@@ -158,6 +158,11 @@ class Results:
         return self.folder / "audit.csv"
 
     @property
+    def payload_model(self) -> Path:
+        """Final speed against payload as the model in use has it."""
+        return self.folder / "payload_model.csv"
+
+    @property
     def fit(self) -> Path:
         """The model in use, fitted to the trajectories."""
         return self.folder / "fit.json"
