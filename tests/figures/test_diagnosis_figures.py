@@ -1,0 +1,203 @@
+"""The pictures of a diagnosis, from tables written by hand: what is drawn where, in which colour, and what is said."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from vinetrack.figures.before_after import AFTER, BEFORE, draw_before_after, rms_m
+from vinetrack.figures.candidates import MAX_ROWS, draw_candidates
+from vinetrack.figures.cosines import MAX_EFFECTS, draw_cosines
+from vinetrack.figures.ladder import draw_ladder
+from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION, render
+from vinetrack.figures.where import draw_where
+
+
+def texts(fig: Figure) -> str:
+    return " ".join(text.get_text() for ax in fig.axes for text in ax.texts)
+
+
+def steps(*added: str, floor_m: float = 1e-3) -> pd.DataFrame:
+    n = len(added)
+    return pd.DataFrame(
+        {
+            "model": "m",
+            "added": added,
+            "rms_in_sample_m": 9e-3 / 4.0 ** np.arange(n),
+            "rms_left_out_m": 10e-3 / 4.0 ** np.arange(n),
+            "rms_highest_pressure_m": 11e-3 / 4.0 ** np.arange(n),
+            "floor_m": floor_m,
+            "excess_left_out_m": 0.0,
+        }
+    )
+
+
+def in_bounds(fig: Figure) -> bool:
+    """Whether everything that is drawn lies inside the figure, to a hundredth of an inch."""
+    fig.draw_without_rendering()
+    box, page = fig.get_tightbbox(), fig.bbox_inches
+    inside = box.x0 > -0.01 and box.y0 > -0.01
+    return bool(inside and box.x1 < page.width + 0.01 and box.y1 < page.height + 0.01)
+
+
+def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis() -> None:
+    (ax,) = draw_ladder(steps("", "reservoir_depletion")).axes
+    assert ax.get_yscale() == "log"
+    assert "(mm)" in ax.get_ylabel()
+    curves = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 2 and line.get_marker() != "None"]
+    assert np.array(curves) == pytest.approx(np.array([[9, 2.25], [10, 2.5], [11, 2.75]]))
+    assert [label.get_text() for label in ax.get_xticklabels()] == [
+        "the model\nyou came with",
+        "+ reservoir\ndepletion",
+    ]
+
+
+def test_the_ladder_says_where_the_floor_is_and_every_error() -> None:
+    said = texts(draw_ladder(steps("", "air_drag")))
+    for number in ("floor: replicates differ by 1.00 mm", "9.00", "10.0", "11.0", "2.25"):
+        assert number in said
+
+
+@pytest.mark.parametrize("added", [("",), ("", "a"), ("", "a", "length_scale"), ("", "a", "b+c", "d" * 30)])
+def test_nothing_of_a_ladder_is_cut_off(added: tuple[str, ...]) -> None:
+    assert in_bounds(draw_ladder(steps(*added)))
+
+
+def test_a_ladder_without_replicates_or_left_out_errors_is_drawn_with_what_there_is() -> None:
+    table = steps("", "air_drag", floor_m=math.nan).assign(rms_highest_pressure_m=math.nan)
+    fig = draw_ladder(table)
+    assert "floor" not in texts(fig)
+    assert [text.get_text() for text in fig.axes[0].get_legend().get_texts()] == ["in sample", "on left-out conditions"]
+
+
+def test_no_ladder_is_said() -> None:
+    assert "No model was fitted" in draw_ladder(steps("").iloc[:0]).texts[0].get_text()
+
+
+def prediction(name: str, before_m: float, after_m: float) -> pd.DataFrame:
+    time_s = np.arange(-10, 100) * 1e-3
+    moved_m = np.maximum(time_s, 0)
+    return pd.DataFrame(
+        {
+            "trial": name,
+            "time_s": time_s,
+            "lead_position_m": moved_m,
+            "model_before_m": moved_m - before_m * (time_s >= 0),
+            "model_after_m": moved_m - after_m * (time_s >= 0),
+        }
+    )
+
+
+def test_a_condition_is_drawn_before_and_after_with_its_errors() -> None:
+    table = pd.concat([prediction("a", 8e-3, 1e-3), prediction("b", 8e-3, 1e-3)])
+    growth, left = draw_before_after("24 kPa", table, "air drag").axes
+    assert [text.get_text() for text in growth.get_legend().get_texts()] == [
+        "measured, N = 2",
+        "before: off by 8.0 mm rms",
+        "with air drag: 1.0 mm rms",
+    ]
+    assert {to_hex(line.get_color()) for line in left.lines} >= {BEFORE.lower(), AFTER.lower()}
+    assert left.lines[0].get_ydata()[-1] == pytest.approx(8.0)
+
+
+def test_where_nothing_was_added_there_is_no_after() -> None:
+    table = prediction("a", 8e-3, math.nan)
+    growth, _ = draw_before_after("24 kPa", table).axes
+    assert len(growth.get_legend().get_texts()) == 2
+    assert rms_m(table, "model_before_m") == pytest.approx(8e-3)
+    assert math.isnan(rms_m(table, "model_after_m"))
+
+
+def ranking(*rows: tuple[str, str, str, float, bool]) -> pd.DataFrame:
+    columns = ["effect", "kind", "status", "delta_chi2", "in_answer_set"]
+    return pd.DataFrame(rows, columns=columns).assign(plausible=True, size="k = 1.0 ± 0.1")
+
+
+def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() -> None:
+    table = ranking(
+        ("air_drag", "physical", "refitted", 400.0, True),
+        ("leak", "physical", "refitted", 100.0, False),
+        ("time_base", "measurement", "screened", 25.0, False),
+        ("payload_drag", "physical", "not testable here", math.nan, False),
+    )
+    (ax,) = draw_candidates([("What is missing?", table)]).axes
+    assert [bar.get_width() for bar in ax.patches] == pytest.approx([20, 10, 5])
+    assert [to_hex(bar.get_edgecolor()) for bar in ax.patches] == [BLUE.lower(), MUTED, ORANGE.lower()]
+    assert ax.patches[2].get_facecolor()[3] == 0
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["air drag", "leak", "time base"]
+    assert "k = 1.0 ± 0.1" in ax.texts[0].get_text()
+
+
+def test_what_is_not_plausible_is_said_beside_its_size() -> None:
+    table = ranking(("air_drag", "physical", "refitted", 9.0, False)).assign(plausible=False)
+    assert "k = 1.0 ± 0.1 (not plausible)" in texts(draw_candidates([("q", table)]))
+
+
+def test_the_longest_of_lists_is_cut_and_rounds_stand_below_each_other() -> None:
+    many = ranking(*((f"effect_{i}", "physical", "screened", 100.0 - i, False) for i in range(30)))
+    fig = draw_candidates([("one", many), ("two", many.head(2)), ("three", many.head(0))])
+    assert [len(ax.patches) for ax in fig.axes] == [MAX_ROWS, 2]
+    assert in_bounds(fig)
+
+
+def test_no_candidate_is_said() -> None:
+    assert draw_candidates([]).texts
+    assert draw_candidates([("one", ranking())]).texts
+
+
+def cells(after: float = 0.1e-3) -> pd.DataFrame:
+    rows = [
+        {"condition_label": f"12 mm, {k} kPa", "n_trials": 2, "growth_from": g / 4, "growth_to": (g + 1) / 4}
+        | {"misfit_before_m": sign * 1e-3 * (g + 1), "misfit_after_m": after, "scatter_m": 0.6e-3}
+        for k, sign in ((24, 1), (60, -1))
+        for g in range(4)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_the_misfit_is_coloured_by_side_and_numbered_where_it_is_beyond_scatter() -> None:
+    before, after = draw_where(cells(), "air drag").axes
+    sides = [to_hex(patch.get_facecolor()) for patch in before.patches]
+    assert sides == [BLUE.lower()] * 4 + [VERMILLION.lower()] * 4
+    depths = [patch.get_alpha() for patch in before.patches[:4]]
+    assert depths == sorted(depths)
+    assert [text.get_text() for text in before.texts] == ["+2.0", "+3.0", "+4.0", "−2.0", "−3.0", "−4.0"]
+    assert not after.texts
+    assert after.get_title(loc="left") == "after: with air drag"
+
+
+def test_one_panel_is_enough_where_nothing_was_added() -> None:
+    assert len(draw_where(cells(after=math.nan)).axes) == 1
+
+
+def test_rows_name_the_condition_and_how_many_trials_it_has() -> None:
+    ax = draw_where(cells()).axes[0]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["12 mm, 24 kPa, N = 2", "12 mm, 60 kPa, N = 2"]
+
+
+def test_cosines_stand_below_the_diagonal_and_ties_are_framed() -> None:
+    (ax,) = draw_cosines(["a", "b", "c"], [[1, 0.97, -0.5], [0.97, 1, 0], [-0.5, 0, 1]]).axes
+    assert [text.get_text() for text in ax.texts] == [".97", "−.50", ".00"]
+    framed = [patch for patch in ax.patches if patch.get_linewidth() > 0]
+    assert len(framed) == 1
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["a", "b"]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["b", "c"]
+
+
+def test_a_large_matrix_is_cut_and_none_is_said() -> None:
+    n = MAX_EFFECTS + 10
+    fig = draw_cosines([f"an_effect_with_a_long_name_{i}" for i in range(n)], np.eye(n).tolist())
+    assert len(fig.axes[0].get_yticklabels()) == MAX_EFFECTS - 1
+    assert in_bounds(fig)
+    assert draw_cosines(["one"], [[1.0]]).texts
+
+
+def test_every_picture_is_small_as_a_file() -> None:
+    table = pd.concat([prediction(f"t{i}", 8e-3, 1e-3) for i in range(6)])
+    for fig in (draw_ladder(steps("", "a")), draw_before_after("c", table), draw_where(cells())):
+        assert len(render(fig, ["svg"])["svg"]) < 150_000

@@ -1,0 +1,96 @@
+"""Where the model fails: the misfit of every condition along its growth, before and after.
+
+Colour says by how much and to which side, in millimetres; numbers stand only where the misfit is beyond what
+replicates explain. Cells fade to nothing with the misfit, so that the page shows through, whatever its colour.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.figures.style import BLUE, INK, MUTED, VERMILLION, blank, look, rows
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+AHEAD, BEHIND = BLUE, VERMILLION
+MAX_ROWS = 48
+_NUMBERED_ROWS = 26
+_COLUMNS = {"misfit_before_m": "before", "misfit_after_m": "after"}
+
+
+def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
+    """Draw the misfit by condition and position.
+
+    Parameters
+    ----------
+    table : one row a condition and stretch of growth: `condition_label, n_trials, growth_from, growth_to` (fractions of
+        the way), `misfit_before_m, misfit_after_m` (mean of measured minus model; the latter NaN where nothing was
+        added) and `scatter_m` (by which that mean may be off by chance, one standard error).
+    added : the effects that were added, in words.
+    """
+    from matplotlib.figure import Figure
+
+    labels = list(dict.fromkeys(table["condition_label"]))[:MAX_ROWS]
+    shown = [column for column in _COLUMNS if np.isfinite(table[column].to_numpy(dtype=float)).any()]
+    if not labels or not shown:
+        return blank("There is no prediction to hold against a measurement.")
+    known_mm = 1e3 * np.abs(table[shown].to_numpy(dtype=float))
+    full_mm = max(float(np.nanpercentile(known_mm, 97)), 1e-6)
+    with look():
+        width_in = 2.6 + 4.3 * len(shown)
+        fig = Figure(figsize=(width_in, 0.3 * len(labels) + 1.75), layout="constrained")
+        axes = fig.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+        for ax, column in zip(axes, shown, strict=True):
+            _draw_cells(ax, table, column, labels, full_mm)
+            words = _COLUMNS[column] + (f": with {added}" if column == "misfit_after_m" and added else "")
+            ax.set_title(words, fontsize=10)
+            ax.set_xlabel("along the growth (%)")
+        axes[0].set_yticks(range(len(labels)), _row_names(table, labels), fontsize=9)
+        _legend(fig, full_mm)
+    return fig
+
+
+def _row_names(table: pd.DataFrame, labels: Sequence[str]) -> list[str]:
+    counts = table.drop_duplicates("condition_label").set_index("condition_label")["n_trials"]
+    return [f"{label}, N = {int(counts[label])}" for label in labels]
+
+
+def _draw_cells(ax: Axes, table: pd.DataFrame, column: str, labels: Sequence[str], full_mm: float) -> None:
+    from matplotlib.patches import Rectangle
+
+    place = {label: i for i, label in enumerate(labels)}
+    for row in rows(table):
+        misfit_m = getattr(row, column)
+        if row.condition_label not in place or not np.isfinite(misfit_m):
+            continue
+        y, misfit_mm = place[row.condition_label], 1e3 * misfit_m
+        left, width = 100 * row.growth_from, 100 * (row.growth_to - row.growth_from)
+        depth = min(abs(misfit_mm) / full_mm, 1.0)
+        cell: dict[str, Any] = {"facecolor": AHEAD if misfit_mm > 0 else BEHIND, "alpha": 0.85 * depth, "lw": 0}
+        ax.add_patch(Rectangle((left, y - 0.46), width, 0.92, **cell))
+        beyond = not abs(misfit_m) <= 2 * row.scatter_m  # a scatter that nobody knows excuses nothing
+        if beyond and len(labels) <= _NUMBERED_ROWS and depth > 0.06:
+            digits = 0 if abs(misfit_mm) >= 9.95 else 1
+            words = f"{misfit_mm:+.{digits}f}".replace("-", "−")
+            ax.text(left + width / 2, y, words, ha="center", va="center", fontsize=7.5, color=INK)
+    ax.set(xlim=(0, 100), ylim=(len(labels) - 0.45, -0.55))
+    ax.grid(visible=False)
+    ax.tick_params(axis="y", length=0)
+
+
+def _legend(fig: Figure, full_mm: float) -> None:
+    from matplotlib.patches import Patch
+
+    handles = [
+        Patch(facecolor=AHEAD, alpha=0.85, label="measured is ahead of the model"),
+        Patch(facecolor=BEHIND, alpha=0.85, label="measured is behind"),
+        Patch(facecolor=MUTED, alpha=0.2, label=f"full colour: {full_mm:.2g} mm; numbers in mm, where beyond scatter"),
+    ]
+    fig.legend(handles=handles, loc="outside upper left", ncols=3, fontsize=9, handlelength=1.3)
