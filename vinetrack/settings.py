@@ -284,6 +284,14 @@ class FigureSettings(_Strict):
         return formats
 
 
+class OverlaySettings(_Strict):
+    """Clips of the recordings with the tracked edge and the models' edges; see `vinetrack.figures.overlay`."""
+
+    of: Literal["one_per_condition", "all", "none"] = "one_per_condition"
+    seconds: Positive = 6.0
+    width_px: Annotated[Count, Field(ge=320, le=3840)] = 960
+
+
 class RunSettings(_Strict):
     """Everything in `config/config.yaml`; any key may be overridden by `--config key=value`."""
 
@@ -295,6 +303,7 @@ class RunSettings(_Strict):
     final_at_fraction: Annotated[Number, Field(gt=0, le=1)] = 0.95
     efficiency_at_mm: Positive = 150.0
     figures: FigureSettings = FigureSettings()
+    overlays: OverlaySettings = OverlaySettings()
 
 
 def read_experiment_settings(path: Path) -> ExperimentSettings:
