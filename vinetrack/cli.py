@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vinetrack.cli_design import register
+
 if TYPE_CHECKING:
     from vinetrack.experiment import Experiment
     from vinetrack.settings import RunSettings
@@ -28,6 +30,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+register(app)
 
 ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]

@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vinetrack import published
 from vinetrack.design import guess
 from vinetrack.design.beliefs import PRESSURE, YIELD, Belief, Draws, Move, Size, Uncertainty, wanted_model
-from vinetrack.design.from_fit import FitNumbers, nearest_vine, same_vine, yield_place
+from vinetrack.design.from_fit import FitNumbers, nearest_vine, numbers_of, same_vine, yield_place
 from vinetrack.effects import BASE_EFFECTS, Effect
 from vinetrack.model.fit_data import FitError
 from vinetrack.model.free import DAMPING, EXPONENT
 from vinetrack.model.model import Model
 from vinetrack.naming import with_names
 from vinetrack.records import Trial
+
+if TYPE_CHECKING:
+    from vinetrack.model.fit_result import Fit
 
 FARTHEST_SCATTER = 20.0
 """Standard deviations at which a draw of Student's t is cut: a factor ten of B, beyond all vines."""
@@ -63,7 +67,7 @@ class _Making:
         self.uncertainties.append(Uncertainty(name, words, key, move))
 
 
-def believe(trial: Trial, said: Said | None = None, fit: FitNumbers | None = None) -> Belief:
+def believe(trial: Trial, said: Said | None = None, fit: FitNumbers | Fit | None = None) -> Belief:
     """Put together what is believed of a trial.
 
     Parameters
@@ -73,7 +77,7 @@ def believe(trial: Trial, said: Said | None = None, fit: FitNumbers | None = Non
     said
         Numbers that a person gives.
     fit
-        Numbers of a fit, whose model is then the model.
+        A fit, or the numbers of one; its model is then the model.
 
     Raises
     ------
@@ -83,6 +87,9 @@ def believe(trial: Trial, said: Said | None = None, fit: FitNumbers | None = Non
         If the fit is not one of everting vines.
     """
     said = said or Said()
+    if fit is not None and not isinstance(fit, FitNumbers):
+        said = replace(said, own={**{effect.name: effect for effect in fit.model}, **said.own})
+        fit = numbers_of(fit)
     making = _Making(trial, fit)
     model = wanted_model(fit.model if fit else said.model, said.effects, said.own)
     if fit is not None and DAMPING not in fit.keys:

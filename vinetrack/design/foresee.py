@@ -25,8 +25,8 @@ from vinetrack.records import Floats
 SAMPLES = 1000
 SAMPLES_OF_A_SHARE = 400
 FINAL_AT_FRACTION = 0.95
-ALONG = np.linspace(0.0, 0.99, 100)
-"""y/L of the curves. Farther on the model's bare vine is faster than anything."""
+ALONG = np.concatenate([[0.0, 0.0005, 0.001, 0.002, 0.004, 0.007], np.linspace(0.01, 0.99, 99)])
+"""y/L of the curves, dense where everything begins. Farther on a bare vine is faster in the model than anything."""
 
 CURVE_COLUMNS = (
     "condition",

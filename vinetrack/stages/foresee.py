@@ -1,0 +1,253 @@
+"""The command `vinetrack predict`: what vines not yet built will do, as lines, a figure, a CSV."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.planned import option
+from vinetrack.problems import ExperimentError, Problem
+from vinetrack.stages.beliefs import (
+    Asked,
+    Ground,
+    beliefs_of,
+    check_figure,
+    input_rows,
+    read_ground,
+    shown,
+    trial_words,
+    unit_of,
+    warnings_of,
+    write_figure,
+)
+from vinetrack.stages.results import ResultsError
+from vinetrack.tables import write_csv, write_json
+
+if TYPE_CHECKING:
+    from vinetrack.design.foresee import Foresight, Quantity
+    from vinetrack.design.hazards import Neglected
+    from vinetrack.figures.foresight import Picture
+
+WORTH_SHOWING = 0.005
+"""Relative change of the final speed below which an effect that is left out is not listed."""
+
+
+@dataclass(frozen=True)
+class Foretold:
+    """One condition: what is foretold, what speaks against it, and what effects left out would change."""
+
+    sight: Foresight
+    hazards: tuple[str, ...]
+    neglected: tuple[Neglected, ...]
+
+
+def foretell(
+    asked: Asked,
+    *,
+    samples: int,
+    seed: int,
+    at_fraction: float,
+    figure: Path | None = None,
+    csv: Path | None = None,
+    json: Path | None = None,
+) -> list[str]:
+    """Lines for the terminal; figure, curves and everything said are written where asked for.
+
+    Raises
+    ------
+    ExperimentError, ResultsError, EffectError
+        If something asked for will not do; see `read_ground`.
+    """
+    import pandas as pd
+
+    check_figure(figure)
+    ground = read_ground(asked)
+    found = foresee_all(ground, samples, seed, at_fraction)
+    lines = [*_one(found[0])] if len(found) == 1 else [*_several(found)]
+    lines += [f"! {words}" for words in warnings_of(ground)]
+    if figure is not None:
+        from vinetrack.figures.foresight import draw_foresight
+
+        write_figure(draw_foresight([_picture(one.sight) for one in found], at_fraction), figure)
+        lines.append(f"Figure: {figure}")
+    if csv is not None:
+        write_csv(csv, pd.concat([one.sight.curve for one in found], ignore_index=True))
+        lines.append(f"Curves: {csv}")
+    if json is not None:
+        write_json(json, [_entry(one) for one in found])
+        lines.append(f"Everything: {json}")
+    return lines
+
+
+def foresee_all(ground: Ground, samples: int, seed: int, at_fraction: float) -> list[Foretold]:
+    """Foretell every condition.
+
+    Raises
+    ------
+    ResultsError
+        If a condition cannot be simulated, or the fit is not one of everting vines.
+    """
+    from vinetrack.design.foresee import foresee
+    from vinetrack.design.hazards import hazards, neglected
+    from vinetrack.effects import EffectError
+    from vinetrack.model.simulate import SimulationError
+    from vinetrack.terminal import progress
+
+    found = []
+    try:
+        for belief in progress(beliefs_of(ground), "predicting", unit="condition"):
+            sight = foresee(belief, samples=samples, seed=seed, at_fraction=at_fraction)
+            found.append(Foretold(sight, hazards(sight), neglected(belief, at_fraction)))
+    except SimulationError as error:
+        raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
+    except EffectError as error:
+        raise _as_option(error) from None
+    return found
+
+
+def _as_option(error: Exception) -> Exception:
+    """What an effect needs, said of the option or column that is missing."""
+    match = re.search(r"the effect (\w+) needs `(\w+)`", str(error))
+    if match is None:
+        return error
+    words = f"is blank, and the effect {match[1]} needs it"
+    return ExperimentError(
+        [Problem(message=words, column=match[2], remedy=f"give it, as {option(match[2])} or in the sheet")]
+    )
+
+
+def _one(found: Foretold) -> Iterator[str]:
+    """Everything about one condition."""
+    from vinetrack.terminal import table
+
+    sight = found.sight
+    belief = sight.belief
+    yield f"{trial_words(belief.trial)}; {' + '.join(belief.model.names)}"
+    yield ""
+    yield from table(
+        input_rows(belief.inputs()), ("what goes in", "median", "90 % band", "unit", "from"), align="<><<<"
+    )
+    yield ""
+    rows = [_quantity_row(one) for one in sight.quantities]
+    yield from table(rows, ("what comes out", "at y/L", "median", "90 % band", "unit"), align="<<><<")
+    yield ""
+    head = (f"uncertainties included ({sight.samples} draws)", "final speed by it alone", "why")
+    yield from table([_share_row(share.name, share.low, share.high, share.words) for share in sight.shares], head)
+    yield from _left_out(found)
+    yield ""
+    yield from (f"! {words}" for words in found.hazards)
+
+
+def _quantity_row(one: Quantity) -> tuple[str, str, str, str, str]:
+    from vinetrack.design.foresee import HOOP
+
+    place = "" if math.isnan(one.y_over_L) else f"{one.y_over_L:g}"
+    spread = "–" if one.low == one.high else f"{shown(one.low, one.unit)} to {shown(one.high, one.unit)}"
+    if one.name == HOOP:
+        return one.name, place, f"{one.median / 1e6:.3g}", spread, "MPa"
+    return one.name, place, shown(one.median, one.unit), spread, unit_of(one.unit)
+
+
+def _share_row(name: str, low: float, high: float, words: str) -> tuple[str, str, str]:
+    return name, f"{shown(low, 'm/s')} to {shown(high, 'm/s')} m/s", words
+
+
+def _left_out(found: Foretold) -> Iterator[str]:
+    """Effects that no vine is free of and the model leaves out, with what they would make of the final speed."""
+    from vinetrack.terminal import table
+
+    rows = [
+        (
+            one.effect,
+            one.size,
+            f"{shown(one.without_m_s, 'm/s')} → {shown(one.final_m_s, 'm/s')} m/s",
+            f"{one.change:+.1%}",
+        )
+        for one in found.neglected
+        if abs(one.change) >= WORTH_SHOWING
+    ]
+    if rows:
+        yield ""
+        yield from table(rows, ("left out of the model", "if it were", "the final speed went", ""))
+
+
+def _several(found: Sequence[Foretold]) -> Iterator[str]:
+    """A row a condition."""
+    from vinetrack.design.foresee import TIME
+    from vinetrack.terminal import table
+
+    yield f"{' + '.join(found[0].sight.belief.model.names)}; medians and 90 % bands of {found[0].sight.samples} draws"
+    rows = [
+        (
+            one.sight.belief.trial.condition,
+            *_quantity_row(one.sight.final)[1:4],
+            *_quantity_row(one.sight[TIME])[2:4],
+            f"{one.sight.slack:.0%}",
+        )
+        for one in found
+    ]
+    head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
+    yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
+    if any(one.sight.belief.trial.payload_kg > 0 for one in found):
+        yield "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine"
+    yield ""
+    yield "uncertainties included:"
+    words = dict.fromkeys(share.words for one in found for share in one.sight.shares)
+    yield from (f"  {text}" for text in words)
+    yield ""
+    said = dict.fromkeys(text for one in found for text in one.hazards)
+    for text in said:
+        conditions = [one.sight.belief.trial.condition for one in found if text in one.hazards]
+        yield f"! {'all conditions' if len(conditions) == len(found) else ', '.join(conditions)}: {text}"
+
+
+def _picture(sight: Foresight) -> Picture:
+    from vinetrack.figures.foresight import Picture
+
+    return Picture(
+        title=trial_words(sight.belief.trial),
+        curve=sight.curve,
+        final_name=sight.final.name,
+        shares=[(share.name, share.low, share.high) for share in sight.shares],
+        final=(sight.final.low, sight.final.median, sight.final.high),
+    )
+
+
+def _entry(found: Foretold) -> dict[str, Any]:
+    """One condition as JSON holds it, SI."""
+    sight = found.sight
+    return {
+        "condition": sight.belief.trial.condition,
+        "model": list(sight.belief.model.names),
+        "samples": sight.samples,
+        "inputs": [
+            {"name": i.name, "unit": i.unit, "median": i.median, "low_90": i.low, "high_90": i.high, "from": i.origin}
+            for i in sight.belief.inputs()
+        ],
+        "quantities": [
+            {
+                "name": q.name,
+                "y_over_L": q.y_over_L,
+                "unit": q.unit,
+                "median": q.median,
+                "low_90": q.low,
+                "high_90": q.high,
+            }
+            for q in sight.quantities
+        ],
+        "uncertainties": [
+            {"name": s.name, "words": s.words, "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
+            for s in sight.shares
+        ],
+        "left_out": [
+            {"effect": n.effect, "size": n.size, "final_m_s": n.final_m_s, "without_m_s": n.without_m_s}
+            for n in found.neglected
+        ],
+        "arrives": sight.arrives,
+        "slack": sight.slack,
+        "warnings": list(found.hazards),
+    }
