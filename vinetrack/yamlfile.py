@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,3 +122,72 @@ def _syntax_problem(error: Exception, file: str) -> Problem:
     remedy = "use spaces (no tabs) to indent, a blank after each colon, and quotes round text that holds : or #"
     line = mark.line + 1 if mark is not None else 0
     return Problem(message=f"is not YAML ({reason})", file=file, line=line, remedy=remedy)
+
+
+def with_list(text: str, key: str, values: Sequence[str], file: str = "experiment.yaml") -> str:
+    r"""The text with a top-level key set to a list of plain words; all else, comments included, stays as it is.
+
+    A list that stands in brackets on one line stays so, one with a line for each value too; a comment behind the value
+    or between its lines stays. The key is added at the end where there is none.
+
+    Raises
+    ------
+    ExperimentError
+        If the text is not YAML, or what comes out would not hold just that (the key is an anchor's alias, say).
+
+    Examples
+    --------
+    >>> with_list("a: 1  # one\nmodel: [x]  # now\n", "model", ["x", "y"])
+    'a: 1  # one\nmodel: [x, y]  # now\n'
+    """
+    before = parse_yaml(text, file).content
+    flow = f"[{', '.join(values)}]"
+    node = _value_of(text, key)
+    if node is None:
+        gap = "" if not text or text.endswith("\n") else "\n"
+        changed = f"{text}{gap}{key}: {flow}\n"
+    elif isinstance(node, yaml.SequenceNode) and not node.flow_style:
+        changed = _with_block_items(text, node, values)
+    else:
+        begin, end = node.start_mark.index, node.end_mark.index
+        changed = text[:begin] + (" " if begin == end else "") + flow + text[end:]
+    try:
+        correct = parse_yaml(changed, file).content == {**before, key: list(values)}
+    except ExperimentError:
+        correct = False
+    if not correct:
+        remedy = f"set it yourself: {key}: {flow}"
+        raise ExperimentError([Problem(message="cannot be set without harm", file=file, column=key, remedy=remedy)])
+    return changed
+
+
+def _value_of(text: str, key: str) -> Any:
+    """The node of a top-level key's value; None where there is no such key, or no mapping."""
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+    finally:
+        loader.dispose()
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    return next((value for name, value in pairs if getattr(name, "value", None) == key), None)
+
+
+def _with_block_items(text: str, node: Any, values: Sequence[str]) -> str:
+    """A list with a line for each value: lines of values that go are removed, new ones follow the last that stays."""
+    lines = text.splitlines(keepends=True)
+    items = [(item.start_mark.line, str(getattr(item, "value", ""))) for item in node.value]
+    indent = " " * node.start_mark.column
+    at = {value: line for line, value in items}
+    gone = {line for line, value in items if value not in values}
+    kept = [value for value in values if value in at]
+    if [value for _, value in items if value in values] != kept or list(values[: len(kept)]) != kept:
+        gone, kept = set(at.values()), []
+    new = [f"{indent}- {value}\n" for value in values[len(kept) :]]
+    after = max((at[value] for value in kept), default=node.start_mark.line - 1)
+    out: list[str] = []
+    for number, line in enumerate(lines):
+        if number not in gone:
+            out.append(line if line.endswith("\n") or number < len(lines) - 1 else line + "\n")
+        if number == after:
+            out += new
+    return "".join(out if after >= 0 else [*new, *out])
