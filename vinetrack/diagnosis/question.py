@@ -53,10 +53,21 @@ class Questions:
 
     @cached_property
     def possible(self) -> Floats:
-        """z of every shape where its size can have that sign, 0 where it cannot, always positive."""
-        z = self.scores.z
-        signs = np.array(self.signs)
-        return np.where(signs == 0, np.abs(z), np.maximum(z * signs, 0.0))
+        """z of every shape where its size can have that sign, 0 where it cannot, always positive.
+
+        As a quantile of the normal distribution: by the noise model, or, where that is less, by the scatter of single
+        trials, which has Student's t for few of them.
+        """
+        from scipy.stats import norm, t
+
+        size, signs = self.scores.size, np.array(self.signs)
+        one_way = np.where(signs == 0, np.abs(size), np.maximum(size * signs, 0.0))
+        plain, robust = self.scores.plain_sigma, self.scores.robust_sigma
+        z = one_way / plain
+        with np.errstate(divide="ignore", invalid="ignore"):
+            by_scatter = np.where(robust > 0, one_way / robust, np.inf)
+        tail = t.logsf(np.minimum(by_scatter, 1e6), max(self.scores.degrees, 3.0))
+        return np.asarray(np.minimum(z, norm.isf(np.exp(np.maximum(tail, -700.0)))))
 
     @property
     def signs(self) -> list[int]:
@@ -65,16 +76,8 @@ class Questions:
 
     @cached_property
     def threshold(self) -> float:
-        """z that the best of all shapes exceeds by chance with probability `level`; Student's t for few trials."""
-        from scipy.stats import norm, t
-
-        normal = family_threshold(self.scores.cosines, self.signs, self.level)
-        return float(t.isf(norm.sf(normal), max(self.scores.degrees, 3.0)))
-
-    @property
-    def far_off(self) -> bool:
-        """Whether the fit misses more than any noise could."""
-        return self.found.chi2_per_dof > FAR_OFF
+        """z that the best of all shapes exceeds by chance with probability `level`."""
+        return family_threshold(self.scores.cosines, self.signs, self.level)
 
     @property
     def something(self) -> bool:
@@ -84,6 +87,11 @@ class Questions:
             or self.structure.p < 0.1 * self.level
             or (self.possible.size and self.possible.max() > self.threshold)
         )
+
+    @property
+    def far_off(self) -> bool:
+        """Whether the fit misses more than any noise could."""
+        return self.found.chi2_per_dof > FAR_OFF
 
     @cached_property
     def gains(self) -> tuple[Floats, Floats]:

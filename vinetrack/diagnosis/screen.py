@@ -48,14 +48,14 @@ class Products:
 class Scores:
     """What is left of each shape beside the fit, shape (n_shapes,) or squared, per unit of its size.
 
-    `score` and `information`, with those of single trials `scores`, shape (n_trials, n_shapes); `sigma` is the error of
-    a size, the larger of the two kinds.
+    `score` and `information` are sums of those of single trials, `scores`, shape (n_trials, n_shapes), and
+    `informations`, shape (n_trials, n_shapes, n_shapes). `sigma` is the error of a size, the larger of the two kinds.
     """
 
     score: Floats
     information: Floats
     scores: Floats
-    robust: Floats
+    informations: Floats
     degrees: float
 
     @property
@@ -67,10 +67,21 @@ class Scores:
     @property
     def sigma(self) -> Floats:
         """Its standard error; infinite where the data say nothing."""
-        diagonal = np.maximum(np.diag(self.information), 1e-300)
-        plain = 1 / np.sqrt(diagonal)
-        robust = np.sqrt(np.diag(self.robust)) / diagonal
-        return np.where(np.diag(self.information) > 0, np.maximum(plain, robust), math.inf)
+        return np.maximum(self.plain_sigma, self.robust_sigma)
+
+    @property
+    def plain_sigma(self) -> Floats:
+        """Its error by the noise and spreads of the fit."""
+        diagonal = np.diag(self.information)
+        return np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), math.inf)
+
+    @property
+    def robust_sigma(self) -> Floats:
+        """Its error by how much the scores of single trials scatter, once the size has explained its part of them."""
+        diagonal = np.diag(self.information)
+        left = self.scores - np.einsum("njj->nj", self.informations) * self.size
+        scatter = np.sqrt(scatter_of(left, self.degrees))
+        return np.where(diagonal > 0, scatter / np.maximum(diagonal, 1e-300), math.inf)
 
     @property
     def z(self) -> Floats:
@@ -124,22 +135,29 @@ def scores_of(found: Fit, sums: Products, state: State | None = None) -> Scores:
     # What rounding leaves of a shape that the free numbers imitate exactly is nothing.
     gone = np.diag(information) < 1e-9 * np.maximum(np.diag(total), 1e-300)
     information[gone, :] = information[:, gone] = 0.0
-    padded_lever = np.vstack([lever, np.zeros((1, sums.n_shapes))])[index]
-    padded_step = np.append(step, 0.0)[index]
-    left = blocks[:, :, r].copy()
-    left -= np.einsum("nqk,nk->nq", blocks[:, :, X], padded_step)
-    single = left[:, C] - np.einsum("nkj,nk->nj", padded_lever, left[:, X])
+    levers = np.vstack([lever, np.zeros((1, sums.n_shapes))])[index]
+    steps = np.append(step, 0.0)[index]
+    left = blocks[:, :, r] - np.einsum("nqk,nk->nq", blocks[:, :, X], steps)
+    single = left[:, C] - np.einsum("nkj,nk->nj", levers, left[:, X])
+    mixed = np.swapaxes(levers, 1, 2) @ blocks[:, X, C]
+    alone = blocks[:, C, C] - mixed - np.swapaxes(mixed, 1, 2)
+    alone = alone + np.swapaxes(levers, 1, 2) @ blocks[:, X, X] @ levers
     single[:, gone] = 0.0
-    trials = len(single)
-    degrees = max(trials - moving.size, 1)
-    # The priors' part of the score belongs to no trial; centring takes it, and what else all share, out of the scatter.
-    centred = single - single.mean(axis=0)
-    robust = centred.T @ centred * trials / max(degrees, 1)
-    if trials < FEWEST_CLUSTERS:
-        robust = np.zeros_like(robust)
     score = blocks[:, C, r].sum(axis=0) - cross.T @ step
     score[gone] = 0.0
-    return Scores(score, information, single, robust, float(degrees))
+    degrees = max(len(single) - moving.size, 1)
+    return Scores(score, information, single, alone, float(degrees))
+
+
+def scatter_of(single: Floats, degrees: float) -> Floats:
+    """Variance of sums over trials from how single trials, shape (n_trials, n), scatter; 0 where they are too few.
+
+    Priors' parts belong to no trial: the mean is taken out.
+    """
+    trials = len(single)
+    if trials < FEWEST_CLUSTERS:
+        return np.zeros(single.shape[1])
+    return np.asarray(np.sum((single - single.mean(axis=0)) ** 2, axis=0) * trials / degrees)
 
 
 def _pressed(found: Fit) -> NDArray[np.bool_]:
@@ -253,9 +271,10 @@ def structure_of(found: Fit) -> Structure:
     values, vectors = np.linalg.eigh(information)
     keep = values > SHARE_LEFT * values.max(initial=0.0)
     along = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
-    single = (scores.scores / root)[:, live] @ vectors[:, keep] / np.sqrt(values[keep])
-    spread = np.var(single, axis=0) * len(single) * len(single) / scores.degrees
-    robust = spread if len(single) >= FEWEST_CLUSTERS else np.ones_like(along)
+    turn = (vectors / root[live][:, None])[:, keep] / np.sqrt(values[keep])
+    single = scores.scores[:, live] @ turn
+    explained = np.einsum("jk,njl,lk->nk", turn, scores.informations[:, live][:, :, live], turn) * along
+    robust = scatter_of(single - explained, scores.degrees)
     chi2 = float(np.sum(along**2 / np.maximum(1.0, robust)))
     degrees = int(np.count_nonzero(keep))
     p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0

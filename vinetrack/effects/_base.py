@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -170,7 +171,7 @@ class Effect:
         lines = [line.strip() for line in self.text.splitlines() if line.startswith("    ")]
         return "; ".join(line for line in lines if line)
 
-    @property
+    @cached_property
     def zero(self) -> tuple[float, ...]:
         """Values of the parameters at which it changes nothing, in their order."""
         return tuple(parameter.zero for parameter in self.parameters)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -54,12 +55,12 @@ class Model:
                 f"{', '.join(self.parameter_names) or 'none'}."
             )
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the effects, in order."""
         return tuple(effect.name for effect in self.effects)
 
-    @property
+    @cached_property
     def parameter_names(self) -> tuple[str, ...]:
         """Every parameter as `effect.parameter`, in the order of `parameters_for`."""
         return tuple(f"{effect.name}.{parameter.name}" for effect in self.effects for parameter in effect.parameters)

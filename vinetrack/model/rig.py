@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from vinetrack.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import EffectError, Rig
 from vinetrack.model.model import Model
-from vinetrack.records import Trial
+from vinetrack.records import Floats, Trial
 
 
 def rig_of(trial: Trial) -> Rig:
@@ -43,6 +45,22 @@ def rig_of(trial: Trial) -> Rig:
         as_printed=float(trial.mass_loss == "as_printed"),
         tail_free=float(trial.tail_slack == "free" and not whole_body),
     )
+
+
+def with_pressures(rigs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
+    """The same rigs, rows of `Rig`, at other pressures, shape (n_rigs,); the gas that moves along weighs as much more.
+
+    A yield pressure that is NaN leaves that of the rig.
+    """
+    place = {name: k for k, name in enumerate(Rig._fields)}
+    changed = rigs.copy()
+    denser = (set_pressure_Pa - rigs[:, place["set_pressure"]]) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
+    volume = rigs[:, place["area"]] * rigs[:, place["length"]] / rigs[:, place["travel_ratio"]] ** 2
+    changed[:, place["set_pressure"]] = set_pressure_Pa
+    changed[:, place["least_mass"]] += denser * volume
+    known = ~np.isnan(yield_pressure_Pa)
+    changed[known, place["yield_pressure"]] = yield_pressure_Pa[known]
+    return changed
 
 
 _COLUMN_OF_FIELD = {

@@ -16,8 +16,9 @@ import numpy as np
 from vinetrack.model.fit_data import FitTrial
 from vinetrack.model.free import DAMPING, YIELD_PRESSURE, Layout
 from vinetrack.model.model import Model
-from vinetrack.model.simulate import Trajectory, simulate_many
-from vinetrack.records import Floats, Trial
+from vinetrack.model.rig import check_needs, rig_of, with_pressures
+from vinetrack.model.simulate import Trajectory, bends_of, lay_out, trajectories
+from vinetrack.records import Floats
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 OWN = 4
@@ -61,6 +62,9 @@ class Predictor:
         self.feels_damping = np.array(
             [self.damping_column >= 0 and item.trial.travel_ratio != 1 for item in data], dtype=bool
         )
+        check_needs(model, *(item.trial for item in data))
+        self.rigs = np.array([rig_of(item.trial) for item in data], dtype=float)
+        self.bends = [bends_of(item.trial) for item in data]
         measured_otherwise = any({"true_time", "observed_position"} & set(effect.functions) for effect in model)
         self.plain_release = [item.trace is None and not measured_otherwise for item in data]
         self.pressure_step = np.full(len(data), 1e-3)
@@ -72,10 +76,17 @@ class Predictor:
 
     def run_as(self, model: Model, jobs: Sequence[Job], rows: Floats) -> list[Trajectory]:
         """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials."""
+        places = np.array([job.trial for job in jobs], dtype=int)
+        rigs = with_pressures(
+            self.rigs[places],
+            self.rigs[places, 0] * (1 + np.array([job.pressure_deviation for job in jobs])),
+            np.array([job.yield_pressure_Pa for job in jobs]),
+        )
         data = [self.data[job.trial] for job in jobs]
-        return simulate_many(
+        batch = lay_out(
             model,
-            [_varied(item.trial, job) for item, job in zip(data, jobs, strict=True)],
+            rigs,
+            [self.bends[job.trial] for job in jobs],
             [item.time_s - job.release_s for item, job in zip(data, jobs, strict=True)],
             traces=[
                 None if item.trace is None else (item.trace[0] - job.release_s, item.trace[1])
@@ -84,6 +95,7 @@ class Predictor:
             parameters=rows,
             host=self.host,
         )
+        return trajectories(batch, [item.trial.travel_ratio for item in data], [item.trial.name for item in data])
 
     def jobs(self, theta: Floats, own: Floats) -> list[Job]:
         """The unmoved trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4)."""
@@ -193,11 +205,3 @@ def _step(answer: float, before: float) -> float:
     if not answer > 0:
         return before
     return float(np.clip(AIMED_RESPONSE / answer, SMALLEST_STEP, LARGEST_STEP))
-
-
-def _varied(trial: Trial, job: Job) -> Trial:
-    """The trial with the pressures of this job."""
-    pressure_Pa = trial.pressure_Pa * (1 + job.pressure_deviation)
-    if np.isnan(job.yield_pressure_Pa):
-        return trial if job.pressure_deviation == 0 else replace(trial, pressure_Pa=pressure_Pa)
-    return replace(trial, pressure_Pa=pressure_Pa, yield_pressure_Pa=job.yield_pressure_Pa)

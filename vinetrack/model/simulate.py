@@ -107,9 +107,26 @@ def simulate_many(
     rest.
     """
     batch = prepare(model, trials, times_s, traces=traces, parameters=parameters, host=host)
+    ratios = [trial.travel_ratio for trial in trials]
+    return trajectories(batch, ratios, [trial.name for trial in trials], relative_tolerance)
+
+
+def trajectories(
+    batch: Batch, ratios: Sequence[float], names: Sequence[str], relative_tolerance: float = RELATIVE_TOLERANCE
+) -> list[Trajectory]:
+    """Run a batch; travel ratios and names by trial.
+
+    Raises
+    ------
+    SimulationError
+        If the integration does not get through.
+    """
     out, ends = batch.run(relative_tolerance)
-    rows = itertools.pairwise(batch.starts)
-    return [_trajectory(trials[i], batch.times_s[i], out[a:b], ends[i]) for i, (a, b) in enumerate(rows)]
+    edges = batch.starts.tolist()
+    return [
+        _trajectory(names[i], ratios[i], batch.times_s[i], out[edges[i] : edges[i + 1]], end)
+        for i, end in enumerate(ends.tolist())
+    ]
 
 
 @dataclass(frozen=True)
@@ -200,27 +217,47 @@ def prepare(
     EffectError
         If a trial lacks what an effect needs, or the host does not hold the model.
     """
-    traces = traces or [None] * len(trials)
     check_needs(model, *trials)
     rigs = np.array([rig_of(trial) for trial in trials], dtype=float).reshape(len(trials), len(Rig._fields))
     if parameters is None:
         of_vine = {vine: model.parameters_for(vine) for vine in {trial.vine for trial in trials}}
         parameters = np.array([of_vine[trial.vine] for trial in trials])
-    thetas = np.ascontiguousarray(parameters, dtype=float).reshape(len(trials), len(model.parameter_names))
+    bends = [bends_of(trial) for trial in trials]
+    return lay_out(model, rigs, bends, times_s, traces=traces, parameters=parameters, host=host)
+
+
+def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
+    """Start, arc and radius of a trial's bends, m."""
+    return [(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]
+
+
+def lay_out(
+    model: Model,
+    rigs: Floats,
+    bends: Sequence[Sequence[tuple[float, float, float]]],
+    times_s: Sequence[Floats],
+    *,
+    traces: Sequence[Trace | None] | None = None,
+    parameters: Floats,
+    host: Model | None = None,
+) -> Batch:
+    """As `prepare`, for trials that are rows of rigs already, shape (n_trials, n_fields of `Rig`)."""
+    count = len(rigs)
+    traces = traces or [None] * count
+    thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
     given = [trace for trace in traces if trace is not None]
-    bends = [[(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends] for trial in trials]
     if host is not None and host.names != model.names:
         resting = np.array([name not in model for name in host.names])
         model, thetas = host, hosted(host, model, thetas)
         on = effects_on(model, thetas) & ~resting
     else:
         on = effects_on(model, thetas)
-    kinks, stops = _limits(model, rigs, thetas, on, trials)
+    kinks, stops = _limits(model, rigs, thetas, on, bends)
     given_times = [np.asarray(t, dtype=float) for t in times_s]
     true_times = _true_times(model, rigs, thetas, on, given_times)
-    tail_free = any(rig[Rig._fields.index("tail_free")] for rig in rigs)
+    tail_free = bool(rigs[:, Rig._fields.index("tail_free")].any()) if count else False
     return Batch(
-        integrate_many=kernel(model.effects, bool(tail_free)).integrate_many,
+        integrate_many=kernel(model.effects, tail_free).integrate_many,
         times_s=given_times,
         starts=_starts(given_times),
         times=np.concatenate(true_times) if true_times else np.empty(0),
@@ -243,7 +280,11 @@ def _starts(parts: Sequence[Sized]) -> NDArray[np.int64]:
 
 
 def _limits(
-    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], trials: Sequence[Trial]
+    model: Model,
+    rigs: Floats,
+    thetas: Floats,
+    on: NDArray[np.bool_],
+    bends: Sequence[Sequence[tuple[float, float, float]]],
 ) -> tuple[Floats, Floats]:
     """Tail travel at which forces have corners, rising, and at which growth ends, m; infinite where they do not.
 
@@ -260,18 +301,18 @@ def _limits(
     loss = np.asarray(rig.mass_loss)
     floor = np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf)
     cornered = [i for i, effect in enumerate(model.effects) if effect.corners is not None and on[:, i].any()]
-    if not cornered and not any(trial.bends for trial in trials):
+    if not cornered and not any(bends):
         return floor[:, None].copy(), end
-    found = [[edge for bend in trial.bends for edge in (bend.start_m, bend.start_m + bend.arc_m)] for trial in trials]
+    found = [[edge for start, arc, _ in rows for edge in (start, start + arc)] for rows in bends]
     for i in cornered:
         corners = model.effects[i].corners
         assert corners is not None
         for k in np.flatnonzero(on[:, i]).tolist():
             found[k] += corners(Rig(*rigs[k]))
-    kinks = np.full((len(trials), 1 + max(map(len, found), default=0)), math.inf)
+    kinks = np.full((len(rigs), 1 + max(map(len, found), default=0)), math.inf)
     kinks[:, 0] = floor
     for k, positions in enumerate(found):
-        kinks[k, 1 : 1 + len(positions)] = np.array(positions) * trials[k].travel_ratio
+        kinks[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
     return np.sort(kinks, axis=1), end
 
 
@@ -287,11 +328,10 @@ def _true_times(
     return found
 
 
-def _trajectory(trial: Trial, times_s: Floats, out: Floats, end: Floats) -> Trajectory:
+def _trajectory(name: str, r: float, times_s: Floats, out: Floats, end: Sequence[float]) -> Trajectory:
     status = STATUS[int(end[0])]
     if status == "too hard":
-        raise SimulationError(f"Trial {trial.name}: the model could not be integrated beyond {end[1]:.6g} s.")
-    r = trial.travel_ratio
+        raise SimulationError(f"Trial {name}: the model could not be integrated beyond {end[1]:.6g} s.")
     return Trajectory(
         time_s=times_s,
         lead_position_m=out[:, 0] / r,
@@ -300,10 +340,10 @@ def _trajectory(trial: Trial, times_s: Floats, out: Floats, end: Floats) -> Traj
         observed_position_m=out[:, 3],
         travel_ratio=r,
         status=status,
-        end_time_s=float(end[1]),
-        end_lead_velocity_m_s=float(end[2]) / r,
+        end_time_s=end[1],
+        end_lead_velocity_m_s=end[2] / r,
         n_steps=int(end[3]),
-        slack_from_s=float(end[4]),
+        slack_from_s=end[4],
     )
 
 
@@ -311,9 +351,12 @@ __all__ = [
     "Batch",
     "SimulationError",
     "Trajectory",
+    "bends_of",
     "check_needs",
+    "lay_out",
     "prepare",
     "rig_of",
     "simulate",
     "simulate_many",
+    "trajectories",
 ]

@@ -1,0 +1,179 @@
+"""From a fit to verdicts: is something missing, which effect, is anything left once it is there.
+
+A verdict is never more certain than the data. One effect alone must mend everything; if something is left, two effects
+together must; if something is left then, the truth is not in the catalogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vinetrack.diagnosis.evidence import Evidence, answer_set
+from vinetrack.diagnosis.question import FIRST_LEVEL, LATER_LEVEL, Questions, question
+from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, UNEXPLAINED
+from vinetrack.diagnosis.singles import Report, Search, pairs
+from vinetrack.effects import Effect
+from vinetrack.model.fit_result import Fit
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One round before it is put in words.
+
+    `kept` are the hypotheses in the answer set (of pairs: the partners, given what was added before), `tried` all that
+    were fitted, `aside` what was set aside and why, by name.
+    """
+
+    verdict: str
+    questions: Questions
+    kept: tuple[Evidence, ...] = ()
+    tried: tuple[Evidence, ...] = ()
+    aside: tuple[tuple[str, str], ...] = ()
+    answer: tuple[str, ...] = ()
+    search: Search | None = None
+    note: str = ""
+
+
+def inquire(found: Fit, effects: Sequence[Effect], report: Report) -> list[Finding]:
+    """The findings of all rounds, the first about the fit itself."""
+    report("questioning the model")
+    questions = question(found, effects, FIRST_LEVEL)
+    if not questions.something:
+        return [Finding(ADEQUATE, questions)]
+    search = Search(questions, report)
+    tried = search.singles()
+    alone = _alone(questions, search, tried)
+    if alone is not None:
+        return alone
+    tried = search.singles(all_of_them=True)
+    alone = _alone(questions, search, tried)
+    if alone is not None:
+        return alone
+    if not tried or best_of(tried).sigma < questions.threshold:
+        mends = questions.structure.p < 0.1 * FIRST_LEVEL or questions.far_off
+        verdict = UNEXPLAINED if mends else ADEQUATE
+        return [Finding(verdict, questions, tried=tuple(tried), search=search)]
+    report("two effects together")
+    return _together(questions, search, tried, effects, report)
+
+
+def best_of(tried: Sequence[Evidence]) -> Evidence:
+    """The hypothesis with the highest likelihood."""
+    return max(tried, key=lambda one: one.fit.log_likelihood)
+
+
+def _alone(questions: Questions, search: Search, tried: Sequence[Evidence]) -> list[Finding] | None:
+    """Findings where one effect mends everything; None where none does."""
+    if not tried:
+        return None
+    best = best_of(tried)
+    if best.sigma < questions.threshold:
+        return None
+    kept, aside = answer_set(tried)
+    if not kept[0].plausible:
+        return None
+    after = question(kept[0].fit, questions.effects, LATER_LEVEL)
+    if after.something:
+        return None
+    verdict = verdict_of(kept)
+    first = Finding(
+        verdict,
+        questions,
+        tuple(kept),
+        tuple(tried),
+        tuple(aside.items()),
+        tuple(one.names[0] for one in kept),
+        search,
+    )
+    return [first, Finding(ADEQUATE, after)] if verdict == MISSING else [first]
+
+
+def verdict_of(kept: Sequence[Evidence]) -> str:
+    """What an answer set amounts to; of each hypothesis the last effect counts."""
+    kinds = {one.effects[-1].kind for one in kept}
+    if kinds == {"measurement"}:
+        return ARTEFACT
+    return MISSING if len(kept) == 1 else AMBIGUOUS
+
+
+def _together(
+    questions: Questions, search: Search, tried: Sequence[Evidence], effects: Sequence[Effect], report: Report
+) -> list[Finding]:
+    """Findings where two effects together mend what none does alone; else nothing known does."""
+    ranked = sorted(tried, key=lambda one: -one.fit.log_likelihood)
+    both = pairs(questions.found, ranked, effects, report)
+    nothing = [
+        Finding(UNEXPLAINED, questions, tried=(*ranked, *both), search=search, aside=_why_not(ranked, both))
+    ]
+    if not both:
+        return nothing
+    kept, aside = answer_set(both)
+    best = kept[0]
+    after = question(best.fit, effects, LATER_LEVEL)
+    gain = 2 * (best.fit.log_likelihood - ranked[0].fit.log_likelihood)
+    if after.something or not best.plausible or gain < after.threshold**2:
+        return nothing
+    common = set.intersection(*(set(one.names) for one in kept))
+    by_name = {one.names[0]: one for one in ranked if len(one.names) == 1}
+    if not common:
+        names = tuple(dict.fromkeys(name for one in kept for name in one.names))
+        answer = _ordered(names, by_name)
+        first = Finding(AMBIGUOUS, questions, tuple(kept), (*ranked, *both), tuple(aside.items()), answer, search)
+        return [first]
+    return _in_order(questions, search, kept, common, by_name, (*ranked, *both), aside, after)
+
+
+def _ordered(names: Sequence[str], by_name: dict[str, Evidence]) -> tuple[str, ...]:
+    """Names by how much each mends alone."""
+    return tuple(sorted(names, key=lambda name: -by_name[name].delta_chi2 if name in by_name else 0.0))
+
+
+def _in_order(
+    questions: Questions,
+    search: Search,
+    kept: Sequence[Evidence],
+    common: set[str],
+    by_name: dict[str, Evidence],
+    tried: Sequence[Evidence],
+    aside: dict[str, str],
+    after: Questions,
+) -> list[Finding]:
+    """Two rounds from pairs that share an effect: that one first, physics before faults of the measurement."""
+    kinds = {effect.name: effect.kind for one in kept for effect in one.effects}
+    order = sorted(common, key=lambda name: (kinds[name] == "measurement", -_alone_gain(name, by_name)))
+    first_name = order[0]
+    turned = [_turned(one, first_name) for one in kept]
+    verdict = ARTEFACT if kinds[first_name] == "measurement" else MISSING
+    first = Finding(
+        verdict, questions, tuple(turned[:1]), tuple(tried), tuple(aside.items()), (first_name,), search,
+        note="two effects are missing: none alone mends everything",
+    )  # fmt: skip
+    if verdict != MISSING:
+        return [first]
+    base = by_name.get(first_name)
+    later = question(base.fit if base else turned[0].fit, questions.effects, LATER_LEVEL)
+    seconds = tuple(one.names[-1] for one in turned)
+    second_verdict = verdict_of(turned)
+    second = Finding(second_verdict, later, tuple(turned), tuple(turned), answer=seconds)
+    return [first, second, Finding(ADEQUATE, after)] if second_verdict == MISSING else [first, second]
+
+
+def _alone_gain(name: str, by_name: dict[str, Evidence]) -> float:
+    return by_name[name].delta_chi2 if name in by_name else 0.0
+
+
+def _turned(one: Evidence, first: str) -> Evidence:
+    """The same pair with the effect of that name in front."""
+    from dataclasses import replace
+
+    ordered = sorted(one.effects, key=lambda effect: effect.name != first)
+    return replace(one, effects=tuple(ordered))
+
+
+def _why_not(ranked: Sequence[Evidence], both: Sequence[Evidence]) -> tuple[tuple[str, str], ...]:
+    best = [one for one in (*ranked[:1], *both[:1])]
+    return tuple(
+        ("+".join(one.names), one.reason if not one.plausible else "something is left once it is added")
+        for one in best
+    )

@@ -1,0 +1,148 @@
+"""Every effect alone, and pairs of them: which hypotheses are worth a fit, and their fits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from vinetrack.diagnosis.evidence import Evidence, weigh
+from vinetrack.diagnosis.question import LATER_LEVEL, Questions, question
+from vinetrack.diagnosis.search import Climb, Slope, best_climb, full_fit, start_of, starts_of
+from vinetrack.effects import Effect
+from vinetrack.model.fit_result import Fit
+
+Report = Callable[[str], None]
+"""Told in a few words what is being done."""
+
+WEAK = 100.0
+"""Δχ² up to which what the sensitivities predict is good to a per cent: hypotheses are then fitted without a climb."""
+
+WITHIN_REACH = 16.0
+ALIKE = 0.95
+SHARE_WORTH_A_CLIMB = 0.2
+FEWEST_CLIMBED = 5
+REACH_OF_CLIMBS, SHARE_OF_REACH = 40.0, 0.1
+MOST_FITTED = 7
+STARTS_EACH = 3
+FIRSTS, PARTNERS = 3, 4
+
+
+@dataclass
+class Search:
+    """Hypotheses tried so far from one fit. Climbs and fits are made once each."""
+
+    questions: Questions
+    report: Report
+    climbs: dict[str, Climb] = field(default_factory=dict)
+    fitted: dict[str, Evidence] = field(default_factory=dict)
+    silent: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self.slope = Slope(self.questions.found)
+        self.goal = math.inf
+
+    @property
+    def weak(self) -> bool:
+        """Whether predictions from sensitivities are good enough to choose by."""
+        return not self.questions.far_off and max(map(self.questions.promise, self.names), default=0.0) < WEAK
+
+    @property
+    def names(self) -> list[str]:
+        """Effects that may be missing, the most promising first."""
+        names = dict.fromkeys(self.questions.answers.effects)
+        return sorted(names, key=lambda name: -self.questions.promise(name))
+
+    def singles(self, *, all_of_them: bool = False) -> list[Evidence]:
+        """Fit the hypotheses that may be the best or near it, each effect alone."""
+        if self.weak:
+            return self._fit_weak(all_of_them=all_of_them)
+        self._climb_all(self.names if all_of_them else self._worth_a_climb())
+        leaders = sorted(self.climbs.values(), key=lambda one: one.deviance)
+        if not leaders:
+            return []
+        best = leaders[0]
+        base = self.slope.climb((), {}, iterations=4)
+        gain = max((base.deviance if base else best.deviance) - best.deviance, 0.0)
+        reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
+        alike = [c for c in leaders if self.questions.cosine(c.names[0], best.names[0]) > ALIKE]
+        chosen = [one for one in leaders if one.deviance - best.deviance < reach or one in alike]
+        for climb in chosen[: MOST_FITTED + 3 * all_of_them]:
+            self._fit(climb)
+        return list(self.fitted.values())
+
+    def _worth_a_climb(self) -> list[str]:
+        top = self.questions.promise(self.names[0]) if self.names else 0.0
+        return [
+            name
+            for k, name in enumerate(self.names)
+            if k < FEWEST_CLIMBED
+            or self.questions.promise(name) > SHARE_WORTH_A_CLIMB * top
+            or self.questions.cosine(name, self.names[0]) > ALIKE
+        ]
+
+    def _climb_all(self, names: Iterable[str]) -> None:
+        for name in names:
+            if name in self.climbs or name in self.silent:
+                continue
+            self.report(f"trying {name}")
+            places = self.questions.of(name)[:STARTS_EACH]
+            sizes = self.questions.gains[1]
+            starts = starts_of((self.questions.answers.shapes[i], float(sizes[i])) for i in places)
+            found = best_climb(self.slope, starts, self.goal)
+            if found is None:
+                self.silent.add(name)
+                continue
+            self.goal = min(self.goal, found.deviance)
+            self.climbs[name] = found
+
+    def _fit_weak(self, *, all_of_them: bool) -> list[Evidence]:
+        names = self.names
+        if not names:
+            return []
+        top = self.questions.promise(names[0])
+        for name in names:
+            near = self.questions.promise(name) > max(top - WITHIN_REACH, 0.25 * top)
+            alike = self.questions.cosine(name, names[0]) > ALIKE
+            if (near or alike or all_of_them) and name not in self.fitted and name not in self.silent:
+                self.report(f"fitting {name}")
+                self._fit_from_prediction(name)
+        return list(self.fitted.values())
+
+    def _fit_from_prediction(self, name: str) -> None:
+        """The best fit from the shapes that promise most."""
+        sizes = self.questions.gains[1]
+        for place in self.questions.of(name)[:STARTS_EACH]:
+            shape = self.questions.answers.shapes[place]
+            self._fit(Climb((shape.effect,), math.nan, start_of(shape, float(sizes[place]))))
+            if name in self.fitted and self.fitted[name].delta_chi2 > 0.7 * self.questions.promise(name):
+                break
+
+    def _fit(self, climb: Climb) -> None:
+        name = "+".join(climb.names)
+        if name in self.fitted and not math.isnan(climb.deviance):
+            return
+        self.report(f"fitting {name}")
+        fit = full_fit(self.questions.found, climb)
+        if fit is None:
+            self.silent.add(name)
+            return
+        found = weigh(self.questions.found, climb.effects, fit)
+        if name not in self.fitted or found.delta_chi2 > self.fitted[name].delta_chi2:
+            self.fitted[name] = found
+
+
+def pairs(before: Fit, firsts: Sequence[Evidence], effects: Sequence[Effect], report: Report) -> list[Evidence]:
+    """Fits of two effects together: to each of the best single ones, those that promise to mend what it leaves."""
+    found: dict[frozenset[str], Evidence] = {}
+    for first in firsts[:FIRSTS]:
+        later = question(first.fit, effects, LATER_LEVEL)
+        search = Search(later, report)
+        search.singles()
+        ranked = sorted(search.fitted.values(), key=lambda one: -one.fit.log_likelihood)
+        for second in ranked[:PARTNERS]:
+            names = frozenset((*first.names, *second.names))
+            both = weigh(before, (*first.effects, *second.effects), second.fit)
+            if names not in found or both.fit.log_likelihood > found[names].fit.log_likelihood:
+                found[names] = both
+    return sorted(found.values(), key=lambda one: -one.fit.log_likelihood)
