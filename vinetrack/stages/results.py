@@ -172,6 +172,29 @@ class Results:
         return result_file(self.folder / "comparison", condition, ".csv")
 
     @property
+    def diagnosis(self) -> Path:
+        """What the model in use lacks."""
+        return self.folder / "diagnosis.json"
+
+    @property
+    def ladder(self) -> Path:
+        """The errors of the model that the user came with and of every one after it."""
+        return self.folder / "ladder.csv"
+
+    def predictions(self, trial: str) -> Path:
+        """One trial, and what the models before and after say of it."""
+        return result_file(self.folder / "diagnosis" / "predictions", trial, ".csv")
+
+    @property
+    def overlays(self) -> Path:
+        """Folder of the clips."""
+        return self.folder / "overlays"
+
+    def overlay(self, trial: str) -> Path:
+        """The recording of one trial with the edges drawn."""
+        return result_file(self.overlays, trial, ".mp4")
+
+    @property
     def provenance(self) -> Path:
         """What all this was made with."""
         return self.folder / "provenance.json"
