@@ -110,6 +110,40 @@ def compare(results: ResultsPath) -> None:
             typer.echo(line)
 
 
+@app.command()
+def overlay(
+    results: ResultsPath,
+    trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],
+    experiment: Annotated[
+        Path | None, typer.Option("--experiment", help="The experiment, where it has moved.", show_default=False)
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.5, help="About how long it plays.", show_default=False)
+    ] = None,
+) -> None:
+    """The recording of one trial, slowed down, with the tracked edge and the models' edges drawn."""
+    with _sentences(None):
+        from vinetrack.stages.overlays import overlay_one
+
+        typer.echo(f"Clip: {overlay_one(results, trial, experiment, seconds)}")
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def overlays(
+    experiment: ExperimentPath,
+    results: ResultsPath,
+    settings: SettingsText = "{}",
+    threads: Threads = 1,
+    log: LogPath = None,
+) -> None:
+    """Clips of the recordings that the settings choose, with the tracked edge and the models' edges drawn."""
+    with _sentences(log):
+        from vinetrack.stages.overlays import draw_overlays
+
+        for line in draw_overlays(_read(experiment), results, _run_settings(settings).overlays, threads):
+            typer.echo(f"  {line}")
+
+
 @app.command(rich_help_panel="Stages of the workflow")
 def recording(
     experiment: ExperimentPath,

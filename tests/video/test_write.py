@@ -1,0 +1,71 @@
+"""Clips: what goes in comes out, in the same colours, and nothing half-written is left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from vinetrack.video.write import write_clip
+
+
+def pictures(n: int, height: int = 64, width: int = 96) -> list[np.ndarray]:
+    made = []
+    for i in range(n):
+        picture = np.full((height, width, 3), 60, np.uint8)
+        picture[:, 8 * i : 8 * i + 8] = (240, 228, 66)
+        made.append(picture)
+    return made
+
+
+def decoded(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_pictures_come_back_in_order_and_in_colour(tmp_path: Path) -> None:
+    path = tmp_path / "overlays" / "a.mp4"
+    assert write_clip(path, iter(pictures(10)), 12.5) == 10
+    back = decoded(path)
+    assert len(back) == 10
+    for i, picture in enumerate(back):
+        middle = picture[20:40, 8 * i + 2 : 8 * i + 6].astype(float).mean(axis=(0, 1))
+        assert middle == pytest.approx([240, 228, 66], abs=14)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert float(stream.average_rate) == 12.5
+
+
+def test_the_index_is_in_front_so_that_a_page_can_play_it_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    write_clip(path, pictures(5), 10)
+    content = path.read_bytes()
+    assert content.index(b"moov") < content.index(b"mdat")
+
+
+def test_the_same_pictures_make_the_same_file(tmp_path: Path) -> None:
+    for name in "ab":
+        write_clip(tmp_path / f"{name}.mp4", pictures(6), 10)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+
+
+def broken():  # type: ignore[no-untyped-def]
+    yield pictures(1)[0]
+    raise RuntimeError("the recording ends here")
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [([], ValueError), ([np.zeros((63, 96, 3), np.uint8)], ValueError), (broken(), RuntimeError)],
+    ids=["nothing", "odd", "broken"],
+)
+def test_what_fails_leaves_the_old_clip_and_no_other_file(tmp_path: Path, given, error) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"the old one")
+    with pytest.raises(error):
+        write_clip(path, given, 10)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
+    assert path.read_bytes() == b"the old one"

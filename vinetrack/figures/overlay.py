@@ -1,0 +1,203 @@
+"""Frames of a clip: the recording, the tracked edge, and the edges that the model predicts before and after.
+
+The tracked edge crosses the tube, the predicted ones stand beside it, the earlier model reaching farther out: so all
+stay visible where they agree. A bar below says which is which, how far each is off, the time, and how much slower than
+life the clip is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.figures.style import SKY, VERMILLION
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+    from PIL.ImageDraw import ImageDraw
+    from PIL.ImageFont import FreeTypeFont
+
+    from vinetrack.video.axis import Axis
+
+Floats = NDArray[np.float64]
+
+TRACKED, BEFORE, AFTER = "#F0E442", VERMILLION, SKY
+"""Okabe and Ito's yellow, vermillion and sky blue: told apart by anyone, and on any grey."""
+
+BAR, BAR_INK, BAR_MUTED = "#16191e", "#f2f4f7", "#9aa3b0"
+LARGEST_ZOOM = 2.0
+REACHES = (2.0, 1.4)
+"""How far from the axis the edges of the models before and after reach, in radii of the tube."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """One edge through a clip: its name, its colour, and where it is along the axis in every frame, px (NaN: unseen).
+
+    `off_mm` is how far it lies ahead of the tracked edge in every frame, None for that itself.
+    """
+
+    name: str
+    colour: str
+    along_px: Floats
+    off_mm: Floats | None = None
+
+
+@dataclass(frozen=True)
+class View:
+    """What all frames of a clip share.
+
+    `size_px` is width and height of the recording; `mm_per_px` its scale along the axis; `slowed` by how much the clip
+    is slower than life.
+    """
+
+    title: str
+    axis: Axis
+    tube_px: float
+    size_px: tuple[int, int]
+    mm_per_px: float
+    slowed: float
+    width_px: int = 960
+
+    @property
+    def zoom(self) -> float:
+        """Pixels of the clip for one of the recording."""
+        return min(self.width_px / self.size_px[0], LARGEST_ZOOM)
+
+    @property
+    def picture_px(self) -> tuple[int, int]:
+        """Width and height of the picture in the clip, both even."""
+        return _even(self.zoom * self.size_px[0]), _even(self.zoom * self.size_px[1])
+
+
+def _even(value: float) -> int:
+    return max(2 * round(value / 2), 2)
+
+
+def compose(view: View, picture: NDArray[Any], frame: int, time_ms: float, edges: list[Edge]) -> NDArray[np.uint8]:
+    """One frame of the clip, RGB, shape (height, width, 3), both even.
+
+    Parameters
+    ----------
+    picture : the recording's frame in grey levels, uint8 (see `levels`).
+    frame : its number, which the edges count by.
+    time_ms : since release.
+    edges : the tracked one first, then those of the models before and after.
+    """
+    from PIL import Image, ImageDraw
+
+    width, height = view.picture_px
+    line_px = _line_height(width)
+    bar_px = _even(1.35 * line_px * max(len(edges), 2) + 0.8 * line_px)
+    whole = Image.new("RGB", (width, height + bar_px), BAR)
+    small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR)
+    whole.paste(small, (0, 0))
+    pen = ImageDraw.Draw(whole)
+    for edge, reach in (*zip(edges[1:], REACHES, strict=False), *((edge, 0.0) for edge in edges[:1])):
+        _draw_edge(pen, view, edge, frame, reach)
+    _scale_bar(pen, view, line_px)
+    whole.paste(_legend(view, tuple((edge.name, edge.colour) for edge in edges), bar_px, line_px), (0, height))
+    _numbers(pen, view, edges, frame, time_ms, line_px)
+    return np.asarray(whole)
+
+
+def _line_height(width_px: int) -> int:
+    return max(round(width_px / 48), 11)
+
+
+@lru_cache(maxsize=8)
+def _font(size_px: int, bold: bool = False) -> FreeTypeFont:
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/{name}", size_px)
+
+
+def _draw_edge(pen: ImageDraw, view: View, edge: Edge, frame: int, reach: float) -> None:
+    """Draw across the tube where `reach` is 0, else on both sides of it as far as that."""
+    along = float(edge.along_px[frame])
+    if not math.isfinite(along):
+        return
+    radius = 0.5 * view.tube_px
+    spans = ((0.85, reach), (-0.85, -reach)) if reach else ((-1.0, 1.0),)
+    thick = max(round(view.picture_px[0] / 320), 3)
+    for low, high in spans:
+        ends = [view.axis.points(np.array(along), across * radius) for across in (low, high)]
+        # Pixel centres lie at whole numbers in the recording, at halves in the clip.
+        line = [tuple((end + 0.5) * view.zoom - 0.5) for end in ends]
+        pen.line(line, fill="black", width=thick + 2)
+        pen.line(line, fill=edge.colour, width=thick)
+
+
+def _scale_bar(pen: ImageDraw, view: View, line_px: int) -> None:
+    """A bar of a round length, about a sixth of the picture, in its lower left corner."""
+    width, height = view.picture_px
+    wanted_mm = width / 6 / view.zoom * view.mm_per_px
+    if not math.isfinite(wanted_mm) or wanted_mm <= 0:
+        return
+    decade = 10.0 ** math.floor(math.log10(wanted_mm))
+    length_mm = max(step * decade for step in (1, 2, 5) if step * decade <= wanted_mm)
+    left, bottom = line_px, height - line_px
+    right = left + length_mm / view.mm_per_px * view.zoom
+    thick = max(line_px // 6, 2)
+    pen.rectangle((left - 1, bottom - thick - 1, right + 1, bottom + 1), fill="black")
+    pen.rectangle((left, bottom - thick, right, bottom), fill="white")
+    pen.text(
+        (left, bottom - thick - 3), f"{length_mm:g} mm", font=_font(line_px), fill="white", anchor="ls",
+        stroke_width=2, stroke_fill="black",
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=2)
+def _legend(view: View, names: tuple[tuple[str, str], ...], bar_px: int, line_px: int) -> Image:
+    """The part of the bar that never changes; numbers are written over it."""
+    from PIL import Image, ImageDraw
+
+    width = view.picture_px[0]
+    bar = Image.new("RGB", (width, bar_px), BAR)
+    pen = ImageDraw.Draw(bar)
+    for i, (name, colour) in enumerate(names):
+        y = _row_y(i, line_px)
+        pen.line([(line_px, y), (2.6 * line_px, y)], fill=colour, width=max(line_px // 4, 3))
+        pen.text(
+            (3.2 * line_px, y), _shortened(name, 0.42 * width, line_px), font=_font(line_px), fill=BAR_INK, anchor="lm"
+        )
+    title = _shortened(view.title, 0.3 * width, line_px, bold=True)
+    pen.text((width - line_px, _row_y(0, line_px)), title, font=_font(line_px, True), fill=BAR_INK, anchor="rm")
+    return bar
+
+
+def _row_y(row: int, line_px: int) -> float:
+    return 1.1 * line_px + 1.35 * line_px * row
+
+
+def _shortened(text: str, room_px: float, line_px: int, bold: bool = False) -> str:
+    if _font(line_px, bold).getlength(text) <= room_px:
+        return text
+    while text and _font(line_px, bold).getlength(text + "…") > room_px:
+        text = text[:-1]
+    return text.rstrip() + "…"
+
+
+def _numbers(pen: ImageDraw, view: View, edges: list[Edge], frame: int, time_ms: float, line_px: int) -> None:
+    width, height = view.picture_px
+    font = _font(line_px)
+    for i, edge in enumerate(edges):
+        if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
+            words = f"{edge.off_mm[frame]:+.1f} mm".replace("-", "−")
+            pen.text((0.6 * width, height + _row_y(i, line_px)), words, font=font, fill=BAR_INK, anchor="rm")
+    y = height + _row_y(1, line_px)
+    words = f"{time_ms:.1f} ms, {view.slowed:.3g} times slower".replace("-", "−")
+    pen.text((width - line_px, y), words, font=font, fill=BAR_MUTED, anchor="rm")
+
+
+def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:
+    """Grey levels stretched so that `low` is black and `high` white, uint8."""
+    stretched = (picture.astype(np.float32) - low) * (255.0 / max(high - low, 1e-9))
+    return np.clip(np.round(stretched), 0, 255).astype(np.uint8)

@@ -1,0 +1,78 @@
+"""Pictures become a clip that any player, browser and slide plays: H.264 in MP4, its index in front."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+CRF = 25
+"""Quality of the encoder: thin coloured lines stay clean, and a clip of six seconds weighs a few hundred kilobytes."""
+
+CODES_709 = 1
+"""Code of ITU-R BT.709 in the stream: players otherwise guess the colours from the size of the picture."""
+
+
+def write_clip(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: float, crf: int = CRF) -> int:
+    """Write RGB pictures of shape (height, width, 3), all alike and of even sides; whole or not at all.
+
+    Parameters
+    ----------
+    play_fps : pictures a second when it is played.
+    crf : constant rate factor, 0 to 51; more is smaller and worse.
+
+    Returns
+    -------
+    int
+        How many pictures were written.
+
+    Raises
+    ------
+    ValueError
+        If there is no picture, or its sides are odd.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".part-{path.name}")
+    try:
+        count = _encode(draft, pictures, play_fps, crf)
+        draft.replace(path)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            draft.unlink()
+    return count
+
+
+def _encode(path: Path, pictures: Iterable[NDArray[np.uint8]], play_fps: float, crf: int) -> int:
+    import av
+
+    count, stream = 0, None
+    with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        for count, picture in enumerate(pictures, 1):
+            if stream is None:
+                height, width = picture.shape[:2]
+                if height % 2 or width % 2:
+                    raise ValueError(f"a clip needs pictures of even sides, not {width} × {height}")
+                stream = _stream(container, width, height, play_fps, crf)
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709")
+            frame.pts = count - 1
+            container.mux(stream.encode(frame))
+        if stream is None:
+            raise ValueError("there is no picture to make a clip of")
+        container.mux(stream.encode())
+    return count
+
+
+def _stream(container: Any, width: int, height: int, play_fps: float, crf: int) -> Any:
+    stream = container.add_stream("libx264", rate=Fraction(play_fps).limit_denominator(1001))
+    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    stream.codec_context.thread_count = 1
+    stream.options = {"preset": "faster", "crf": str(crf), "profile": "high", "tune": "animation"}
+    context = stream.codec_context
+    context.colorspace = context.color_primaries = context.color_trc = CODES_709
+    return stream
