@@ -67,11 +67,10 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
     """
     from vinetrack.experiment import read_experiment
     from vinetrack.settings import OverlaySettings
-    from vinetrack.workflow import find_experiment
 
     results = Results(folder)
     said = read_json(results.provenance)
-    read = read_experiment(find_experiment(experiment or Path(str(said["experiment"]))))
+    read = read_experiment(experiment or Path(str(said["experiment"])))
     filmed = [one.name for one in read.trials if one.video is not None]
     if trial not in filmed:
         known = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there is none"
