@@ -42,12 +42,13 @@ class Condition:
     """A trial that could be made.
 
     `like` is the place among the trials of the experiment of the one it is modelled on: for a vine that exists, a trial
-    with it; else one with the vine nearest in size.
+    with it; else one with the vine nearest in size. `changed` names what differs from the rig of that trial.
     """
 
     trial: Trial
     like: int
     effort: int
+    changed: tuple[str, ...] = ()
 
 
 def conditions(data: Sequence[FitTrial], limits: Limits) -> list[Condition]:
@@ -74,7 +75,17 @@ def conditions(data: Sequence[FitTrial], limits: Limits) -> list[Condition]:
             if effort == least:
                 found += _loads(rig, k, NEW_VINE, used, limits)
     named = [f"next_{i + 1}" for i in range(len(found))]
-    return [replace(one, trial=replace(one.trial, name=name)) for one, name in zip(found, named, strict=True)]
+    return [
+        replace(one, trial=replace(one.trial, name=name), changed=_changed(one.trial, data[one.like].trial))
+        for one, name in zip(found, named, strict=True)
+    ]
+
+
+RIG = {"chamber_l": "chamber_m3", "inlet_mm": "inlet_m", "growth_angle_deg": "growth_angle_rad"}
+
+
+def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
+    return tuple(column for column, name in RIG.items() if not _alike(rig, before, [name]))
 
 
 def _models(data: Sequence[FitTrial]) -> list[int]:
@@ -114,14 +125,10 @@ def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int,
     rigs: list[tuple[int, int, Trial]] = []
     for chamber, inlet, angle in itertools.product(chambers, inlets, angles):
         rig = replace(vine, chamber_m3=chamber, inlet_m=inlet, growth_angle_rad=angle)
-        changes = [
-            not _alike(rig, vine, [name])
-            for name in ("chamber_m3", "inlet_m", "growth_angle_rad")
-            if math.isfinite(getattr(vine, name))
-        ]
-        if changes.count(True) == 0 or not inlet > vine.diameter_m:
-            at_hand = any(_alike(rig, trial, ("chamber_m3", "inlet_m", "growth_angle_rad")) for trial in used)
-            rigs.append((changes.count(True), SAME_RIG if at_hand else OTHER_RIG, rig))
+        changes = len(_changed(rig, vine))
+        if changes == 0 or not inlet > vine.diameter_m:
+            at_hand = any(_alike(rig, trial, tuple(RIG.values())) for trial in used)
+            rigs.append((changes, SAME_RIG if at_hand else OTHER_RIG, rig))
     fewest = min((changed for changed, _, _ in rigs), default=0)
     return [(effort, rig) for changed, effort, rig in rigs if changed <= max(1, fewest)]
 

@@ -45,8 +45,8 @@ class Answers:
     """What one trial of every condition tells of one hypothesis, what a trial has of its own eliminated.
 
     `information`, shape (n_conditions, n_free, n_free), is of the hypothesis' own numbers; `pull`, shape (n_conditions,
-    n_free, n_hypotheses), how the motion by each of the others draws at them; `gap`, shape (n_conditions, n_hypotheses),
-    the sum of squares between its motion and theirs.
+    n_free, n_hypotheses), how the motion by each of the others draws at them; `gap`, shape (n_conditions,
+    n_hypotheses), the sum of squares between its motion and theirs.
     """
 
     information: Floats
@@ -65,9 +65,7 @@ def all_answers(
     times, weights = zip(*(_times(lens, run) for lens, run in zip(cameras, runs, strict=True)), strict=True)
     items = [blank(one, t, data, 1e-3 * t) for one, t in zip(conditions, times, strict=True)]
     own = np.zeros((len(conditions), OWN))
-    columns = [
-        np.stack(one.predictor(range(len(conditions)), items).linearise(one.theta, own)) for one in hypotheses
-    ]
+    columns = [np.stack(one.predictor(range(len(conditions)), items).linearise(one.theta, own)) for one in hypotheses]
     heavy = np.sqrt(np.stack(weights))[:, :, None]
     # The last column is placeholder − motion; differences of two hypotheses are free of the placeholder.
     motions = np.stack([-one[:, :, -1] for one in columns], axis=2)
@@ -188,7 +186,7 @@ def best_design(
         before = design.copy()
         for place in range(trials):
             counts = np.zeros((allowed.size, n))
-            np.add.at(counts, (slice(None), np.delete(design, place)), 1.0)
+            counts += np.bincount(np.delete(design, place), minlength=n)
             counts[np.arange(allowed.size), allowed] += 1
             good = worth(separations(hypotheses, answers, counts))
             now = good[np.flatnonzero(allowed == design[place])[0]]

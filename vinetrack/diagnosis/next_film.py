@@ -25,8 +25,8 @@ LEAST_TRAVEL = 0.3
 
 TIMES_LOOKED_AT = 400
 LEAST_SLACK = 1.05
-"""Tail speed, in steady speeds at the same pressure, beyond which a tail would have to push: there the model is in doubt
-unless it was made for that, or the trials so far were of that kind."""
+"""Tail speed, in steady speeds at the same pressure, beyond which a tail would have to push: there the model is in
+doubt unless it was made for that, or the trials so far were of that kind."""
 
 LINGER_FRAMES = 3
 
@@ -157,44 +157,46 @@ def _slackest_so_far(fit: Fit) -> float:
 
 
 def film(
-    hypothesis: Hypothesis,
+    truth: Hypothesis,
     places: Sequence[int],
     conditions: Sequence[Condition],
     cameras: Sequence[Camera],
     theta: Floats,
-    draw: np.random.Generator | None,
-) -> list[tuple[FitTrial | None, Floats]]:
-    """The conditions at `places` grown as the hypothesis has it and filmed: the trial as a fit sees it, its own numbers.
+    deviations: Floats,
+    rng: np.random.Generator,
+) -> list[FitTrial | None]:
+    """The conditions at `places` grown as the hypothesis has it and filmed: each as a fit sees it.
 
-    With `draw` every trial has its own deviations of pressure and B, release, origin and noise; without it none, and
-    the release is half-way between two frames. None where the film shows nothing that can be fitted.
+    Every trial has a release, an origin and noise of its own. None where the film shows nothing that can be fitted.
+
+    Parameters
+    ----------
+    theta : array, shape (n_free,): the true numbers, scaled
+    deviations : array, shape (n_places, 2): of pressure, relative, and of ln B
     """
     chosen, lenses = [conditions[k] for k in places], [cameras[k] for k in places]
-    data = hypothesis.fit.predictor.data
-    own = np.zeros((len(chosen), OWN))
-    times = []
-    for i, lens in enumerate(lenses):
-        own[i, RELEASE] = (lens.rest_frames - 1 + (0.5 if draw is None else draw.uniform())) * lens.frame_s
-        if draw is not None:
-            own[i, ORIGIN] = draw.uniform(-0.02, 0.02)
-            own[i, PRESSURE], own[i, DAMPING_DEVIATION] = draw.standard_normal(2) * hypothesis.spread
-        times.append(lens.frame_s * np.arange(lens.rest_frames + math.ceil(lens.longest_s / lens.frame_s)))
+    data = truth.fit.predictor.data
+    times = [
+        lens.frame_s * np.arange(lens.rest_frames + math.ceil(lens.longest_s / lens.frame_s), dtype=float)
+        for lens in lenses
+    ]
     items = [blank(one, t, data, t) for one, t in zip(chosen, times, strict=True)]
-    predictor = hypothesis.predictor(places, items)
-    own[~predictor.feels_pressure, PRESSURE] = 0.0
-    own[~predictor.feels_damping, DAMPING_DEVIATION] = 0.0
-    moved = predictor.run(predictor.jobs(theta, own))
-    filmed = []
-    for i, one in enumerate(moved):
+    predictor = truth.predictor(places, items)
+    own = np.zeros((len(chosen), OWN))
+    own[:, RELEASE] = [(lens.rest_frames - 1 + rng.uniform()) * lens.frame_s for lens in lenses]
+    own[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
+    own[:, PRESSURE] = np.where(predictor.feels_pressure, deviations[:, 0], 0.0)
+    own[:, DAMPING_DEVIATION] = np.where(predictor.feels_damping, deviations[:, 1], 0.0)
+    seen = []
+    for i, moved in enumerate(predictor.run(predictor.jobs(theta, own))):
         stop = times[i].size
-        if one.status == "ended":
-            last_s = own[i, RELEASE] + one.end_time_s
+        if moved.status == "ended":
+            last_s = own[i, RELEASE] + moved.end_time_s
             stop = min(stop, int(np.searchsorted(times[i], last_s)) + lenses[i].frames_behind_end)
-        position_m = own[i, ORIGIN] + one.observed_position_m[:stop]
-        if draw is not None:
-            position_m = position_m + _noise(stop, hypothesis.rho, math.sqrt(hypothesis.variance), draw)
-        filmed.append((_as_seen(chosen[i], times[i][:stop], position_m, items[i].trace), own[i]))
-    return filmed
+        noise = _noise(stop, truth.rho, math.sqrt(truth.variance), rng)
+        position_m = own[i, ORIGIN] + moved.observed_position_m[:stop] + noise
+        seen.append(_as_seen(chosen[i], times[i][:stop], position_m, items[i].trace))
+    return seen
 
 
 def _noise(count: int, rho: float, innovation_m: float, draw: np.random.Generator) -> Floats:

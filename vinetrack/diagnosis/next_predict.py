@@ -1,4 +1,4 @@
-"""What a fitted hypothesis says of trials that have not been made: their motion, and how it answers to what is not known.
+"""What a fitted hypothesis says of trials that have not been made.
 
 The free numbers of the fit stay as they are; every new vine adds its own: B from the guess for vines not built, brought
 to the level of the vines that were measured, and its yield pressure within the error it will be measured to.

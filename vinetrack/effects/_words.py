@@ -40,6 +40,23 @@ def explanation(effect: Effect) -> list[str]:
     return [*lines, *(f"{what}: {words}" for what, words in facts if words)]
 
 
+def remedy(effect: Effect) -> str:
+    """How to reduce an effect or to measure it, as its file says, in one line; blank where it does not."""
+    return _paragraph(effect, ("Reduce it", "It cannot be reduced", "Measure it"))
+
+
+def told_apart(effect: Effect) -> str:
+    """What it is easily taken for and what tells them apart, as its file says, in one line; blank where it does not."""
+    return _paragraph(effect, ("Easily taken for",))
+
+
+def _paragraph(effect: Effect, begins: tuple[str, ...]) -> str:
+    for paragraph in effect.text.split("\n\n"):
+        if paragraph.startswith(begins):
+            return " ".join(paragraph.split()).replace("`", "")
+    return ""
+
+
 def _parameter_table(effect: Effect) -> list[str]:
     head = ("symbol", "unit", "default", "bounds", "plausible", "no size at", "one for", "meaning")
     rows = [_cells(effect, parameter) for parameter in effect.parameters]

@@ -9,7 +9,7 @@ Matters as twice its size on the drive: 1 % of 12 mm is 0.12 mm, 2 % of PA.
 Easily taken for `pressure_gain`: with a heavy payload, or where λ is weighed, nothing tells them apart. Depletion sees
 the swept volume and does.
 
-Reduce it by measuring the width of the flattened tube: the diameter is 2/π of it.
+Reduce it by measuring the width of the flattened tube: the diameter is 2/π of it; or the blown-up vine with callipers.
 
 Source: the geometry of a tube; Eq. (2) of Alvarez et al. (2025).
 """

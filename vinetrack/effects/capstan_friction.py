@@ -12,7 +12,8 @@ without.
 
 Easily taken for `tail_friction`: a small k y grows like y. A path with known bends, and one without, tell them apart.
 
-Reduce it with fewer, wider bends and powder on the film.
+Reduce it with fewer, wider bends and powder on the film. Measure it with a spring balance: pull a tail through the
+bends with a known weight at its other end.
 
 Source: the capstan equation (Euler, Eytelwein); Blumenschein, Okamura, Hawkes (2017); last term of Eq. (1) of Alvarez
 et al. (2025).

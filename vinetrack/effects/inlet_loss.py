@@ -10,7 +10,8 @@ K is 0.5 for the sharp edge into the connector and 1 for the jet that spreads in
 Easily taken for `air_drag`: both grow with ẏ², and on one tube at one pressure they are the same curve. Another
 connector, or a vine of another diameter on the same one, tells them apart; another pressure only through ρ_gas.
 
-Reduce it with a wider, rounded connector.
+Reduce it with a wider, rounded connector. Measure it with a second gauge behind the connector: what that reads less
+during growth is the loss.
 
 Source: loss coefficients K as in Idelchik (1986), Handbook of Hydraulic Resistance, chapters 3 and 4.
 """

@@ -10,7 +10,8 @@ coefficient, not that of the materials.
 Easily taken for an error of the growth angle or of the payload's mass: both are a force in proportion to m_pay. Growth
 upwards and downwards tells it from an angle, which changes sign.
 
-Reduce it with a smooth, round payload of smaller diameter, and powder.
+Reduce it with a smooth, round payload of smaller diameter, and powder. Measure it with a spring balance: pull the
+payload through a vine that is held; and weigh it, and hold a plumb-line beside the vine.
 
 Source: Coulomb's law of friction.
 """

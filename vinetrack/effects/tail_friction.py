@@ -11,7 +11,8 @@ shrinks again in the second half, when the tail runs out; a tail that comes off 
 Easily taken for `reservoir_depletion` in the first half of growth, or all along with a reel. Another chamber or another
 diameter tells them apart; so does the second half.
 
-Reduce it with powder or oil between tail and wall, or a shorter vine.
+Reduce it with powder or oil between tail and wall, or a shorter vine. Measure it with a spring balance: pull the tail
+through a vine that is grown half-way and held.
 
 Source: Alvarez et al. (2025), μ_s w L of Eq. (1); Blumenschein, Okamura, Hawkes (2017) give the friction along a
 straight body.

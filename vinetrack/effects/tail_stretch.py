@@ -12,7 +12,8 @@ infinity, where no slope is left. 10 to 50 MPa are 100 to 20 billionths a pascal
 Easily taken for an error of `length_scale`, or of the release time. The stretch at rest hides in the origin of the
 position; its fading is what is seen.
 
-Reduce it with stiffer or thicker film, or mark the tail and film the mark.
+Reduce it with stiffer or thicker film, or mark the tail and film the mark. Measure E by hanging a weight from a strip
+of the film.
 
 Source: Hooke's law.
 """

@@ -1,0 +1,299 @@
+"""The next experiment: the trials that best separate hypotheses which the trials so far cannot tell apart.
+
+    found = next_experiment([fit_with_drag, fit_with_inlet_loss], limits)
+    print(found.text)
+
+Every trial within the limits is looked at by sensitivities, the best set of them found by exchange, and what it will
+bring foretold by refitting simulated trials; then the trials are simulated once more, truth and all drawn anew, as a
+check. Where no trials help, or only measurements are in doubt, it says what to measure instead.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from vinetrack.diagnosis.next_check import Bench, expected, observed, separation
+from vinetrack.diagnosis.next_conditions import EFFORTS, NEW_VINE, Condition, conditions
+from vinetrack.diagnosis.next_design import all_answers, best_design, separations, worth
+from vinetrack.diagnosis.next_film import camera_of, courses
+from vinetrack.diagnosis.next_predict import carry
+from vinetrack.diagnosis.next_words import calibration_for, only_measurement, outlook, trials_in_words
+from vinetrack.model.fit_data import FitError
+from vinetrack.model.fit_result import Fit
+from vinetrack.records import Floats, Trial
+from vinetrack.settings import Limits
+
+__all__ = ["Limits", "NextExperiment", "next_experiment"]
+
+SEPARATES = 3.0
+"""Standard deviations below which trials are not worth making for the purpose."""
+
+ENOUGH = 8.0
+"""Standard deviations beyond which no more effort, such as a vine that has to be made, is asked for."""
+
+MOST_HYPOTHESES = 5
+DRAWS_EXPECTED, DRAWS_OBSERVED = 2, 3
+MUCH_BETTER = 1.2
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """What to do next.
+
+    `trials` has an entry a condition: `pressure_kPa, payload_g, diameter_mm, thickness_um, length_mm, chamber_l,
+    inlet_mm, growth_angle_deg` (NaN where the sheet is blank), `replicates`, `vine`, `new_vine` and `changed`, the
+    names of what differs from the rig so far. Empty where no trials are recommended.
+
+    `separation_sigma` holds, by pair (`"a | b"`), the separation to expect once the trials are made and all are fitted
+    together, in standard deviations: the smaller of a against b and b against a. `simulated_sigma` mean and standard
+    deviation of what the check by simulation gave. `alternatives` are the next best sets of trials with their
+    separations. `calibration` says what to measure, where that is needed or would do as well.
+    """
+
+    text: str
+    trials: tuple[Mapping[str, Any], ...] = ()
+    separation_sigma: Mapping[str, float] = field(default_factory=dict)
+    simulated_sigma: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    alternatives: tuple[Mapping[str, Any], ...] = ()
+    calibration: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As `diagnosis.json` holds it."""
+        return {
+            "text": self.text,
+            "trials": [dict(trial) for trial in self.trials],
+            "separation_sigma": dict(self.separation_sigma),
+            "simulated_sigma": {pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()},
+            "alternatives": [dict(other) for other in self.alternatives],
+            "calibration": self.calibration,
+        }
+
+
+@dataclass(frozen=True)
+class _Option:
+    """A set of trials (places among the conditions, one a trial) and the separation it should bring, shape (n, n)."""
+
+    design: tuple[int, ...]
+    between: Floats
+
+    @property
+    def worth(self) -> float:
+        return float(worth(self.between[None])[0])
+
+    @property
+    def weakest(self) -> float:
+        return min(_by_pair(self.between).values())
+
+
+def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: int = 0) -> NextExperiment:
+    """What to do to tell hypotheses apart that the same trials fit alike.
+
+    Parameters
+    ----------
+    tied
+        Fits of two hypotheses or more to the same trials, most likely first; of more than five the first five count.
+    limits
+        Within what further trials can be made; what it leaves open follows the trials so far.
+    seed
+        Of the random numbers of the simulated trials.
+
+    Raises
+    ------
+    FitError
+        If there are fewer than two fits, or they are not of the same trials.
+    """
+    limits = limits or Limits()
+    _judge(tied)
+    tied = list(tied)[:MOST_HYPOTHESES]
+    names = hypothesis_names(tied)
+    if only_measurement(tied):
+        advice = calibration_for(list(itertools.combinations(tied, 2)))
+        return NextExperiment(
+            text=f"Measure before making more trials: {_list(names)} are errors of measurement. {advice}",
+            calibration=advice,
+        )
+    bench, answers = _bench(tied, names, limits)
+    options = _options(bench, answers, limits, seed)
+    if not options:
+        advice = calibration_for(list(itertools.combinations(tied, 2)))
+        return NextExperiment(text=f"No trial within the limits can be made and followed. {advice}", calibration=advice)
+    return _conclude(bench, options, seed)
+
+
+def _judge(tied: Sequence[Fit]) -> None:
+    if len(tied) < 2:
+        raise FitError("A next experiment needs two hypotheses to tell apart: give the fits of at least two.")
+    names = [[item.trial.name for item in fit.predictor.data] for fit in tied]
+    if any(others != names[0] for others in names[1:]):
+        raise FitError("The fits to tell apart are not of the same trials: fit all of them to one set.")
+
+
+def hypothesis_names(tied: Sequence[Fit]) -> list[str]:
+    """Each hypothesis by the effects that not all of them have."""
+    common = set.intersection(*(set(fit.model.names) for fit in tied))
+    return [" + ".join(name for name in fit.model.names if name not in common) or "nothing more" for fit in tied]
+
+
+def _list(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
+
+
+def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[Any]]:
+    """Hypotheses, every condition worth filming, and what a trial of each would answer."""
+    data = tied[0].predictor.data
+    every = conditions(data, limits)
+    if not every:
+        return Bench((), (), ()), []
+    cameras = [camera_of(data, one.like) for one in every]
+    runs = courses([carry(fit, name, every) for fit, name in zip(tied, names, strict=True)], every, cameras)
+    kept = [(one, lens, run) for one, lens, run in zip(every, cameras, runs, strict=True) if run is not None]
+    if not kept:
+        return Bench((), (), ()), []
+    chosen, lenses, ways = (list(column) for column in zip(*kept, strict=True))
+    hypotheses = [carry(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
+    return Bench(hypotheses, chosen, lenses), all_answers(hypotheses, chosen, lenses, ways)
+
+
+def _options(bench: Bench, answers: list[Any], limits: Limits, seed: int) -> list[_Option]:
+    """The best set of trials by every effort that gains over the lesser ones, with what to expect of it."""
+    efforts = np.array([one.effort for one in bench.conditions])
+    found: list[_Option] = []
+    before = -math.inf
+    for effort in EFFORTS:
+        allowed = np.flatnonzero(efforts <= effort)
+        if not (efforts == effort).any():
+            continue
+        design = best_design(bench.hypotheses, answers, allowed, limits.trials)
+        counts = np.bincount(design, minlength=len(efforts)).astype(float)
+        foretold = float(worth(separations(bench.hypotheses, answers, counts[None]))[0])
+        if foretold <= before * 1.01:
+            continue
+        before = foretold
+        rises = expected(bench, design.tolist(), DRAWS_EXPECTED, seed)
+        found.append(_Option(tuple(design.tolist()), separation(rises)))
+    return found
+
+
+def _by_pair(between: Floats) -> dict[tuple[int, int], float]:
+    """The smaller separation of both directions, by pair."""
+    return {(a, b): float(min(between[a, b], between[b, a])) for a, b in itertools.combinations(range(len(between)), 2)}
+
+
+def _choice(options: Sequence[_Option]) -> _Option:
+    """The least effort that is enough, else the best."""
+    for option in options:
+        if option.weakest >= ENOUGH:
+            return option
+    return max(options, key=lambda option: option.worth)
+
+
+def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperiment:
+    best = _choice(options)
+    names = [one.name for one in bench.hypotheses]
+    to_expect = _by_pair(best.between)
+    worth_it = max(to_expect.values()) >= SEPARATES
+    checked = _checked(observed(bench, best.design, DRAWS_OBSERVED, seed)) if worth_it else {}
+    left = [place for place, sigma in to_expect.items() if min(sigma, checked.get(place, (sigma,))[0]) < SEPARATES]
+    worth_it = worth_it and len(left) < len(to_expect)
+    fits = [one.fit for one in bench.hypotheses]
+    advice = calibration_for([(fits[a], fits[b]) for a, b in left or _measured(fits)])
+    sigmas = {_pair(names, place): sigma for place, sigma in to_expect.items()}
+    seen = {_pair(names, place): both for place, both in checked.items()}
+    trials = _entries(bench.conditions, best.design)
+    return NextExperiment(
+        text=_text(trials, sigmas, seen, [_pair(names, place) for place in left], advice, worth_it=worth_it),
+        trials=trials if worth_it else (),
+        separation_sigma=sigmas,
+        simulated_sigma=seen,
+        alternatives=tuple(
+            {
+                "trials": [dict(entry) for entry in _entries(bench.conditions, option.design)],
+                "separation_sigma": {_pair(names, p): s for p, s in _by_pair(option.between).items()},
+            }
+            for option in sorted(options, key=lambda one: -one.worth)
+            if option is not best
+        ),
+        calibration=advice or None,
+    )
+
+
+def _measured(fits: Sequence[Fit]) -> list[tuple[int, int]]:
+    """Pairs of which a measurement would decide as well as trials: those with a measurement effect in one of them."""
+    kinds = [{effect.kind for effect in fit.model} for fit in fits]
+    pairs = itertools.combinations(range(len(fits)), 2)
+    return [(a, b) for a, b in pairs if "measurement" in kinds[a] ^ kinds[b]]
+
+
+def _checked(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
+    """Mean and standard deviation of the separations observed, by pair, of the direction that separates less."""
+    sigma = np.sqrt(np.maximum(rises, 0.0))
+    found = {}
+    for a, b in itertools.combinations(range(rises.shape[1]), 2):
+        ways = [one[np.isfinite(one)] for one in (sigma[:, a, b], sigma[:, b, a])]
+        ways = [one for one in ways if one.size]
+        if ways:
+            least = min(ways, key=lambda one: float(np.mean(one)))
+            found[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
+    return found
+
+
+def _pair(names: Sequence[str], place: tuple[int, int]) -> str:
+    return f"{names[place[0]]} | {names[place[1]]}"
+
+
+def _entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
+    """The trials of a design as entries, one a condition."""
+    return tuple(
+        _entry(every[place], int(count))
+        for place, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
+    )
+
+
+def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
+    trial: Trial = condition.trial
+    return {
+        "pressure_kPa": trial.pressure_Pa / 1e3,
+        "payload_g": trial.payload_kg * 1e3,
+        "diameter_mm": trial.diameter_m * 1e3,
+        "thickness_um": trial.thickness_m * 1e6,
+        "length_mm": trial.length_m * 1e3,
+        "chamber_l": trial.chamber_m3 * 1e3,
+        "inlet_mm": trial.inlet_m * 1e3,
+        "growth_angle_deg": math.degrees(trial.growth_angle_rad),
+        "replicates": replicates,
+        "vine": trial.vine,
+        "new_vine": condition.effort == NEW_VINE,
+        "changed": list(condition.changed),
+    }
+
+
+def _text(
+    trials: Sequence[Mapping[str, Any]],
+    sigmas: Mapping[str, float],
+    seen: Mapping[str, tuple[float, float]],
+    left: Sequence[str],
+    advice: str,
+    *,
+    worth_it: bool,
+) -> str:
+    """The advice in plain sentences."""
+    if not worth_it:
+        return (
+            f"No trials within the limits separate what is tied by {SEPARATES:g} σ; the best would separate"
+            f" {outlook(sigmas, seen)}. {advice}".rstrip()
+        )
+    text = f"Make {trials_in_words(trials)}. Together with the trials so far they separate {outlook(sigmas, seen)}."
+    if any(trial["new_vine"] for trial in trials):
+        text += " B of the new vine is a guess here and is fitted; its yield pressure has to be measured."
+    if left:
+        pairs = _list([pair.replace(" | ", " from ") for pair in left])
+        text += f" They will not tell {pairs}. {advice}"
+    elif advice:
+        text += f" A measurement would do as well: {advice}"
+    return text.rstrip()

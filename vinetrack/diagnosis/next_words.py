@@ -1,0 +1,83 @@
+"""The next experiment in words: which trials to make, what they will tell, and what to measure instead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from vinetrack.effects import Effect
+from vinetrack.effects._words import remedy, told_apart
+from vinetrack.model.fit_result import Fit
+
+WITH_TRACE = (
+    "Record the pressure at the vine during growth and give it with the track: what the chamber does is then measured,"
+    " and only the other is left to explain what remains."
+)
+
+
+def effects_between(one: Fit, other: Fit) -> tuple[list[Effect], list[Effect]]:
+    """What the first has in its model and the second has not, and the other way round."""
+    mine, yours = one.model, other.model
+    return [e for e in mine if e.name not in yours], [e for e in yours if e.name not in mine]
+
+
+def only_measurement(tied: Sequence[Fit]) -> bool:
+    """Whether all that the hypotheses differ by is how things were measured."""
+    common = set.intersection(*(set(fit.model.names) for fit in tied))
+    differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
+    return bool(differ) and all(effect.kind == "measurement" for effect in differ)
+
+
+def calibration_for(pairs: Sequence[tuple[Fit, Fit]]) -> str:
+    """What to measure so that one of each pair can be ruled out, in the words of the effects themselves.
+
+    Where an error of measurement is among them it is what can be settled for certain, and the rest is not spoken of.
+    """
+    sentences: list[str] = []
+    effects: dict[str, Effect] = {}
+    for one, other in pairs:
+        mine, yours = effects_between(one, other)
+        if any(e.in_trace for e in mine) != any(e.in_trace for e in yours) and WITH_TRACE not in sentences:
+            sentences.append(WITH_TRACE)
+        effects.update({effect.name: effect for effect in [*mine, *yours]})
+    measured = [effect for effect in effects.values() if effect.kind == "measurement"]
+    for effect in measured or effects.values():
+        words = " ".join(filter(None, ("" if measured else told_apart(effect), remedy(effect))))
+        if words:
+            sentences.append(f"{effect.name}: {words[0].lower()}{words[1:]}")
+    return " ".join(sentences)
+
+
+def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
+    """The trials to make, as a list in one sentence."""
+    return "; ".join(_trial_in_words(trial) for trial in trials)
+
+
+def _trial_in_words(trial: Mapping[str, Any]) -> str:
+    count = trial["replicates"]
+    words = f"{count} {'trial' if count == 1 else 'trials'} at {trial['pressure_kPa']:.3g} kPa"
+    if trial["payload_g"]:
+        words += f" with {trial['payload_g']:.3g} g"
+    size = f"{trial['diameter_mm']:.3g} mm × {trial['thickness_um']:.3g} µm × {trial['length_mm']:.3g} mm"
+    words += f" with {'a new' if trial['new_vine'] else 'the'} vine of {size}"
+    changed = [
+        text.format(trial[key])
+        for key, text in (
+            ("chamber_l", "a chamber of {:.3g} l"),
+            ("inlet_mm", "a connector of {:.3g} mm"),
+            ("growth_angle_deg", "grown {:.3g}° from straight down"),
+        )
+        if key in trial["changed"]
+    ]
+    return f"{words}, {' and '.join(changed)}" if changed else words
+
+
+def outlook(pairs: Mapping[str, float], simulated: Mapping[str, tuple[float, float]]) -> str:
+    """What the trials are expected to tell, pair by pair."""
+    parts = []
+    for pair, sigma in pairs.items():
+        mean, sd = simulated.get(pair, (math.nan, math.nan))
+        seen = f" (simulated: {mean:.2g} ± {max(sd, 0.1):.1g} σ)" if math.isfinite(mean) else ""
+        parts.append(f"{pair.replace(' | ', ' from ')} by {sigma:.2g} σ{seen}")
+    return ", ".join(parts)
