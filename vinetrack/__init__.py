@@ -25,6 +25,7 @@ _HOMES = {
     "base_model": "vinetrack.model.model",
     "believe": "vinetrack.design.believe",
     "compare": "vinetrack.diagnosis.compare",
+    "diagnose": "vinetrack.diagnosis.diagnose",
     "fit": "vinetrack.model.fit",
     "foresee": "vinetrack.design.foresee",
     "make_model": "vinetrack.model.model",

@@ -76,9 +76,8 @@ def belief(effects: Sequence[Effect], after: Fit) -> tuple[bool, str]:
                 if not is_plausible(parameter, number.value, number.sigma):
                     low, high = parameter.plausible or (math.nan, math.nan)
                     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-                    return False, (
-                        f"it would need {number.symbol} = {number.value:.3g}{unit}; plausible is {low:.3g} to {high:.3g}"
-                    )
+                    needs = f"it would need {number.symbol} = {number.value:.3g}{unit}"
+                    return False, f"{needs}, and {low:.3g} to {high:.3g} is plausible"
     return True, ""
 
 

@@ -66,9 +66,7 @@ def candidates_of(
     return tuple(find_effect(name, own) for name in names if name not in model and name not in replaced)
 
 
-def testable(
-    model: Model, candidates: Sequence[Effect], data: Sequence[FitTrial]
-) -> tuple[tuple[Effect, ...], dict[str, str]]:
+def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
     """Candidates that the sheet lets act, and for the others the reason why not, by name."""
     found, reasons = [], {}
     for effect in candidates:
@@ -118,9 +116,7 @@ def whole_shapes(effect: Effect, rests: Sequence[tuple[float, ...]] = ((),)) -> 
     low, high = plausible_range(effect.parameters[0])
     largest = high if abs(high) >= abs(low) else low
     zero = effect.parameters[0].zero
-    return [
-        Shape(effect, rest, part * (largest - zero), whole=True) for rest in rests for part in AMPLITUDES
-    ]
+    return [Shape(effect, rest, part * (largest - zero), whole=True) for rest in rests for part in AMPLITUDES]
 
 
 def first_step(size: Parameter) -> float:
@@ -143,7 +139,7 @@ def typical_values(parameter: Parameter) -> tuple[float, ...]:
     low, high = plausible_range(parameter)
     if low > 0 and high / low > WIDE_RANGE:
         return tuple(np.geomspace(low, high, 5)[1:4].tolist())
-    if low > 0 and high / low < 2:  # noqa: PLR2004
+    if low > 0 and high / low < 2:
         return ((low + high) / 2,)
     return tuple((low + part * (high - low)) for part in (0.15, 0.5, 0.85))
 

@@ -103,9 +103,7 @@ def _together(
     """Findings where two effects together mend what none does alone; else nothing known does."""
     ranked = sorted(tried, key=lambda one: -one.fit.log_likelihood)
     both = pairs(questions.found, ranked, effects, report)
-    nothing = [
-        Finding(UNEXPLAINED, questions, tried=(*ranked, *both), search=search, aside=_why_not(ranked, both))
-    ]
+    nothing = [Finding(UNEXPLAINED, questions, tried=(*ranked, *both), search=search, aside=_why_not(ranked, both))]
     if not both:
         return nothing
     kept, aside = answer_set(both)
@@ -172,8 +170,7 @@ def _turned(one: Evidence, first: str) -> Evidence:
 
 
 def _why_not(ranked: Sequence[Evidence], both: Sequence[Evidence]) -> tuple[tuple[str, str], ...]:
-    best = [one for one in (*ranked[:1], *both[:1])]
     return tuple(
         ("+".join(one.names), one.reason if not one.plausible else "something is left once it is added")
-        for one in best
+        for one in (*ranked[:1], *both[:1])
     )

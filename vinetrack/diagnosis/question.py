@@ -53,7 +53,7 @@ class Questions:
 
     @cached_property
     def possible(self) -> Floats:
-        """z of every shape where its size can have that sign, 0 where it cannot, always positive.
+        """The z of every shape where its size can have that sign, 0 where it cannot, always positive.
 
         As a quantile of the normal distribution: by the noise model, or, where that is less, by the scatter of single
         trials, which has Student's t for few of them.
@@ -76,7 +76,7 @@ class Questions:
 
     @cached_property
     def threshold(self) -> float:
-        """z that the best of all shapes exceeds by chance with probability `level`."""
+        """The z that the best of all shapes exceeds by chance with probability `level`."""
         return family_threshold(self.scores.cosines, self.signs, self.level)
 
     @property
@@ -141,7 +141,9 @@ class Questions:
         if not math.isfinite(sigma) or top < TESTABLE_SIGMAS * self.scores.sigma[places].min():
             return {}, False
         if parameter.sign:
-            return {key: parameter.zero + parameter.sign * (max(parameter.sign * size, 0.0) + ONE_SIDED_95 * sigma)}, True
+            return {
+                key: parameter.zero + parameter.sign * (max(parameter.sign * size, 0.0) + ONE_SIDED_95 * sigma)
+            }, True
         return {key: parameter.zero + math.copysign(abs(size) + ONE_SIDED_95 * sigma, size)}, True
 
 

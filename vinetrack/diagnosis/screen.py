@@ -185,8 +185,8 @@ def eliminated(sums: Products, found: Fit, state: State) -> Floats:
 def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
     """How far −2 ln L would fall with each shape, and at which size, if everything were linear.
 
-    The noise is as correlated as in the tracks, of whatever size is left: where a model is far off, the noise of its fit
-    has taken in what it misses, and says nothing of what is missing.
+    The noise is as correlated as in the tracks, of whatever size is left: where a model is far off, the noise of its
+    fit has taken in what it misses, and says nothing of what is missing.
     """
     state = found.solution.state
     points = found.solution.frame.points

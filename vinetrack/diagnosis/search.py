@@ -27,6 +27,9 @@ from vinetrack.model.solve import Held, first_state, make_frame, solve, track_co
 from vinetrack.model.starts import align
 from vinetrack.records import Floats
 
+Start = tuple[Sequence[Effect], Mapping[str, Value]]
+"""Effects to add and values to begin from."""
+
 CLIMB_SPREADS = (0.01, 0.03)
 FIRST_ITERATIONS, MORE_ITERATIONS = 4, 10
 MOST_CLIMBED = 14
@@ -138,12 +141,10 @@ def start_of(shape: Shape, size: float) -> dict[str, Value]:
     if parameter.sign * size < 0 or size == 0:
         size = parameter.sign * abs(shape.step) or shape.step
     values = (float(np.clip(parameter.zero + size, low, high)), *shape.rest)
-    return {
-        f"{effect.name}.{one.name}": value for one, value in zip(effect.parameters, values, strict=True)
-    }
+    return {f"{effect.name}.{one.name}": value for one, value in zip(effect.parameters, values, strict=True)}
 
 
-def best_climb(slope: Slope, starts: Sequence[tuple[Sequence[Effect], Mapping[str, Value]]], goal: float) -> Climb | None:
+def best_climb(slope: Slope, starts: Sequence[Start], goal: float) -> Climb | None:
     """The best of several starts of one hypothesis: each a few steps, the best of them on to the end.
 
     One that stays far above `goal`, the best deviance of any hypothesis so far, is not followed further.
@@ -178,9 +179,10 @@ def full_fit(found: Fit, climb: Climb) -> Fit | None:
         return None
 
 
-def starts_of(shapes: Iterable[tuple[Shape, float]]) -> list[tuple[Sequence[Effect], Mapping[str, Value]]]:
+def starts_of(shapes: Iterable[tuple[Shape, float]]) -> list[Start]:
     """Starts of one effect from its shapes and the sizes predicted for them."""
-    seen, starts = set(), []
+    seen: set[tuple[float, ...]] = set()
+    starts: list[Start] = []
     for shape, size in shapes:
         start = start_of(shape, size)
         key = tuple(round(float(value), 12) for value in start.values())  # type: ignore[arg-type]

@@ -24,11 +24,11 @@ PARAMETERS = (
 def tail_force(s, rig, size, kind, centre, width):  # noqa: D103
     along = s.lead_position / rig.length if rig.length > 0.0 else s.lead_position
     coordinate = along
-    if kind == 1.0 or kind == 4.0:  # noqa: PLR1714 - compiled: a set is not
+    if kind == 1.0 or kind == 4.0:
         coordinate = s.tail_velocity
-    if kind == 2.0 or kind == 5.0:  # noqa: PLR1714
+    if kind == 2.0 or kind == 5.0:
         coordinate = s.time
-    factor = size * s.pressure / 1e5 if kind > 2.5 else size  # noqa: PLR2004
+    factor = size * s.pressure / 1e5 if kind > 2.5 else size
     return factor * np.exp(-0.5 * ((coordinate - centre) / width) ** 2)
 
 

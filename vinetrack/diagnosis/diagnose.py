@@ -1,0 +1,354 @@
+"""The diagnosis of an experiment: what its model lacks, how sure that is, what it brings to add it, what to do next.
+
+diagnosis = vinetrack.diagnose("my_experiment")
+print(diagnosis)
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.diagnosis.hypotheses import candidates_of, host_for, testable
+from vinetrack.diagnosis.inquiry import Finding, inquire
+from vinetrack.diagnosis.question import Questions
+from vinetrack.diagnosis.result import (
+    ADEQUATE,
+    AMBIGUOUS,
+    ARTEFACT,
+    DROPPED_FRAMES,
+    NOT_TESTABLE,
+    REFITTED,
+    SCREENED,
+    UNEXPLAINED,
+    Candidate,
+    Diagnosis,
+    Round,
+)
+from vinetrack.diagnosis.words import dropped_in_words, explain
+from vinetrack.effects import Effect
+from vinetrack.model.fit import fit as fit_model
+from vinetrack.model.fit_data import FitError, Pairs, pairs_of
+from vinetrack.model.fit_result import Fit, Number
+from vinetrack.model.model import Model, base_model, make_model
+from vinetrack.model.sensitivity import Predictor
+from vinetrack.records import Track, Trial
+
+if TYPE_CHECKING:
+    from vinetrack.experiment import Experiment
+    from vinetrack.settings import Limits
+
+log = logging.getLogger(__name__)
+
+Report = Callable[[str], None]
+
+BLIND = "no trial answers to it at any plausible size"
+TOO_WEAK = "in these conditions the largest plausible size would not show"
+
+
+def _quiet(_: str) -> None:
+    pass
+
+
+def diagnose(
+    source: Fit | Experiment | Path | str | Pairs,
+    *,
+    model: Model | None = None,
+    tracks: Mapping[str, Track] | None = None,
+    candidates: Iterable[str] | None = None,
+    own: Mapping[str, Effect] | None = None,
+    limits: Limits | None = None,
+    ladder: bool = True,
+    advice: bool = True,
+    report: Report = _quiet,
+) -> Diagnosis:
+    """Ask of a model what is missing from it.
+
+    Parameters
+    ----------
+    source
+        A fit, whose model is questioned; or an experiment, its folder, or pairs of trial and track, to which the model
+        is fitted first.
+    model
+        The model to question, by default the one the experiment names, else the base model.
+    tracks
+        Tracks by name of trial, where the experiment brings recordings.
+    candidates, own
+        Names of the effects to question, by default those the experiment names, else the whole catalogue; and the
+        user's own effects by name.
+    limits
+        Within which limits further trials can be made.
+    ladder, advice
+        Whether errors before and after are worked out, and what to do next.
+    report
+        Told in a few words what is being done.
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit.
+    EffectError
+        If an effect is unknown or a trial lacks what the model needs.
+    ExperimentError
+        If the experiment cannot be read.
+    """
+    if isinstance(source, Fit):
+        questioned = candidates_of(source.model, candidates, own)
+        found, dropped = _with_host(source, questioned), _dropped_in_fit(source)
+    else:
+        settings = _settings(source)
+        if settings is not None:
+            source, named, listed_candidates, brought, stated = settings
+            model, own = model or named, {**brought, **(own or {})}
+            candidates = listed_candidates if candidates is None else candidates
+            limits = limits or stated
+        model = model or base_model()
+        questioned = candidates_of(model, candidates, own)
+        pairs, left_out = pairs_of(source, tracks)
+        pairs, dropped = _frames_put_right(pairs)
+        report("fitting the model")
+        found = fit_model(model, pairs, host=host_for(model, questioned), profile=False)
+        found = replace(found, left_out={**left_out, **found.left_out})
+    effects, blind = testable(questioned, found.predictor.data)
+    findings = inquire(found, effects, report)
+    result = _conclude(found, findings, blind)
+    if dropped:
+        result = _artefact_first(result, dropped)
+    if ladder:
+        result = _with_ladder(result, report)
+    if advice:
+        result = _with_advice(result, limits, report)
+    return result
+
+
+def _settings(
+    source: Experiment | Path | str | Pairs,
+) -> tuple[Experiment, Model, tuple[str, ...] | None, dict[str, Effect], Limits] | None:
+    """An experiment with what it says of model, candidates, own effects and limits; None for bare pairs."""
+    from vinetrack.effects import own_effects
+    from vinetrack.experiment import Experiment, read_experiment
+
+    if isinstance(source, (str, Path)):
+        source = read_experiment(source)
+    if not isinstance(source, Experiment):
+        return None
+    settings = source.settings
+    own = own_effects([source.folder / path for path in settings.effects])
+    return source, make_model(settings.model, own), settings.candidates, dict(own), settings.limits
+
+
+def _with_host(found: Fit, questioned: Sequence[Effect]) -> Fit:
+    """A fit whose trajectories come from a kernel that holds all candidates."""
+    host = host_for(found.model, questioned)
+    predictor = Predictor(found.predictor.layout, found.predictor.data, host)
+    predictor.steps, predictor.pressure_step = found.predictor.steps, found.predictor.pressure_step
+    return replace(found, predictor=predictor)
+
+
+def _frames_put_right(pairs: Iterable[tuple[Trial, Track]]) -> tuple[list[tuple[Trial, Track]], list[str]]:
+    """Tracks with dropped and repeated frames put right, and the trials from which frames are missing."""
+    from vinetrack.video.corrections import correct_frames
+
+    right, dropped = [], []
+    for trial, track in pairs:
+        if trial.video is None and not any("corrected" in str(flag) for flag in track.flag):
+            track = correct_frames(track)
+        if any("gap" in str(flag) and "corrected" in str(flag) for flag in track.flag):
+            dropped.append(trial.name)
+        right.append((trial, track))
+    return right, dropped
+
+
+def _dropped_in_fit(found: Fit) -> list[str]:
+    """Trials of a fit from which frames are missing that nobody has put right."""
+    from vinetrack.video.corrections import correct_frames
+
+    dropped = []
+    for item in found.predictor.data:
+        blank = np.full(item.time_s.size, "", dtype=object)
+        track = Track(
+            time_s=item.time_s,
+            lead_position_m=item.lead_position_m,
+            lead_position_sigma_m=np.full(item.time_s.size, math.nan),
+            flag=blank,
+            edge_px=np.full(item.time_s.size, math.nan),
+        )
+        if any("corrected" in str(flag) for flag in correct_frames(track).flag):
+            dropped.append(item.trial.name)
+    return dropped
+
+
+def _conclude(found: Fit, findings: Sequence[Finding], blind: Mapping[str, str]) -> Diagnosis:
+    """Findings in words and tables."""
+    rounds = tuple(_round(finding, blind) for finding in findings)
+    added: list[str] = []
+    fits = [found]
+    for finding in findings[:-1]:
+        effect = finding.answer[0]
+        added.append(effect)
+    for after in findings[1:]:
+        fits.append(after.questions.found)
+    explanation = " ".join(one.explanation for one in rounds)
+    return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits))
+
+
+def _round(finding: Finding, blind: Mapping[str, str]) -> Round:
+    questions = finding.questions
+    names, cosines = _cosines(questions)
+    return Round(
+        model=questions.found.model.names,
+        verdict=finding.verdict,
+        answer_set=finding.answer,
+        ranking=tuple(_ranking(finding, blind)),
+        explanation=explain(finding),
+        cosine_names=names,
+        cosines=cosines,
+        fit=questions.found,
+        fits={one.names[-1]: one.fit for one in finding.kept},
+    )
+
+
+def _cosines(questions: Questions) -> tuple[tuple[str, ...], list[list[float]]]:
+    """Cosines between effects, each in the shape that promises most."""
+    names = tuple(dict.fromkeys(questions.answers.effects))
+    places = [questions.of(name)[0] for name in names]
+    matrix = questions.scores.cosines[np.ix_(places, places)] if places else np.zeros((0, 0))
+    return names, matrix.tolist()
+
+
+def _ranking(finding: Finding, blind: Mapping[str, str]) -> list[Candidate]:
+    questions = finding.questions
+    aside = dict(finding.aside)
+    singles = {one.names[0]: one for one in finding.tried if len(one.names) == 1}
+    rows = []
+    for effect in questions.effects:
+        largest, shows = questions.largest(effect)
+        if effect.name in questions.answers.silent:
+            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, reason=BLIND))
+            continue
+        z, place = questions.best_z(effect.name)
+        if effect.name in singles:
+            one = singles[effect.name]
+            rows.append(
+                Candidate(
+                    effect.name,
+                    effect.kind,
+                    REFITTED,
+                    one.delta_chi2,
+                    one.sigma,
+                    one.numbers,
+                    one.plausible,
+                    effect.name in finding.answer,
+                    aside.get(effect.name, one.reason),
+                    largest,
+                )
+            )
+        elif finding.verdict == ADEQUATE and not shows and z < questions.threshold:
+            rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=TOO_WEAK))
+        else:
+            rows.append(
+                Candidate(
+                    effect.name,
+                    effect.kind,
+                    SCREENED,
+                    math.nan if questions.far_off else questions.promise(effect.name),
+                    z,
+                    _predicted(questions, effect, place),
+                    in_answer_set=effect.name in finding.answer,
+                    reason=_behind(finding, effect.name),
+                    largest={} if questions.far_off else largest,
+                )
+            )
+    rows += [
+        Candidate(name, "", NOT_TESTABLE, reason=why)
+        for name, why in blind.items()
+        if name not in questions.found.model
+    ]
+    order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
+    return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_known(row.delta_chi2)))
+
+
+def _behind(finding: Finding, name: str) -> str:
+    """How far a candidate stayed behind the best where only one trial of every condition was fitted."""
+    climbs = finding.search.climbs if finding.search else {}
+    if name not in climbs:
+        return ""
+    behind = climbs[name].deviance - min(one.deviance for one in climbs.values())
+    return f"fitted to one trial of every condition, worse by Δχ² = {behind:.0f}" if behind > 0 else ""
+
+
+def _known(value: float) -> float:
+    return value if math.isfinite(value) else -math.inf
+
+
+def _predicted(questions: Questions, effect: Effect, place: int) -> tuple[Number, ...]:
+    """The size that the sensitivities predict, with its error; nothing where the model is too far off for that."""
+    if place < 0 or not effect.parameters or questions.far_off:
+        return ()
+    size, sigma = float(questions.scores.size[place]), float(questions.scores.sigma[place])
+    parameter = questions.answers.shapes[place].size
+    value = parameter.zero + size
+    return (
+        Number(
+            key=f"{effect.name}.{parameter.name}",
+            vine="",
+            symbol=parameter.symbol,
+            unit=parameter.unit,
+            value=value,
+            sigma=sigma,
+            low=value - 1.96 * sigma,
+            high=value + 1.96 * sigma,
+            dof=questions.scores.degrees,
+            method="predicted",
+        ),
+    )
+
+
+def _artefact_first(result: Diagnosis, dropped: Sequence[str]) -> Diagnosis:
+    """Frames are missing: that is said first, and what follows from the times put right stands as a note."""
+    first = result.rounds[0]
+    words = dropped_in_words(dropped)
+    artefact = Round(
+        model=first.model,
+        verdict=ARTEFACT,
+        answer_set=(DROPPED_FRAMES,),
+        ranking=first.ranking,
+        explanation=words,
+        cosine_names=first.cosine_names,
+        cosines=first.cosines,
+        fit=first.fit,
+    )
+    note = f"With the times put right: {result.verdict}. {result.explanation}"
+    return Diagnosis(rounds=(artefact,), effects=(), explanation=words, fits=result.fits[:1], notes=(note,))
+
+
+def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:
+    """Errors of every model, and how the numbers moved."""
+    from vinetrack.diagnosis.ladder import ladder
+
+    report("errors before and after")
+    try:
+        return replace(result, ladder=ladder(result.fits, ("", *result.effects)))
+    except FitError as error:
+        return replace(result, notes=(*result.notes, f"The ladder of errors could not be made: {error}"))
+
+
+def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Diagnosis:
+    """What to do next where something is tied."""
+    last = result.rounds[-1]
+    if last.verdict not in (AMBIGUOUS, ARTEFACT, UNEXPLAINED) or len(last.fits) < 2:
+        return result
+    from vinetrack.diagnosis.next_trial import next_experiment
+
+    report("looking for the next experiment")
+    try:
+        advice: Any = next_experiment(list(last.fits.values()), limits)
+    except (FitError, ValueError) as error:
+        return replace(result, notes=(*result.notes, f"No next experiment could be worked out: {error}"))
+    return replace(result, next_experiment=advice.to_json())
