@@ -203,14 +203,22 @@ def marginal(grams: Floats, frame: Frame, state: State) -> Marginal:
     return Marginal(rest, float(log_noise + log_flat + np.sum(frame.points) * math.log(2 * math.pi)))
 
 
+def left_to_keys(part: Marginal, frame: Frame, spread: tuple[float, float]) -> tuple[Floats, Floats]:
+    """What every trial says of its keys once all it has of its own is integrated out, and what that took.
+
+    Shapes (n_trials, n_keys + 1, n_keys + 1), the last row and column the rest, and (n_trials, 2, 2).
+    """
+    root = np.array(spread) * frame.feels
+    inner = np.eye(2) + root[:, :, None] * part.blocks[:, :2, :2] * root[:, None, :]
+    side = root[:, :, None] * part.blocks[:, :2, 2:]
+    return part.blocks[:, 2:, 2:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(inner, side), inner
+
+
 def normal_equations(
     part: Marginal, frame: Frame, state: State, spread: tuple[float, float]
 ) -> tuple[Floats, Floats, float, float]:
     """Information of the free numbers, its slope, the sum of squares and the log-determinant at these spreads."""
-    root = np.array(spread) * frame.feels
-    inner = np.eye(2) + root[:, :, None] * part.blocks[:, :2, :2] * root[:, None, :]
-    side = root[:, :, None] * part.blocks[:, :2, 2:]
-    left = part.blocks[:, 2:, 2:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(inner, side)
+    left, inner = left_to_keys(part, frame, spread)
     information = gather(left[:, :-1, :-1], frame) + np.diag(frame.prior_precision)
     away = state.theta - frame.prior_mean
     slope = gather_vector(left[:, :-1, -1], frame) - frame.prior_precision * away
