@@ -100,6 +100,7 @@ def _wants(names: tuple[str, ...], outsider: str, kind: str) -> Wants:
         bends=kind.startswith("bends:"),
         vines=2 if len(names) > 1 else 1,
         fast=any(part.fast for part in parts),
+        wide_chamber=any(part.wide_chamber for part in parts) and len(parts) == 1,
         trials=(8, 12) if kind == "null:few_trials" else (24, 48),
     )
 

@@ -31,7 +31,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Scene:
-    """What sizes are measured by: the weakest and the strongest drive ½(P − P_y)A, N, the lengths, and whether bent."""
+    """What sizes are measured by: drives ½(P − P_y)A, lengths, speeds, payload and pressures."""
 
     weakest_N: float
     strongest_N: float
@@ -40,6 +40,7 @@ class Scene:
     slowest_m_s: float
     weakest_B: float
     payload_kg: float
+    weakest_Pa: float
     highest_Pa: float
 
     @classmethod
@@ -56,6 +57,7 @@ class Scene:
             min(speeds),
             min(one.vine.B for one in settings),
             max(one.payload_g for one in settings) / 1e3,
+            1e3 * min(one.pressure_kPa - one.vine.yield_kPa for one in settings),
             1e3 * max(one.pressure_kPa for one in settings),
         )
 
@@ -95,20 +97,20 @@ def _refill(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
 
 
 def _pressure_damping(draw: Draw, scene: Scene) -> Hidden:
-    beta = _either(draw, 1e-6, min(1e-5, 0.6 / scene.highest_Pa))
+    beta = _either(draw, 3e-6, min(2.5e-5, 0.7 / scene.highest_Pa))
     return Hidden({"beta": beta}, {"pressure_damping.beta": beta})
 
 
 def _capstan(draw: Draw, scene: Scene) -> Hidden:
     k, mu = float(draw.uniform(2, 10)), float(draw.uniform(0.2, 1.2))
     most = 0.6 * scene.weakest_N / (math.exp(max(k * scene.longest_m, 3.2 * mu)) - 1)
-    C = _between(draw, 0.05 * most, most)
+    C = _between(draw, 0.01 * most, most)
     values = {"capstan_friction.C": C, "capstan_friction.mu_c": mu, "capstan_friction.k": k}
     return Hidden({"capstan_C": C, "capstan_mu": mu, "capstan_k": k}, values)
 
 
 def _latch(draw: Draw, scene: Scene) -> Hidden:
-    F, reach = scene.weakest_N * _between(draw, 0.1, 0.9), _between(draw, 2e-3, 30e-3)
+    F, reach = scene.weakest_N * _between(draw, 0.03, 0.9), _between(draw, 2e-3, 30e-3)
     return Hidden({"latch_F": F, "latch_reach": reach}, {"latch_release.F": F, "latch_release.reach": reach})
 
 
@@ -123,49 +125,49 @@ def _time_base(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
 
 
 def _pressure_gain(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
-    eps = _either(draw, 0.01, 0.05)
+    eps = _either(draw, 0.02, 0.15)
     return Hidden(values={"pressure_gain.eps": eps}, pressure_gain=eps)
 
 
 def _pressure_gauge(draw: Draw, scene: Scene) -> Hidden:
-    delta = _either(draw, 300, 2000)
-    if delta < -2 * scene.weakest_N / 1e-3:
+    delta = _either(draw, 400, 3000)
+    if delta < -0.3 * scene.weakest_Pa:
         delta = -delta
     return Hidden(values={"pressure_gauge.delta": delta}, pressure_offset_Pa=delta)
 
 
 def _area_scale(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
-    eps = _either(draw, 0.01, 0.05)
+    eps = _either(draw, 0.01, 0.15)
     return Hidden(values={"area_scale.eps": eps}, diameter=eps)
 
 
 def _perspective(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
-    k = _either(draw, 0.02, 0.3)
+    k = _either(draw, 0.003, 0.3)
     return Hidden(values={"perspective.k": k}, bow_per_m=k)
 
 
 EFFECTS: dict[str, tuple[Maker, Wants]] = {
-    "reservoir_depletion": (_depletion, Wants(chamber=True)),
-    "supply_refill": (_refill, Wants(chamber=True)),
-    "leak": (_one("leak.rate", "leak_rate", 0.1, 5.0), Wants()),
-    "inlet_loss": (_one("inlet_loss.K", "K", 0.5, 3.0), Wants(inlet=True, fast=True)),
-    "gas_inertia": (_one("gas_inertia.factor", "gas", 0.8, 1.2), Wants(fast=True)),
-    "air_drag": (_one("air_drag.C_D", "C_D", 0.3, 3.0), Wants(fast=True)),
-    "fold_inertia": (_one("fold_inertia.eta", "eta", 0.05, 1.0), Wants()),
-    "linear_damping": (_one("linear_damping.b", "b", 0.01, 0.6, lambda s: 0.5 * s.weakest_B), Wants()),
+    "reservoir_depletion": (_depletion, Wants(chamber=True, wide_chamber=True)),
+    "supply_refill": (_refill, Wants(chamber=True, wide_chamber=True)),
+    "leak": (_one("leak.rate", "leak_rate", 0.005, 5.0), Wants()),
+    "inlet_loss": (_one("inlet_loss.K", "K", 0.05, 3.0), Wants(inlet=True, fast=True)),
+    "gas_inertia": (_one("gas_inertia.factor", "gas", 0.7, 1.3), Wants(fast=True)),
+    "air_drag": (_one("air_drag.C_D", "C_D", 1.0, 30.0), Wants(fast=True)),
+    "fold_inertia": (_one("fold_inertia.eta", "eta", 0.2, 1.0), Wants(fast=True)),
+    "linear_damping": (_one("linear_damping.b", "b", 0.01, 1.0, lambda s: 0.5 * s.weakest_B), Wants()),
     "pressure_damping": (_pressure_damping, Wants()),
     "tail_friction": (
-        _one("tail_friction.mu_w", "mu_w", 0.05, 6.0, lambda s: 1.2 * s.weakest_N / s.longest_m),
+        _one("tail_friction.mu_w", "mu_w", 0.01, 6.0, lambda s: 1.2 * s.weakest_N / s.longest_m),
         Wants(),
     ),
     "capstan_friction": (_capstan, Wants()),
     "payload_friction": (
-        _one("payload_friction.mu_p", "mu_p", 0.03, 1.2, lambda s: 0.5 * s.weakest_N / (s.payload_kg * 9.81)),
+        _one("payload_friction.mu_p", "mu_p", 0.05, 1.5, lambda s: 0.5 * s.weakest_N / (s.payload_kg * 9.81)),
         Wants(payload=True),
     ),
-    "payload_drag": (_one("payload_drag.drag_area", "drag_area", 5e-5, 2e-3), Wants(payload=True, fast=True)),
-    "wall_stretch": (_one("wall_stretch.kappa", "kappa", 3e-7, 6e-6), Wants()),
-    "tail_stretch": (_one("tail_stretch.compliance", "compliance", 1e-8, 1e-7), Wants()),
+    "payload_drag": (_one("payload_drag.drag_area", "drag_area", 2e-4, 6e-3), Wants(payload=True, fast=True)),
+    "wall_stretch": (_one("wall_stretch.kappa", "kappa", 5e-7, 1e-5), Wants()),
+    "tail_stretch": (_one("tail_stretch.compliance", "compliance", 2e-9, 1e-7), Wants()),
     "latch_release": (_latch, Wants()),
     "length_scale": (_length_scale, Wants()),
     "time_base": (_time_base, Wants()),

@@ -222,7 +222,7 @@ MOST_STEPS = 25_000
 
 @njit(cache=True, nogil=True)
 def _explicit(times, tube, f, bends, trace_t, trace_P, tolerance):
-    """States (y, ẋ, chamber) at the times, when all film was everted (NaN if it was not), and the rows that are good."""
+    """States (y, ẋ, chamber) at the times, when all film was everted (NaN if it was not), the number of good rows."""
     out = np.empty((times.size, 3))
     state = np.array([0.0, 0.0, tube.pressure])
     k = np.zeros((7, 3))
