@@ -16,6 +16,8 @@ from vinetrack.model.fit_result import Fit, Number
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.locate import Failure
+
 ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
     "adequate",
     "missing",
@@ -105,25 +107,26 @@ class Diagnosis:
 
     `effects` are those added, in order; `fits` the model the user came with and every one after it. `drift` holds a row
     a drifting parameter, `ladder` the errors before and after (None where not computed), `next_experiment` what
-    to do now where something is tied.
+    to do now where something is tied; `failure` tells where the first model fails, `force_table` what force it lacks.
     """
 
     rounds: tuple[Round, ...]
     effects: tuple[str, ...]
     explanation: str
     fits: tuple[Fit, ...] = ()
-    verdict_override: str = ""
     ladder: pd.DataFrame | None = None
     drift: Sequence[Mapping[str, Any]] = ()
     where: Sequence[str] = ()
     next_experiment: Mapping[str, Any] | None = None
     missing_force: Mapping[str, Any] | None = None
     notes: Sequence[str] = ()
+    failure: Failure | None = None
+    force_table: pd.DataFrame | None = None
 
     @property
     def verdict(self) -> str:
         """About the model the user came with."""
-        return self.verdict_override or self.rounds[0].verdict
+        return self.rounds[0].verdict
 
     @property
     def final_verdict(self) -> str:

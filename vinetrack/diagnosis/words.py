@@ -13,14 +13,16 @@ from vinetrack.diagnosis.result import (
     DROPPED_FRAMES,
     MISSING,
     NOT_TESTABLE,
-    Candidate,
     Diagnosis,
     Round,
 )
 from vinetrack.model.fit_result import SHOWN_AS, Number, decimals
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from vinetrack.diagnosis.inquiry import Finding
+    from vinetrack.model.fit_result import Fit
 
 MEANINGS = {
     ADEQUATE: "nothing missing can be detected",
@@ -141,7 +143,7 @@ def printed(found: Diagnosis) -> str:
         if one.ranking:
             lines += ["", f"{' + '.join(one.model)}: {one.verdict}", *_ranking(one)]
     if found.ladder is not None and len(found.ladder) > 1:
-        lines += ["", "position error", *_ladder(found)]
+        lines += ["", "position error", *_ladder_table(found.ladder)]
     if found.where:
         lines += ["", *found.where]
     if found.next_experiment:
@@ -180,11 +182,10 @@ def _ranking(one: Round) -> list[str]:
     return lines + ([f"not testable here: {', '.join(blind)}"] if blind else [])
 
 
-def _ladder(found: Diagnosis) -> list[str]:
+def _ladder_table(ladder: pd.DataFrame) -> list[str]:
     from vinetrack.figures.style import rows
     from vinetrack.terminal import table
 
-    assert found.ladder is not None
     body = [
         (
             str(row.added) or "as it came",
@@ -193,11 +194,32 @@ def _ladder(found: Diagnosis) -> list[str]:
                 for value in (row.rms_in_sample_m, row.rms_left_out_m, row.rms_highest_pressure_m, row.floor_m)
             ),
         )
-        for row in rows(found.ladder)
+        for row in rows(ladder)
     ]
     return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))
 
 
-def candidate_note(candidate: Candidate) -> str:
-    """Why a candidate is where it is, in a few words."""
-    return candidate.reason or candidate.status
+def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
+    """What an effect put in by hand did to errors and numbers, as lines of aligned tables."""
+    from vinetrack.figures.style import rows
+    from vinetrack.terminal import table as aligned
+
+    gain = 2 * (after.log_likelihood - before.log_likelihood)
+    lines = [
+        f"{after.model.names[-1]} added to {' + '.join(before.model.names)}: Δχ² = {gain:.1f}",
+        "",
+        "position error",
+        *_ladder_table(table),
+        "",
+        "numbers",
+    ]
+    changed: dict[tuple[str, str], dict[str, str]] = {}
+    for row in rows(numbers):
+        unit, factor = SHOWN_AS.get(row.unit, (row.unit, 1.0))
+        digits = decimals(row.sigma * factor) if math.isfinite(row.sigma) else 3
+        title = f"{row.symbol} ({row.vine})" if row.vine else row.symbol
+        place = changed.setdefault((title, unit), {})
+        place["after" if row.added else "before"] = f"{row.value * factor:.{digits}f} ± {row.sigma * factor:.{digits}f}"
+    body = [(title, one.get("before", "–"), one.get("after", "–"), unit) for (title, unit), one in changed.items()]
+    lines += aligned(body, ("", "before", "after", "unit"))
+    return lines + [f"! {message}" for message in after.messages]

@@ -1,0 +1,59 @@
+"""One effect put into the model by hand: both fitted, both held against what they had not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from vinetrack.diagnosis.hypotheses import host_for, shapes_of
+from vinetrack.diagnosis.search import Slope, best_climb, full_fit, start_of
+from vinetrack.effects import EffectError, find_effect
+from vinetrack.model.fit import fit as fit_model
+from vinetrack.model.fit import refit
+from vinetrack.model.fit_data import FitError
+from vinetrack.model.fit_result import Fit
+from vinetrack.model.model import make_model
+from vinetrack.model.rig import check_needs
+from vinetrack.records import Track
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.experiment import Experiment
+
+
+def add(
+    experiment: Experiment, tracks: Mapping[str, Track], name: str, report: Callable[[str], None]
+) -> tuple[Fit, Fit, pd.DataFrame]:
+    """The model in use fitted without and with an effect, and the ladder of both.
+
+    Raises
+    ------
+    EffectError
+        If there is no such effect, it is in the model already, or a trial lacks what it needs.
+    FitError
+        If a model cannot be followed.
+    """
+    from vinetrack.diagnosis.ladder import ladder
+    from vinetrack.effects import own_effects
+
+    own = own_effects([experiment.folder / path for path in experiment.settings.effects])
+    model = make_model(experiment.settings.model, own)
+    effect = find_effect(name, own)
+    if effect.name in model:
+        raise EffectError(f"{effect.name} is in the model already: {' + '.join(model.names)}.")
+    check_needs(model + effect, *(trial for trial in experiment.trials if trial.name in tracks))
+    report("fitting the model as it is")
+    before = fit_model(model, experiment, tracks=tracks, host=host_for(model, (effect,)), profile=False)
+    report(f"fitting it with {effect.name}")
+    slope = Slope(before)
+    starts = [((effect,), start_of(shape, shape.step * 10)) for shape in shapes_of(effect)]
+    climb = best_climb(slope, starts, float("inf"))
+    after = full_fit(before, climb) if climb is not None else None
+    if after is None:
+        raise FitError(f"The model with {effect.name} cannot be followed from any start.")
+    if after.log_likelihood < before.log_likelihood:
+        again = refit(before, model + effect)
+        after = max((after, again), key=lambda fit: fit.log_likelihood)
+    report("errors before and after")
+    return before, after, ladder((before, after), ("", effect.name))
