@@ -215,6 +215,8 @@ rule campaign_figures:
         plan.result("scaling.json"),
         plan.result("comparison.csv"),
         plan.result("comparison"),
+        plan.result("conditions.csv"),
+        plan.result("payload_model.csv"),
     output:
         [
             report(

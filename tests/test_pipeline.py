@@ -174,7 +174,7 @@ def test_both_rules_are_reported_for_every_trial(campaign: tuple) -> None:
 def test_every_figure_is_there_as_png_and_svg(campaign: tuple) -> None:
     figures = campaign[0] / "figures"
     names = ["damping_law", "exponents", "scaling", "overview", "trial_d12_0", "trial_torn"]
-    names += ["model_comparison", "model_residuals"]
+    names += ["model_comparison", "model_residuals", "speed_scaling", "efficiency", "payload_speed"]
     for name in names:
         assert (figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert "<svg" in (figures / f"{name}.svg").read_text(encoding="utf-8")

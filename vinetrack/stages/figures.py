@@ -65,10 +65,13 @@ def _draw_trial(picture: _TrialPicture, results: Results, settings: FigureSettin
 def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> None:
     """Draw the figures of the whole experiment."""
     from vinetrack.figures.damping_law import draw_damping_law
+    from vinetrack.figures.efficiency import draw_efficiency
     from vinetrack.figures.exponents import draw_exponents
     from vinetrack.figures.model_comparison import draw_model_comparison, draw_model_residuals
     from vinetrack.figures.overview import draw_overview
+    from vinetrack.figures.payload_speed import draw_payload_speed
     from vinetrack.figures.scaling import draw_scaling
+    from vinetrack.figures.speed_scaling import draw_speed_scaling
     from vinetrack.figures.style import METHOD_NAMES
 
     results = Results(folder)
@@ -82,10 +85,14 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
     compared = label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
+    scaling = read_json(results.scaling)
     drawings: dict[str, Figure] = {
         "damping_law": draw_damping_law(points, damping),
         "exponents": draw_exponents(damping),
-        "scaling": draw_scaling(read_json(results.scaling)),
+        "scaling": draw_scaling(scaling),
+        "speed_scaling": draw_speed_scaling(scaling),
+        "efficiency": draw_efficiency(scaling),
+        "payload_speed": draw_payload_speed(read_result(results.conditions), read_result(results.payload_model)),
         "overview": draw_overview(described, moved),
         "model_comparison": draw_model_comparison(compared, trajectories),
         "model_residuals": draw_model_residuals(compared, trajectories),

@@ -21,6 +21,9 @@ FIGURES = {
     "damping_law": ("Steady force and steady speed", "damping_points.csv"),
     "exponents": ("The exponent and the coefficients, by both methods", "damping.json"),
     "scaling": ("How damping grows with size", "scaling.json"),
+    "speed_scaling": ("How steady speed goes with size", "conditions.csv"),
+    "efficiency": ("How much of the work becomes motion", "conditions.csv"),
+    "payload_speed": ("Final speed and payload", "conditions.csv"),
     "overview": ("All trials at a glance", "trials.csv"),
     "model_comparison": ("Model and measurement", "comparison.csv"),
     "model_residuals": ("What the model leaves", "comparison.csv"),
@@ -77,6 +80,8 @@ def _drawn(results: Results) -> list[str]:
     damping, scaling = read_json(results.damping), read_json(results.scaling)
     empty = set() if any(damping[method]["vines"] for method in METHOD_NAMES) else {"exponents"}
     empty |= set() if scaling["isometric"] or scaling["thickness"] else {"scaling"}
+    empty |= {key for key, of in (("speed_scaling", "steady_speed"), ("efficiency", "efficiency")) if not scaling[of]}
+    empty |= set() if len(read_result(results.payload_model)) else {"payload_speed"}
     empty |= {"model_comparison", "model_residuals"} if read_json(results.fit)["refused"] else set()
     return [name for name in FIGURES if name not in empty]
 
