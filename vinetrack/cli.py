@@ -17,10 +17,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vinetrack.cli_design import register
+from vinetrack.cli_diagnose import register as register_diagnose
+from vinetrack.cli_explore import register as register_explore
 
 if TYPE_CHECKING:
     from vinetrack.experiment import Experiment
     from vinetrack.settings import RunSettings
+
+SENTENCES = frozenset(
+    {"ResultsError", "EffectError", "TableError", "FitError", "SimulationError", "ChoiceError", "PortError"}
+)
+"""Errors that say themselves what is wrong and what to do; by name, so that nothing is loaded to know them."""
 
 app = typer.Typer(
     name="vinetrack",
@@ -142,6 +149,10 @@ def overlays(
 
         for line in draw_overlays(_read(experiment), results, _run_settings(settings).overlays, threads):
             typer.echo(f"  {line}")
+
+
+register_explore(app)
+register_diagnose(app)
 
 
 @app.command(rich_help_panel="Stages of the workflow")
@@ -292,7 +303,7 @@ def _sentences(log: Path | None) -> Iterator[None]:
         raise typer.Exit(1) from None
     except Exception as error:
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
-        if type(error).__name__ in ("ResultsError", "EffectError", "TableError"):
+        if type(error).__name__ in SENTENCES:
             _stop(str(error))
         place = f"; the traceback is in {log}" if log else "; run it with --log FILE to have the traceback"
         _stop(f"A fault of the program, not of your data ({type(error).__name__}: {error}){place}.")

@@ -17,6 +17,9 @@ from vinetrack.records import Floats
 ANSWER_SET = 9.0
 """Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
 
+CREDIBLE = 3.0
+"""How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag."""
+
 LIMIT_DISTANCE = 4.0
 """Squared distance, in units of the noise, below which what two hypotheses predict is the same curve."""
 
@@ -26,7 +29,8 @@ class Evidence:
     """One hypothesis refitted: the effects it adds to a fit, its own fit, and what came of it.
 
     `delta_chi2` is the fall of −2 ln L from the fit without them, `sigma` that in standard deviations, brought down
-    where trials scatter more than the model of the noise says.
+    where trials scatter more than the model of the noise says. A size beyond what is `plausible` may lose a tie; one
+    that is not even `credible`, several times beyond, is no explanation.
     """
 
     effects: tuple[Effect, ...]
@@ -35,6 +39,7 @@ class Evidence:
     sigma: float
     plausible: bool
     reason: str
+    credible: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,17 +68,18 @@ def weigh(before: Fit, effects: Sequence[Effect], after: Fit) -> Evidence:
         sigma=math.copysign(math.sqrt(abs(fall)), fall) / ratio,
         plausible=plausible,
         reason=reason,
+        credible=belief(effects, after, CREDIBLE)[0],
     )
 
 
-def belief(effects: Sequence[Effect], after: Fit) -> tuple[bool, str]:
-    """Whether an experimenter would believe the sizes, and why not."""
+def belief(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:
+    """Whether an experimenter would believe the sizes, and why not; `widened` stretches what is plausible."""
     for effect in effects:
         for parameter in effect.parameters:
             for number in after.numbers:
                 if number.key != f"{effect.name}.{parameter.name}" or not math.isfinite(number.sigma):
                     continue
-                if not is_plausible(parameter, number.value, number.sigma):
+                if not is_plausible(parameter, number.value, number.sigma, widened=widened):
                     low, high = parameter.plausible or (math.nan, math.nan)
                     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
                     needs = f"it would need {number.symbol} = {number.value:.3g}{unit}"

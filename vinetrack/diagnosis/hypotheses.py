@@ -21,6 +21,9 @@ PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
 WIDE_RANGE = 10.0
 """Plausible values that differ by more than this factor are tried at geometric steps."""
 
+NARROW, ROOM_BELOW = 2.0, 3.0
+"""Where plausible values differ by more than the first, an effect may be smaller than them by the second."""
+
 AMPLITUDES = (0.03, 0.2, 0.7)
 """Fractions of the plausible range at which an effect is tried whose small sizes do nothing."""
 
@@ -139,15 +142,21 @@ def typical_values(parameter: Parameter) -> tuple[float, ...]:
     low, high = plausible_range(parameter)
     if low > 0 and high / low > WIDE_RANGE:
         return tuple(np.geomspace(low, high, 5)[1:4].tolist())
-    if low > 0 and high / low < 2:
+    if low > 0 and high / low < NARROW:
         return ((low + high) / 2,)
     return tuple((low + part * (high - low)) for part in (0.15, 0.5, 0.85))
 
 
-def is_plausible(parameter: Parameter, value: float, sigma: float, reach: float = 3.0) -> bool:
-    """Whether a value lies in the plausible range, or no further outside than `reach` of its errors."""
+def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0, widened: float = 1.0) -> bool:
+    """Whether a value lies in the plausible range, or no further outside than `reach` of its errors.
+
+    `widened` is how many times further from zero it may lie.
+    """
     if parameter.plausible is None or value == parameter.zero:
         return True
     low, high = parameter.plausible
+    if low > 0 and high / low > NARROW:
+        low /= ROOM_BELOW
+    low, high = min(low / widened, low * widened), max(high * widened, high / widened)
     room = reach * sigma if math.isfinite(sigma) else math.inf
     return bool(low - room <= value <= high + room)

@@ -71,7 +71,7 @@ def _alone(questions: Questions, search: Search, tried: Sequence[Evidence]) -> l
     if best.sigma < questions.threshold:
         return None
     kept, aside = answer_set(tried)
-    if not kept[0].plausible:
+    if not kept[0].credible:
         return None
     after = question(kept[0].fit, questions.effects, LATER_LEVEL)
     if after.something:
@@ -110,7 +110,7 @@ def _together(
     best = kept[0]
     after = question(best.fit, effects, LATER_LEVEL)
     gain = 2 * (best.fit.log_likelihood - ranked[0].fit.log_likelihood)
-    if after.something or not best.plausible or gain < after.threshold**2:
+    if after.something or not best.credible or gain < after.threshold**2:
         return nothing
     common = set.intersection(*(set(one.names) for one in kept))
     by_name = {one.names[0]: one for one in ranked if len(one.names) == 1}
@@ -171,6 +171,6 @@ def _turned(one: Evidence, first: str) -> Evidence:
 
 def _why_not(ranked: Sequence[Evidence], both: Sequence[Evidence]) -> tuple[tuple[str, str], ...]:
     return tuple(
-        ("+".join(one.names), one.reason if not one.plausible else "something is left once it is added")
+        ("+".join(one.names), one.reason if not one.credible else "something is left once it is added")
         for one in (*ranked[:1], *both[:1])
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,10 +55,8 @@ def diagnose_results(experiment: Experiment, folder: Path, report: Report = _qui
         found = diagnose_pairs(experiment, pairs, report)
     except Exception as error:
         return _write_refusal(results, experiment, _reason(error))
-    content = {**found.to_json(), "refused": None}
-    _write(results, found, content)
     log.info("%s: %s", found.verdict, found.explanation)
-    return content
+    return write_diagnosis(results, found)
 
 
 def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report = _quiet) -> Diagnosis:
@@ -104,7 +102,8 @@ def _emptied(results: Results) -> Path:
     return folder
 
 
-def _write(results: Results, found: Diagnosis, content: Mapping[str, Any]) -> None:
+def write_diagnosis(results: Results, found: Diagnosis) -> dict[str, Any]:
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; return the first."""
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
 
     folder = _emptied(results)
@@ -117,7 +116,9 @@ def _write(results: Results, found: Diagnosis, content: Mapping[str, Any]) -> No
         path.parent.mkdir(parents=True, exist_ok=True)
         write_csv(path, table)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS) if found.ladder is None else found.ladder)
-    write_json(results.diagnosis, dict(content))
+    content = {**found.to_json(), "refused": None}
+    write_json(results.diagnosis, content)
+    return content
 
 
 def tables_of(found: Diagnosis) -> dict[str, pd.DataFrame]:
