@@ -176,6 +176,28 @@ rule model:
         "vinetrack model {params.experiment:q} {params.results:q} --settings {params.settings:q} --log {log:q}"
 
 
+rule diagnosis:
+    """What the model in use lacks; added, while it is one effect, with the errors before and after."""
+    input:
+        plan.sheets,
+        plan.own_effects,
+        plan.per_trial("tracks", ".csv"),
+        plan.per_trial("kinematics", ".csv"),
+    output:
+        plan.result("diagnosis.json"),
+        plan.result("ladder.csv"),
+        directory(plan.result("diagnosis")),
+    log:
+        plan.result("logs", "diagnosis.log"),
+    params:
+        code=code_hash("model"),
+        unwatched=plan.unwatched,
+        experiment=plan.experiment,
+        results=plan.results,
+    shell:
+        "vinetrack diagnosis {params.experiment:q} {params.results:q} --log {log:q}"
+
+
 rule trial_figures:
     """Position, speed and steady stretches of every trial."""
     input:
@@ -246,6 +268,8 @@ rule report_page:
         plan.figure_files(),
         plan.result("steady.csv"),
         plan.result("fit.json"),
+        plan.result("diagnosis.json"),
+        plan.result("ladder.csv"),
         plan.result("comparison.csv"),
         plan.result("model_check.csv"),
     output:
