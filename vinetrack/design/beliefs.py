@@ -60,14 +60,15 @@ class Input:
 class Belief:
     """What is believed of one trial.
 
-    `trial` and `model` stand at the medians; `origins` says by number where it comes from; `notes` are sentences for
-    people.
+    `trial` and `model` stand at the medians; `origins` says by number where it comes from; `spreads` are those of
+    pressure and B from trial to trial, relative, and among the uncertainties too; `notes` are sentences for people.
     """
 
     trial: Trial
     model: Model
     origins: Mapping[str, str]
     uncertainties: tuple[Uncertainty, ...]
+    spreads: tuple[float, float]
     notes: tuple[str, ...] = ()
 
     @property

@@ -12,7 +12,7 @@ import numpy as np
 from vinetrack import published
 from vinetrack.design import guess
 from vinetrack.design.beliefs import PRESSURE, YIELD, Belief, Draws, Move, Size, Uncertainty, wanted_model
-from vinetrack.design.from_fit import FitNumbers, nearest_vine, numbers_of, same_vine, yield_place
+from vinetrack.design.from_fit import FitNumbers, alike, nearest_vine, numbers_of, same_vine, yield_place
 from vinetrack.effects import BASE_EFFECTS, Effect
 from vinetrack.model.fit_data import FitError
 from vinetrack.model.free import DAMPING, EXPONENT
@@ -100,13 +100,14 @@ def believe(trial: Trial, said: Said | None = None, fit: FitNumbers | Fit | None
     _yield_pressure(making, anchor)
     _further(making, said, model, anchor)
     _from_fit(making)
-    _spreads(making, said)
+    spreads = _spreads(making, said)
     values = {name: value for name, value in making.values.items() if name in model.parameter_names}
     return Belief(
         trial=replace(making.trial, yield_pressure_Pa=making.values[YIELD]),
         model=model.with_values(values),
         origins=making.origins,
         uncertainties=tuple(making.uncertainties),
+        spreads=spreads,
         notes=tuple(making.notes),
     )
 
@@ -144,7 +145,7 @@ def _damping(making: _Making, said: Said, anchor: tuple[str, bool]) -> None:
             f"no vine of {fit.source} has this diameter and wall: B is carried over from {vine} by a guess"
         )
         split = guess.split_leverage(trial.diameter_m, trial.thickness_m) - guess.split_leverage(*size)
-    elif scale := published.scale_of(1e3 * trial.diameter_m, 1e6 * trial.thickness_m):
+    elif (scale := _printed_scale(trial)) is not None:
         making.know(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
         words = f"the error of the printed B is not printed; taken for {100 * guess.PRINTED_ERROR:.0f} %"
         making.doubt("error of B", words, f"B printed|{trial.vine}", _scaled(DAMPING, guess.PRINTED_ERROR))
@@ -157,6 +158,15 @@ def _damping(making: _Making, said: Said, anchor: tuple[str, bool]) -> None:
         )
         split = guess.split_leverage(trial.diameter_m, trial.thickness_m)
     _doubt_guess(making, split)
+
+
+def _printed_scale(trial: Trial) -> int | None:
+    """Scale R of the printed vine of just this size; a vine of nearly this size is guessed, so that B has no steps."""
+    for scale in published.DAMPING_B:
+        size = 1e-3 * published.DIAMETER_MM[scale], 1e-6 * published.THICKNESS_UM[scale]
+        if alike(size, (trial.diameter_m, trial.thickness_m)):
+            return scale
+    return None
 
 
 def _doubt_guess(making: _Making, split: float) -> None:
@@ -271,8 +281,8 @@ def _from_fit(making: _Making) -> None:
         )
 
 
-def _spreads(making: _Making, said: Said) -> None:
-    """What differs from one trial to the next."""
+def _spreads(making: _Making, said: Said) -> tuple[float, float]:
+    """What differs from one trial to the next: relative spreads of pressure and B."""
     fit, trial = making.fit, making.trial
     stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else guess.PRESSURE_SPREAD
     pressure = stated if math.isfinite(stated) else guess.PRESSURE_SPREAD
@@ -289,6 +299,7 @@ def _spreads(making: _Making, said: Said) -> None:
     if damping > 0:
         words = f"B from trial to trial, {origin} {100 * damping:.2g} %"
         making.doubt("B from trial to trial", words, f"B trial|{trial.vine}", _scaled(DAMPING, damping))
+    return pressure, damping
 
 
 def _scaled(name: str, log_sigma: float) -> Move:

@@ -147,13 +147,14 @@ def numbers_of(found: Fit) -> FitNumbers:
 def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
     """The fitted vine of this diameter and wall, of any length, for B is a matter of the tip; None if there is none."""
     sizes = [
-        (vine, size) for vine, size in numbers.sizes().items() if _alike(size, (trial.diameter_m, trial.thickness_m))
+        (vine, size) for vine, size in numbers.sizes().items() if alike(size, (trial.diameter_m, trial.thickness_m))
     ]
     exact = [vine for vine, _ in sizes if vine == trial.vine]
     return exact[0] if exact else sizes[0][0] if sizes else None
 
 
-def _alike(one: tuple[float, float], other: tuple[float, float]) -> bool:
+def alike(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two sizes are the same to five digits."""
     return all(abs(a / b - 1) < 1e-5 for a, b in zip(one, other, strict=True))
 
 

@@ -126,9 +126,8 @@ def neglected(belief: Belief, at_fraction: float) -> tuple[Neglected, ...]:
 
     Each is put in by itself, at its typical size; those whose columns are blank are passed over.
     """
-    own = {effect.name: effect for effect in belief.model if effect.name not in catalogue()}
-    host = make_model([*catalogue(), *own], own)
-    without = _final_m_s(belief, belief.model, host, at_fraction)
+    host = whole_model(belief.model)
+    without = final_m_s(belief, belief.model, host, at_fraction)
     found = []
     for name in INEVITABLE:
         effect = catalogue()[name]
@@ -138,11 +137,17 @@ def neglected(belief: Belief, at_fraction: float) -> tuple[Neglected, ...]:
         sizes = typical_sizes(name, belief.trial)
         model = (belief.model + effect).with_values(sizes)
         try:
-            final = _final_m_s(belief, model, host, at_fraction)
+            final = final_m_s(belief, model, host, at_fraction)
         except EffectError:
             continue
         found.append(Neglected(name, _words(effect, sizes), final, without))
     return tuple(sorted(found, key=lambda one: -abs(np.nan_to_num(one.change))))
+
+
+def whole_model(model: Model) -> Model:
+    """The catalogue and the model's own effects: its compiled form serves every model that is looked at here."""
+    own = {effect.name: effect for effect in model if effect.name not in catalogue()}
+    return make_model([*catalogue(), *own], own)
 
 
 def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
@@ -158,7 +163,7 @@ def _words(effect: Effect, sizes: Mapping[str, float]) -> str:
     return ", ".join(f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in values)
 
 
-def _final_m_s(belief: Belief, model: Model, host: Model, at_fraction: float) -> float:
+def final_m_s(belief: Belief, model: Model, host: Model, at_fraction: float) -> float:
     """The final speed at the medians under this model: a payload's at the end, else the leading edge's."""
     (trial,), _ = _medians(belief)
     (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=host)
