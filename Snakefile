@@ -239,6 +239,10 @@ rule campaign_figures:
         plan.result("comparison"),
         plan.result("conditions.csv"),
         plan.result("payload_model.csv"),
+        plan.result("fit.json"),
+        plan.result("diagnosis.json"),
+        plan.result("ladder.csv"),
+        plan.result("diagnosis"),
     output:
         [
             report(
@@ -261,11 +265,45 @@ rule campaign_figures:
         " --log {log:q}"
 
 
+if plan.clips:
+
+    rule overlays:
+        """Recordings slowed down, with the tracked edge and the edges that the models predict."""
+        input:
+            [path for paths in plan.filmed.values() for path in paths],
+            plan.per_trial("tracks", ".csv", plan.filmed),
+            plan.per_trial("analysed", ".json", plan.filmed),
+            plan.result("trials.csv"),
+            plan.result("fit.json"),
+            plan.result("diagnosis.json"),
+            plan.result("diagnosis"),
+        output:
+            report(
+                directory(plan.result("overlays")),
+                patterns=["{trial}.mp4"],
+                caption="vinetrack/report/captions/overlay.rst",
+                category="Clips",
+                labels={"trial": "{trial}"},
+            ),
+        log:
+            plan.result("logs", "overlays.log"),
+        threads: 32  # scaled down to the cores that are given
+        params:
+            code=code_hash("overlays"),
+            experiment=plan.experiment,
+            results=plan.results,
+            settings=plan.stage_settings("overlays"),
+        shell:
+            "vinetrack overlays {params.experiment:q} {params.results:q} --settings {params.settings:q}"
+            " --threads {threads} --log {log:q}"
+
+
 rule report_page:
     """Everything a person wants to see, in one file, and what it was made with."""
     input:
         plan.inputs,
         plan.figure_files(),
+        plan.clips,
         plan.result("steady.csv"),
         plan.result("fit.json"),
         plan.result("diagnosis.json"),

@@ -34,6 +34,13 @@ CAMPAIGN_FIGURES = {
     "overview": "All trials",
     "model_comparison": "Model and measurement",
     "model_residuals": "What the model leaves",
+    "ladder": "The error falls",
+    "before_after": "The worst condition",
+    "where": "Where it fails",
+    "missing_force": "The missing force",
+    "candidates": "Candidates",
+    "cosines": "What is tied",
+    "drift": "Drift of parameters",
 }
 """Figures of a whole experiment, by file name, with the label Snakemake's own report gives them."""
 
@@ -47,7 +54,12 @@ STAGE_CODE = {
     "gather": (*_INTAKE, "stages", "motion"),
     "damping": ("tables.py", "stages", "motion"),
     "model": (*_INTAKE, "settings.py", "stages", "video", "motion", "effects", "model", "diagnosis"),
-    "figures": ("tables.py", "stages", "figures"),
+    "figures": ("tables.py", "stages", "figures", "report/verdict.py"),
+    "overlays": (
+        *_INTAKE,
+        *("stages/overlays.py", "stages/pool.py", "stages/results.py", "figures/overlay.py", "figures/style.py"),
+        *("video/frames.py", "video/images.py", "video/axis.py", "video/write.py"),
+    ),
     "report": ("tables.py", "stages", "provenance.py", "figures", "report"),
     "laboratory": ("effects", "model", "laboratory"),
 }
@@ -108,6 +120,11 @@ class Plan:
     def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
         """One result for each of these trials, by default all."""
         return [self.result(folder, f"{trial}{suffix}") for trial in (self.trials if trials is None else trials)]
+
+    @property
+    def clips(self) -> list[str]:
+        """The folder of clips, where there is anything to make one of and they are wanted."""
+        return [self.result("overlays")] if self.filmed and self.settings.overlays.of != "none" else []
 
     @staticmethod
     def one_of(names: Iterable[str]) -> str:

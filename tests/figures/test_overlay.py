@@ -30,8 +30,8 @@ def edges(tracked: float = 200.0, before: float = 300.0, after: float = 210.0) -
 
 
 def columns_of(picture: np.ndarray, colour: str, height: int = SIZE[1]) -> np.ndarray:
-    """Columns of the picture, without the bar, in which a colour stands."""
-    return np.flatnonzero((picture[:height] == rgb(colour)).all(axis=2).any(axis=0))
+    """Columns of the picture, without the bar above it, in which a colour stands."""
+    return np.flatnonzero((picture[-height:] == rgb(colour)).all(axis=2).any(axis=0))
 
 
 def grey() -> np.ndarray:
@@ -75,13 +75,13 @@ def test_sides_are_even_whatever_comes_in() -> None:
 def test_an_axis_down_the_picture_has_its_edges_across_it() -> None:
     down = View("a", Axis((100.0, 10.0), (100.0, 190.0)), 40.0, (200, 200), 0.25, 30.0, 200)
     picture = compose(down, np.full((200, 200), 90, np.uint8), 1, 0.0, edges(90, 140, 60))
-    rows = np.flatnonzero((picture[:200] == rgb(TRACKED)).all(axis=2).any(axis=1))
+    rows = np.flatnonzero((picture[-200:] == rgb(TRACKED)).all(axis=2).any(axis=1))
     assert np.mean(rows) == pytest.approx(100, abs=1)
 
 
 def test_the_scale_bar_has_the_length_it_names() -> None:
     picture = compose(view(), grey(), 1, 0.0, [])
-    white = (picture[: SIZE[1]] == 255).all(axis=2)
+    white = (picture[-SIZE[1] :] == 255).all(axis=2)
     longest = max(int(row.sum()) for row in white)
     # A sixth of 640 px is 26.7 mm; the round length below it is 20 mm, or 80 px.
     assert longest == pytest.approx(80, abs=2)
@@ -89,11 +89,11 @@ def test_the_scale_bar_has_the_length_it_names() -> None:
 
 def test_without_a_scale_there_is_no_bar() -> None:
     blind = View("a", Axis((20.0, 100.0), (620.0, 100.0)), 40.0, SIZE, math.nan, 30.0, 640)
-    assert not (compose(blind, grey(), 1, 0.0, [])[: SIZE[1]] == 255).all(axis=2).any()
+    assert not (compose(blind, grey(), 1, 0.0, [])[-SIZE[1] :] == 255).all(axis=2).any()
 
 
-def test_the_bar_below_has_a_row_for_each_edge_and_changes_with_time() -> None:
-    early, late = (compose(view(), grey(), 1, time_ms, edges())[SIZE[1] :] for time_ms in (1.0, 99.0))
+def test_the_bar_above_has_a_row_for_each_edge_and_changes_with_time() -> None:
+    early, late = (compose(view(), grey(), 1, time_ms, edges())[: -SIZE[1]] for time_ms in (1.0, 99.0))
     for colour in (TRACKED, BEFORE, AFTER):
         assert (early == rgb(colour)).all(axis=2).any()
     assert (early != late).any()
@@ -105,7 +105,7 @@ def test_long_names_are_cut_to_their_room() -> None:
     bars = []
     for name in (long, "b"):
         picture = compose(view(), grey(), 1, 0.0, [*edges()[:2], Edge(name, AFTER, unseen, unseen)])
-        bars.append(picture[SIZE[1] :])
+        bars.append(picture[: -SIZE[1]])
     differs = np.flatnonzero((bars[0] != bars[1]).any(axis=(0, 2)))
     assert 200 < differs.max() < 0.5 * 640
 

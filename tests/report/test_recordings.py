@@ -7,7 +7,10 @@ import math
 import pytest
 from test_report import EVIL, SVG, Tags, page, trials
 
+from vinetrack.report import trials as report_trials
+from vinetrack.report.build import LARGEST_CLIP_BYTES, Clip
 from vinetrack.report.recordings import LARGEST_SVG_BYTES, SHARED_ERROR, Recording, calibration_table, count_frames
+from vinetrack.report.svg import inline_svg
 
 BOARD = {
     "kind": "charuco",
@@ -30,8 +33,8 @@ def test_strip_and_motion_stand_side_by_side_and_the_motion_once() -> None:
     assert html.count('<div class="pair">') == 1
     assert html.count('aria-label="Strip of a with its tracked edge"') == 1
     assert html.count('aria-label="Motion of a"') == 1
-    assert 'id="recording-a"' in html
-    assert 'href="#recording-a"' in html
+    assert 'id="trial-a"' in html
+    assert 'href="#trial-a"' in html
     assert not Tags(html).wrong
 
 
@@ -43,7 +46,7 @@ def test_how_edge_and_scale_were_found_is_said_where_there_are_recordings() -> N
 
 def test_an_experiment_of_tracks_has_neither_section() -> None:
     html = page()
-    assert "Recordings" not in html
+    assert "A strip is the recording" not in html
     assert 'id="calibration"' not in html
 
 
@@ -87,10 +90,26 @@ def test_a_failed_recording_shows_its_reason_and_no_picture() -> None:
     assert '<div class="pair">' not in html
 
 
-def test_too_many_strips_stay_files_and_it_says_so() -> None:
-    html = page(recordings={"a": Recording("", ["", ""])}, n_strips_left_out=61)
-    assert "With 61 recordings the pictures stay beside this page" in html
-    assert "2 frames" in html
+def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("a", "b", "c")
+    recordings = {name: recording() for name in names}
+    weight = len(inline_svg(SVG, "s-a", "Strip of a with its tracked edge"))
+    monkeypatch.setattr(report_trials, "PICTURES_BYTES", 2 * weight)
+    html = page(trials=trials(*names), recordings=recordings)
+    assert html.count('aria-label="Strip of') == 2
+    assert "The pictures of 1 trials were too much for one page" in html
+    assert html.count("4 frames: 1 before release, 1 doubtful") == 3
+
+
+def test_a_clip_beside_the_page_is_linked_and_one_plays_in_it() -> None:
+    html = page(clips={"a": "overlays/a.mp4"}, clip=Clip("a", b"film", EVIL))
+    assert '<a href="overlays/a.mp4">Its clip, beside this page</a>' in html
+    assert 'src="data:video/mp4;base64,ZmlsbQ=="' in html
+    assert EVIL not in html
+
+
+def test_a_clip_too_large_for_the_page_does_not_play_in_it() -> None:
+    assert "<video" not in page(clip=Clip("a", bytes(LARGEST_CLIP_BYTES + 1), "c"))
 
 
 def test_a_strip_too_large_for_the_page_is_left_out() -> None:

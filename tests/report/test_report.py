@@ -5,13 +5,16 @@ from __future__ import annotations
 import base64
 import re
 from html.parser import HTMLParser
+from urllib.parse import unquote
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.report.build import ReportContent, ReportFigure, build_report
+from vinetrack.report.build import ReportContent, ReportFigure, ReportSection, ReportTable, build_report
+from vinetrack.report.section import data_uri
 from vinetrack.report.svg import inline_svg, speed_sparkline
+from vinetrack.report.trials import MOST_ROWS
 from vinetrack.report.words import headline, tally, without_law
 
 EVIL = "<script>alert('x')</script>&\"'"
@@ -94,6 +97,13 @@ class Tags(HTMLParser):
             self.wrong.append(tag)
 
 
+def downloaded(href: str | None) -> str:
+    """The file behind a data address."""
+    head, _, data = (href or "").partition(",")
+    assert head.startswith("data:")
+    return base64.b64decode(data).decode() if head.endswith("base64") else unquote(data)
+
+
 def test_the_first_screen_says_n_with_its_error_and_how_many_trials() -> None:
     html = page(damping=damping("v", "w"), trials=trials("a", "b"))
     heading = re.search(r"<h1>(.*?)</h1>", html)
@@ -124,7 +134,8 @@ def test_vines_that_the_fit_left_out_are_named() -> None:
 
 def test_every_trial_stands_with_status_and_reason() -> None:
     html = page(trials=trials("a", "b", status="failed", reason="fewer than 5 points"), windows=windows())
-    assert html.count('class="status status-failed"') == 2
+    # Each in the table of numbers, and in the list that opens.
+    assert html.count('class="status status-failed"') == 4
     assert html.count("fewer than 5 points") == 2
 
 
@@ -194,7 +205,36 @@ def test_identifiers_are_unique_though_pictures_share_them() -> None:
 def test_the_numbers_of_a_figure_are_one_click_away() -> None:
     html = page(figures=[ReportFigure("law", "Law", "c", SVG, "points.csv", "µ,b\n1,2\n")])
     link = next(a for tag, a in Tags(html).tags if tag == "a" and a.get("download") == "points.csv")
-    assert base64.b64decode((link["href"] or "").split("base64,")[1]).decode() == "µ,b\n1,2\n"
+    assert downloaded(link["href"]) == "µ,b\n1,2\n"
+
+
+def test_a_large_table_is_written_the_shorter_way() -> None:
+    numbers = "time_s,force_N\n" + "0.001,2.5\n" * 500
+    assert data_uri("a.csv", numbers).startswith("data:text/csv;charset=utf-8,")
+    assert downloaded(data_uri("a.csv", numbers)) == numbers
+    words = '{"name": "µ–⁷"}' * 99
+    assert ";base64," in data_uri("a.json", words)
+    assert downloaded(data_uri("a.json", words)) == words
+
+
+def test_the_motion_of_a_trial_is_one_click_away_thinned_to_what_is_shown() -> None:
+    html = page(trials=trials("a"), kinematics=curves("a", n=3000))
+    link = next(a for tag, a in Tags(html).tags if tag == "a" and a.get("download") == "a.csv")
+    lines = downloaded(link["href"]).splitlines()
+    assert lines[0] == "time_s,lead_velocity_m_s"
+    assert 100 < len(lines) <= 1 + MOST_ROWS
+
+
+def test_a_section_of_another_room_stands_before_the_trials() -> None:
+    table = ReportTable("Numbers", ("what", "value"), [("n", "0.37"), (EVIL, "1")], frozenset({1}), "by hand")
+    figure = ReportFigure("own", "Own", "caption", SVG, "o.csv", "a\n1\n")
+    html = page(sections=[ReportSection("paper", "The paper", [EVIL], [table], [figure])])
+    assert html.index('<h2 id="paper">The paper</h2>') < html.index('<h2 id="trials">')
+    assert '<td class="number">0.37</td>' in html
+    assert 'href="#paper"' in html
+    assert 'id="figure-own"' in html
+    assert EVIL not in html
+    assert not Tags(html).wrong
 
 
 def test_an_inlined_picture_follows_the_page_and_keeps_its_proportions() -> None:

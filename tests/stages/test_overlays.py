@@ -95,7 +95,7 @@ def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path: Path)
     # 20 mm ahead is 40 px, 5 mm behind 10 px.
     for colour, place in ((TRACKED, 190), (BEFORE, 230), (AFTER, 180)):
         target = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
-        away = np.abs(picture[:HEIGHT] - target).sum(axis=2)
+        away = np.abs(picture[-HEIGHT:] - target).sum(axis=2)
         # Half of the colour is lost on lines of three pixels: the column that comes nearest is the line's.
         assert np.sort(away, axis=0)[:8].mean(axis=0).argmin() == pytest.approx(place, abs=2), colour
 

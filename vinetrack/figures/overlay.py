@@ -1,8 +1,8 @@
 """Frames of a clip: the recording, the tracked edge, and the edges that the model predicts before and after.
 
 The tracked edge crosses the tube, the predicted ones stand beside it, the earlier model reaching farther out: so all
-stay visible where they agree. A bar below says which is which, how far each is off, the time, and how much slower than
-life the clip is.
+stay visible where they agree. A bar above, where no player puts its buttons, says which is which, how far each is off,
+the time, and how much slower than life the clip is.
 """
 
 from __future__ import annotations
@@ -94,15 +94,15 @@ def compose(view: View, picture: NDArray[Any], frame: int, time_ms: float, edges
     width, height = view.picture_px
     line_px = _line_height(width)
     bar_px = _even(1.35 * line_px * max(len(edges), 2) + 0.8 * line_px)
-    whole = Image.new("RGB", (width, height + bar_px), BAR)
-    small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR)
-    whole.paste(small, (0, 0))
-    pen = ImageDraw.Draw(whole)
+    small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR).convert("RGB")
+    pen = ImageDraw.Draw(small)
     for edge, reach in (*zip(edges[1:], REACHES, strict=False), *((edge, 0.0) for edge in edges[:1])):
         _draw_edge(pen, view, edge, frame, reach)
     _scale_bar(pen, view, line_px)
-    whole.paste(_legend(view, tuple((edge.name, edge.colour) for edge in edges), bar_px, line_px), (0, height))
-    _numbers(pen, view, edges, frame, time_ms, line_px)
+    whole = Image.new("RGB", (width, height + bar_px), BAR)
+    whole.paste(_legend(view, tuple((edge.name, edge.colour) for edge in edges), bar_px, line_px), (0, 0))
+    whole.paste(small, (0, bar_px))
+    _numbers(ImageDraw.Draw(whole), view, edges, frame, time_ms, line_px)
     return np.asarray(whole)
 
 
@@ -186,15 +186,13 @@ def _shortened(text: str, room_px: float, line_px: int, bold: bool = False) -> s
 
 
 def _numbers(pen: ImageDraw, view: View, edges: list[Edge], frame: int, time_ms: float, line_px: int) -> None:
-    width, height = view.picture_px
-    font = _font(line_px)
+    width, font = view.picture_px[0], _font(line_px)
     for i, edge in enumerate(edges):
         if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
             words = f"{edge.off_mm[frame]:+.1f} mm".replace("-", "−")
-            pen.text((0.6 * width, height + _row_y(i, line_px)), words, font=font, fill=BAR_INK, anchor="rm")
-    y = height + _row_y(1, line_px)
+            pen.text((0.6 * width, _row_y(i, line_px)), words, font=font, fill=BAR_INK, anchor="rm")
     words = f"{time_ms:.1f} ms, {view.slowed:.3g} times slower".replace("-", "−")
-    pen.text((width - line_px, y), words, font=font, fill=BAR_MUTED, anchor="rm")
+    pen.text((width - line_px, _row_y(1, line_px)), words, font=font, fill=BAR_MUTED, anchor="rm")
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from vinetrack.figures.numbers import number
-from vinetrack.report.svg import inline_svg
 
 LARGEST_SVG_BYTES = 1_500_000
 """A larger picture is left as a file beside the report."""
@@ -61,24 +60,6 @@ class Recording:
     strip: str
     flags: Sequence[str]
     calibration: Mapping[str, Any] | None = None
-
-
-def recording_entry(name: str, recording: Recording, row: Any, motion_svg: str) -> dict[str, Any]:
-    """One recording for the template: a line about it, strip and motion."""
-    from markupsafe import Markup
-
-    strip = recording.strip if len(recording.strip) <= LARGEST_SVG_BYTES else ""
-    failed = row.status == "failed"
-    return {
-        "trial": name,
-        "status": row.status,
-        "reason": row.reason if isinstance(row.reason, str) else "",
-        "frames": "" if failed else count_frames(recording.flags),
-        "strip": Markup(inline_svg(strip, f"s-{name}", f"Strip of {name} with its tracked edge"))
-        if strip and not failed
-        else "",
-        "motion": Markup(inline_svg(motion_svg, f"t-{name}", f"Motion of {name}")) if motion_svg and not failed else "",
-    }
 
 
 def count_frames(flags: Iterable[str]) -> str:

@@ -30,6 +30,36 @@ REFERENCES = (
     "Efron and Tibshirani, An Introduction to the Bootstrap, 1993: intervals by resampling whole trials.",
 )
 
+DIAGNOSIS_METHODS = (
+    (
+        "Model",
+        "Simulated positions are fitted to measured ones, of all trials at once: the numbers of the model, B for every "
+        "vine, n for all, the yield pressure with the sheet's error as prior; for every trial its release, its origin, "
+        "and deviations of pressure and of B whose spreads are estimated too. What replicates differ by, the noise and "
+        "its correlation are found with it.",
+    ),
+    (
+        "Diagnosis",
+        "Every candidate of the catalogue is asked by how much the trajectories would be explained better with it, "
+        "after all that is fitted anyway has taken its share; faults of the measurement are candidates like any other. "
+        "The best, and all that look like them, are fitted in full. Hypotheses within Δχ² = 9 of the best form the "
+        "answer set. The threshold for calling anything missing allows for how many candidates were asked and how "
+        "alike they are. An effect is added only where it is the only answer, and the question is asked again.",
+    ),
+    (
+        "Ladder",
+        "Errors of position are root mean squares with a release and an origin of each trial's own and nothing else. "
+        "Left-out conditions are predicted by the model fitted to all other conditions, the highest pressure of each "
+        "vine by the model fitted to all lower ones. The floor is what replicates differ by.",
+    ),
+)
+DIAGNOSIS_REFERENCES = (
+    "Rao, Large sample tests of statistical hypotheses concerning several parameters with applications to problems of "
+    "estimation, Proceedings of the Cambridge Philosophical Society 44, 1948: asking candidates without fitting each.",
+    "Wilks, The large-sample distribution of the likelihood ratio for testing composite hypotheses, Annals of "
+    "Mathematical Statistics 9, 1938: what a Δχ² is worth.",
+)
+
 
 def headline(damping: Mapping[str, Any]) -> str:
     """The main result in one sentence."""

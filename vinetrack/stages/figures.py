@@ -73,6 +73,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     from vinetrack.figures.scaling import draw_scaling
     from vinetrack.figures.speed_scaling import draw_speed_scaling
     from vinetrack.figures.style import METHOD_NAMES
+    from vinetrack.stages.diagnosed import draw_diagnosed, read_diagnosed
 
     results = Results(folder)
     damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)
@@ -96,6 +97,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
         "overview": draw_overview(described, moved),
         "model_comparison": draw_model_comparison(compared, trajectories),
         "model_residuals": draw_model_residuals(compared, trajectories),
+        **draw_diagnosed(read_diagnosed(results, described)),
     }
     for name, figure in drawings.items():
         _write(figure, partial(results.figure, name), settings)

@@ -9,15 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.style import METHOD_NAMES
 from vinetrack.provenance import describe_run
+from vinetrack.stages.diagnosed import figure_tables, read_diagnosed, read_diagnosis
+from vinetrack.stages.figures import describe_conditions
 from vinetrack.stages.results import Results, read_json, read_result
 from vinetrack.tables import write_json, write_text
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from vinetrack.experiment import Experiment
-    from vinetrack.report.build import ReportFigure
+    from vinetrack.report.build import Clip, ReportFigure
     from vinetrack.report.recordings import Recording
+    from vinetrack.stages.diagnosed import Diagnosed
 
 FIGURES = {
+    "ladder": ("The error falls", ""),
+    "before_after": ("The worst condition, before and after", ""),
     "damping_law": ("Steady force and steady speed", "damping_points.csv"),
     "exponents": ("The exponent and the coefficients, by both methods", "damping.json"),
     "scaling": ("How damping grows with size", "scaling.json"),
@@ -25,11 +32,18 @@ FIGURES = {
     "efficiency": ("How much of the work becomes motion", "conditions.csv"),
     "payload_speed": ("Final speed and payload", "conditions.csv"),
     "overview": ("All trials at a glance", "trials.csv"),
-    "model_comparison": ("Model and measurement", "comparison.csv"),
+    "model_comparison": ("Model and measurement", ""),
     "model_residuals": ("What the model leaves", "comparison.csv"),
+    "where": ("Misfit by condition and position", ""),
+    "missing_force": ("The missing force", ""),
+    "candidates": ("What would explain it", ""),
+    "cosines": ("What can be taken for what", ""),
+    "drift": ("What follows a condition it should not know", ""),
 }
-MAX_TRIAL_PICTURES = 60
-"""With more trials their figures stay files beside the report: at 0.1 MB each the page would not open at once."""
+"""Figures of the page in their order: title, and the file their numbers stand in where it is not one of their own."""
+
+MOST_CURVE_ROWS = 6000
+"""Of the curves of all trials as data to download."""
 
 
 def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> Path:
@@ -55,7 +69,9 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
     trials = read_result(results.trials)
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
     filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
-    few = len(drawn) <= MAX_TRIAL_PICTURES
+    diagnosed = read_diagnosed(results, describe_conditions(trials, experiment.trials))
+    own_data = {name: _as_csv(table) for name, table in figure_tables(diagnosed).items()}
+    own_data["model_comparison"] = _as_csv(_curves(results))
     content = ReportContent(
         name=experiment.name,
         trials=trials,
@@ -63,11 +79,13 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
         damping=read_json(results.damping),
         provenance=provenance,
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
-        figures=[figure for name in _drawn(results) if (figure := _figure(results, name))],
-        trial_figures=_trial_figures(results, drawn) if few else {},
-        recordings={name: _recording(results, name, few) for name in filmed},
-        n_strips_left_out=0 if few else len(filmed),
+        figures=[figure for name in _drawn(results, own_data) if (figure := _figure(results, name, own_data))],
+        trial_figures=_trial_figures(results, drawn),
+        recordings={name: _recording(results, name) for name in filmed},
+        clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
+        clip=_clip(results, diagnosed, trials),
         model=ModelResult(read_json(results.fit), read_result(results.comparison), read_result(results.model_check)),
+        diagnosis=read_diagnosis(results, experiment),
     )
     page = build_report(content)
     write_json(results.provenance, provenance)
@@ -75,7 +93,7 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
     return results.report
 
 
-def _drawn(results: Results) -> list[str]:
+def _drawn(results: Results, own_data: Mapping[str, str]) -> list[str]:
     """Figures with something in them; the others would only repeat why there is no law."""
     damping, scaling = read_json(results.damping), read_json(results.scaling)
     empty = set() if any(damping[method]["vines"] for method in METHOD_NAMES) else {"exponents"}
@@ -83,10 +101,11 @@ def _drawn(results: Results) -> list[str]:
     empty |= {key for key, of in (("speed_scaling", "steady_speed"), ("efficiency", "efficiency")) if not scaling[of]}
     empty |= set() if len(read_result(results.payload_model)) else {"payload_speed"}
     empty |= {"model_comparison", "model_residuals"} if read_json(results.fit)["refused"] else set()
+    empty |= {name for name, (_, file) in FIGURES.items() if not file and name not in own_data}
     return [name for name in FIGURES if name not in empty]
 
 
-def _figure(results: Results, name: str) -> ReportFigure | None:
+def _figure(results: Results, name: str, own_data: Mapping[str, str]) -> ReportFigure | None:
     from vinetrack.report.build import ReportFigure
 
     path = results.figure(name, ".svg")
@@ -94,16 +113,54 @@ def _figure(results: Results, name: str) -> ReportFigure | None:
         return None
     title, data_name = FIGURES[name]
     caption = (files("vinetrack.report") / "captions" / f"{name}.rst").read_text(encoding="utf-8")
-    data = (results.folder / data_name).read_text(encoding="utf-8")
-    return ReportFigure(name, title, " ".join(caption.split()), path.read_text(encoding="utf-8"), data_name, data)
+    data = (results.folder / data_name).read_text(encoding="utf-8") if data_name else own_data[name]
+    return ReportFigure(
+        name, title, " ".join(caption.split()), path.read_text(encoding="utf-8"), data_name or f"{name}.csv", data
+    )
 
 
-def _recording(results: Results, name: str, with_strip: bool) -> Recording:
+def _as_csv(table: pd.DataFrame) -> str:
+    """A table to download, with five digits, which is finer than any number of a figure is drawn."""
+    return str(table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
+
+
+def _curves(results: Results) -> pd.DataFrame:
+    """Measured and modelled growth of all trials, thinned evenly."""
+    import pandas as pd
+
+    conditions = read_result(results.comparison)["condition"]
+    parts = [read_result(results.trajectories(name)).assign(condition=name) for name in conditions]
+    if not parts:
+        return pd.DataFrame()
+    whole = pd.concat(parts, ignore_index=True)
+    return whole.iloc[:: -(-len(whole) // MOST_CURVE_ROWS)]
+
+
+def _clip(results: Results, diagnosed: Diagnosed | None, trials: pd.DataFrame) -> Clip | None:
+    """The clip that plays in the page: of the condition where the model fails most, else the first there is."""
+    from vinetrack.report.build import Clip
+
+    there = trials[[results.overlay(name).exists() for name in trials["trial"]]]
+    if not len(there):
+        return None
+    worst = diagnosed.worst if diagnosed is not None else ""
+    chosen = there[there["condition"] == worst] if (there["condition"] == worst).any() else there
+    name = str(chosen["trial"].iloc[0])
+    where = " The condition is the one where the model fails most." if len(chosen) < len(there) else ""
+    edges = "the tracked edge (yellow)"
+    if diagnosed is not None:
+        edges += ", where the model that you came with has it (vermillion)"
+        edges += f", and where it is with {diagnosed.added} (blue)" if diagnosed.added else ""
+    caption = f"The recording, slowed down, with {edges}.{where}"
+    return Clip(name, results.overlay(name).read_bytes(), caption)
+
+
+def _recording(results: Results, name: str) -> Recording:
     from vinetrack.report.recordings import Recording
 
     strip = results.strip_figure(name, ".svg")
     return Recording(
-        strip=strip.read_text(encoding="utf-8") if with_strip and strip.exists() else "",
+        strip=strip.read_text(encoding="utf-8") if strip.exists() else "",
         flags=read_result(results.track(name))["flag"].tolist(),
         calibration=read_json(results.analysed(name)).get("calibration"),
     )

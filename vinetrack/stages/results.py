@@ -96,10 +96,16 @@ TEXT_COLUMNS = frozenset(
         "term",
         "size",
         "note",
+        "added",
+        "parameter",
+        "symbol",
+        "unit",
+        "against",
+        "sentence",
     }
 )
 COUNT_COLUMNS = frozenset({"n_frames", "points"})
-TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used"})
+TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relative"})
 
 
 class ResultsError(Exception):
@@ -180,6 +186,10 @@ class Results:
     def ladder(self) -> Path:
         """The errors of the model that the user came with and of every one after it."""
         return self.folder / "ladder.csv"
+
+    def diagnosed(self, name: str) -> Path:
+        """A table that the diagnosis wrote."""
+        return self.folder / "diagnosis" / name
 
     def predictions(self, trial: str) -> Path:
         """One trial, and what the models before and after say of it."""

@@ -1,0 +1,241 @@
+"""The diagnosis as the report shows it: candidates, what could still hide, what is tied, the next trial, drift."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.figures.numbers import number
+from vinetrack.report.model import READABLE
+from vinetrack.report.section import ReportTable
+from vinetrack.report.verdict import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+NOT_TESTABLE = "not testable here"
+TIED = 0.95
+DIAGNOSIS_FIGURES = {
+    "ladder": "first",
+    "before_after": "first",
+    "where": "where",
+    "missing_force": "where",
+    "candidates": "candidates",
+    "cosines": "tied",
+    "drift": "drift",
+}
+"""Pictures of a diagnosis, and the part of the page each stands in."""
+
+
+@dataclass(frozen=True)
+class DiagnosisResult:
+    """`diagnosis.json`, `ladder.csv` and the values of every number along it; None where a part does not exist.
+
+    `summaries` says of effects by name what each is, in a sentence.
+    """
+
+    content: Mapping[str, Any]
+    ladder: pd.DataFrame | None = None
+    moved: pd.DataFrame | None = None
+    summaries: Mapping[str, str] = field(default_factory=dict)
+
+
+def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
+    """Everything the page says of a diagnosis, as text; None where there is none."""
+    if result is None:
+        return None
+    content = result.content
+    rounds = list(content.get("rounds") or [])
+    return {
+        "badge": BADGES.get(str(content.get("verdict")), BADGES["none"]),
+        "kind": str(content.get("verdict")) if content.get("verdict") in BADGES else "none",
+        "sentence": sentence(content),
+        "meaning": meaning(content),
+        "summaries": [
+            result.summaries[name]
+            for name in content.get("effects") or content.get("answer_set") or []
+            if name in result.summaries
+        ],
+        "facts": facts(content, result.ladder),
+        "explanation": str(content.get("explanation") or ""),
+        "ladder": ladder_table(result.ladder),
+        "where": [str(line) for line in content.get("where") or []],
+        "force": _force(content.get("missing_force")),
+        "rounds": [_round(i, one) for i, one in enumerate(rounds)],
+        "hidden": hidden_table(rounds[-1].get("ranking") or []) if rounds else None,
+        "blind": _blind(rounds[0].get("ranking") or []) if rounds else [],
+        "tied": tied_pairs(content.get("cosines") or {}),
+        "next": next_experiment(content.get("next_experiment")),
+        "drift": [str(row["sentence"]) for row in content.get("drift") or [] if row.get("sentence")],
+        "moved": moved_table(result.moved),
+        "notes": [str(note) for note in content.get("notes") or []],
+    }
+
+
+def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
+    """The errors along the ladder, mm."""
+    if ladder is None or not len(ladder):
+        return None
+    keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
+    head = (
+        "Model",
+        "in sample (mm)",
+        "conditions left out (mm)",
+        "highest pressure left out (mm)",
+        "replicates (mm)",
+        "excess on left out (mm)",
+    )
+    rows = [
+        (_step(str(row["added"] or "")), *(number(1e3 * float(row[key])) for key in keys))
+        for row in ladder.to_dict("records")
+    ]
+    note = (
+        "Root mean square error of position. Left out: every condition is predicted by the model fitted to all others; "
+        "every vine's highest pressure by the model fitted to all lower ones. Excess: √(rms² − replicates²)."
+    )
+    return ReportTable("The numbers of the ladder", head, rows, frozenset(range(1, len(head))), note)
+
+
+def _step(added: str) -> str:
+    return f"+ {listed(added.split('+'))}" if added else "as you came with it"
+
+
+def _round(index: int, one: Mapping[str, Any]) -> dict[str, Any]:
+    ranking = [row for row in one.get("ranking") or [] if row.get("status") != NOT_TESTABLE]
+    head = ("Candidate", "kind", "Δχ²", "σ", "size", "how it is known", "")
+    rows = [
+        (
+            ("● " if row.get("in_answer_set") else "") + plain(row["effect"]),
+            str(row.get("kind", "")),
+            number(row.get("delta_chi2")),
+            number(row.get("sigma"), 2),
+            sizes(row) or "–",
+            "fitted" if row.get("status") == "refitted" else "predicted",
+            "; ".join(
+                part for part in ("" if row.get("plausible", True) else "not plausible", row.get("reason", "")) if part
+            ),
+        )
+        for row in ranking
+    ]
+    return {
+        "title": f"Round {index + 1}: {round_question(one)}",
+        "verdict": str(one.get("verdict", "")),
+        "explanation": str(one.get("explanation") or ""),
+        "table": ReportTable("", head, rows, frozenset({2, 3}), "● in the answer set") if rows else None,
+    }
+
+
+def round_question(one: Mapping[str, Any]) -> str:
+    """What a round asks, in words."""
+    return f"what does {listed(list(one.get('model') or []))} lack?"
+
+
+def hidden_table(ranking: Sequence[Mapping[str, Any]]) -> ReportTable | None:
+    """For every candidate the largest size that could still hide, one-sided 95 %."""
+    rows = []
+    for row in ranking:
+        units = {str(entry["parameter"]).split(".")[-1]: entry for entry in row.get("numbers") or []}
+        for name, largest in (row.get("largest") or {}).items():
+            if not known(largest):
+                continue
+            entry = units.get(str(name).split(".")[-1])
+            unit, factor = READABLE.get(entry["unit"], (entry["unit"], 1.0)) if entry else ("", 1.0)
+            symbol = entry["symbol"] if entry else str(name)
+            rows.append((plain(row["effect"]), symbol, f"{number(factor * float(largest))} {unit}".strip()))
+    if not rows:
+        return None
+    note = (
+        "A larger effect than this would have been seen (one-sided 95 %). Numbers without a unit here are in SI units."
+    )
+    return ReportTable("What could still hide", ("Candidate", "number", "largest size"), rows, frozenset({2}), note)
+
+
+def _blind(ranking: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Candidates that these conditions could not show, each with the reason."""
+    return [
+        f"{plain(row['effect'])}: {row.get('reason') or 'no reason is given'}"
+        for row in ranking
+        if row.get("status") == NOT_TESTABLE
+    ]
+
+
+def tied_pairs(cosines: Mapping[str, Any]) -> list[str]:
+    """Pairs of candidates whose traces are nearly the same, most alike first."""
+    names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
+    pairs = [
+        (abs(float(matrix[i][j])), names[i], names[j], float(matrix[i][j]))
+        for i in range(len(matrix))
+        for j in range(i)
+        if known(matrix[i][j]) and abs(float(matrix[i][j])) >= TIED
+    ]
+    return [f"{plain(b)} and {plain(a)} (cosine {number(value)})" for _, a, b, value in sorted(pairs, reverse=True)]
+
+
+def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What to do next: a sentence, the trials to make, and what they are expected to tell."""
+    if not content:
+        return None
+    trials = [dict(trial) for trial in content.get("trials") or []]
+    keys = (
+        "replicates",
+        "pressure_kPa",
+        "payload_g",
+        "diameter_mm",
+        "thickness_um",
+        "length_mm",
+        "chamber_l",
+        "inlet_mm",
+    )
+    shown = [key for key in keys if any(known(trial.get(key)) for trial in trials)]
+    head = [{"replicates": "trials"}.get(key, key.rpartition("_")[0] + f" ({key.rpartition('_')[2]})") for key in shown]
+    rows = [
+        [number(trial.get(key)) if key != "replicates" else str(trial.get(key)) for key in shown] for trial in trials
+    ]
+    simulated = content.get("simulated_sigma") or {}
+    separations = [
+        (
+            " from ".join(plain(part.strip()) for part in str(pair).split("|")),
+            number(sigma, 2),
+            _simulated(simulated.get(pair) or {}),
+        )
+        for pair, sigma in (content.get("separation_sigma") or {}).items()
+    ]
+    told = ReportTable("", ("These would tell", "by (σ)", "in simulation (σ)"), separations, frozenset({1, 2}))
+    return {
+        "text": str(content.get("text") or ""),
+        "trials": ReportTable("", head, rows, frozenset(range(len(head)))) if rows and head else None,
+        "separations": told if separations else None,
+        "calibration": str(content.get("calibration") or ""),
+    }
+
+
+def _simulated(entry: Mapping[str, Any]) -> str:
+    if not known(entry.get("mean")):
+        return "–"
+    return f"{number(entry['mean'], 2)} ± {number(entry.get('sd'), 1)}"
+
+
+def _force(content: Mapping[str, Any] | None) -> list[str]:
+    """What is said of the force that is missing: its text, or its sentences."""
+    if not content:
+        return []
+    said = content.get("text") or content.get("sentences") or content.get("words") or ""
+    return [said] if isinstance(said, str) else [str(line) for line in said]
+
+
+def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
+    """How every number moved as effects were added: a row a number, a column a model."""
+    if moved is None or not len(moved):
+        return None
+    steps = list(dict.fromkeys(moved["added"].fillna("").astype(str)))
+    head = ["Number", *map(_step, steps)]
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    titles: dict[tuple[str, str], str] = {}
+    for entry in moved.fillna({"vine": "", "added": ""}).to_dict("records"):
+        key = (str(entry["parameter"]), str(entry["vine"]))
+        left, _, right = size({str(k): v for k, v in entry.items()}).partition(" = ")
+        titles[key] = left
+        cells.setdefault(key, {})[str(entry["added"])] = right
+    rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]
+    return ReportTable("How the numbers moved", head, rows, frozenset(range(1, len(head))))
