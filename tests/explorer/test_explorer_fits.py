@@ -1,0 +1,155 @@
+"""Fits in the background: the missing effect found, progress told, a fit given up, faults in a sentence."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+
+from vinetrack.explorer.campaign import Campaign
+from vinetrack.explorer.choice import first_choice
+from vinetrack.explorer.curves import overall_m
+from vinetrack.explorer.fitting import FAULT, Fitted, Job, first_fit, fit_choice, gained_words, tied_words
+from vinetrack.explorer.ground import Ground
+from vinetrack.explorer.waiting import Waiting
+from vinetrack.model.fit_data import FitError
+from vinetrack.model.solve import Step, Watch
+
+GAMMA = "reservoir_depletion.gamma"
+
+
+@pytest.fixture(scope="module")
+def first(campaign: Campaign) -> Fitted:
+    return first_fit(campaign, first_choice(campaign))
+
+
+def test_the_first_fit_is_that_of_the_workflow(campaign: Campaign, first: Fitted) -> None:
+    for name, value in campaign.numbers.items():
+        assert first.choice.numbers[name] == pytest.approx(value, rel=0.02)
+
+
+def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campaign: Campaign, first: Fitted) -> None:
+    steps: list[Step] = []
+    choice = first.choice.with_effect("reservoir_depletion")
+    found = fit_choice(campaign, first.fit, choice, steps.append)
+    assert steps
+    assert found.choice.numbers[GAMMA] == pytest.approx(1.4, abs=0.05)
+    number = found.number(GAMMA)
+    assert number is not None
+    assert number.low <= 1.4
+    after, before = (overall_m(one.errors_m, campaign.conditions) for one in (found, first))
+    floor = overall_m(campaign.floors_m, campaign.conditions)
+    assert after < 0.5 * before
+    assert after < 1.3 * floor
+    assert gained_words(first.fit, found.fit).endswith("for 1 number more.")
+    assert "fell" in gained_words(first.fit, found.fit)
+    back = fit_choice(campaign, found.fit, found.choice.with_effect("reservoir_depletion", False))
+    assert "rose" in gained_words(found.fit, back.fit)
+    assert overall_m(back.errors_m, campaign.conditions) == pytest.approx(before, rel=0.05)
+
+
+def test_a_bad_beginning_is_left_behind(campaign: Campaign, first: Fitted) -> None:
+    """A time constant dragged to nothing is tried again from its default."""
+    choice = first.choice.with_effect("supply_refill").with_size("supply_refill.tau", 1e-6)
+    found = fit_choice(campaign, first.fit, choice)
+    assert found.fit.log_likelihood >= first.fit.log_likelihood - 0.5
+
+
+def test_numbers_that_hang_together_are_named(first: Fitted) -> None:
+    lines = tied_words(first.fit)
+    assert all("correlation" in line for line in lines)
+    tied = replace(first.fit, covariance=first.fit.covariance * 0 + 1.0)
+    assert len(tied_words(tied)) == len(tied.numbers) * (len(tied.numbers) - 1) // 2
+    assert tied_words(tied)[0].endswith("+1.00")
+
+
+class Heard:
+    """What a job says, and when it has ended."""
+
+    def __init__(self) -> None:
+        self.steps: list[Step] = []
+        self.found: list[Fitted] = []
+        self.reasons: list[str] = []
+
+    def job(self, work: object) -> Job:
+        return Job(work, told=self.steps.append, done=self.found.append, failed=self.reasons.append)  # type: ignore[arg-type]
+
+
+def test_a_job_tells_and_ends(campaign: Campaign, first: Fitted) -> None:
+    heard = Heard()
+    job = heard.job(lambda watch: fit_choice(campaign, first.fit, first.choice, watch))
+    job.wait(60)
+    assert not job.running
+    assert heard.steps
+    assert heard.found[0].fit.model.names == first.fit.model.names
+
+
+def test_a_job_that_is_given_up_is_heard_of_no_more() -> None:
+    heard, begun = Heard(), threading.Event()
+
+    def endless(watch: Watch) -> Fitted:
+        begun.set()
+        while True:
+            watch(Step(1, {}, 1.0))
+            time.sleep(0.01)
+
+    job = heard.job(endless)
+    begun.wait(10)
+    job.give_up()
+    assert not job.running
+    job.wait(10)
+    count = len(heard.steps)
+    time.sleep(0.05)
+    assert len(heard.steps) == count
+    assert not heard.found
+    assert not heard.reasons
+
+
+@pytest.mark.parametrize(("error", "said"), [(FitError("no start"), "no start"), (ZeroDivisionError(), FAULT)])
+def test_a_job_that_fails_says_why_in_a_sentence(error: Exception, said: str) -> None:
+    heard = Heard()
+
+    def fail(_: Watch) -> Fitted:
+        raise error
+
+    heard.job(fail).wait(10)
+    assert heard.reasons == [said]
+
+
+def test_the_ground_grows_once_for_all_pages(campaign: Campaign) -> None:
+    ground = Ground(campaign)
+    news: list[bool] = []
+
+    def hear() -> None:
+        news.append(ground.fitted is not None)
+
+    ground.listen(hear)
+    ground.begin().wait(120)
+    assert ground.trouble == ""
+    assert not ground.growing
+    assert ground.curves is not None
+    assert ground.fitted is not None
+    assert ground.step is not None
+    assert len(news) > 2
+    assert news[-1]
+    ground.forget(hear)
+    ground.forget(hear)
+
+
+def test_what_a_person_waits_for_only_ever_comes_nearer() -> None:
+    waiting = Waiting()
+    waiting.begin(100.0)
+    assert waiting.state(100.5, "refitting")[1] == "refitting · 0.5 s"
+    shares = []
+    for k, promised in enumerate((5e4, 300.0, 800.0, 2.0, 1e-3)):
+        waiting.reach(Step(k + 1, {}, promised))
+        shares.append(waiting.state(101.0, "refitting")[0])
+    assert shares == sorted(shares)
+    assert 0 < shares[0] < 0.1
+    assert shares[-1] == 0.97
+    waiting.reach(Step(9, {}, 123.0))
+    assert waiting.state(101.0, "refitting")[1] == "refitting · step 9 · the next lowers −2 ln L by 1.2e+02 · 1.0 s"
+    waiting.end("The fit was stopped.")
+    assert waiting.words == "The fit was stopped."

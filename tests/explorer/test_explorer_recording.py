@@ -1,0 +1,123 @@
+"""A recording for scrubbing: where edges lie in its picture, and what is said of a trial without one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from vinetrack.explorer.campaign import Campaign
+from vinetrack.explorer.recording import Film, View, view_of
+from vinetrack.stages.results import Results
+
+
+def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) -> Path:
+    """A bright bar on dark grey whose right end moves by 8 px a frame."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for k in range(count):
+            picture = np.full((height, width), 40, np.uint8)
+            picture[30:66, : 20 + 8 * k] = 200
+            frame = av.VideoFrame.from_ndarray(np.stack([picture] * 3, axis=2), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
+    told: list[int] = []
+    film = Film(write_clip(tmp_path / "a.mp4")).decode(lambda one: told.append(one.count))
+    assert film.complete
+    assert film.words == ""
+    assert (film.count, film.expected, film.shape, film.scale) == (30, 30, (96, 320), 1.0)
+    assert told[0] == 1
+    assert told[-1] == 30
+    row = film.picture(10)[48]
+    assert abs(int(np.argmax(row < 120)) - 100) <= 1
+
+
+def test_a_wide_recording_is_kept_as_wide_as_the_page_shows_it(tmp_path: Path) -> None:
+    film = Film(write_clip(tmp_path / "a.mp4", count=4, width=1920, height=200)).decode()
+    assert film.shape == (100, 960)
+    assert film.scale == 0.5
+
+
+def test_a_file_that_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"not a film")
+    film = Film(tmp_path / "a.mp4").decode()
+    assert film.complete
+    assert film.count == 0
+    assert "a.mp4" in film.words
+
+
+def test_a_film_nobody_wants_any_more_stops(tmp_path: Path) -> None:
+    film = Film(write_clip(tmp_path / "a.mp4"))
+    film.decode(lambda one: one.give_up())
+    assert not film.complete
+    assert film.count == 1
+
+
+def view(angle: float = 0.0) -> View:
+    frames = np.arange(20.0)
+    edge_px = np.where(frames < 15, 10 + 5 * frames, np.nan)
+    return View(
+        trial="a",
+        path=Path("a.mp4"),
+        from_px=(100.0, 50.0),
+        direction=(float(np.cos(angle)), float(np.sin(angle))),
+        half_width_px=10.0,
+        time_s=frames / 1000,
+        edge_px=edge_px,
+        lead_position_m=1e-3 * (edge_px - 10),
+    )
+
+
+def test_positions_of_the_model_find_their_place_by_those_of_the_track() -> None:
+    one = view()
+    along = one.along_px(np.array([0.0, 0.0125, 0.1, -0.01]))
+    np.testing.assert_allclose(along, [10.0, 22.5, 110.0, 0.0], atol=1e-9)
+
+
+def test_a_track_of_one_point_places_nothing() -> None:
+    bare = replace(view(), edge_px=np.full(20, np.nan))
+    assert np.isnan(bare.along_px(np.array([0.0, 0.1]))).all()
+
+
+def test_an_edge_is_drawn_across_the_axis() -> None:
+    assert view().across(20.0) == ((120.0, 120.0), (60.0, 40.0))
+    (xs, ys) = view(angle=np.pi / 2).across(20.0)
+    np.testing.assert_allclose(xs, (90.0, 110.0))
+    np.testing.assert_allclose(ys, (70.0, 70.0))
+
+
+def test_of_a_track_only_it_is_said_that_there_is_no_recording(campaign: Campaign) -> None:
+    words = view_of(Results(campaign.folder), campaign.trials[0].item.trial)
+    assert isinstance(words, str)
+    assert "came as a track (d24_24kPa_1.csv): there is no recording to show" in words
+
+
+def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campaign, tmp_path: Path) -> None:
+    seen = campaign.trials[0]
+    results = Results(tmp_path)
+    trial = replace(seen.item.trial, video=tmp_path / "gone.mp4", track=None)
+    assert "no longer there" in str(view_of(results, trial))
+    trial = replace(trial, video=write_clip(tmp_path / "a.mp4", count=2))
+    assert "does not exist" in str(view_of(results, trial))
+    results.track(trial.name).parent.mkdir()
+    results.analysed(trial.name).parent.mkdir()
+    results.track(trial.name).write_text(
+        "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag\n0,0,5,0,0,\n"
+    )
+    results.analysed(trial.name).write_text("{}")
+    assert "run snakemake again" in str(view_of(results, trial))
+    axis = {"from_px": [0, 10], "to_px": [300, 10], "width_px": None}
+    results.analysed(trial.name).write_text(json.dumps({"axis": axis}))
+    found = view_of(results, trial)
+    assert isinstance(found, View)
+    assert found.half_width_px == pytest.approx(15.0)
+    assert found.direction == (1.0, 0.0)

@@ -1,0 +1,278 @@
+"""From a choice to curves and errors: those of the comparison where nothing was moved, physics where something was."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from explorer_campaign import make_experiment, make_results
+
+from vinetrack.effects import Parameter
+from vinetrack.explorer.campaign import Campaign, condition_labels
+from vinetrack.explorer.choice import ChoiceError, changed, chosen, first_choice, sized, slider_range
+from vinetrack.explorer.command import open_campaign
+from vinetrack.explorer.curves import errors_m, follow, overall_m
+from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, exported, model_words
+from vinetrack.explorer.series import bands, error_bars, measured, modelled, residuals, symmetric, thinned, vine_colours
+from vinetrack.records import Trial
+from vinetrack.stages.results import ResultsError
+
+GAMMA = "reservoir_depletion.gamma"
+
+
+def test_untouched_the_errors_are_those_of_the_comparison(campaign: Campaign) -> None:
+    table = pd.read_csv(campaign.folder / "comparison.csv").set_index("condition")
+    errors = errors_m(campaign, follow(campaign, sized(campaign, first_choice(campaign))))
+    for condition, error in errors.items():
+        assert error == pytest.approx(table.loc[condition, "rms_position_m"], rel=2e-3)
+        assert campaign.floors_m[condition] == pytest.approx(table.loc[condition, "replicate_floor_m"])
+
+
+def test_the_missing_effect_at_its_size_lowers_every_error_to_the_replicates(campaign: Campaign) -> None:
+    start = first_choice(campaign)
+    true = {"eversion_damping.B[24mm-200um-200mm]": 6.44, "eversion_damping.n": 0.37, GAMMA: 1.4}
+    choice = start.with_effect("reservoir_depletion")
+    for name, value in true.items():
+        choice = choice.with_size(name, value)
+    curves = follow(campaign, sized(campaign, choice), follow(campaign, sized(campaign, start)))
+    before = errors_m(campaign, follow(campaign, sized(campaign, start)))
+    after = errors_m(campaign, curves)
+    assert all(after[name] < before[name] for name in campaign.conditions)
+    assert overall_m(after, campaign.conditions) < 1.5 * overall_m(campaign.floors_m, campaign.conditions)
+
+
+def test_an_effect_of_no_size_changes_nothing(campaign: Campaign) -> None:
+    start = first_choice(campaign)
+    none = follow(campaign, sized(campaign, start.with_effect("air_drag").with_size("air_drag.C_D", 0.0)))
+    for bare, with_it in zip(follow(campaign, sized(campaign, start)), none, strict=True):
+        np.testing.assert_allclose(with_it.growth_m, bare.growth_m, atol=1e-9)
+
+
+def test_curves_do_not_depend_on_where_releases_are_looked_for_from(campaign: Campaign) -> None:
+    start = first_choice(campaign)
+    far = follow(campaign, sized(campaign, start.with_size("eversion_damping.n", 0.6)))
+    cold, warm = follow(campaign, sized(campaign, start)), follow(campaign, sized(campaign, start), far)
+    for one, other in zip(cold, warm, strict=True):
+        assert one.release_s == pytest.approx(other.release_s, abs=2e-6)
+
+
+def test_a_motion_is_told_on_the_ruler_of_its_track(campaign: Campaign) -> None:
+    curves = follow(campaign, sized(campaign, first_choice(campaign)))
+    seen, motion = campaign.trials[0], curves[0]
+    positions = motion.lead_position_m(seen.item.time_s)
+    np.testing.assert_allclose(seen.item.lead_position_m - positions, motion.residual_m, atol=1e-12)
+    assert math.isnan(motion.lead_position_m(np.array([99.0]))[0])
+
+
+def test_a_pressure_measured_along_moves_with_the_release(campaign: Campaign) -> None:
+    """A constant trace at the set pressure is the set pressure."""
+
+    def traced(seen: object) -> object:
+        time_s = np.array([-1.0, 2.0])
+        item = replace(seen.item, trace=(time_s, np.full(2, seen.item.trial.pressure_Pa)))  # type: ignore[attr-defined]
+        return replace(seen, item=item)  # type: ignore[type-var]
+
+    other = replace(campaign, trials=tuple(traced(seen) for seen in campaign.trials))  # type: ignore[misc]
+    start = first_choice(campaign)
+    for one, same in zip(follow(campaign, sized(campaign, start)), follow(other, sized(other, start)), strict=True):
+        np.testing.assert_allclose(same.growth_m, one.growth_m, atol=2e-6)
+
+
+def test_twenty_four_trials_follow_a_slider_in_a_fraction_of_a_frame(campaign: Campaign) -> None:
+    """The processor's time of the part that is not drawing; the rest is measured in the browser."""
+    many = replace(campaign, trials=campaign.trials * 4)
+    start = first_choice(many)
+    curves = follow(many, sized(many, start))
+    begun = time.process_time()
+    for k in range(20):
+        curves = follow(many, sized(many, start.with_size("eversion_damping.n", 0.35 + 0.005 * k)), curves)
+    assert (time.process_time() - begun) / 20 < 0.05
+
+
+def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    shutil.copytree(campaign.folder, folder)
+    (folder / "fit.json").write_text(json.dumps({"model": [], "refused": "no reason"}))
+    bare = open_campaign(folder)
+    assert bare.refused == "no reason"
+    assert bare.floors_m == {}
+    assert len(bare.trials) == 6
+    assert first_choice(bare).numbers["eversion_damping.n"] == 0.37
+    for seen, known in zip(bare.trials, campaign.trials, strict=True):
+        assert seen.release_s == pytest.approx(known.release_s, abs=0.02)
+
+
+def test_a_folder_without_usable_trials_says_so(campaign: Campaign, tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    shutil.copytree(campaign.folder, folder)
+    for path in (folder / "tracks").iterdir():
+        path.write_text(path.read_text().splitlines()[0] + "\n")
+    with pytest.raises(ResultsError, match="no trial to explore"):
+        open_campaign(folder)
+
+
+def test_own_effects_may_be_chosen(tmp_path: Path) -> None:
+    settings = "capture_fps: 1069\nyield_pressure_kPa: 3\neffects: [spring_line.py]\n"
+    experiment = make_experiment(tmp_path / "vines", ("d24_24kPa_1", "d24_36kPa_1"), settings + "chamber_l: 2\n")
+    (experiment / "spring_line.py").write_text(
+        '"""Spring line: pulls the tail back.\n\n    tail force −k x\n\nShorten it.\n"""\n\n'
+        "from vinetrack.effects import Parameter\n\n"
+        'PARAMETERS = (Parameter("k", "k", "N/m", 0.5, bounds=(0.0, 20.0)),)\n\n\n'
+        "def tail_force(s, rig, k):\n    return -k * s.tail_position\n"
+    )
+    own = open_campaign(make_results(experiment, tmp_path / "results"))
+    start = first_choice(own)
+    slow = follow(own, sized(own, start.with_effect("spring_line").with_size("spring_line.k", 2.0)))
+    assert slow[0].path_m.mean() < follow(own, sized(own, start))[0].path_m.mean()
+
+
+# ---- choices ---------------------------------------------------------------------------------------------------------
+
+
+def test_an_effect_goes_in_at_the_end_and_keeps_its_size_when_it_goes_out(campaign: Campaign) -> None:
+    choice = first_choice(campaign).with_effect("air_drag").with_size("air_drag.C_D", 0.7)
+    assert choice.effects[-1] == "air_drag"
+    assert changed(campaign, choice) == (["air_drag"], [])
+    out = choice.with_effect("air_drag", False)
+    assert out.effects == campaign.in_use
+    assert out.numbers["air_drag.C_D"] == 0.7
+    assert choice.with_effect("air_drag") is choice
+
+
+def test_a_choice_is_written_in_words_as_on_the_command_line(campaign: Campaign) -> None:
+    start = first_choice(campaign)
+    choice = chosen(campaign, start, ["leak"], [], [f"{GAMMA}=1.2", "eversion_damping.B=6"])
+    assert choice.effects[-2:] == ("leak", "reservoir_depletion")
+    assert choice.numbers[GAMMA] == 1.2
+    assert choice.numbers["eversion_damping.B[24mm-200um-200mm]"] == 6.0
+
+
+@pytest.mark.parametrize(
+    ("add", "drop", "sizes", "words"),
+    [
+        (["air_drga"], [], [], "did you mean air_drag"),
+        (["inlet_loss"], [], [], "inlet_loss needs inlet_mm"),
+        ([], ["gravity"], [], "gravity is one of the base effects"),
+        ([], [], ["air_drag.C=1"], "is no size"),
+        ([], [], ["air_drag.C_D"], "is no size"),
+        ([], [], ["air_drag.C_D=much"], "is no number"),
+        ([], [], ["air_drag.C_D=-1"], "outside its bounds, 0 to 200"),
+    ],
+)
+def test_what_there_is_not_is_refused_in_a_sentence(
+    campaign: Campaign, add: list[str], drop: list[str], sizes: list[str], words: str
+) -> None:
+    with pytest.raises(ChoiceError, match=words):
+        chosen(campaign, first_choice(campaign), add, drop, sizes)
+
+
+def test_sliders_reach_from_nothing_to_what_is_plausible_and_hold_what_was_fitted() -> None:
+    drag = Parameter("C_D", "C_D", "1", 1.0, bounds=(0.0, 200.0), plausible=(0.0, 3.0))
+    assert slider_range("air_drag.C_D", drag, 1.0) == (0.0, 3.0)
+    low, high = slider_range("air_drag.C_D", drag, 17.0)
+    assert low == 0.0
+    assert 17.0 < high < 200.0
+    assert slider_range("air_drag.C_D", drag, 200.0)[1] == 200.0
+    gamma = Parameter("gamma", "γ", "1", 1.4, bounds=(1.0, 1.4), plausible=(1.0, 1.4))
+    assert slider_range(GAMMA, gamma, 1.4) == (1.0, 1.4)
+    gauge = Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3))
+    assert slider_range("pressure_gauge.delta", gauge, -3e3) == (-3e3, 2e3)
+    damping = Parameter("B", "B", "N·(s/m)ⁿ", 3.0, bounds=(0.0, math.inf), shared="vine")
+    assert slider_range("eversion_damping.B", damping, 6.0) == (0.0, 12.0)
+
+
+# ---- labels, lines, files, commands ----------------------------------------------------------------------------------
+
+
+def test_a_condition_is_called_by_what_tells_it_from_the_others(campaign: Campaign) -> None:
+    assert [campaign.labels[name] for name in campaign.conditions] == ["24 kPa", "36 kPa", "48 kPa, 20 g"]
+    thick = Trial(name="a", diameter_m=0.012, thickness_m=1e-4, length_m=0.14, pressure_Pa=24e3)
+    other = replace(thick, diameter_m=0.024, thickness_m=2e-4, length_m=0.2)
+    thin = replace(other, thickness_m=1e-4)
+    assert condition_labels({"a": thick, "b": other}) == {"a": "12 mm", "b": "24 mm"}
+    labels = condition_labels({"a": thick, "b": other, "c": thin})
+    assert labels["b"] == "24 mm, 200 µm"
+    assert labels["c"] == "24 mm, 100 µm"
+    assert len(set(condition_labels({"a": thick, "b": thick}).values())) == 2
+
+
+def test_lines_are_in_milliseconds_and_millimetres_and_no_longer_than_can_be_seen(campaign: Campaign) -> None:
+    curves = follow(campaign, sized(campaign, first_choice(campaign)))
+    shown = [0, 1, 2]
+    lines, left = measured(campaign, shown), residuals(campaign, curves, shown)
+    assert lines["trial"] == [campaign.trials[i].name for i in shown]
+    assert max(np.nanmax(part) for part in lines["ys"]) == pytest.approx(200, abs=1)
+    assert all(len(part) <= 260 for part in lines["xs"])
+    assert [len(part) for part in left["ys"]] == [len(part) for part in lines["ys"]]
+    assert len(modelled(campaign, curves, shown)["xs"]) == 2
+    assert len(bands(campaign, shown)["xs"]) == 2
+    assert len(range(*thinned(10_000, 2000).indices(10_000))) <= 260
+
+
+def test_error_bars_have_a_row_a_condition_first_on_top(campaign: Campaign) -> None:
+    now = dict.fromkeys(campaign.conditions, 2e-3)
+    rows = error_bars(campaign, now, {}, campaign.floors_m, [campaign.conditions[0]])
+    assert rows["label"] == ["48 kPa, 20 g", "36 kPa", "24 kPa"]
+    assert rows["now"] == pytest.approx([2.0, 2.0, 2.0])
+    assert all(math.isnan(value) for value in rows["before"])
+    assert rows["alpha"][2] > rows["alpha"][0]
+
+
+def test_the_range_of_residuals_moves_in_steps() -> None:
+    assert symmetric({"ys": [np.array([0.1, -3.3])]}) == (-5.0, 5.0)
+    assert symmetric({"ys": [np.array([math.nan, 4.6])]}) == (-5.0, 5.0)
+    assert symmetric({"ys": []}) == (-0.12, 0.12)
+
+
+def test_each_vine_has_its_colour(campaign: Campaign) -> None:
+    assert vine_colours(campaign) == [("measured", "#0072B2")]
+
+
+def test_the_curves_go_out_as_a_table_and_as_a_figure(campaign: Campaign) -> None:
+    choice = first_choice(campaign)
+    curves = follow(campaign, sized(campaign, choice))
+    table = curve_table(campaign, choice, curves, range(6))
+    assert tuple(table.columns) == CURVE_COLUMNS
+    np.testing.assert_allclose(table["lead_position_m"] - table["model_position_m"], table["residual_m"], atol=1e-12)
+    assert exported(campaign, choice, curves, [0], "csv").decode().splitlines()[0] == ",".join(CURVE_COLUMNS)
+    assert b"<svg" in exported(campaign, choice, curves, range(6), "svg")
+    assert exported(campaign, choice, curves, [], "png").startswith(b"\x89PNG")
+    with pytest.raises(ChoiceError, match="say one of csv"):
+        exported(campaign, choice, curves, [0], "xls")
+
+
+def test_the_page_says_the_command_for_what_it_shows(campaign: Campaign) -> None:
+    start = first_choice(campaign)
+    folder = campaign.folder.as_posix()
+    assert commands(campaign, start, start, fitted=True) == [f"vinetrack compare {folder}"]
+    more = start.with_effect("reservoir_depletion").with_effect("leak")
+    assert commands(campaign, start, more, fitted=True, save=True) == [
+        f"vinetrack add reservoir_depletion {folder} --save",
+        f"vinetrack add leak {folder} --save",
+    ]
+    moved = start.with_effect("leak").with_size("leak.rate", 0.25)
+    assert commands(campaign, start, moved, fitted=False) == [
+        f"vinetrack explore {folder} --add leak --set leak.rate=0.25"
+    ]
+    own = replace(campaign, experiment=_with_model(campaign, ("leak",)))
+    less = first_choice(own).with_effect("leak", False)
+    assert commands(own, first_choice(own), less, fitted=True) == [f"vinetrack explore {folder} --drop leak --refit"]
+
+
+def _with_model(campaign: Campaign, more: tuple[str, ...]) -> object:
+    settings = campaign.experiment.settings
+    return replace(campaign.experiment, settings=settings.model_copy(update={"model": (*settings.model, *more)}))
+
+
+def test_a_model_has_a_short_name() -> None:
+    base = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
+    assert model_words(base) == "base model"
+    assert model_words((*base, "air_drag")) == "base model + air drag"
+    assert model_words(("gravity",)) == "gravity"

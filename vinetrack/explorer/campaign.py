@@ -1,0 +1,284 @@
+"""What a results folder holds for the explorer: trials on one clock, the model in use, and what may be added to it.
+
+Everything is read once and never changed; what a person chooses lives in `choice`, what follows from it in `curves`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.effects import Effect, EffectError, catalogue
+from vinetrack.model.fit_data import FitTrial, prepare
+from vinetrack.model.left_out import FEWEST_AT_REST
+from vinetrack.model.model import Model
+from vinetrack.model.rig import check_needs
+from vinetrack.model.starts import first_own
+from vinetrack.records import Floats, Kinematics, Track, Trial
+from vinetrack.stages.model import measured
+from vinetrack.stages.results import Results, ResultsError, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.experiment import Experiment
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One trial as it was filmed; its release and origin put it on the clock and the ruler that all trials share.
+
+    `origin_known` tells whether the vine was filmed at rest: where it was not, the origin is a model's to find.
+    """
+
+    item: FitTrial
+    release_s: float
+    origin_m: float
+    origin_known: bool
+
+    @property
+    def name(self) -> str:
+        """The trial's name."""
+        return self.item.trial.name
+
+    @property
+    def condition(self) -> str:
+        """The condition it is a replicate of."""
+        return self.item.trial.condition
+
+    @cached_property
+    def time_s(self) -> Floats:
+        """Since release, shape (n_points,)."""
+        return self.item.time_s - self.release_s
+
+    @cached_property
+    def growth_m(self) -> Floats:
+        """From the origin, shape (n_points,)."""
+        return self.item.lead_position_m - self.origin_m
+
+    def counts_from(self, release_s: float) -> int:
+        """The frame where the first of a model released then and the measurement moves: rest would dilute an error."""
+        released = int(np.searchsorted(self.item.time_s, release_s))
+        return min(released, max(self.item.n_rest - 1, 0), self.item.time_s.size - 1)
+
+
+@dataclass(frozen=True)
+class Band:
+    """Mean and standard deviation of the replicates of one condition, shape (n_times,); empty where there is one."""
+
+    time_s: Floats
+    mean_m: Floats
+    sigma_m: Floats
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Read from a results folder by `read_campaign`.
+
+    `numbers` are those of the fit in `fit.json`, by name, SI; empty where it was refused, for the `refused` reason.
+    `floors_m` holds by condition what replicates differ by, NaN where there is one alone. `unusable` gives effects
+    that these trials cannot be asked about, and why.
+    """
+
+    name: str
+    folder: Path
+    experiment: Experiment
+    pairs: tuple[tuple[Trial, Track], ...]
+    kinematics: Mapping[str, Kinematics]
+    trials: tuple[Seen, ...]
+    left_out: Mapping[str, str]
+    bands: Mapping[str, Band]
+    floors_m: Mapping[str, float]
+    numbers: Mapping[str, float]
+    refused: str
+    effects: Mapping[str, Effect]
+    unusable: Mapping[str, str]
+
+    @property
+    def in_use(self) -> tuple[str, ...]:
+        """Names of the effects in use: `model:` of the experiment."""
+        return tuple(self.experiment.settings.model)
+
+    @cached_property
+    def conditions(self) -> tuple[str, ...]:
+        """In the order of the sheet, vines together, pressure rising."""
+        first = {seen.condition: seen.item.trial for seen in reversed(self.trials)}
+        vines = list(dict.fromkeys(seen.item.trial.vine for seen in self.trials))
+        rank = {name: (vines.index(t.vine), t.payload_kg, t.pressure_Pa) for name, t in first.items()}
+        return tuple(sorted(rank, key=lambda name: rank[name]))
+
+    @cached_property
+    def vines(self) -> tuple[str, ...]:
+        """In the order of the sheet."""
+        return tuple(dict.fromkeys(seen.item.trial.vine for seen in self.trials))
+
+    @cached_property
+    def labels(self) -> Mapping[str, str]:
+        """A short name of every condition: of its settings those that vary."""
+        return condition_labels({name: self.trials[self.of_condition(name)[0]].item.trial for name in self.conditions})
+
+    @cached_property
+    def host(self) -> Model:
+        """All effects in one: its compiled form serves every model that a person may choose."""
+        return Model(tuple(self.effects.values()))
+
+    def of_condition(self, condition: str) -> list[int]:
+        """Places of the trials of a condition among `trials`."""
+        return [i for i, seen in enumerate(self.trials) if seen.condition == condition]
+
+    def trial(self, name: str) -> Seen:
+        """The trial of that name; KeyError where there is none."""
+        return {seen.name: seen for seen in self.trials}[name]
+
+
+def read_campaign(folder: Path, experiment: Experiment, own: Mapping[str, Effect]) -> Campaign:
+    """What the results folder of an experiment holds.
+
+    Parameters
+    ----------
+    own
+        The user's own effects, see `vinetrack.stages.effects.effects_of`.
+
+    Raises
+    ------
+    ResultsError
+        If a stage before the model has not run, or no trial has a track that can be used.
+    """
+    results = Results(folder)
+    pairs, kinematics = measured(experiment, results)
+    data, left_out = prepare(pairs)
+    if not data:
+        why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items()) or "every trial failed"
+        raise ResultsError(f"{folder} has no trial to explore: {why}")
+    fitted = read_json(results.fit)
+    refused = str(fitted.get("refused") or "")
+    compared = {} if refused else _compared(results)
+    seen = _on_one_clock(data, compared)
+    effects = {**catalogue(), **own}
+    floors = {} if refused else _floors(results)
+    return Campaign(
+        name=folder.name,
+        folder=folder,
+        experiment=experiment,
+        pairs=tuple(pairs),
+        kinematics=kinematics,
+        trials=tuple(seen),
+        left_out={**experiment.failed, **experiment.left_out, **left_out},
+        bands=_bands(compared),
+        floors_m=floors,
+        numbers={_full_name(entry): float(entry["value"]) for entry in fitted.get("numbers", [])},
+        refused=refused,
+        effects=effects,
+        unusable=_unusable(effects.values(), [item.trial for item in data]),
+    )
+
+
+def _full_name(entry: Mapping[str, Any]) -> str:
+    return f"{entry['parameter']}[{entry['vine']}]" if entry["vine"] else str(entry["parameter"])
+
+
+def _compared(results: Results) -> dict[str, pd.DataFrame]:
+    """`comparison/<condition>.csv` by condition."""
+    conditions = read_result(results.comparison)["condition"]
+    return {str(name): read_result(results.trajectories(str(name))) for name in conditions}
+
+
+def _floors(results: Results) -> dict[str, float]:
+    table = read_result(results.comparison)
+    return dict(zip(table["condition"].astype(str), table["replicate_floor_m"].astype(float), strict=True))
+
+
+def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[Seen]:
+    """Trials with the release and origin that the comparison found, or else what the track alone shows."""
+    own = first_own(data)
+    found = []
+    for i, item in enumerate(data):
+        release_s, origin_m = float(own[i, 0]), float(own[i, 1])
+        table = compared.get(item.trial.condition)
+        rows = None if table is None else table[table["trial"] == item.trial.name]
+        if rows is not None and len(rows) == item.time_s.size:
+            release_s = float(item.time_s[0] - rows["time_s"].iloc[0])
+            origin_m = float(item.lead_position_m[0] - rows["lead_position_m"].iloc[0])
+        at_rest = item.n_rest >= FEWEST_AT_REST
+        if at_rest:
+            origin_m = float(np.mean(item.lead_position_m[: item.n_rest]))
+        found.append(Seen(item, release_s, origin_m, at_rest))
+    return found
+
+
+def _bands(compared: Mapping[str, pd.DataFrame]) -> dict[str, Band]:
+    """The replicates' mean and spread, along the longest trial of each condition."""
+    bands = {}
+    for condition, table in compared.items():
+        if table["trial"].nunique() < 2:
+            continue
+        longest = table.groupby("trial")["time_s"].max().idxmax()
+        rows = table[table["trial"] == longest]
+        names = ("time_s", "replicates_mean_m", "replicates_sigma_m")
+        time_s, mean_m, sigma_m = (rows[name].to_numpy(dtype=float) for name in names)
+        known = np.isfinite(sigma_m) & np.isfinite(mean_m)
+        bands[condition] = Band(time_s[known], mean_m[known], sigma_m[known])
+    return bands
+
+
+def _unusable(effects: Any, trials: list[Trial]) -> dict[str, str]:
+    reasons = {}
+    for effect in effects:
+        try:
+            check_needs(Model((effect,)), *trials)
+        except EffectError:
+            reasons[effect.name] = f"needs {' and '.join(effect.needs)} in the sheet"
+    return reasons
+
+
+def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
+    """A label for each condition, of those settings in which the trials of the experiment differ.
+
+    >>> a, b = Trial(name="a", diameter_m=0.012, pressure_Pa=24e3), Trial(name="b", diameter_m=0.012, pressure_Pa=30e3)
+    >>> condition_labels({"one": a, "two": b})
+    {'one': '24 kPa', 'two': '30 kPa'}
+    """
+    written = {name: _settings(trial) for name, trial in conditions.items()}
+    keys = list(dict.fromkeys(key for settings in written.values() for key in settings))
+    varying = [key for key in keys if len({settings.get(key, "") for settings in written.values()}) > 1]
+    kept = _without_what_follows(varying, written) or ["pressure"]
+    labels = {
+        name: ", ".join(settings[key] for key in kept if settings.get(key)) or name
+        for name, settings in written.items()
+    }
+    named = list(labels.values())
+    # What differs in a setting that has no place here is told apart by its own name.
+    return {name: label if named.count(label) == 1 else f"{label} ({name})" for name, label in labels.items()}
+
+
+def _without_what_follows(keys: list[str], written: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Drop thickness and length where the diameter tells them."""
+    kept = list(keys)
+    for key in ("length", "thickness"):
+        others = [other for other in kept if other in ("diameter", "thickness", "length") and other != key]
+        with_it = {tuple(s.get(k, "") for k in (*others, key)) for s in written.values()}
+        if key in kept and others and len(with_it) == len({pair[:-1] for pair in with_it}):
+            kept.remove(key)
+    return kept
+
+
+def _settings(trial: Trial) -> dict[str, str]:
+    """What may tell a condition from another, in the units of the sheet."""
+    numbers = {
+        "diameter": (1e3 * trial.diameter_m, "mm"),
+        "thickness": (1e6 * trial.thickness_m, "µm"),
+        "length": (1e3 * trial.length_m, "mm long"),
+        "pressure": (trial.pressure_Pa / 1e3, "kPa"),
+        "payload": (1e3 * trial.payload_kg if trial.payload_kg else math.nan, "g"),
+        "angle": (math.degrees(trial.growth_angle_rad), "°"),
+        "chamber": (1e3 * trial.chamber_m3, "L"),
+        "inlet": (1e3 * trial.inlet_m, "mm inlet"),
+        "bends": (len(trial.bends) if trial.bends else math.nan, "bends"),
+    }
+    return {key: f"{value:.3g} {unit}" for key, (value, unit) in numbers.items() if math.isfinite(value)}

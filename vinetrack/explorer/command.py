@@ -1,0 +1,140 @@
+"""The command `vinetrack explore`: the page for a results folder, or what the page does, without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vinetrack.stages.results import Results, ResultsError, read_json
+
+if TYPE_CHECKING:
+    from vinetrack.experiment import Experiment
+    from vinetrack.explorer.campaign import Campaign
+    from vinetrack.explorer.choice import Choice
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the command line asks for; see `vinetrack explore --help`."""
+
+    add: Sequence[str] = ()
+    drop: Sequence[str] = ()
+    sizes: Sequence[str] = ()
+    refit: bool = False
+    export: Sequence[Path] = ()
+    save: bool = False
+    port: int | None = None
+    browser: bool = True
+
+    @property
+    def is_for_a_page(self) -> bool:
+        """Whether somebody is to look: what is only computed, written or saved needs no page."""
+        return not (self.refit or self.export or self.save)
+
+
+def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
+    """A results folder with the experiment it was made from.
+
+    Raises
+    ------
+    ResultsError
+        If it is no results folder, or its experiment has moved.
+    ExperimentError
+        If the experiment cannot be read.
+    """
+    from vinetrack.explorer.campaign import read_campaign
+    from vinetrack.stages.effects import effects_of
+
+    read = experiment_behind(folder, experiment)
+    return read_campaign(folder, read, effects_of(read.folder))
+
+
+def experiment_behind(folder: Path, experiment: Path | None = None) -> Experiment:
+    """The experiment that a results folder was made from, by its `provenance.json`; see `open_campaign`."""
+    from vinetrack.experiment import read_experiment
+
+    results = Results(folder)
+    if not folder.is_dir():
+        raise ResultsError(f"{folder} is no folder: name the one that snakemake made, results/NAME")
+    if not results.provenance.exists():
+        raise ResultsError(f"{folder} is no results folder: it has no {results.provenance.name}; run snakemake first")
+    where = experiment or Path(str(read_json(results.provenance)["experiment"]))
+    if not where.is_dir():
+        raise ResultsError(f"{where}, the experiment of {folder}, has moved: say where it is with --experiment PATH")
+    return read_experiment(where)
+
+
+def explore(folder: Path, experiment: Path | None, wanted: Wanted, say: Callable[[str], None]) -> None:
+    """Serve the page, or do what was asked for and say what came of it.
+
+    Raises
+    ------
+    ResultsError, ExperimentError, ChoiceError, PortError, FitError, EffectError, SimulationError
+        In one sentence each.
+    """
+    from vinetrack.explorer.choice import chosen, first_choice
+    from vinetrack.terminal import waiting
+
+    with waiting(f"opening {folder}"):
+        campaign = open_campaign(folder, experiment)
+        start = first_choice(campaign)
+        choice = chosen(campaign, start, wanted.add, wanted.drop, wanted.sizes)
+    if wanted.is_for_a_page:
+        from vinetrack.explorer.ground import Ground
+        from vinetrack.explorer.server import serve
+
+        serve(Ground(campaign, start if choice == start else choice), say, wanted.port, browser=wanted.browser)
+        return
+    _without_a_page(campaign, start, choice, wanted, say)
+
+
+def _without_a_page(
+    campaign: Campaign, start: Choice, choice: Choice, wanted: Wanted, say: Callable[[str], None]
+) -> None:
+    from vinetrack.explorer.choice import sized
+    from vinetrack.explorer.curves import errors_m, follow
+    from vinetrack.explorer.export import model_words, write_export
+    from vinetrack.explorer.fitting import first_fit, fit_choice, gained_words
+    from vinetrack.stages.save_model import save_model
+    from vinetrack.terminal import waiting
+
+    with waiting("simulating the trials"):
+        before = errors_m(campaign, follow(campaign, sized(campaign, start)))
+    if wanted.refit:
+        with waiting("fitting the model in use"):
+            first = first_fit(campaign, start)
+        with waiting(f"fitting {model_words(choice.effects)}"):
+            found = fit_choice(campaign, first.fit, choice)
+        choice = found.choice
+        say(str(found.fit))
+        say(gained_words(first.fit, found.fit))
+    curves = follow(campaign, sized(campaign, choice))
+    for line in error_lines(campaign, choice, errors_m(campaign, curves), before):
+        say(line)
+    for path in wanted.export:
+        write_export(campaign, choice, curves, path)
+        say(f"Written: {path}")
+    if wanted.save:
+        say(f"Saved: {save_model(campaign.experiment.folder, choice.effects)}")
+
+
+def error_lines(campaign: Campaign, choice: Choice, now: dict[str, float], before: dict[str, float]) -> list[str]:
+    """The error of every condition before and now beside what replicates differ by, aligned, with units."""
+    from vinetrack.explorer.curves import overall_m
+    from vinetrack.explorer.export import model_words
+    from vinetrack.terminal import table
+
+    def cells(values: dict[str, float]) -> list[str]:
+        return [f"{1e3 * values[key]:.3f}" if values[key] == values[key] else "–" for key in ("was", "now", "floor")]
+
+    floors = campaign.floors_m
+    rows = [
+        (campaign.labels[c], *cells({"was": before[c], "now": now[c], "floor": floors.get(c, float("nan"))}))
+        for c in campaign.conditions
+    ]
+    sums = (overall_m(errors, campaign.conditions) for errors in (before, now, floors))
+    rows.append(("all", *cells(dict(zip(("was", "now", "floor"), sums, strict=True)))))
+    head = ("condition", "model in use", "now", "replicates")
+    return [model_words(choice.effects), *table(rows, head, ("", "mm", "mm", "mm"), align="<>>>")]

@@ -1,0 +1,187 @@
+"""What a model of given sizes says of every trial, fast enough to follow a finger on a slider.
+
+As in a comparison, a prediction has a release and an origin of its own and nothing else: the origin is where the vine
+is seen at rest; the release, and the origin where no rest was filmed, are where the mean square is least. Each trial
+is simulated once on a grid and shifted there; only where a pressure was measured along with the motion, whose shift
+is another motion, is it simulated again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vinetrack.explorer.campaign import Campaign, Seen
+from vinetrack.model.free import YIELD_PRESSURE
+from vinetrack.model.model import Model
+from vinetrack.model.simulate import Trace, Trajectory, simulate_many
+from vinetrack.records import Floats, Trial
+
+GRID_POINTS = 500
+"""Points of the grid a trial is simulated on: linear between them it is good to a part in 10⁵ of its length."""
+
+ROOM_FRAMES = 25
+"""Frames beyond the recording that the grid reaches, for a release that comes earlier."""
+
+SHIFTS = 12
+LARGEST_SHIFT_FRAMES = 5.0
+SETTLED_FRAMES = 1e-3
+TRACE_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Sized:
+    """A model with its sizes: parameters in `model`, yield pressures, Pa, by name of trial."""
+
+    model: Model
+    yield_Pa: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the model says of one trial; arrays have shape (n_points,), at the trial's own frames.
+
+    `release_s` and `origin_m` are on the track's clock and ruler. `growth_m` is the position the camera would report,
+    from the origin that the page uses (`Seen.origin_m`), `residual_m` measurement minus model. `path_m`, shape
+    (GRID_POINTS,), is the whole motion at `path_s` since that release, from the model's own origin.
+    """
+
+    release_s: float
+    origin_m: float
+    growth_m: Floats
+    residual_m: Floats
+    mean_square_m2: float
+    path_s: Floats
+    path_m: Floats
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the residuals while anything moves, m."""
+        return math.sqrt(self.mean_square_m2)
+
+    def lead_position_m(self, time_s: Floats) -> Floats:
+        """Position on the track's ruler at instants of the track's clock; NaN beyond what was simulated."""
+        since = time_s - self.release_s
+        return self.origin_m + np.interp(since, self.path_s, self.path_m, right=math.nan)
+
+
+Curves = tuple[Motion, ...]
+"""A motion for every trial of a campaign, in its order."""
+
+
+def follow(campaign: Campaign, sized: Sized, before: Curves | None = None) -> Curves:
+    """Simulate every trial and lay it on its measurement.
+
+    Parameters
+    ----------
+    before
+        Where releases are looked for from; by default those of the comparison.
+
+    Raises
+    ------
+    SimulationError
+        If the model cannot be followed at these sizes.
+    """
+    trials = [with_yield(seen.item.trial, sized.yield_Pa) for seen in campaign.trials]
+    starts = [seen.release_s for seen in campaign.trials] if before is None else [one.release_s for one in before]
+    return _follow_part(campaign, campaign.trials, trials, sized.model, starts)
+
+
+def _follow_part(
+    campaign: Campaign, seen: Sequence[Seen], trials: Sequence[Trial], model: Model, starts: Sequence[float]
+) -> Curves:
+    grids = [_grid(one) for one in seen]
+    releases = list(starts)
+    found: list[Motion] = []
+    for _ in range(TRACE_ROUNDS):
+        traces = [_since(one, release_s) for one, release_s in zip(seen, releases, strict=True)]
+        moved = simulate_many(model, trials, grids, traces=traces, host=campaign.host)
+        found = [_laid(*one) for one in zip(seen, grids, moved, releases, strict=True)]
+        late = [
+            trace is not None and abs(one.release_s - release_s) > 0.1 * item.item.frame_s
+            for item, trace, one, release_s in zip(seen, traces, found, releases, strict=True)
+        ]
+        if not any(late):
+            break
+        releases = [one.release_s for one in found]
+    return tuple(found)
+
+
+def with_yield(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
+    """The trial with the yield pressure that a fit found for its vine, where it found one."""
+    return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
+
+
+def _grid(seen: Seen) -> Floats:
+    """Instants since release: until the end of the recording and a little on."""
+    item = seen.item
+    last_s = max(item.time_s[-1] - seen.release_s, 0.0) + ROOM_FRAMES * item.frame_s
+    return np.linspace(0.0, last_s, GRID_POINTS)
+
+
+def _since(seen: Seen, release_s: float) -> Trace | None:
+    trace = seen.item.trace
+    return None if trace is None else (trace[0] - release_s, trace[1])
+
+
+def _laid(seen: Seen, grid: Floats, moved: Trajectory, start_s: float) -> Motion:
+    """Newton's steps in release, and in the origin where the vine was not seen at rest."""
+    item, position = seen.item, moved.observed_position_m
+    speed = np.gradient(position, grid)
+    release_s, origin_m = start_s, seen.origin_m
+    longest_s = LARGEST_SHIFT_FRAMES * item.frame_s
+    for _ in range(SHIFTS):
+        since = item.time_s - release_s
+        left = item.lead_position_m - origin_m - np.interp(since, grid, position)
+        # Before release the vine stands: its speed there is nothing.
+        slope = -np.interp(since, grid, speed, left=0.0, right=0.0)
+        later_s, higher_m = _step(slope, left, free_origin=not seen.origin_known)
+        later_s = min(max(later_s, -longest_s), longest_s)
+        release_s += later_s
+        origin_m += higher_m
+        if abs(later_s) < SETTLED_FRAMES * item.frame_s:
+            break
+    growth = np.interp(item.time_s - release_s, grid, position)
+    residual = item.lead_position_m - origin_m - growth
+    counted = residual[seen.counts_from(release_s) :]
+    above = origin_m - seen.origin_m
+    return Motion(release_s, origin_m, growth + above, residual, float(np.mean(counted**2)), grid, position)
+
+
+def _step(slope: Floats, left: Floats, *, free_origin: bool) -> tuple[float, float]:
+    """Least squares of what is left on a shift in time, and one in position where that is free."""
+    if not free_origin:
+        square = float(slope @ slope)
+        return (float(slope @ left) / square if square > 0 else 0.0), 0.0
+    design = np.column_stack([slope, np.ones(slope.size)])
+    later, higher = np.linalg.lstsq(design, left, rcond=1e-9)[0]
+    return float(later), float(higher)
+
+
+def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
+    """Root mean square position error by condition, m; its trials count alike, however many frames they have."""
+    return {
+        condition: math.sqrt(float(np.mean([curves[i].mean_square_m2 for i in campaign.of_condition(condition)])))
+        for condition in campaign.conditions
+    }
+
+
+def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
+    """Root mean square over conditions, m; NaN over none. Conditions whose error is not known are passed over."""
+    known = [errors[name] for name in conditions if math.isfinite(errors.get(name, math.nan))]
+    return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
+
+
+def yields_of(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, float]:
+    """Yield pressures, Pa, by trial, from those that a fit gives by vine (and stated value, where it has several)."""
+    found = {}
+    for seen in campaign.trials:
+        trial = seen.item.trial
+        for vine in (trial.vine, f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"):
+            value = numbers.get(f"{YIELD_PRESSURE}[{vine}]")
+            if value is not None:
+                found[trial.name] = value
+    return found

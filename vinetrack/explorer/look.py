@@ -1,0 +1,133 @@
+"""One look with the report: colours, fonts and the pieces of HTML that the page is made of."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from bokeh.models import Div, InlineStyleSheet
+from bokeh.plotting import figure
+from bokeh.themes import Theme
+
+from vinetrack.figures.style import BLUE, GRID, INK, MUTED
+
+TEMPLATES = Path(__file__).with_name("templates")
+SANS = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
+MEASURED_EDGE, EARLIER_EDGE, MODEL_EDGE = "#56B4E9", "#E69F00", "#D55E00"
+"""The tracked edge, and the model's before and now, over a grey picture."""
+
+_AXIS = {
+    "axis_label_text_font": SANS,
+    "axis_label_text_font_size": "13px",
+    "axis_label_text_font_style": "normal",
+    "axis_label_text_color": INK,
+    "axis_line_color": INK,
+    "major_label_text_font": SANS,
+    "major_label_text_font_size": "12px",
+    "major_label_text_color": INK,
+    "major_tick_line_color": INK,
+    "minor_tick_line_color": None,
+    "axis_label_standoff": 6,
+}
+THEME: dict[str, Any] = {
+    "attrs": {
+        "Plot": {"background_fill_color": None, "border_fill_color": None, "outline_line_color": None},
+        "Axis": _AXIS,
+        "Grid": {"grid_line_color": GRID, "grid_line_width": 0.8},
+        "Slider": {"bar_color": BLUE},
+    }
+}
+
+
+def theme() -> Theme:
+    """The look of plots and widgets."""
+    return Theme(json=THEME)
+
+
+def page_template() -> str:
+    """The page, for jinja2."""
+    return (TEMPLATES / "page.html").read_text(encoding="utf-8")
+
+
+def page_style() -> str:
+    """CSS of the page around the widgets."""
+    return (TEMPLATES / "page.css").read_text(encoding="utf-8")
+
+
+def sheet(more: str = "") -> InlineStyleSheet:
+    """CSS inside a widget, which the page's does not reach."""
+    return InlineStyleSheet(css=(TEMPLATES / "widgets.css").read_text(encoding="utf-8") + more)
+
+
+def words(text: str = "", name: str | None = None, **keywords: Any) -> Div:
+    """A piece of HTML."""
+    return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[sheet()], margin=0, **keywords)
+
+
+def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
+    """An empty figure as wide as its card."""
+    fig = figure(
+        height=height,
+        sizing_mode="stretch_width",
+        tools="box_zoom,pan,reset",
+        active_drag=None,
+        active_scroll=None,
+        toolbar_location="above",
+        x_axis_label=x_label,
+        y_axis_label=y_label,
+        min_border_right=14,
+        margin=0,
+        **keywords,
+    )
+    fig.toolbar.autohide = True
+    fig.toolbar_inner = True
+    fig.toolbar.logo = None
+    return fig
+
+
+def escaped(text: object) -> str:
+    """Text that may hold anything, for HTML."""
+    return html.escape(str(text))
+
+
+def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequence[int] = ()) -> str:
+    """A table in HTML; cells are escaped, columns `numeric` stand to the right."""
+    kinds = [' class="n"' if k in numeric else "" for k in range(len(header))]
+    head = "".join(f"<th{kind}>{escaped(cell)}</th>" for kind, cell in zip(kinds, header, strict=True))
+    body = "".join(
+        "<tr>" + "".join(f"<td{kind}>{escaped(cell)}</td>" for kind, cell in zip(kinds, row, strict=True)) + "</tr>"
+        for row in rows
+    )
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def progress_bar(share: float, text: str) -> str:
+    """A bar filled to a share between 0 and 1, with words below it."""
+    percent = 100 * min(max(share, 0.02), 1.0)
+    return f'<div class="bar"><i style="width:{percent:.0f}%"></i></div><small>{escaped(text)}</small>'
+
+
+def command_block(lines: Sequence[str]) -> str:
+    """Commands to copy."""
+    return f"<pre><code>{escaped(chr(10).join(lines))}</code></pre>"
+
+
+__all__ = [
+    "EARLIER_EDGE",
+    "INK",
+    "MEASURED_EDGE",
+    "MODEL_EDGE",
+    "MUTED",
+    "command_block",
+    "escaped",
+    "page_style",
+    "page_template",
+    "plot",
+    "progress_bar",
+    "sheet",
+    "table",
+    "theme",
+    "words",
+]

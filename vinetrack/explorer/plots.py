@@ -1,0 +1,156 @@
+"""The figures that follow the choice: positions, what is left of them, and the error of each condition."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from bokeh.models import ColumnDataSource, CustomJSTickFormatter, HoverTool, Range1d, Span, TapTool
+
+from vinetrack.explorer.campaign import Campaign
+from vinetrack.explorer.curves import Curves
+from vinetrack.explorer.look import INK, MUTED, plot
+from vinetrack.explorer.series import bands, error_bars, extent, measured, modelled, residuals, symmetric
+
+ROW_PX = 25
+MOST_BANDS = 4
+"""Conditions up to which bands help: more of them lie on each other."""
+
+
+class Plots:
+    """Figures and their data. `set_…` methods put new data in; nothing here decides what they are."""
+
+    def __init__(self, campaign: Campaign, chosen: Callable[[str], None]) -> None:
+        self.campaign, self._chosen = campaign, chosen
+        self._earlier_drawn: object = None
+        empty: dict[str, Any] = {"xs": [], "ys": []}
+        self._band = ColumnDataSource({**empty, "colour": []})
+        self._measured = ColumnDataSource({**empty, "colour": [], "trial": [], "condition": []})
+        self._earlier = ColumnDataSource(empty)
+        self._model = ColumnDataSource(empty, name="model_curves")
+        self._left = ColumnDataSource({**empty, "colour": [], "trial": [], "condition": []}, name="residual_curves")
+        self._bars = ColumnDataSource(error_bars(campaign, {}, {}, {}, ()), name="error_bars")
+        self.motion, self.residual = self._draw_motion(), self._draw_residual()
+        self.errors = self._draw_errors()
+
+    def _draw_motion(self) -> Any:
+        fig = plot(360, "time since release (ms)", "growth (mm)", name="motion", x_range=Range1d(), y_range=Range1d())
+        fig.patches("xs", "ys", source=self._band, fill_color="colour", fill_alpha=0.2, line_color=None)
+        lines = fig.multi_line("xs", "ys", source=self._measured, line_color="colour", line_width=1.6, line_alpha=0.9)
+        ghost = {"line_color": MUTED, "line_width": 1.5, "line_dash": [2, 3]}
+        fig.multi_line("xs", "ys", source=self._earlier, **ghost)
+        fig.multi_line("xs", "ys", source=self._model, line_color=INK, line_width=2, line_dash=[7, 4])
+        fig.add_tools(
+            HoverTool(renderers=[lines], tooltips=[("trial", "@trial"), ("", "@condition")], line_policy="interp")
+        )
+        self.instant = Span(dimension="height", line_color=INK, line_width=1, line_alpha=0.5, visible=False)
+        fig.add_layout(self.instant)
+        return fig
+
+    def _draw_residual(self) -> Any:
+        fig = plot(
+            230, "growth (mm)", "measured − model (mm)", name="residual", x_range=Range1d(), y_range=Range1d(-1, 1)
+        )
+        fig.add_layout(Span(location=0, dimension="width", line_color=INK, line_width=1.5, line_dash=[7, 4]))
+        lines = fig.multi_line("xs", "ys", source=self._left, line_color="colour", line_width=1.4)
+        fig.add_tools(
+            HoverTool(renderers=[lines], tooltips=[("trial", "@trial"), ("", "@condition")], line_policy="interp")
+        )
+        return fig
+
+    def _draw_errors(self) -> Any:
+        names = list(reversed(self.campaign.conditions))
+        height = 70 + ROW_PX * max(len(names), 2)
+        fig = plot(height, "rms error of position (mm)", "", name="errors", y_range=names, x_range=Range1d(0, 1))
+        common = {"y": "condition", "source": self._bars}
+        fig.hbar(right="before", height=0.8, fill_color="#e6e9ee", line_color="#b9c0c9", **common)
+        bars = fig.hbar(right="now", height=0.44, fill_color="colour", line_color=None, fill_alpha="alpha", **common)
+        floors = fig.scatter(
+            x="floor", marker="dash", angle=math.pi / 2, size=17, line_color=INK, line_width=2.6, **common
+        )
+        for drawn in (bars, floors, fig.renderers[0]):
+            drawn.nonselection_glyph = drawn.selection_glyph = None
+        tips = [
+            ("", "@label"),
+            ("now", "@now{0.000} mm"),
+            ("at first", "@before{0.000} mm"),
+            ("replicates", "@floor{0.000} mm"),
+        ]
+        fig.add_tools(HoverTool(renderers=[bars], tooltips=tips), TapTool(renderers=[bars, fig.renderers[0]]))
+        self._bars.selected.on_change("indices", self._tapped)
+        labels = [self.campaign.labels[name] for name in names]
+        fig.yaxis.formatter = CustomJSTickFormatter(
+            args={"names": names, "labels": labels}, code="return labels[names.indexOf(tick)] ?? tick"
+        )
+        fig.ygrid.visible = False
+        fig.yaxis.major_tick_line_color = None
+        return fig
+
+    def _tapped(self, _attr: str, _old: list[int], new: list[int]) -> None:
+        if not new:
+            return
+        names = list(reversed(self.campaign.conditions))
+        self._bars.selected.indices = []
+        self._chosen(names[new[0]])
+
+    def set_shown(self, shown: Sequence[int], earlier: Curves | None) -> None:
+        """Trials to draw; of the earlier curves those of their conditions."""
+        lines = measured(self.campaign, shown)
+        (left, right), (bottom, top) = extent(lines)
+        self.motion.x_range.update(start=left, end=right)
+        self.motion.y_range.update(start=bottom, end=top)
+        self.residual.x_range.update(start=bottom, end=top)
+        self._measured.data = lines
+        self.set_earlier(earlier, shown)
+        few = len({self.campaign.trials[i].condition for i in shown}) <= MOST_BANDS
+        self._band.data = bands(self.campaign, shown if few else [])
+
+    def set_earlier(self, earlier: Curves | None, shown: Sequence[int]) -> None:
+        """The curves to compare with, where they are others."""
+        key = (id(earlier), tuple(shown))
+        if key != self._earlier_drawn:
+            self._earlier_drawn = key
+            self._earlier.data = (
+                modelled(self.campaign, earlier, shown) if earlier is not None else {"xs": [], "ys": []}
+            )
+
+    def set_instant(self, since_s: float | None) -> None:
+        """Mark an instant, s since release, or none."""
+        self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
+
+    def set_curves(self, curves: Curves, shown: Sequence[int]) -> None:
+        """What the model says now."""
+        self._model.data = modelled(self.campaign, curves, shown)
+        left = residuals(self.campaign, curves, shown)
+        low, high = symmetric(left)
+        if high != self.residual.y_range.end:
+            self.residual.y_range.update(start=low, end=high)
+        self._left.data = left
+
+    def set_errors(
+        self,
+        now_m: Mapping[str, float],
+        before_m: Mapping[str, float],
+        floors_m: Mapping[str, float],
+        conditions: Sequence[str],
+    ) -> None:
+        """The error of every condition; those not among `conditions` are drawn faint."""
+        rows = error_bars(self.campaign, now_m, before_m, floors_m, conditions)
+        known = [value for key in ("now", "before", "floor") for value in rows[key] if math.isfinite(value)]
+        end = round_up(1.04 * max(known, default=1.0))
+        if end != self.errors.x_range.end:
+            self.errors.x_range.end = end
+        self._bars.data = rows
+
+
+def round_up(value: float) -> float:
+    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten, so that an axis does not twitch.
+
+    >>> round_up(0.42), round_up(7.1)
+    (0.5, 8.0)
+    """
+    if not value > 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(round(power * k, 12) for k in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if power * k >= value or k == 10)

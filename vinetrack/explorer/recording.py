@@ -1,0 +1,168 @@
+"""Frames of one recording for scrubbing, with where the tracked edge and the model's edge lie in the picture.
+
+A recording is decoded once, in the background, and its frames are kept as JPEG no wider than the page shows them: a
+second of a high-speed camera fits in a few tens of megabytes.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.records import Floats, Trial
+from vinetrack.stages.results import Results, ResultsError, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WIDEST_PX = 960
+QUALITY = 88
+TOLD_EVERY = 10
+"""Frames between two reports of progress."""
+
+
+@dataclass(frozen=True)
+class View:
+    """How positions along the growth axis lie in the picture of one recording, px of the recording.
+
+    `edge_px`, shape (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and
+    `lead_position_m` are those of the track.
+    """
+
+    trial: str
+    path: Path
+    from_px: tuple[float, float]
+    direction: tuple[float, float]
+    half_width_px: float
+    time_s: Floats
+    edge_px: Floats
+    lead_position_m: Floats
+
+    def along_px(self, lead_position_m: Floats) -> Floats:
+        """Where positions on the track's ruler lie along the axis; beyond the track, in a straight line.
+
+        NaN where the track has fewer than two points.
+        """
+        known = np.isfinite(self.edge_px) & np.isfinite(self.lead_position_m)
+        if np.count_nonzero(known) < 2:
+            return np.full(np.shape(lead_position_m), np.nan)
+        position, along = self.lead_position_m[known], self.edge_px[known]
+        order = np.argsort(position, kind="stable")
+        position, along = position[order], along[order]
+        scale, offset = np.polyfit(position, along, 1)
+        inside = np.interp(lead_position_m, position, along)
+        outside = (lead_position_m < position[0]) | (lead_position_m > position[-1])
+        return np.where(outside, offset + scale * lead_position_m, inside)
+
+    def across(self, along_px: float) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Ends, x and y, of a line across the vine at a place along the axis."""
+        (x0, y0), (dx, dy), half = self.from_px, self.direction, self.half_width_px
+        x, y = x0 + along_px * dx, y0 + along_px * dy
+        return (x - half * dy, x + half * dy), (y + half * dx, y - half * dx)
+
+
+def view_of(results: Results, trial: Trial) -> View | str:
+    """The view of a trial, or in words why there is none: it is a track only, or its axis was not kept."""
+    if trial.video is None:
+        name = trial.track.name if trial.track is not None else "a table"
+        return f"{trial.name} came as a track ({name}): there is no recording to show, only where its edge was."
+    if not trial.video.exists():
+        return f"The recording of {trial.name}, {trial.video.name}, is no longer there; its track is shown instead."
+    try:
+        axis = read_json(results.analysed(trial.name)).get("axis")
+        table = read_result(results.track(trial.name))
+    except ResultsError as error:
+        return str(error)
+    if not axis:
+        return f"Where the axis of {trial.name} lies in its picture was not kept: run snakemake again."
+    return _view(trial, axis, table)
+
+
+def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> View:
+    (x0, y0), (x1, y1) = axis["from_px"], axis["to_px"]
+    length = float(np.hypot(x1 - x0, y1 - y0))
+    width = axis.get("width_px")
+    assert trial.video is not None
+    return View(
+        trial=trial.name,
+        path=trial.video,
+        from_px=(float(x0), float(y0)),
+        direction=((x1 - x0) / length, (y1 - y0) / length),
+        half_width_px=0.75 * float(width) if width else 0.05 * length,
+        time_s=table["time_s"].to_numpy(dtype=float),
+        edge_px=table["edge_px"].to_numpy(dtype=float),
+        lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
+    )
+
+
+@dataclass
+class Film:
+    """Frames of one recording, decoded in the background. `shape` is that of the pictures, height and width, px.
+
+    `scale` is pixels of these pictures in one of the recording. `words` say what went wrong, blank where nothing.
+    """
+
+    path: Path
+    count: int = 0
+    expected: int = 0
+    shape: tuple[int, int] = (0, 0)
+    scale: float = 1.0
+    complete: bool = False
+    words: str = ""
+    _frames: list[bytes] = field(default_factory=list)
+    _unwanted: bool = False
+
+    def picture(self, frame: int) -> NDArray[np.uint8]:
+        """Grey levels of one frame, shape `shape`."""
+        import cv2
+
+        data = np.frombuffer(self._frames[frame], dtype=np.uint8)
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+
+    def decode(self, told: Callable[[Film], None] | None = None) -> Film:
+        """Decode every frame; `told` hears every so often."""
+        from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
+
+        try:
+            recording = inspect_recording(self.path)
+            self.expected = recording.declared_frames or 0
+            for luma in iterate_frames(recording):
+                if self._unwanted:
+                    return self
+                self._add(luma, recording.bit_depth)
+                if told is not None and self.count % TOLD_EVERY == 1:
+                    told(self)
+        except (RecordingError, OSError) as error:
+            self.words = str(error)
+        self.complete = True
+        if told is not None:
+            told(self)
+        return self
+
+    def in_background(self, told: Callable[[Film], None]) -> None:
+        """`decode` in a thread, from which `told` is called."""
+        threading.Thread(target=self.decode, args=(told,), daemon=True, name="vinetrack-film").start()
+
+    def give_up(self) -> None:
+        """Stop decoding: another recording is wanted."""
+        self._unwanted = True
+
+    def _add(self, luma: NDArray[Any], bit_depth: int) -> None:
+        import cv2
+
+        height, width = luma.shape
+        if luma.dtype != np.uint8:
+            luma = (luma >> max(bit_depth - 8, 0)).astype(np.uint8)
+        if width > WIDEST_PX:
+            size = (WIDEST_PX, round(height * WIDEST_PX / width))
+            luma = cv2.resize(luma, size, interpolation=cv2.INTER_AREA)
+        _, data = cv2.imencode(".jpg", luma, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        self._frames.append(data.tobytes())
+        self.shape, self.scale = (luma.shape[0], luma.shape[1]), luma.shape[1] / width
+        self.count += 1

@@ -1,0 +1,121 @@
+"""The page served: on this machine's own address alone, everything it needs included, until Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from bokeh.application import Application
+from bokeh.application.handlers.function import FunctionHandler
+from bokeh.document import Document
+from bokeh.server.server import Server
+
+from vinetrack.explorer.ground import Ground
+
+LOOPBACK = "127.0.0.1"
+FIRST_PORT, PORTS = 5070, 30
+QUIET = ("bokeh", "tornado")
+KEEP_ALIVE_MS = 20_000
+
+
+class PortError(RuntimeError):
+    """No port to serve on; one sentence with a remedy."""
+
+
+def application(ground: Ground) -> Application:
+    """A page for whoever opens one."""
+    from vinetrack.explorer.page import Page
+
+    def open_page(document: Document) -> None:
+        Page(ground, document)
+
+    return Application(FunctionHandler(open_page, trap_exceptions=False))
+
+
+def start_server(ground: Ground, port: int | None = None) -> Server:
+    """A server that is bound to the loopback address and answers no page from elsewhere.
+
+    Parameters
+    ----------
+    port
+        The port to take, 0 for any that is free; None looks for the first free one from `FIRST_PORT`.
+
+    Raises
+    ------
+    PortError
+        If it is taken.
+    """
+    tried = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
+    for number in tried:
+        with contextlib.suppress(OSError):
+            return _serve(ground, number)
+    raise PortError(f"Port {port} is taken: give another with --port, or none to have one found.")
+
+
+def _serve(ground: Ground, port: int) -> Server:
+    from bokeh.server.util import bind_sockets
+
+    # Bound first, so that the port is known before it is said who may connect to it.
+    sockets, found = bind_sockets(LOOPBACK, port)
+    for one in sockets:
+        one.close()
+    server = Server(
+        {"/": application(ground)},
+        address=LOOPBACK,
+        port=found,
+        allow_websocket_origin=[f"{LOOPBACK}:{found}", f"localhost:{found}"],
+        keep_alive_milliseconds=KEEP_ALIVE_MS,
+        check_unused_sessions_milliseconds=5_000,
+        unused_session_lifetime_milliseconds=10_000,
+        use_index=False,
+    )
+    server.start()
+    return server
+
+
+def address(server: Server) -> str:
+    """Where the page is."""
+    return f"http://{LOOPBACK}:{server.port}/"
+
+
+def serve(ground: Ground, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
+    """Serve until Ctrl-C (or SIGTERM), then leave without a word more than needed.
+
+    Raises
+    ------
+    PortError
+        If the port is taken.
+    """
+    for name in QUIET:
+        logging.getLogger(name).setLevel(logging.ERROR)
+    server = start_server(ground, port)
+    where = address(server)
+    ground.begin()
+    say(f"Explorer: {where}")
+    say("For this machine alone. Ctrl-C ends it.")
+    if browser:
+        threading.Thread(target=webbrowser.open, args=(where,), daemon=True).start()
+    with _ended_by_signals(server):
+        server.io_loop.start()
+    server.stop()
+    say("Explorer ended.")
+
+
+@contextlib.contextmanager
+def _ended_by_signals(server: Server) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the loop between two turns of it, in the middle of nothing."""
+
+    def end(_number: int, _frame: Any) -> None:
+        server.io_loop.add_callback_from_signal(server.io_loop.stop)
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
