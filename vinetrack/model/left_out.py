@@ -54,15 +54,12 @@ def predict_prepared(found: Fit, data: Sequence[FitTrial], *, from_rest: bool = 
     FitError
         If a vine was not in the fit and B is one per vine, or the model cannot be followed.
     """
-    data = [_known_yield(found, item) for item in data]
-    predictor = Predictor(_nothing_free(found, data), data, found.predictor.host)
     rho = 0.0 if from_rest else found.noise_correlation
     variance = found.noise_m**2 * (1 - rho**2)
-    nothing = np.empty(0)
+    predictor, own, square = laid_on(found, data, from_rest=from_rest)
+    data = predictor.data
     try:
-        own, _ = align(data, predictor, nothing, first_own(data))
-        own, square = _settle(predictor, own, rho, from_rest)
-        moved = predictor.run(predictor.jobs(nothing, own))
+        moved = predictor.run(predictor.jobs(np.empty(0), own))
     except SimulationError as error:
         raise FitError(f"The model cannot be followed: {error}") from error
     sigma = np.zeros((len(data), OWN))
@@ -71,6 +68,35 @@ def predict_prepared(found: Fit, data: Sequence[FitTrial], *, from_rest: bool = 
         trial_fit(item, own[i], sigma[i], moved[i].observed_position_m, moved[i].lead_velocity_m_s, rho, variance)
         for i, item in enumerate(data)
     ]
+
+
+def laid_on(found: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
+    """The fitted model laid on trials: see `predict_prepared`.
+
+    Returns
+    -------
+    predictor : of these trials with nothing free
+    own : array, shape (n_trials, 4), the release and origin found, deviations 0
+    square : array, shape (n_trials, 2, 2), whitened products of release and origin
+
+    Raises
+    ------
+    FitError
+        As `predict_prepared`.
+    """
+    data = [_known_yield(found, item) for item in data]
+    predictor = Predictor(_nothing_free(found, data), data, found.predictor.host)
+    try:
+        own, _ = align(data, predictor, np.empty(0), first_own(data))
+        own, square = _settle(predictor, own, 0.0 if from_rest else found.noise_correlation, from_rest)
+    except SimulationError as error:
+        raise FitError(f"The model cannot be followed: {error}") from error
+    return predictor, own, square
+
+
+def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
+    """Trials filmed long enough at rest to say where they began, shape (n_trials,)."""
+    return np.array([item.n_rest >= FEWEST_AT_REST for item in data], dtype=bool)
 
 
 def _prepared(trial: Trial, track: Track) -> FitTrial:
@@ -105,7 +131,7 @@ def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> t
     """
     data = predictor.data
     frames = np.array([item.frame_s for item in data])
-    held = np.array([from_rest and item.n_rest >= FEWEST_AT_REST for item in data], dtype=bool)
+    held = rest_is_seen(data) & from_rest
     own, square = own.copy(), np.zeros((len(data), 2, 2))
     own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
     for i in np.flatnonzero(held).tolist():

@@ -1,0 +1,349 @@
+"""Parameters that drift with a condition they should not know.
+
+One B should do for a vine at every pressure, with every payload; one γ for all trials. So every trial is asked which
+value would suit it best, all else held at the common law: position, least squares, its release free. Values that follow
+the pressure point to what is missing. The scatter of replicates says how far such values stray by themselves; spreads
+and noise of the fit, which a model that fails inflates, are not asked.
+
+The common law was fitted to the same trials and has taken part of the drift upon itself (n most of it, where B would
+follow the pressure): what is found is what is left, and its z errs to the small side.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.diagnosis.drift_tests import CONDITIONS, Against, Sums, as_deviate, constancy, sums_of
+from vinetrack.diagnosis.own_values import OwnValues, lay, own_values
+from vinetrack.model.fit_data import FitError
+from vinetrack.model.fit_result import SHOWN_AS, Fit
+from vinetrack.model.free import EXPONENT, YIELD_PRESSURE
+from vinetrack.model.simulate import SimulationError
+from vinetrack.model.subset import fit_subset
+from vinetrack.records import Floats
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+DRIFT_COLUMNS = (
+    "parameter",
+    "vine",
+    "symbol",
+    "unit",
+    "against",
+    "from_level",
+    "to_level",
+    "change",
+    "change_sigma",
+    "relative",
+    "z",
+    "z_constancy",
+    "dof",
+    "n_trials",
+    "significant",
+    "sentence",
+)
+GROUP_COLUMNS = (
+    "parameter",
+    "vine",
+    "symbol",
+    "unit",
+    "against",
+    "level",
+    "value",
+    "sigma",
+    "ratio",
+    "ratio_sigma",
+    "n_trials",
+)
+
+FALSE_ALARMS = 0.01
+"""How often any drift at all is called significant where nothing drifts."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What drifts, most significant first, and the values behind it; SI.
+
+    `table`, columns `DRIFT_COLUMNS`, has a row a parameter, vine (blank: all) and condition: from `from_level` to
+    `to_level` of the nominal condition it rises by `change` ± `change_sigma` (`relative`: of itself). `z` is that in
+    standard errors by Student's t with `dof` degrees of freedom, `z_constancy` how unlikely groups so different are.
+    `groups`, columns `GROUP_COLUMNS`, has the mean value of every group: `level` is the nominal condition, NaN where
+    the groups are vines; `ratio` the value over that of the common law.
+    """
+
+    table: pd.DataFrame
+    groups: pd.DataFrame
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """A sentence for every parameter and condition it drifts with, of the row that says so most clearly."""
+        significant = self.table[self.table["significant"]].drop_duplicates(["parameter", "against"])
+        return tuple(significant["sentence"])
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A row of the table and its p, with the rows of its groups."""
+
+    row: dict[str, object]
+    p: float
+    groups: list[dict[str, object]] = field(default_factory=list)
+
+
+def drift(found: Fit) -> Drift:
+    """Ask every parameter whether it drifts with pressure, payload, angle, chamber, inlet or vine.
+
+    Raises
+    ------
+    FitError
+        If the model cannot be followed.
+    """
+    import pandas as pd
+
+    notes: list[str] = []
+    tests = list(_tests(found, notes))
+    level = 1 - (1 - FALSE_ALARMS) ** (1 / max(len(tests), 1))
+    tests.sort(key=lambda one: one.p)
+    rows = [{**one.row, "significant": bool(one.p < level)} for one in tests]
+    groups = [group for one in tests for group in one.groups]
+    return Drift(
+        pd.DataFrame(rows, columns=list(DRIFT_COLUMNS)).astype({"significant": bool, "relative": bool}),
+        pd.DataFrame(groups, columns=list(GROUP_COLUMNS)),
+        tuple(notes),
+    )
+
+
+def _tests(found: Fit, notes: list[str]) -> Iterator[_Found]:
+    keys = [key for key in found.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
+    laid = lay(found)
+    for key in keys:
+        try:
+            own = own_values(found, key, laid)
+        except SimulationError:
+            notes.append(f"{key} could not be found for single trials: the model cannot be followed there.")
+            continue
+        for against in CONDITIONS:
+            yield from _against(own, against)
+        if not own.per_vine:
+            yield from _between_vines(own)
+    if EXPONENT in found.predictor.layout.keys:
+        yield from _exponents(found)
+
+
+def _against(own: OwnValues, against: Against) -> Iterator[_Found]:
+    """Rows of one parameter against one condition: each vine alone where it has values of its own, and all."""
+    levels = np.array([against.level(trial) for trial in own.trials])
+    usable = np.isfinite(levels) & np.isfinite(own.deviation)
+    vines = np.array([trial.vine for trial in own.trials])
+    varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
+    if not varying:
+        if own.per_vine or np.unique(levels[usable]).size < 2:
+            return
+        choices = [("", usable)]
+    elif own.per_vine:
+        choices = [(vine, usable & (vines == vine)) for vine in varying]
+        choices += [("", usable & np.isin(vines, varying))] if len(varying) > 1 else []
+    else:
+        choices = [("", usable)]
+    for vine, chosen in choices:
+        sums = sums_of(own, against.along(levels), levels, chosen)
+        if sums is None:
+            continue
+        shown = [] if own.per_vine and not vine else _groups(own, against, levels, chosen, sums, vine)
+        yield _slope(own, against, levels[chosen], sums, vine, shown)
+
+
+def _slope(
+    own: OwnValues, against: Against, levels: Floats, sums: Sums, vine: str, groups: list[dict[str, object]]
+) -> _Found:
+    from scipy.stats import t as student
+
+    square = float(np.sum(sums.weight * sums.x**2))
+    slope = float(np.sum(sums.weight * sums.x * sums.d)) / square
+    sigma = math.sqrt(sums.variance / square)
+    low, high = float(levels.min()), float(levels.max())
+    reach = float(np.diff(against.along(np.array([low, high])))[0])
+    start, stop = (low, high) if slope >= 0 else (high, low)
+    change, error = abs(slope) * reach, sigma * reach
+    if own.logarithmic:
+        change, error = math.expm1(change), math.exp(change) * error
+    p = float(2 * student.sf(abs(slope) / sigma, sums.dof))
+    p_groups, z_constancy = constancy(sums)
+    row: dict[str, object] = {
+        "parameter": own.key,
+        "vine": vine,
+        "symbol": own.symbol,
+        "unit": own.unit,
+        "against": against.column,
+        "from_level": start,
+        "to_level": stop,
+        "change": change,
+        "change_sigma": error,
+        "relative": own.logarithmic,
+        "z": as_deviate(p),
+        "z_constancy": z_constancy,
+        "dof": sums.dof,
+        "n_trials": int(sums.x.size),
+    }
+    who = f"{own.symbol} of {vine}" if vine else own.symbol
+    if p <= p_groups:
+        row["sentence"] = (
+            f"{who} rises by {_amount(own, change, error)} from {against.shown(start)} to {against.shown(stop)}"
+            f" of {against.words} ({as_deviate(p):.1f} σ), though it should not know the {against.words}."
+        )
+    else:
+        row["sentence"] = (
+            f"{who} is not the same at every {against.words} ({z_constancy:.1f} σ), without rising or falling steadily"
+            f" from {against.shown(low)} to {against.shown(high)}."
+        )
+    return _Found(row, min(1.0, 2 * min(p, p_groups)), groups)
+
+
+def _amount(own: OwnValues, change: float, error: float) -> str:
+    """A change with its error, in per cent or in the unit it reads best in."""
+    if own.logarithmic:
+        return f"{100 * change:.2g} ± {100 * error:.1g} %"
+    unit, factor = SHOWN_AS.get(own.unit, (own.unit, 1.0))
+    return f"{change * factor:.2g} ± {error * factor:.1g} {unit}".rstrip()
+
+
+def _groups(
+    own: OwnValues, against: Against | None, levels: Floats, chosen: NDArray[np.bool_], sums: Sums, vine: str
+) -> list[dict[str, object]]:
+    """Mean value of every group; error from the scatter of replicates."""
+    rows = []
+    for level in np.unique(levels[chosen]):
+        k = np.flatnonzero(chosen & (levels == level))
+        w = 1 / own.variance[k]
+        mean = float(np.average(own.deviation[k], weights=w))
+        sigma = math.sqrt(sums.variance / float(np.sum(w)))
+        rows.append(_group_row(own, against, float(level), vine, mean, sigma, k))
+    return rows
+
+
+def _group_row(
+    own: OwnValues, against: Against | None, level: float, vine: str, mean: float, sigma: float, k: NDArray[np.int_]
+) -> dict[str, object]:
+    base = float(np.mean(own.base[k])) if np.ptp(own.base[k]) <= 1e-9 * abs(own.base[k][0]) else math.nan
+    if own.logarithmic:
+        ratio, ratio_sigma = math.exp(mean), math.exp(mean) * sigma
+        value, value_sigma = base * ratio, base * ratio_sigma
+    else:
+        value, value_sigma = base + mean, sigma
+        ratio, ratio_sigma = (value / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
+    return {
+        "parameter": own.key,
+        "vine": vine,
+        "symbol": own.symbol,
+        "unit": own.unit,
+        "against": against.column if against else "vine",
+        "level": level if against else math.nan,
+        "value": value,
+        "sigma": value_sigma,
+        "ratio": ratio,
+        "ratio_sigma": ratio_sigma,
+        "n_trials": int(k.size),
+    }
+
+
+def _between_vines(own: OwnValues) -> Iterator[_Found]:
+    """Whether a number that all trials share suits every vine."""
+    vines = np.array([trial.vine for trial in own.trials])
+    names = list(dict.fromkeys(vines))
+    usable = np.isfinite(own.deviation)
+    places = np.array([float(names.index(vine)) for vine in vines])
+    if len(names) < 2 or np.unique(places[usable]).size < 2:
+        return
+    sums = sums_of(own, places, places, usable)
+    if sums is None:
+        return
+    p, z = constancy(sums)
+    groups = []
+    for place, name in enumerate(names):
+        k = np.flatnonzero(usable & (places == place))
+        if k.size:
+            w = 1 / own.variance[k]
+            mean = float(np.average(own.deviation[k], weights=w))
+            groups.append(_group_row(own, None, math.nan, name, mean, math.sqrt(sums.variance / float(w.sum())), k))
+    yield _Found(_vine_row(own.key, own.symbol, own.unit, groups, z, sums.dof, int(usable.sum())), p, groups)
+
+
+def _vine_row(
+    key: str, symbol: str, unit: str, groups: Sequence[dict[str, object]], z: float, dof: float, n_trials: int
+) -> dict[str, object]:
+    """A row for values that differ between vines; the change is from the lowest to the highest."""
+    ordered = sorted(groups, key=lambda group: float(str(group["value"])))
+    low, high = ordered[0], ordered[-1]
+    shown, factor = SHOWN_AS.get(unit, (unit, 1.0))
+    ends = " and ".join(
+        f"{float(str(one['value'])) * factor:.3g} ± {float(str(one['sigma'])) * factor:.1g} {shown}".rstrip()
+        + f" ({one['vine']})"
+        for one in (low, high)
+    )
+    return {
+        "parameter": key,
+        "vine": "",
+        "symbol": symbol,
+        "unit": unit,
+        "against": "vine",
+        "from_level": math.nan,
+        "to_level": math.nan,
+        "change": float(str(high["value"])) - float(str(low["value"])),
+        "change_sigma": math.hypot(float(str(high["sigma"])), float(str(low["sigma"]))),
+        "relative": False,
+        "z": z,
+        "z_constancy": z,
+        "dof": dof,
+        "n_trials": n_trials,
+        "sentence": f"{symbol} differs between the vines ({z:.1f} σ), though one should do for all: {ends}.",
+    }
+
+
+def _exponents(found: Fit) -> Iterator[_Found]:
+    """Whether one n serves all: n of every vine alone, its B free."""
+    from scipy.stats import chi2 as chi_square
+
+    parts = []
+    for vine in dict.fromkeys(trial.trial.vine for trial in found.trials):
+        members = [trial for trial in found.trials if trial.trial.vine == vine]
+        if len({trial.trial.pressure_Pa for trial in members}) < 2:
+            continue
+        try:
+            number = fit_subset(found, [trial.name for trial in members])[EXPONENT]
+        except FitError:
+            continue
+        if math.isfinite(number.sigma) and number.sigma > 0:
+            parts.append((vine, number, len(members)))
+    if len(parts) < 2:
+        return
+    value, sigma = (np.array([getattr(number, name) for _, number, _ in parts]) for name in ("value", "sigma"))
+    mean = float(np.average(value, weights=1 / sigma**2))
+    square = float(np.sum((value - mean) ** 2 / sigma**2))
+    p = float(chi_square.sf(square, len(parts) - 1))
+    common = found[EXPONENT].value
+    groups: list[dict[str, object]] = [
+        {
+            "parameter": EXPONENT,
+            "vine": vine,
+            "symbol": number.symbol,
+            "unit": number.unit,
+            "against": "vine",
+            "level": math.nan,
+            "value": number.value,
+            "sigma": number.sigma,
+            "ratio": number.value / common if common else math.nan,
+            "ratio_sigma": number.sigma / common if common else math.nan,
+            "n_trials": count,
+        }
+        for vine, number, count in parts
+    ]
+    row = _vine_row(EXPONENT, "n", "1", groups, as_deviate(p), math.inf, sum(count for _, _, count in parts))
+    yield _Found(row, p, groups)

@@ -1,0 +1,352 @@
+"""Where a model fails beyond what replicates explain.
+
+By condition; along time, position and speed; and by which parameter drifts with a condition it should not know
+(`vinetrack.diagnosis.drift`). A prediction has a release and an origin of its own and nothing else, as in
+`vinetrack.diagnosis.compare`. Errors are those of the mean of the trials there, from how replicates scatter
+(`vinetrack.diagnosis.scatter`): a thousand frames of one trial are one trial.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinetrack.diagnosis.compare import position_errors
+from vinetrack.diagnosis.drift import Drift, drift
+from vinetrack.diagnosis.ladder import excess, in_sample
+from vinetrack.diagnosis.own_values import lay
+from vinetrack.diagnosis.replicates import first_that_counts, replicates_of
+from vinetrack.diagnosis.scatter import (
+    Scatter,
+    Stretches,
+    answers_to_scatter,
+    find_scatter,
+    stretch_covariance,
+    unlikely,
+)
+from vinetrack.model.fit_data import FitTrial
+from vinetrack.model.fit_result import Fit, TrialFit, decimals
+from vinetrack.records import Floats, Trial
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STRETCHES = 8
+"""Parts of the growth that a mean is taken over."""
+
+FEWEST_FRAMES = 2
+"""Frames of a stretch, at least: a shorter recording is cut into fewer."""
+
+FAILS = 3.0
+"""Standard deviations from which a condition is said to fail; the worst of many must be less likely still."""
+
+CONDITION_COLUMNS = (
+    "vine",
+    "condition",
+    "pressure_Pa",
+    "payload_kg",
+    "n_trials",
+    "rms_m",
+    "floor_m",
+    "ratio",
+    "excess_m",
+    "z",
+    "worst_at_s",
+    "worst_at_m",
+    "worst_residual_m",
+    "worst_sigma_m",
+)
+_MEANS = ("mean_residual_m", "sigma_m", "z", "n_trials")
+TIME_COLUMNS = ("vine", "condition", "from_s", "to_s", "time_s", *_MEANS)
+POSITION_COLUMNS = ("vine", "condition", "from_m", "to_m", "lead_position_m", *_MEANS)
+SPEED_COLUMNS = ("vine", "condition", "from_m_s", "to_m_s", "lead_velocity_m_s", *_MEANS)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Where a model fails; tables in SI, a residual is measurement minus model.
+
+    `by_condition`, columns `CONDITION_COLUMNS`, worst first: `z` tells how unlikely replicates alone make the
+    course of the mean residual. `along_time`, `along_position` and `along_speed` (since release; growth and speed of
+    the leading edge in the model) hold the mean residual of a stretch with its error; rows with a blank `condition`
+    take all trials of a vine together. `drift` tells which parameter knows a condition it should not.
+    """
+
+    model: str
+    by_condition: pd.DataFrame
+    along_time: pd.DataFrame
+    along_position: pd.DataFrame
+    along_speed: pd.DataFrame
+    scatter: Scatter
+    drift: Drift
+
+    @property
+    def fails(self) -> bool:
+        """Whether any condition is off the model by more than replicates explain."""
+        return bool((self.by_condition["z"] > self._threshold).any())
+
+    @property
+    def _threshold(self) -> float:
+        """Of as many conditions one goes beyond this as seldom as a single one beyond `FAILS`."""
+        from scipy.stats import norm
+
+        return float(norm.isf(norm.sf(FAILS) / max(len(self.by_condition), 1)))
+
+    def sentences(self) -> tuple[str, ...]:
+        """Where it fails most, by how much, and what drifts, in plain words."""
+        return (*_where(self.by_condition, self._threshold), *self.drift.sentences)
+
+
+@dataclass(frozen=True)
+class _Course:
+    """One trial's residuals and what it answers to scatter, with the coordinates they are looked at along.
+
+    From the first motion on; arrays have shape (n_points,), `answers` (n_points, 2). `noise_m2` is the variance of a
+    frame's position, times the frames that share one error; `rest_m2` that of the origin.
+    """
+
+    trial: Trial
+    residual_m: Floats
+    answers: Floats
+    time_s: Floats
+    lead_position_m: Floats
+    lead_velocity_m_s: Floats
+    noise_m2: float
+    rest_m2: float
+
+
+def locate(found: Fit) -> Failure:
+    """Find where a fitted model fails.
+
+    Raises
+    ------
+    FitError
+        If the model cannot be followed.
+    """
+    import pandas as pd
+
+    predicted = in_sample(found).trials
+    answers = answers_to_scatter(lay(found))
+    courses = [_course(*one) for one in zip(predicted, answers, found.predictor.data, strict=True)]
+    conditions = list(dict.fromkeys(one.trial.condition for one in courses))
+    of = {name: [one for one in courses if one.trial.condition == name] for name in conditions}
+    edges = {name: _common_edges(members) for name, members in of.items()}
+    stretches = {name: _stretches(members, "time_s", edges[name]) for name, members in of.items()}
+    scatter = find_scatter(found, list(stretches.values()))
+    rows = []
+    for name in conditions:
+        members = [trial for trial in predicted if trial.trial.condition == name]
+        rows.append(_condition_row(members, stretches[name], scatter))
+    by_condition = pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
+    vines = list(dict.fromkeys(one.trial.vine for one in courses))
+    whole = {vine: [one for one in courses if one.trial.vine == vine] for vine in vines}
+    return Failure(
+        model="+".join(found.model.names),
+        by_condition=by_condition.sort_values("z", ascending=False, kind="stable", ignore_index=True),
+        along_time=_table([(of[n], "time_s", edges[n], n) for n in conditions], TIME_COLUMNS, scatter),
+        along_position=_along("lead_position_m", of, whole, POSITION_COLUMNS, scatter),
+        along_speed=_along("lead_velocity_m_s", of, whole, SPEED_COLUMNS, scatter),
+        scatter=scatter,
+        drift=drift(found),
+    )
+
+
+def _course(trial: TrialFit, answers: Floats, item: FitTrial) -> _Course:
+    noise_m2 = item.noise_m**2 * (1 + item.correlation) / (1 - item.correlation)
+    begin = first_that_counts(trial)
+    growth = trial.predicted_position_m - trial.origin_m
+    return _Course(
+        trial=trial.trial,
+        residual_m=trial.residual_m[begin:],
+        answers=answers[begin:],
+        time_s=trial.time_s[begin:] - trial.release_s,
+        lead_position_m=growth[begin:],
+        lead_velocity_m_s=trial.predicted_velocity_m_s[begin:],
+        noise_m2=noise_m2,
+        rest_m2=noise_m2 / max(item.n_rest, 1),
+    )
+
+
+def _common_edges(members: Sequence[_Course]) -> Floats:
+    """Edges of stretches of time that every replicate was filmed in."""
+    begin = max(float(one.time_s[0]) for one in members)
+    end = min(float(one.time_s[-1]) for one in members)
+    frames = min(int(np.count_nonzero((one.time_s >= begin) & (one.time_s <= end))) for one in members)
+    count = max(min(STRETCHES, frames // FEWEST_FRAMES), 1)
+    return np.linspace(begin, max(end, begin), count + 1)
+
+
+def _means(one: _Course, along: str, edges: Floats) -> tuple[Floats, Floats]:
+    """Means of [residual, answers] in each stretch, shape (n_stretches, 3), NaN where no frame is; and the frames."""
+    values, at = np.column_stack([one.residual_m, one.answers]), getattr(one, along)
+    place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
+    inside = (at >= edges[0]) & (at <= edges[-1])
+    total, count = np.zeros((edges.size - 1, values.shape[1])), np.zeros(edges.size - 1)
+    np.add.at(total, place[inside], values[inside])
+    np.add.at(count, place[inside], 1.0)
+    return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], math.nan), count
+
+
+def _stretches(members: Sequence[_Course], along: str, edges: Floats) -> Stretches:
+    """The stretches that all of the members have frames in."""
+    parts = [_means(one, along, edges) for one in members]
+    both = np.array([means for means, _ in parts])
+    reached = np.isfinite(both).all(axis=(0, 2))
+    noise = np.mean([_noise(one, count[reached]) for one, (_, count) in zip(members, parts, strict=True)], axis=0)
+    return Stretches(both[:, reached, 0], both[:, reached, 1:].mean(axis=0), noise)
+
+
+def _noise(one: _Course, count: Floats) -> Floats:
+    """Covariance of the means of stretches of so many frames; the error of the origin is common to all."""
+    return np.asarray(np.diag(one.noise_m2 / np.maximum(count, 1.0)) + one.rest_m2)
+
+
+def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: Scatter) -> dict[str, object]:
+    together = replicates_of(members)
+    errors = position_errors(members, together)
+    covariance = stretch_covariance(scatter, stretches)
+    mean, count = stretches.means_m.mean(axis=0), len(members)
+    sigma = np.sqrt(np.diag(covariance) / count)
+    worst = int(np.argmax(np.abs(mean)))
+    trial = members[0].trial
+    return {
+        "vine": trial.vine,
+        "condition": trial.condition,
+        "pressure_Pa": trial.pressure_Pa,
+        "payload_kg": trial.payload_kg,
+        "n_trials": count,
+        "rms_m": errors["rms_position_m"],
+        "floor_m": errors["replicate_floor_m"],
+        "ratio": errors["ratio"],
+        "excess_m": excess(errors["rms_position_m"], errors["replicate_floor_m"]),
+        "z": unlikely(mean, covariance, count, scatter),
+        "worst_at_s": errors["worst_at_s"],
+        "worst_at_m": errors["worst_at_m"],
+        "worst_residual_m": float(mean[worst]),
+        "worst_sigma_m": float(sigma[worst]),
+    }
+
+
+def _along(
+    along: str,
+    of: dict[str, list[_Course]],
+    whole: dict[str, list[_Course]],
+    columns: Sequence[str],
+    scatter: Scatter,
+) -> pd.DataFrame:
+    """Conditions of a vine along the same stretches, and all of its trials together."""
+    parts = []
+    for members in whole.values():
+        edges = np.linspace(0.0, max(float(getattr(one, along).max()) for one in members), STRETCHES + 1)
+        names = dict.fromkeys(one.trial.condition for one in members)
+        parts += [(of[name], along, edges, name) for name in names] + [(members, along, edges, "")]
+    return _table(parts, columns, scatter)
+
+
+def _table(
+    parts: Sequence[tuple[Sequence[_Course], str, Floats, str]], columns: Sequence[str], scatter: Scatter
+) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = [row for part in parts for row in _mean_rows(*part, scatter)]
+    return pd.DataFrame(rows, columns=list(columns))
+
+
+def _mean_rows(
+    members: Sequence[_Course], along: str, edges: Floats, condition: str, scatter: Scatter
+) -> list[tuple[object, ...]]:
+    """Mean residual of every stretch over the trials that reach it, and its error."""
+    parts = [_means(one, along, edges) for one in members]
+    both = np.array([means for means, _ in parts])
+    present = np.isfinite(both).all(axis=2)
+    each = np.array([_variances(*part, scatter) for part in zip(members, parts, strict=True)])
+    rows: list[tuple[object, ...]] = []
+    for k in range(edges.size - 1):
+        there = present[:, k]
+        if not there.any():
+            continue
+        count = int(there.sum())
+        mean = float(both[there, k, 0].mean())
+        sigma = math.sqrt(float(each[there, k].sum())) / count
+        low, high = float(edges[k]), float(edges[k + 1])
+        middle = (low + high) / 2
+        rows.append((members[0].trial.vine, condition, low, high, middle, mean, sigma, mean / sigma, count))
+    return rows
+
+
+def _variances(one: _Course, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
+    """Variances of the means of one trial's stretches, shape (n_stretches,)."""
+    means, count = part
+    alone = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(one, count))
+    return np.diag(stretch_covariance(scatter, alone))
+
+
+def _where(table: pd.DataFrame, threshold: float) -> list[str]:
+    """Sentences about conditions; the table has the worst first."""
+    failing = table[table["z"] > FAILS]
+    if not (table["z"] > threshold).any():
+        worst = table.sort_values("z").iloc[-1]
+        return [
+            "Nowhere does the mean of the replicates leave the model by more than they explain themselves"
+            f" (at most {max(float(worst['z']), 0.0):.1f} σ, at {_named(worst, table)})."
+        ]
+    worst = failing.iloc[0]
+    beside = (
+        f"where replicates differ by {_mm(worst['floor_m'])}"
+        if math.isfinite(worst["floor_m"])
+        else "without replicates"
+    )
+    ahead = "ahead of" if worst["worst_residual_m"] > 0 else "behind"
+    found = [
+        f"The model fails most at {_named(worst, table)}: root mean square {_mm(worst['rms_m'])} {beside}; there the"
+        f" vine is {_off(worst)} {ahead} the model"
+        f" ({worst['z']:.1f} σ in all)."
+    ]
+    where = "every condition" if len(failing) == len(table) else f"{len(failing)} of {len(table)} conditions"
+    found.append(f"It fails in {where} beyond what replicates explain.")
+    return found + _trend(table)
+
+
+def _trend(table: pd.DataFrame) -> list[str]:
+    """Whether it fails more and more towards one end of the pressures (or payloads)."""
+    found = []
+    for column, words, low, high in (
+        ("pressure_Pa", "pressure", "lower", "higher"),
+        ("payload_kg", "payload", "smaller", "larger"),
+    ):
+        usable = table[np.isfinite(table["ratio"])]
+        steps = [group.sort_values(column)["ratio"].to_numpy(float) for _, group in usable.groupby("vine")]
+        steps = [one for one in steps if one.size > 2]
+        if not steps or len(set(usable[column])) < 3:
+            continue
+        ranks = [np.corrcoef(np.arange(one.size), np.argsort(np.argsort(one)))[0, 1] for one in steps]
+        if all(rank > 0.75 for rank in ranks):
+            found.append(f"The {high} the {words}, the more it fails.")
+        elif all(rank < -0.75 for rank in ranks):
+            found.append(f"The {low} the {words}, the more it fails.")
+    return found
+
+
+def _named(row: pd.Series, table: pd.DataFrame) -> str:
+    """A condition in words: pressure, payload and vine as far as they vary."""
+    words = f"{row['pressure_Pa'] / 1e3:.3g} kPa"
+    if len(set(table["payload_kg"])) > 1:
+        words += f" with {row['payload_kg'] * 1e3:.3g} g"
+    if len(set(table["vine"])) > 1:
+        words += f" ({row['vine']})"
+    return words
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.2g} mm"
+
+
+def _off(row: pd.Series) -> str:
+    """How far off, with its error, mm."""
+    off, sigma = 1e3 * abs(row["worst_residual_m"]), 1e3 * row["worst_sigma_m"]
+    digits = decimals(sigma)
+    return f"{off:.{digits}f} ± {sigma:.{digits}f} mm"
