@@ -131,7 +131,7 @@ def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_pa
     write_json(results / "fit.json", content)
     write_json(results / "provenance.json", {"experiment": experiment.as_posix()})
     values = dict(zip((name[2:].replace("-", "_") for name in FAST[::2]), map(str, FAST[1::2]), strict=True))
-    (belief,) = beliefs_of(read_ground(Asked(values=values, results=results)))
+    (belief,) = beliefs_of(read_ground(Asked(cells=values, results=results)))
     assert belief.model.names[-1] == "spring_line"
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
     done = run("predict", *FAST, "--from", results)

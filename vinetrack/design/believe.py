@@ -13,6 +13,7 @@ from vinetrack import published
 from vinetrack.design import guess
 from vinetrack.design.beliefs import PRESSURE, YIELD, Belief, Draws, Move, Size, Uncertainty, wanted_model
 from vinetrack.design.from_fit import FitNumbers, alike, nearest_vine, numbers_of, same_vine, yield_place
+from vinetrack.design.moves import even, heavy, relative, scaled, shifted
 from vinetrack.effects import BASE_EFFECTS, Effect
 from vinetrack.model.fit_data import FitError
 from vinetrack.model.free import DAMPING, EXPONENT
@@ -22,9 +23,6 @@ from vinetrack.records import Trial
 
 if TYPE_CHECKING:
     from vinetrack.model.fit_result import Fit
-
-FARTHEST_SCATTER = 20.0
-"""Standard deviations at which a draw of Student's t is cut: a factor ten of B, beyond all vines."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ def _damping(making: _Making, said: Said, anchor: tuple[str, bool]) -> None:
         making.know(DAMPING, said.B, "given")
         if said.B_error > 0:
             words = f"B is given to {100 * said.B_error:.2g} % (one standard deviation)"
-            making.doubt("error of B", words, f"B given|{trial.vine}", _scaled(DAMPING, said.B_error))
+            making.doubt("error of B", words, f"B given|{trial.vine}", scaled(DAMPING, said.B_error))
         return
     place = fit.place(DAMPING, vine) if fit else None
     if fit is not None and place is not None:
@@ -148,7 +146,7 @@ def _damping(making: _Making, said: Said, anchor: tuple[str, bool]) -> None:
     elif (scale := _printed_scale(trial)) is not None:
         making.know(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
         words = f"the error of the printed B is not printed; taken for {100 * guess.PRINTED_ERROR:.0f} %"
-        making.doubt("error of B", words, f"B printed|{trial.vine}", _scaled(DAMPING, guess.PRINTED_ERROR))
+        making.doubt("error of B", words, f"B printed|{trial.vine}", scaled(DAMPING, guess.PRINTED_ERROR))
         return
     else:
         making.know(
@@ -176,13 +174,13 @@ def _doubt_guess(making: _Making, split: float) -> None:
         f"the four printed B scatter by {100 * guess.damping_scatter():.0f} % about the guessed law, which at this "
         f"size makes {100 * scatter:.0f} % (Student's t, {guess.SCATTER_DOF} degrees of freedom)"
     )
-    making.doubt("guess of B", words, f"B scatter|{making.trial.vine}", _heavy(DAMPING, scatter))
+    making.doubt("guess of B", words, f"B scatter|{making.trial.vine}", heavy(DAMPING, scatter))
     if abs(split) > 1e-9:
         words = (
             f"what t and D do apart is not printed: exponents off by {guess.SPLIT_SIGMA:g} against each other, "
             f"{100 * abs(split) * guess.SPLIT_SIGMA:.0f} % of B at this t/D"
         )
-        making.doubt("t against D", words, "B split", _scaled(DAMPING, split * guess.SPLIT_SIGMA))
+        making.doubt("t against D", words, "B split", scaled(DAMPING, split * guess.SPLIT_SIGMA))
 
 
 def _exponent(making: _Making, said: Said) -> None:
@@ -190,7 +188,7 @@ def _exponent(making: _Making, said: Said) -> None:
         making.know(EXPONENT, said.n, "given")
         if said.n_error > 0:
             words = f"n is given to {said.n_error:.2g} (one standard deviation)"
-            making.doubt("error of n", words, "n given", _shifted(EXPONENT, said.n_error))
+            making.doubt("error of n", words, "n given", shifted(EXPONENT, said.n_error))
         return
     place = making.fit.place(EXPONENT) if making.fit else None
     if making.fit is not None and place is not None:
@@ -200,7 +198,7 @@ def _exponent(making: _Making, said: Said) -> None:
     sigma = guess.exponent_sigma()
     making.know(EXPONENT, published.EXPONENT, f"printed, {published.SOURCE}")
     words = f"n is known to {sigma:.2g}, from the printed R² of its fits"
-    making.doubt("error of n", words, "n printed", _shifted(EXPONENT, sigma))
+    making.doubt("error of n", words, "n printed", shifted(EXPONENT, sigma))
 
 
 def _yield_pressure(making: _Making, anchor: tuple[str, bool]) -> None:
@@ -215,14 +213,14 @@ def _yield_pressure(making: _Making, anchor: tuple[str, bool]) -> None:
         sigma = trial.yield_pressure_sigma_Pa
         if sigma > 0:
             words = f"the yield pressure is stated to {sigma / 1e3:.2g} kPa"
-            making.doubt("stated P_y", words, f"P_y stated|{trial.vine}", _shifted(YIELD, sigma))
+            making.doubt("stated P_y", words, f"P_y stated|{trial.vine}", shifted(YIELD, sigma))
     else:
         making.know(YIELD, guess.YIELD_PRESSURE_PA, "guess: the one that is printed, for another vine")
         words = (
             f"the yield pressure is a guess: {published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine, nine of ten "
             f"others within a factor {guess.YIELD_FACTOR:g} of it"
         )
-        making.doubt("guess of P_y", words, "P_y guess", _scaled(YIELD, guess.yield_log_sigma()))
+        making.doubt("guess of P_y", words, "P_y guess", scaled(YIELD, guess.yield_log_sigma()))
 
 
 def _agrees(fit: FitNumbers, place: int, trial: Trial) -> bool:
@@ -245,7 +243,7 @@ def _further(making: _Making, said: Said, model: Model, anchor: tuple[str, bool]
                 making.know(name, size.middle, "given")
                 if size.high > size.low:
                     words = f"{parameter.symbol} of {effect.name} evenly between {size.low:g} and {size.high:g}"
-                    making.doubt(f"{parameter.symbol} ({effect.name})", words, name, _even(name, size))
+                    making.doubt(f"{parameter.symbol} ({effect.name})", words, name, even(name, size))
             elif making.fit is not None and place is not None:
                 making.drawn[name] = place
                 making.know(name, float(making.fit.mean[place]), f"fitted, {making.fit.source}")
@@ -295,44 +293,8 @@ def _spreads(making: _Making, said: Said) -> tuple[float, float]:
     making.know(PRESSURE, trial.pressure_Pa, "set")
     if pressure > 0:
         words = f"pressure from trial to trial, {origin} {100 * pressure:.2g} %"
-        making.doubt("P from trial to trial", words, f"P trial|{trial.vine}", _relative(PRESSURE, pressure))
+        making.doubt("P from trial to trial", words, f"P trial|{trial.vine}", relative(PRESSURE, pressure))
     if damping > 0:
         words = f"B from trial to trial, {origin} {100 * damping:.2g} %"
-        making.doubt("B from trial to trial", words, f"B trial|{trial.vine}", _scaled(DAMPING, damping))
+        making.doubt("B from trial to trial", words, f"B trial|{trial.vine}", scaled(DAMPING, damping))
     return pressure, damping
-
-
-def _scaled(name: str, log_sigma: float) -> Move:
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draws[name] * np.exp(log_sigma * draw.standard_normal(draws[name].size))}
-
-    return move
-
-
-def _heavy(name: str, log_sigma: float) -> Move:
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
-        t = np.clip(draw.standard_t(guess.SCATTER_DOF, draws[name].size), -FARTHEST_SCATTER, FARTHEST_SCATTER)
-        return {**draws, name: draws[name] * np.exp(log_sigma * t)}
-
-    return move
-
-
-def _shifted(name: str, sigma: float) -> Move:
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draws[name] + sigma * draw.standard_normal(draws[name].size)}
-
-    return move
-
-
-def _relative(name: str, sigma: float) -> Move:
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draws[name] * (1 + sigma * draw.standard_normal(draws[name].size))}
-
-    return move
-
-
-def _even(name: str, size: Size) -> Move:
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draw.uniform(size.low, size.high, draws[name].size)}
-
-    return move

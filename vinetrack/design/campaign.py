@@ -219,7 +219,8 @@ def _spread(count: int, wanted: int) -> list[int]:
 def _smallest(found: Candidates, scope: Scope, shape: _Shape, n_error: float, B_error: float) -> Plan:
     """The fewest replicates of a shape that will do, or as many as there may be."""
     one = None
-    for replicates in range(scope.replicates[0], scope.replicates[1] + 1):
+    affordable = scope.most_trials // int(np.count_nonzero(shape.chosen))
+    for replicates in range(scope.replicates[0], max(min(scope.replicates[1], affordable), scope.replicates[0]) + 1):
         counts = replicates * shape.chosen.astype(float)
         one = replace(
             _judged(found, counts), pressures=shape.pressures, replicates=replicates, payloads_kg=shape.payloads_kg

@@ -23,6 +23,7 @@ from vinetrack.model.sensitivity import OWN, Predictor
 from vinetrack.model.simulate import simulate_many
 from vinetrack.model.solve import make_frame
 from vinetrack.model.whitened import all_products
+from vinetrack.motion.efficiency import lead_velocity_at
 from vinetrack.records import Floats, Trial
 
 REST_FRAMES = 20
@@ -112,6 +113,18 @@ def filmed(model: Model, trials: Sequence[Trial], camera: Camera) -> list[FitTri
             )
         )
     return data
+
+
+def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -> Floats:
+    """Speed of the leading edge at 0.95 of the length, m/s, shape (n_trials,); 0 where it does not get there."""
+    times = [np.linspace(0.0, 1.0, 4000) ** 2 * longest_s] * len(trials)
+    moved = simulate_many(model, trials, times)
+    return np.array(
+        [
+            np.nan_to_num(lead_velocity_at(one.lead_position_m, one.lead_velocity_m_s, END_FRACTION * trial.length_m))
+            for trial, one in zip(trials, moved, strict=True)
+        ]
+    )
 
 
 def information(model: Model, data: Sequence[FitTrial], camera: Camera, spreads: tuple[float, float]) -> Information:

@@ -33,9 +33,12 @@ NEVER = "never"
 
 @dataclass(frozen=True)
 class Asked:
-    """What stands on the command line. `values` are texts by column of the sheet, those that were given."""
+    """What stands on the command line. `cells` are texts by column of the sheet, those that were given.
 
-    values: Mapping[str, str] = field(default_factory=dict)
+    `B_error` and `spreads` are relative. NaN and None where nothing is said.
+    """
+
+    cells: Mapping[str, str] = field(default_factory=dict)
     sheet: Path | None = None
     results: Path | None = None
     effects: tuple[str, ...] = ()
@@ -44,6 +47,7 @@ class Asked:
     B_error: float = 0.0
     n: float = math.nan
     n_error: float = 0.0
+    spreads: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
         planned = planned_sheet(asked.sheet)
         _refuse_beside_sheet(asked)
     else:
-        planned = planned_trial(asked.values, ExperimentSettings(), NEEDED if needed is None else needed)
+        planned = planned_trial(asked.cells, ExperimentSettings(), NEEDED if needed is None else needed)
     if asked.tail_slack is not None:
         planned = replace(planned, trials=tuple(replace(one, tail_slack=asked.tail_slack) for one in planned.trials))
     fit, own = (None, _own(planned)) if asked.results is None else read_fit(asked.results)
@@ -90,6 +94,7 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
         effects=tuple(name for name, _ in sizes),
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
         own=own,
+        spreads=asked.spreads,
     )
     return Ground(planned, said, fit)
 
@@ -99,7 +104,7 @@ def _refuse_beside_sheet(asked: Asked) -> None:
 
     problems = [
         Problem(message="stands beside a sheet", column=option(name), value=text, remedy="write it in the sheet")
-        for name, text in asked.values.items()
+        for name, text in asked.cells.items()
     ]
     if problems:
         raise ExperimentError(problems)
