@@ -17,29 +17,25 @@ import numpy as np
 
 from vinetrack.diagnosis.compare import position_errors
 from vinetrack.diagnosis.drift import Drift, drift
-from vinetrack.diagnosis.ladder import excess, in_sample
-from vinetrack.diagnosis.own_values import lay
-from vinetrack.diagnosis.replicates import first_that_counts, replicates_of
-from vinetrack.diagnosis.scatter import (
-    Scatter,
-    Stretches,
-    answers_to_scatter,
-    find_scatter,
-    stretch_covariance,
-    unlikely,
+from vinetrack.diagnosis.ladder import excess
+from vinetrack.diagnosis.replicates import replicates_of
+from vinetrack.diagnosis.scatter import Scatter, Stretches, stretch_covariance, unlikely
+from vinetrack.diagnosis.stretches import (
+    STRETCHES,
+    Course,
+    by_condition,
+    common_edges,
+    courses_of,
+    means_of,
+    replicate_scatter,
+    stretches_of,
+    variances_of,
 )
-from vinetrack.model.fit_data import FitTrial
 from vinetrack.model.fit_result import Fit, TrialFit, decimals
-from vinetrack.records import Floats, Trial
+from vinetrack.records import Floats
 
 if TYPE_CHECKING:
     import pandas as pd
-
-STRETCHES = 8
-"""Parts of the growth that a mean is taken over."""
-
-FEWEST_FRAMES = 2
-"""Frames of a stretch, at least: a shorter recording is cut into fewer."""
 
 FAILS = 3.0
 """Standard deviations from which a condition is said to fail; the worst of many must be less likely still."""
@@ -101,24 +97,6 @@ class Failure:
         return (*_where(self.by_condition, self._threshold), *self.drift.sentences)
 
 
-@dataclass(frozen=True)
-class _Course:
-    """One trial's residuals and what it answers to scatter, with the coordinates they are looked at along.
-
-    From the first motion on; arrays have shape (n_points,), `answers` (n_points, 2). `noise_m2` is the variance of a
-    frame's position, times the frames that share one error; `rest_m2` that of the origin.
-    """
-
-    trial: Trial
-    residual_m: Floats
-    answers: Floats
-    time_s: Floats
-    lead_position_m: Floats
-    lead_velocity_m_s: Floats
-    noise_m2: float
-    rest_m2: float
-
-
 def locate(found: Fit) -> Failure:
     """Find where a fitted model fails.
 
@@ -129,80 +107,27 @@ def locate(found: Fit) -> Failure:
     """
     import pandas as pd
 
-    predicted = in_sample(found).trials
-    answers = answers_to_scatter(lay(found))
-    courses = [_course(*one) for one in zip(predicted, answers, found.predictor.data, strict=True)]
-    conditions = list(dict.fromkeys(one.trial.condition for one in courses))
-    of = {name: [one for one in courses if one.trial.condition == name] for name in conditions}
-    edges = {name: _common_edges(members) for name, members in of.items()}
-    stretches = {name: _stretches(members, "time_s", edges[name]) for name, members in of.items()}
-    scatter = find_scatter(found, list(stretches.values()))
+    courses, predicted = courses_of(found)
+    scatter = replicate_scatter(found, courses)
+    of = by_condition(courses)
+    conditions = list(of)
+    edges = {name: common_edges(members) for name, members in of.items()}
     rows = []
     for name in conditions:
         members = [trial for trial in predicted if trial.trial.condition == name]
-        rows.append(_condition_row(members, stretches[name], scatter))
-    by_condition = pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
+        rows.append(_condition_row(members, stretches_of(of[name], "time_s", edges[name]), scatter))
+    table = pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
     vines = list(dict.fromkeys(one.trial.vine for one in courses))
     whole = {vine: [one for one in courses if one.trial.vine == vine] for vine in vines}
     return Failure(
         model="+".join(found.model.names),
-        by_condition=by_condition.sort_values("z", ascending=False, kind="stable", ignore_index=True),
+        by_condition=table.sort_values("z", ascending=False, kind="stable", ignore_index=True),
         along_time=_table([(of[n], "time_s", edges[n], n) for n in conditions], TIME_COLUMNS, scatter),
         along_position=_along("lead_position_m", of, whole, POSITION_COLUMNS, scatter),
         along_speed=_along("lead_velocity_m_s", of, whole, SPEED_COLUMNS, scatter),
         scatter=scatter,
         drift=drift(found),
     )
-
-
-def _course(trial: TrialFit, answers: Floats, item: FitTrial) -> _Course:
-    noise_m2 = item.noise_m**2 * (1 + item.correlation) / (1 - item.correlation)
-    begin = first_that_counts(trial)
-    growth = trial.predicted_position_m - trial.origin_m
-    return _Course(
-        trial=trial.trial,
-        residual_m=trial.residual_m[begin:],
-        answers=answers[begin:],
-        time_s=trial.time_s[begin:] - trial.release_s,
-        lead_position_m=growth[begin:],
-        lead_velocity_m_s=trial.predicted_velocity_m_s[begin:],
-        noise_m2=noise_m2,
-        rest_m2=noise_m2 / max(item.n_rest, 1),
-    )
-
-
-def _common_edges(members: Sequence[_Course]) -> Floats:
-    """Edges of stretches of time that every replicate was filmed in."""
-    begin = max(float(one.time_s[0]) for one in members)
-    end = min(float(one.time_s[-1]) for one in members)
-    frames = min(int(np.count_nonzero((one.time_s >= begin) & (one.time_s <= end))) for one in members)
-    count = max(min(STRETCHES, frames // FEWEST_FRAMES), 1)
-    return np.linspace(begin, max(end, begin), count + 1)
-
-
-def _means(one: _Course, along: str, edges: Floats) -> tuple[Floats, Floats]:
-    """Means of [residual, answers] in each stretch, shape (n_stretches, 3), NaN where no frame is; and the frames."""
-    values, at = np.column_stack([one.residual_m, one.answers]), getattr(one, along)
-    place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
-    inside = (at >= edges[0]) & (at <= edges[-1])
-    total, count = np.zeros((edges.size - 1, values.shape[1])), np.zeros(edges.size - 1)
-    np.add.at(total, place[inside], values[inside])
-    np.add.at(count, place[inside], 1.0)
-    return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], math.nan), count
-
-
-def _stretches(members: Sequence[_Course], along: str, edges: Floats) -> Stretches:
-    """The stretches that all of the members have frames in."""
-    parts = [_means(one, along, edges) for one in members]
-    both = np.array([means for means, _ in parts])
-    reached = np.isfinite(both).all(axis=(0, 2))
-    noise = np.mean([_noise(one, count[reached]) for one, (_, count) in zip(members, parts, strict=True)], axis=0)
-    return Stretches(both[:, reached, 0], both[:, reached, 1:].mean(axis=0), noise)
-
-
-def _noise(one: _Course, count: Floats) -> Floats:
-    """Covariance of the means of stretches of so many frames; the error of the origin is common to all."""
-    return np.asarray(np.diag(one.noise_m2 / np.maximum(count, 1.0)) + one.rest_m2)
 
 
 def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: Scatter) -> dict[str, object]:
@@ -233,8 +158,8 @@ def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: S
 
 def _along(
     along: str,
-    of: dict[str, list[_Course]],
-    whole: dict[str, list[_Course]],
+    of: dict[str, list[Course]],
+    whole: dict[str, list[Course]],
     columns: Sequence[str],
     scatter: Scatter,
 ) -> pd.DataFrame:
@@ -248,7 +173,7 @@ def _along(
 
 
 def _table(
-    parts: Sequence[tuple[Sequence[_Course], str, Floats, str]], columns: Sequence[str], scatter: Scatter
+    parts: Sequence[tuple[Sequence[Course], str, Floats, str]], columns: Sequence[str], scatter: Scatter
 ) -> pd.DataFrame:
     import pandas as pd
 
@@ -257,13 +182,13 @@ def _table(
 
 
 def _mean_rows(
-    members: Sequence[_Course], along: str, edges: Floats, condition: str, scatter: Scatter
+    members: Sequence[Course], along: str, edges: Floats, condition: str, scatter: Scatter
 ) -> list[tuple[object, ...]]:
     """Mean residual of every stretch over the trials that reach it, and its error."""
-    parts = [_means(one, along, edges) for one in members]
+    parts = [means_of(one, along, edges) for one in members]
     both = np.array([means for means, _ in parts])
     present = np.isfinite(both).all(axis=2)
-    each = np.array([_variances(*part, scatter) for part in zip(members, parts, strict=True)])
+    each = np.array([variances_of(*part, scatter) for part in zip(members, parts, strict=True)])
     rows: list[tuple[object, ...]] = []
     for k in range(edges.size - 1):
         there = present[:, k]
@@ -276,13 +201,6 @@ def _mean_rows(
         middle = (low + high) / 2
         rows.append((members[0].trial.vine, condition, low, high, middle, mean, sigma, mean / sigma, count))
     return rows
-
-
-def _variances(one: _Course, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
-    """Variances of the means of one trial's stretches, shape (n_stretches,)."""
-    means, count = part
-    alone = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(one, count))
-    return np.diag(stretch_covariance(scatter, alone))
 
 
 def _where(table: pd.DataFrame, threshold: float) -> list[str]:

@@ -1,0 +1,123 @@
+"""Trials cut into stretches, and how much replicates scatter in them; see `vinetrack.diagnosis.scatter`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.diagnosis.ladder import in_sample
+from vinetrack.diagnosis.own_values import lay
+from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.diagnosis.scatter import Scatter, Stretches, answers_to_scatter, find_scatter, stretch_covariance
+from vinetrack.model.fit_data import FitTrial
+from vinetrack.model.fit_result import Fit, TrialFit
+from vinetrack.records import Floats, Trial
+
+STRETCHES = 8
+"""Parts of the growth that a mean is taken over."""
+
+FEWEST_FRAMES = 2
+"""Frames of a stretch, at least: a shorter recording is cut into fewer."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """One trial's residuals and what it answers to scatter, with the coordinates they are looked at along.
+
+    From the first motion on; arrays have shape (n_points,), `answers` (n_points, 2). `noise_m2` is the variance of a
+    frame's position, times the frames that share one error; `rest_m2` that of the origin.
+    """
+
+    trial: Trial
+    residual_m: Floats
+    answers: Floats
+    time_s: Floats
+    lead_position_m: Floats
+    lead_velocity_m_s: Floats
+    noise_m2: float
+    rest_m2: float
+
+
+def courses_of(found: Fit) -> tuple[list[Course], tuple[TrialFit, ...]]:
+    """Every trial of a fit as a course, and as predicted with a release and an origin of its own.
+
+    Raises
+    ------
+    FitError
+        If the model cannot be followed.
+    """
+    predicted = in_sample(found).trials
+    answers = answers_to_scatter(lay(found))
+    return [_course(*one) for one in zip(predicted, answers, found.predictor.data, strict=True)], predicted
+
+
+def by_condition(courses: Sequence[Course]) -> dict[str, list[Course]]:
+    """Courses by name of condition, in order."""
+    names = dict.fromkeys(one.trial.condition for one in courses)
+    return {name: [one for one in courses if one.trial.condition == name] for name in names}
+
+
+def replicate_scatter(found: Fit, courses: Sequence[Course]) -> Scatter:
+    """How much replicates scatter, from stretches of time that all of a condition were filmed in."""
+    groups = by_condition(courses).values()
+    return find_scatter(found, [stretches_of(members, "time_s", common_edges(members)) for members in groups])
+
+
+def _course(trial: TrialFit, answers: Floats, item: FitTrial) -> Course:
+    noise_m2 = item.noise_m**2 * (1 + item.correlation) / (1 - item.correlation)
+    begin = first_that_counts(trial)
+    growth = trial.predicted_position_m - trial.origin_m
+    return Course(
+        trial=trial.trial,
+        residual_m=trial.residual_m[begin:],
+        answers=answers[begin:],
+        time_s=trial.time_s[begin:] - trial.release_s,
+        lead_position_m=growth[begin:],
+        lead_velocity_m_s=trial.predicted_velocity_m_s[begin:],
+        noise_m2=noise_m2,
+        rest_m2=noise_m2 / max(item.n_rest, 1),
+    )
+
+
+def common_edges(members: Sequence[Course]) -> Floats:
+    """Edges of stretches of time that every replicate was filmed in."""
+    begin = max(float(one.time_s[0]) for one in members)
+    end = min(float(one.time_s[-1]) for one in members)
+    frames = min(int(np.count_nonzero((one.time_s >= begin) & (one.time_s <= end))) for one in members)
+    count = max(min(STRETCHES, frames // FEWEST_FRAMES), 1)
+    return np.linspace(begin, max(end, begin), count + 1)
+
+
+def means_of(one: Course, along: str, edges: Floats) -> tuple[Floats, Floats]:
+    """Means of [residual, answers] in each stretch, shape (n_stretches, 3), NaN where no frame is; and the frames."""
+    values, at = np.column_stack([one.residual_m, one.answers]), getattr(one, along)
+    place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
+    inside = (at >= edges[0]) & (at <= edges[-1])
+    total, count = np.zeros((edges.size - 1, values.shape[1])), np.zeros(edges.size - 1)
+    np.add.at(total, place[inside], values[inside])
+    np.add.at(count, place[inside], 1.0)
+    return np.where(count[:, None] > 0, total / np.maximum(count, 1.0)[:, None], math.nan), count
+
+
+def stretches_of(members: Sequence[Course], along: str, edges: Floats) -> Stretches:
+    """The stretches that all of the members have frames in."""
+    parts = [means_of(one, along, edges) for one in members]
+    both = np.array([means for means, _ in parts])
+    reached = np.isfinite(both).all(axis=(0, 2))
+    noise = np.mean([_noise(one, count[reached]) for one, (_, count) in zip(members, parts, strict=True)], axis=0)
+    return Stretches(both[:, reached, 0], both[:, reached, 1:].mean(axis=0), noise)
+
+
+def _noise(one: Course, count: Floats) -> Floats:
+    """Covariance of the means of stretches of so many frames; the error of the origin is common to all."""
+    return np.asarray(np.diag(one.noise_m2 / np.maximum(count, 1.0)) + one.rest_m2)
+
+
+def variances_of(one: Course, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
+    """Variances of the means of one trial's stretches, shape (n_stretches,)."""
+    means, count = part
+    alone = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(one, count))
+    return np.diag(stretch_covariance(scatter, alone))
