@@ -172,6 +172,15 @@ def test_a_number_at_its_bound_is_said_in_words(depleting: Fit) -> None:
     assert any("sits at its bound 1" in message for message in depleting.messages)
 
 
+def test_a_number_held_by_its_bound_is_not_credited_with_what_it_would_explain_beyond(campaign: Campaign) -> None:
+    # n is held too low, so that a drag is wanted; the fold's inertia acts the other way and stays at nothing.
+    low = {"eversion_damping.n": N_TRUE - 0.06}
+    plain = vt.fit(vt.base_model(), campaign[1], fixed=("n",), start=low, profile=False)
+    folded = vt.refit(plain, plain.model + vt.effects.fold_inertia)
+    assert folded["eta"].bound == 0.0
+    assert plain.log_likelihood - 2 < folded.log_likelihood < plain.log_likelihood + 0.1
+
+
 def test_what_the_model_leaves_beyond_the_noise_is_said_in_words(depleting: Fit) -> None:
     assert depleting.chi2_per_dof > 2
     assert any("something is missing" in message for message in depleting.messages)

@@ -231,7 +231,12 @@ def deviance(
 ) -> float:
     """−2 ln of the (restricted) likelihood of the spreads, the free numbers at their best for them."""
     information, slope, square, log_det = normal_equations(part, frame, state, spread)
-    k = np.flatnonzero(frame.free & (np.diag(information) > 0))
+    moves = frame.free & (np.diag(information) > 0)
+    if ((state.theta <= frame.lower) | (state.theta >= frame.upper)).any():
+        # What would rather lie beyond its bound must not be credited with what it would explain there.
+        step = _bounded_solve(information, slope, frame, state.theta)
+        moves &= (step != 0) | ((state.theta > frame.lower) & (state.theta < frame.upper))
+    k = np.flatnonzero(moves)
     total = square + log_det + part.log_constant
     if k.size:
         inside = information[np.ix_(k, k)]
