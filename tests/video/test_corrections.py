@@ -132,6 +132,23 @@ def test_nothing_is_found_in_clean_trials(noise_m, rho):
     assert alarms == []
 
 
+@pytest.mark.parametrize("rho", [0.0, 0.5])
+def test_wild_points_of_heavy_tails_move_no_times(rho):
+    """Student's t with 3 degrees of freedom puts a point a whole step ahead or behind now and then."""
+    moved = []
+    for seed in range(1000, 1150):
+        rng = np.random.default_rng(seed)
+        trial = record(Vine(4, 2.0), rng, noise_m=1e-9, rho=0.0, rest_frames=int(rng.integers(0, 60)))
+        kicks = rng.standard_t(3, trial.track.time_s.size) / np.sqrt(3)
+        wild = np.empty_like(kicks)
+        before = 0.0
+        for k, kick in enumerate(np.sqrt(1 - rho**2) * kicks):
+            before = wild[k] = rho * before + kick
+        track = replace(trial.track, lead_position_m=trial.track.lead_position_m + 1e-4 * wild)
+        moved += [note for note in correct_frames(track).notes if "later times" in note]
+    assert len(moved) <= 1
+
+
 def test_release_is_not_a_dropped_frame():
     time_s = np.arange(100) * FRAME_S
     y = 0.5 * 4000 * np.maximum(time_s - time_s[50], 0) ** 2

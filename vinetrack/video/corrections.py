@@ -32,6 +32,9 @@ JUMP_SIGMAS = 5.5
 STILL, STILL_SIGMAS = 0.25, 5.0
 """A copy stands still to within this part of a step, which must be this significant; a copy is nearly exact."""
 
+LONG_BEFORE_COPY = 1.4
+"""A step so many times those around it, just before what looks like an inserted copy, is one point seen ahead."""
+
 COPY_SIGMAS = 3.5
 """Least significance of the step back after an inserted copy."""
 
@@ -47,8 +50,18 @@ SIMILAR_SIDES = 1.8
 LARGEST_MISFIT = 0.1
 """Scatter about the parabola, in steps, beyond which the motion is not smooth enough to show a jump."""
 
+WILD_RATIO, WILD_SIGMAS = 3.0, 4.0
+"""A single wild point must leave so many times the squares of a jump, and so many squared deviations more."""
+
+WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
+"""Points on either side that must see at least this part of the jump too, where they can tell."""
+
 UNEVEN = 0.05
 """Spacings within this fraction of a whole number of frames count as even: printed times are rounded."""
+
+
+_Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
+"""Frame numbers and positions before and after."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +174,7 @@ def _judge_drop(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, ro
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 1, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
         return None
-    size, sigma, step = jump
+    size, sigma, step, sides = jump
     missing = round(size / step)
     long = y[i + 1] - y[i]
     if missing < 1 or long <= DROP_RATIO * step or size < JUMP_SIGMAS * sigma:
@@ -170,7 +183,9 @@ def _judge_drop(frame: Floats, y: Floats, i: int, noise_m: float, rho: float, ro
     nearest = max((y[i] - y[i - 1]) / (frame[i] - frame[i - 1]), (y[i + 2] - y[i + 1]) / (frame[i + 2] - frame[i + 1]))
     if long <= DROP_RATIO * nearest - noise_m * math.sqrt(2 * (1 - rho)):
         return None
-    if abs(size - missing * step) > max(4 * sigma, 0.3 * step):
+    if abs(size - missing * step) > max(4 * sigma, 0.3 * step) or _one_wild_point(sides, noise_m):
+        return None
+    if _jump_far_around(frame, y, i, noise_m) < LEAST_SHARE * missing * step:
         return None
     return _Event("dropped", int(rows[i + 1]), missing)
 
@@ -182,7 +197,7 @@ def _judge_repeat(
     jump = _jump(frame, y, slice(0, i + 1), slice(i + 2, None), noise_m, rho)
     if jump is None or frame[i + 1] - frame[i] != 1:
         return None
-    size, sigma, step = jump
+    size, sigma, step, _ = jump
     step_sigma = noise_m * math.sqrt(2 * (1 - rho))
     still = y[i + 1] - y[i]
     if abs(still) > min(STILL * step, 4 * step_sigma + 0.02 * step) or step - still < STILL_SIGMAS * step_sigma:
@@ -193,14 +208,19 @@ def _judge_repeat(
     if abs(size) <= max(3 * sigma, 0.3 * step) and abs(size) < 0.5 * step:
         return _Event("stale", int(rows[i + 1]))
     if abs(size + step) <= max(3 * sigma, 0.3 * step) and -size > COPY_SIGMAS * sigma:
+        # Seen a step ahead of its time, a frame leaves its follower where a copy would be.
+        ahead = i >= 2 and y[i] - y[i - 1] > LONG_BEFORE_COPY * max(y[i - 1] - y[i - 2], step)
+        without = np.delete(frame, i + 1), np.delete(y, i + 1)
+        if ahead or -_jump_far_around(*without, i, noise_m, sign=-1) < LEAST_SHARE * step:
+            return None
         return _Event("inserted", int(rows[i + 1]))
     return None
 
 
 def _jump(
     frame: Floats, y: Floats, left: slice, right: slice, noise_m: float, rho: float
-) -> tuple[float, float, float] | None:
-    """Jump of position between two sides of a smooth motion, its standard error, and the step of one frame there.
+) -> tuple[float, float, float, _Sides] | None:
+    """Jump of position between two sides of a smooth motion, its standard error, the step of one frame, the sides.
 
     The widest sides that follow one parabola are used. None where there are no such sides, where either moves slowly
     beside the noise, or where they move so differently that a jump cannot be told from acceleration.
@@ -211,13 +231,49 @@ def _jump(
             return None
         fit = _parabola_with_step(sides, noise_m, rho)
         if fit is not None:
-            return fit
+            return *fit, sides
     return None
 
 
-def _parabola_with_step(
-    sides: tuple[tuple[Floats, Floats], tuple[Floats, Floats]], noise_m: float, rho: float
-) -> tuple[float, float, float] | None:
+def _one_wild_point(sides: _Sides, noise_m: float) -> bool:
+    """Whether one point far off explains these points about as well as a jump between the sides does.
+
+    Both bring one number more than a plain parabola, so what they leave can be compared. Errors with heavy tails put a
+    point one step ahead or behind now and then; the points behind a jump all go along.
+    """
+    (t_left, y_left), (t_right, y_right) = sides
+    t, y = np.concatenate([t_left, t_right]), np.concatenate([y_left, y_right])
+    t = t - (t_left[-1] + t_right[0]) / 2
+    smooth = np.column_stack([np.ones(t.size), t, t**2])
+    with_jump = _left(np.column_stack([smooth, t > 0]), y)
+    with_wild = min(_left(np.delete(smooth, k, axis=0), np.delete(y, k)) for k in range(t.size))
+    return with_wild < max(WILD_RATIO * with_jump, with_jump + (WILD_SIGMAS * noise_m) ** 2)
+
+
+def _jump_far_around(frame: Floats, y: Floats, i: int, noise_m: float, sign: int = 1) -> float:
+    """Jump between points i and i + 1 against many more points on either side, ±∞ where those cannot tell.
+
+    They can where one cubic and a step follow all of them to within the noise: then what a few wild points near by made
+    up is gone.
+    """
+    first = max(i + 1 - WIDE_SIDE_POINTS, 0)
+    near = slice(first, i + 1 + WIDE_SIDE_POINTS)
+    t, points = (frame[near] - frame[i]) / WIDE_SIDE_POINTS, y[near]
+    before = i + 1 - first
+    if min(before, t.size - before) < 2 * SIDE_POINTS[0]:
+        return sign * math.inf
+    basis = np.column_stack([np.ones(t.size), t, t**2, t**3, np.arange(t.size) >= before])
+    fit = np.linalg.pinv(basis) @ points
+    misfit_m = math.sqrt(float(np.sum((points - basis @ fit) ** 2)) / (t.size - 5))
+    return float(fit[4]) if misfit_m < 2.5 * noise_m else sign * math.inf
+
+
+def _left(basis: Floats, y: Floats) -> float:
+    """Sum of squares that least squares leave."""
+    return float(np.sum((y - basis @ (np.linalg.pinv(basis) @ y)) ** 2))
+
+
+def _parabola_with_step(sides: _Sides, noise_m: float, rho: float) -> tuple[float, float, float] | None:
     """Jump, its error and the step of one frame, if both sides follow a parabola at a clear and similar speed."""
     (t_left, y_left), (t_right, y_right) = sides
     near_left = (y_left[-1] - y_left[-3]) / (t_left[-1] - t_left[-3])
