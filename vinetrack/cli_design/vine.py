@@ -133,6 +133,7 @@ def reservoir(
     yields: Yield = None,
     payload: Payload = None,
     angle: Angle = None,
+    inlet: Inlet = None,
     results: Results = None,
     B: Damping = None,
     n: Exponent = None,
@@ -158,6 +159,7 @@ def reservoir(
             "payload_g": payload,
             "growth_angle_deg": angle,
             "chamber_l": chamber,
+            "inlet_mm": inlet,
         }
         asked = Asked(
             cells=given(values),

@@ -33,6 +33,10 @@ MEASURED_YIELD_SIGMA_PA = 200.0
 ENDLESS = 1e7
 
 
+class CampaignError(ValueError):
+    """A campaign that cannot be: one sentence with a remedy."""
+
+
 @dataclass(frozen=True)
 class Scope:
     """What a campaign may consist of; pressures in Pa (NaN: as low, or high, as can be), payloads in kg."""
@@ -114,15 +118,15 @@ def candidates(beliefs: Sequence[Belief], scope: Scope, camera: Camera) -> Candi
 
     Raises
     ------
-    ValueError
-        If no condition can be filmed; the message is a sentence with a remedy.
+    CampaignError
+        If no condition can be filmed.
     """
     trials = with_names([trial for belief in beliefs for trial in _conditions(belief, scope)])
     model = joint_model(beliefs)
     data = filmed(model, trials, camera)
     kept = [item for item in data if item is not None]
     if not kept:
-        raise ValueError(
+        raise CampaignError(
             f"No trial of the campaign could be filmed: none grows within {camera.longest_s:g} s and in a dozen frames "
             "or more; widen the range of pressures, or change --fps or --longest-s."
         )

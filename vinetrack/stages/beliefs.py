@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinetrack.figures.numbers import number
-from vinetrack.planned import Planned, planned_sheet, planned_trial
+from vinetrack.planned import Planned, option, planned_sheet, planned_trial
 from vinetrack.problems import ExperimentError, Problem
 from vinetrack.stages.results import Results, ResultsError, read_json
 from vinetrack.tables import write_bytes
@@ -100,8 +101,6 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
 
 
 def _refuse_beside_sheet(asked: Asked) -> None:
-    from vinetrack.planned import option
-
     problems = [
         Problem(message="stands beside a sheet", column=option(name), value=text, remedy="write it in the sheet")
         for name, text in asked.cells.items()
@@ -163,6 +162,17 @@ def beliefs_of(ground: Ground) -> list[Belief]:
         return [believe(trial, ground.said, ground.fit) for trial in ground.planned.trials]
     except FitError as error:
         raise ResultsError(str(error)) from None
+
+
+def as_option(error: Exception) -> Exception:
+    """What an effect needs, said of the option or the column that is missing; any other error as it is."""
+    match = re.search(r"the effect (\w+) needs `(\w+)`", str(error))
+    if match is None:
+        return error
+    words = f"is blank, and the effect {match[1]} needs it"
+    return ExperimentError(
+        [Problem(message=words, column=match[2], remedy=f"give it, as {option(match[2])} or in the sheet")]
+    )
 
 
 def warnings_of(ground: Ground) -> list[str]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.problems import ExperimentError, Problem
-from vinetrack.stages.beliefs import Asked, beliefs_of, check_figure, read_ground, write_figure
+from vinetrack.stages.beliefs import Asked, as_option, beliefs_of, check_figure, read_ground, write_figure
 from vinetrack.stages.campaign_words import campaign_lines, rehearsal_lines
 from vinetrack.stages.design_vine import read_list, read_range
 from vinetrack.stages.results import ResultsError
@@ -83,8 +83,10 @@ def design_campaign(
     ExperimentError, ResultsError, EffectError
         If something asked for will not do.
     """
-    from vinetrack.design.campaign import candidates, plan
+    from vinetrack.design.campaign import CampaignError, candidates, plan
     from vinetrack.design.precision import Camera
+    from vinetrack.effects import EffectError
+    from vinetrack.model.fit_data import FitError
     from vinetrack.model.simulate import SimulationError
     from vinetrack.terminal import waiting
 
@@ -96,7 +98,9 @@ def design_campaign(
         with waiting("weighing conditions"):
             found = plan(candidates(beliefs, scope, camera), scope, wanted.n_error, wanted.B_error)
         rehearsal = _rehearsed(found, beliefs, camera, wanted)
-    except (SimulationError, ValueError) as error:
+    except EffectError as error:
+        raise as_option(error) from None
+    except (SimulationError, FitError, CampaignError) as error:
         raise ResultsError(str(error)) from None
     lines = list(campaign_lines(found, beliefs, camera, wanted.n_error, wanted.B_error, wanted.most_trials))
     if rehearsal is not None:

@@ -7,7 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vinetrack.stages.beliefs import Asked, beliefs_of, check_figure, read_ground, shown, trial_words, write_figure
+from vinetrack.stages.beliefs import (
+    Asked,
+    as_option,
+    beliefs_of,
+    check_figure,
+    read_ground,
+    shown,
+    trial_words,
+    write_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,6 +49,7 @@ def design_reservoir(
     ExperimentError, ResultsError, EffectError
         If something asked for will not do.
     """
+    from vinetrack.effects import EffectError
     from vinetrack.terminal import waiting
 
     check_figure(figure)
@@ -47,10 +57,13 @@ def design_reservoir(
     trial = ground.planned.trials[0]
     belief = beliefs_of(ground)[0] if math.isfinite(trial.thickness_m) else None
     loss = within_percent / 100
-    with waiting("simulating"):
-        lines = [*_lines(ground.planned.trials[0], belief, loss, at_fraction)]
-        if supply_s is not None and belief is not None:
-            lines += _supplied(belief, loss, supply_s)
+    try:
+        with waiting("simulating"):
+            lines = [*_lines(trial, belief, loss, at_fraction)]
+            if supply_s is not None and belief is not None:
+                lines += _supplied(belief, loss, supply_s)
+    except EffectError as error:
+        raise as_option(error) from None
     if supply_s is not None and belief is None:
         lines.append("! how fast the vine draws gas depends on its wall: give --thickness-um to use --supply-s")
     if figure is not None:

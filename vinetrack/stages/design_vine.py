@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vinetrack.planned import option
 from vinetrack.problems import ExperimentError, Problem
-from vinetrack.stages.beliefs import Asked, check_figure, read_ground, shown, trial_words, write_figure
+from vinetrack.stages.beliefs import Asked, as_option, check_figure, read_ground, shown, trial_words, write_figure
 from vinetrack.stages.results import ResultsError
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from vinetrack.design.fastest import Choice, Room
 
 MOST_FILMS = 12
+FILMS = "--films-um"
 
 
 def read_range(column: str, text: str) -> tuple[float, float]:
@@ -38,29 +39,29 @@ def read_range(column: str, text: str) -> tuple[float, float]:
     return values[0], values[-1]
 
 
-def read_list(column: str, text: str) -> tuple[float, ...]:
-    """Values, SI, from numbers joined by commas; see `read_range`."""
-    return tuple(dict.fromkeys(_cell(column, part) for part in text.split(",") if part.strip()))
+def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
+    """Values, SI, from numbers joined by commas; see `read_range`. `name` is the option's, if not the column's."""
+    return tuple(dict.fromkeys(_cell(column, part, name) for part in text.split(",") if part.strip()))
 
 
 SI = {"mm": 1e-3, "um": 1e-6, "kPa": 1e3, "g": 1e-3}
 
 
-def _cell(column: str, text: str) -> float:
+def _cell(column: str, text: str, name: str = "") -> float:
     """One number of a column, in SI; divided, so that 25 mm are 0.025 m and not a digit off."""
     from vinetrack.columns import COLUMNS, CellError, read_cell
 
     try:
         value = read_cell(COLUMNS[column], text.strip())
     except CellError as error:
-        raise _refusal(column, text, error.message, error.remedy, error.allowed) from None
+        raise _refusal(column, text, error.message, error.remedy, error.allowed, name) from None
     assert isinstance(value, float)
     factor = SI[column.rsplit("_", 1)[-1]]
     return value / round(1 / factor) if factor < 1 else value * factor
 
 
-def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "") -> ExperimentError:
-    problem = Problem(message=message, column=option(column), value=text, allowed=allowed, remedy=remedy)
+def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "", name: str = "") -> ExperimentError:
+    problem = Problem(message=message, column=name or option(column), value=text, allowed=allowed, remedy=remedy)
     return ExperimentError([problem])
 
 
@@ -86,13 +87,14 @@ def design_vine(
     """
     from vinetrack.design.fastest import Room, fastest
     from vinetrack.effects import EffectError
+    from vinetrack.model.fit_data import FitError
     from vinetrack.model.simulate import SimulationError
     from vinetrack.terminal import waiting
 
     check_figure(figure)
     ground = read_ground(asked, needed=("pressure_kPa",))
     room = Room(
-        films_m=read_list("thickness_um", films),
+        films_m=read_list("thickness_um", films, FILMS),
         diameter_m=read_range("diameter_mm", diameter),
         length_m=read_range("length_mm", length),
         pressure_Pa=ground.planned.trials[0].pressure_Pa,
@@ -104,7 +106,9 @@ def design_vine(
     try:
         with waiting("looking for the fastest vine"):
             found = fastest(room, ground.said, ground.fit, samples=samples, seed=seed, at_fraction=at_fraction)
-    except (SimulationError, EffectError, ValueError) as error:
+    except EffectError as error:
+        raise as_option(error) from None
+    except (SimulationError, FitError) as error:
         raise ResultsError(str(error)) from None
     lines = list(_lines(room, found))
     if figure is not None:
@@ -116,7 +120,8 @@ def design_vine(
 def _check(room: Room, films: str, diameter: str) -> None:
     """Refuse films that no tube of the smallest diameter can have, and none or too many of them."""
     if not 0 < len(room.films_m) <= MOST_FILMS:
-        raise _refusal("thickness_um", films, f"names {len(room.films_m)} films", f"name 1 to {MOST_FILMS}")
+        words = f"names {len(room.films_m)} films"
+        raise _refusal("thickness_um", films, words, f"name 1 to {MOST_FILMS}", name=FILMS)
     if max(room.films_m) > room.diameter_m[0] / 4:
         words = f"begins below four times the thickest film, {1e6 * max(room.films_m):g} µm"
         raise _refusal("diameter_mm", diameter, words, f"begin at {4e3 * max(room.films_m):g} mm or more")

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.planned import option
-from vinetrack.problems import ExperimentError, Problem
 from vinetrack.stages.beliefs import (
     Asked,
     Ground,
+    as_option,
     beliefs_of,
     check_figure,
     input_rows,
@@ -105,19 +103,8 @@ def foresee_all(ground: Ground, samples: int, seed: int, at_fraction: float) -> 
     except SimulationError as error:
         raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
     except EffectError as error:
-        raise _as_option(error) from None
+        raise as_option(error) from None
     return found
-
-
-def _as_option(error: Exception) -> Exception:
-    """What an effect needs, said of the option or column that is missing."""
-    match = re.search(r"the effect (\w+) needs `(\w+)`", str(error))
-    if match is None:
-        return error
-    words = f"is blank, and the effect {match[1]} needs it"
-    return ExperimentError(
-        [Problem(message=words, column=match[2], remedy=f"give it, as {option(match[2])} or in the sheet")]
-    )
 
 
 def _one(found: Foretold) -> Iterator[str]:
