@@ -162,10 +162,10 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     ),
     "capstan_friction": (_capstan, Wants()),
     "payload_friction": (
-        _one("payload_friction.mu_p", "mu_p", 0.05, 1.5, lambda s: 0.5 * s.weakest_N / (s.payload_kg * 9.81)),
+        _one("payload_friction.mu_p", "mu_p", 0.2, 2.0, lambda s: 0.5 * s.weakest_N / (s.payload_kg * 9.81)),
         Wants(payload=True),
     ),
-    "payload_drag": (_one("payload_drag.drag_area", "drag_area", 2e-4, 6e-3), Wants(payload=True, fast=True)),
+    "payload_drag": (_one("payload_drag.drag_area", "drag_area", 8e-4, 1e-2), Wants(payload=True, fast=True)),
     "wall_stretch": (_one("wall_stretch.kappa", "kappa", 5e-7, 1e-5), Wants()),
     "tail_stretch": (_one("tail_stretch.compliance", "compliance", 2e-9, 1e-7), Wants()),
     "latch_release": (_latch, Wants()),
