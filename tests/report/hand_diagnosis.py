@@ -1,0 +1,141 @@
+"""Diagnoses written by hand, in the shape of `diagnosis.json`: one of every verdict, and one that was refused."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pandas as pd
+
+BASE = ["pressure_drive", "gravity", "eversion_damping", "yield_pressure"]
+VERDICTS = ("missing", "ambiguous", "artefact", "adequate", "unexplained")
+
+
+def number(parameter: str, symbol: str, value: float, sigma: float | None, unit: str = "1", vine: str = "") -> dict:
+    low, high = (None, None) if sigma is None else (value - 2 * sigma, value + 2 * sigma)
+    return {"parameter": parameter, "vine": vine, "symbol": symbol, "unit": unit, "value": value, "sigma": sigma} | {
+        "low_95": low,
+        "high_95": high,
+        "interval": "linear",
+        "bound": None,
+    }
+
+
+def candidate(effect: str, delta_chi2: float | None, **changes: Any) -> dict[str, Any]:
+    """A row of a ranking; physical, refitted, plausible and not in the answer unless said otherwise."""
+    row = {
+        "effect": effect,
+        "kind": "physical",
+        "status": "refitted",
+        "delta_chi2": delta_chi2,
+        "sigma": None if delta_chi2 is None else math.sqrt(delta_chi2),
+        "numbers": [number(f"{effect}.k", "k", 2.0, 0.1, "Pa")],
+        "plausible": True,
+        "in_answer_set": False,
+        "reason": "",
+        "largest": {},
+    }
+    return row | changes
+
+
+def ranking(*answers: str, kind: str = "physical") -> list[dict[str, Any]]:
+    rows = [candidate(name, 400.0 - i, in_answer_set=True, kind=kind) for i, name in enumerate(answers)]
+    rows += [
+        candidate("leak", 350.0, plausible=False, reason="needs more gas than there is"),
+        candidate("time_base", 25.0, kind="measurement", status="screened", numbers=[], largest={"tau": 3e-3}),
+        candidate("payload_drag", None, status="not testable here", numbers=[], reason="no trial has a payload"),
+    ]
+    return rows
+
+
+def one_round(verdict: str, *answers: str, model: list[str] | None = None, kind: str = "physical") -> dict[str, Any]:
+    effects = [*answers, "leak", "time_base"]
+    matrix = [
+        [1.0 if i == j else 0.97 if {i, j} == {0, 1} else 0.2 for j in range(len(effects))] for i in range(len(effects))
+    ]
+    return {
+        "model": model or BASE,
+        "verdict": verdict,
+        "answer_set": list(answers),
+        "explanation": f"In the words of the diagnosis: {verdict}.",
+        "ranking": ranking(*answers, kind=kind),
+        "cosines": {"effects": effects, "matrix": matrix},
+    }
+
+
+def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
+    """A whole diagnosis; `missing` has reservoir depletion added and nothing left."""
+    answers = {
+        "missing": ["reservoir_depletion"],
+        "ambiguous": ["air_drag", "inlet_loss"],
+        "artefact": ["length_scale"],
+    }
+    named = answers.get(verdict, [])
+    rounds = [one_round(verdict, *named, kind="measurement" if verdict == "artefact" else "physical")]
+    added = named if verdict == "missing" else []
+    parameters = [number("eversion_damping.n", "n", 0.37, 0.004)]
+    if added:
+        rounds.append(one_round("adequate", model=[*BASE, *added]))
+        parameters.append(number("reservoir_depletion.gamma", "γ", 1.17, 0.004))
+    content = {
+        "verdict": verdict,
+        "effects": added,
+        "answer_set": named,
+        "explanation": rounds[0]["explanation"],
+        "final_verdict": rounds[-1]["verdict"],
+        "rounds": rounds,
+        "parameters": parameters,
+        "cosines": rounds[0]["cosines"],
+        "where": ["The model fails most at 24 kPa."],
+        "drift": [{"parameter": "eversion_damping.B", "sentence": "B rises by 39 ± 3 % from 60 kPa to 24 kPa."}],
+        "next_experiment": next_experiment() if verdict == "ambiguous" else None,
+        "missing_force": {"text": "It looks like a constant."} if verdict == "unexplained" else None,
+        "notes": [],
+        "refused": None,
+    }
+    return content | changes
+
+
+def refused(reason: str = "fewer than two trials move") -> dict[str, Any]:
+    empty: dict[str, Any] = {"effects": [], "answer_set": [], "rounds": [], "parameters": [], "model": BASE}
+    return empty | {
+        "verdict": None,
+        "final_verdict": None,
+        "refused": reason,
+        "explanation": f"No diagnosis could be made: {reason}",
+    }
+
+
+def next_experiment() -> dict[str, Any]:
+    trial = {"replicates": 4, "pressure_kPa": 30.0, "payload_g": 0.0, "diameter_mm": 24.0, "thickness_um": 100.0}
+    trial |= {"length_mm": 200.0, "chamber_l": 2.0, "inlet_mm": None, "growth_angle_deg": 0.0, "new_vine": True}
+    pair = "air_drag | inlet_loss"
+    return {
+        "text": "Make four trials on a tube of half the wall.",
+        "trials": [trial],
+        "separation_sigma": {pair: 21.0},
+        "simulated_sigma": {pair: {"mean": 20.0, "sd": 1.4}},
+        "alternatives": [],
+        "calibration": "film a ruler and a strobe",
+    }
+
+
+def ladder(*added: str) -> pd.DataFrame:
+    rows = [
+        {"model": "+".join(BASE), "added": name, "rms_in_sample_m": 9e-3 / 5**i, "rms_left_out_m": 10e-3 / 5**i}
+        | {"rms_highest_pressure_m": 11e-3 / 5**i, "floor_m": 1.5e-3, "excess_left_out_m": 5e-3 / 5**i}
+        for i, name in enumerate(added)
+    ]
+    return pd.DataFrame(rows)
+
+
+def moved() -> pd.DataFrame:
+    columns = {"model": "m", "vine": "", "symbol": "n", "unit": "1", "parameter": "eversion_damping.n"}
+    rows = [
+        columns | {"added": "", "value": 0.5, "sigma": 0.009, "low_95": 0.48, "high_95": 0.52},
+        columns | {"added": "reservoir_depletion", "value": 0.37, "sigma": 0.004, "low_95": 0.36, "high_95": 0.38},
+        columns
+        | {"added": "reservoir_depletion", "parameter": "reservoir_depletion.gamma", "symbol": "γ"}
+        | {"value": 1.17, "sigma": 0.004, "low_95": 1.16, "high_95": 1.18},
+    ]
+    return pd.DataFrame(rows)

@@ -1,0 +1,226 @@
+"""What the page says of a diagnosis, for every verdict, for one that was refused, and for none."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, moved, next_experiment, number, refused
+from test_report import EVIL, SVG, Tags, page
+
+from vinetrack.report.build import ReportFigure
+from vinetrack.report.diagnosis import (
+    DIAGNOSIS_FIGURES,
+    DiagnosisResult,
+    diagnosis_section,
+    hidden_table,
+    moved_table,
+    tied_pairs,
+)
+from vinetrack.report.diagnosis import next_experiment as next_entry
+from vinetrack.report.verdict import facts, listed, meaning, sentence, size
+
+
+def heading(html: str) -> str:
+    found = re.search(r"<h1>(.*?)</h1>", html, re.DOTALL)
+    assert found is not None
+    return re.sub(r"<[^>]+>", "", found[1]).strip()
+
+
+def shown(content: dict, **changes: object) -> str:
+    added = ["", *content.get("effects", [])]
+    return page(diagnosis=DiagnosisResult(content, ladder(*added), **changes))  # type: ignore[arg-type]
+
+
+SENTENCES = {
+    "missing": "Missing from the model: reservoir depletion.",
+    "ambiguous": "Missing from the model: air drag or inlet loss. These trials cannot tell which.",
+    "artefact": "The measurement is at fault, not the physics: length scale.",
+    "adequate": "Nothing missing from the model can be detected.",
+    "unexplained": "The model fails, and nothing in the catalogue mends it.",
+}
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_the_page_begins_with_the_verdict_in_one_sentence(verdict: str) -> None:
+    html = shown(diagnosis(verdict))
+    assert heading(html) == f"{verdict} {SENTENCES[verdict]}"
+    assert f'class="badge badge-{verdict}"' in html
+    assert meaning(diagnosis(verdict)) in html
+    tags = Tags(html)
+    assert (tags.wrong, tags.open) == ([], [])
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_identifiers_are_unique_and_every_link_of_the_page_leads_somewhere(verdict: str) -> None:
+    html = shown(diagnosis(verdict), moved=moved())
+    attributes = [attributes for _, attributes in Tags(html).tags]
+    ids = [one["id"] for one in attributes if one.get("id")]
+    assert len(ids) == len(set(ids))
+    inner = {one["href"][1:] for one in attributes if (one.get("href") or "").startswith("#")}
+    assert inner <= set(ids)
+
+
+def test_what_is_missing_comes_with_how_sure_how_large_and_what_it_did() -> None:
+    found = {fact.question: fact for fact in facts(diagnosis(), ladder("", "reservoir_depletion"))}
+    assert found["How sure"].answer == "20 σ"
+    assert found["How sure"].note == "next best: leak, worse by Δχ² = 50.0, not plausible"
+    assert found["Size of reservoir depletion"].answer == "γ = 1.1700 ± 0.0040"
+    assert found["Size of reservoir depletion"].note == "95 %: 1.162 to 1.178"
+    assert found["Error on conditions left out"].answer == "10.0 → 2.00 mm"
+    assert found["Error on conditions left out"].note == "replicates differ by 1.50 mm"
+    assert found["Damping exponent"].answer == "n = 0.3700 ± 0.0040"
+
+
+def test_two_effects_are_named_in_order_each_with_its_size() -> None:
+    content = diagnosis(effects=["reservoir_depletion", "tail_friction"])
+    content["parameters"].append(number("tail_friction.f", "f", 3.0, 0.2, "N/m"))
+    assert sentence(content) == "Missing from the model: reservoir depletion and tail friction."
+    assert meaning(content).endswith("With them, nothing more can be detected.")
+    questions = [fact.question for fact in facts(content, None)]
+    assert questions[1:3] == ["Size of reservoir depletion", "Size of tail friction"]
+
+
+@pytest.mark.parametrize(
+    ("final", "words"), [("unexplained", "Even then the model fails"), ("missing", "still missing")]
+)
+def test_what_is_left_after_the_last_effect_is_said(final: str, words: str) -> None:
+    assert words in meaning(diagnosis(final_verdict=final))
+
+
+def test_what_cannot_be_told_apart_has_the_size_of_each_and_the_next_trial() -> None:
+    content = diagnosis("ambiguous")
+    questions = [fact.question for fact in facts(content, None)]
+    assert questions == ["How sure", "If air drag", "If inlet loss", "Damping exponent"]
+    html = shown(content)
+    assert "Make four trials on a tube of half the wall." in html
+    assert "air drag from inlet loss" in html
+    assert "20 ± 1" in html
+    assert "inlet loss" in html
+    assert "film a ruler and a strobe" in html
+
+
+def test_adequate_says_what_could_still_hide() -> None:
+    html = shown(diagnosis("adequate"))
+    assert "What could still hide" in html
+    assert "<details open>" in html
+    assert facts(diagnosis("adequate"), None)[0].question == "Most suspicious"
+
+
+def test_what_could_still_hide_is_in_the_unit_of_its_number() -> None:
+    row = candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")})
+    table = hidden_table([row])
+    assert table is not None
+    assert table.rows == [("leak", "k", "2.50 kPa")]
+    assert hidden_table([candidate("leak", 1.0)]) is None
+
+
+def test_candidates_that_cannot_be_tested_here_are_listed_with_the_reason() -> None:
+    html = shown(diagnosis())
+    assert "Not testable here: 1 effect" in html
+    assert "payload drag: no trial has a payload" in html
+
+
+def test_the_ranking_has_every_candidate_with_its_numbers() -> None:
+    section = diagnosis_section(DiagnosisResult(diagnosis()))
+    assert section is not None
+    first = section["rounds"][0]["table"].rows
+    assert [row[0] for row in first] == ["● reservoir depletion", "leak", "time base"]
+    assert first[1][4:] == ("k = 0.00200 ± 0.00010 kPa", "fitted", "not plausible; needs more gas than there is")
+    assert first[2][5] == "predicted"
+    assert len(section["rounds"]) == 2
+
+
+def test_ties_are_named_most_alike_first() -> None:
+    cosines = {"effects": ["a", "b_c", "d"], "matrix": [[1, 0.96, None], [0.96, 1, -0.99], [None, -0.99, 1]]}
+    assert tied_pairs(cosines) == ["b c and d (cosine -0.990)", "a and b c (cosine 0.960)"]
+    assert tied_pairs({}) == []
+
+
+def test_how_the_numbers_moved_stands_side_by_side() -> None:
+    table = moved_table(moved())
+    assert table is not None
+    assert list(table.head) == ["Number", "as you came with it", "+ reservoir depletion"]
+    assert [list(row) for row in table.rows] == [
+        ["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"],
+        ["γ", "–", "1.1700 ± 0.0040"],
+    ]
+
+
+def test_the_ladder_is_a_table_of_numbers_too() -> None:
+    html = shown(diagnosis())
+    assert "The numbers of the ladder" in html
+    assert '<td class="number">10.0</td>' in html
+
+
+def test_what_an_effect_is_is_said_beside_its_name() -> None:
+    html = shown(
+        diagnosis(), summaries={"reservoir_depletion": "The pressure falls while it grows.", "leak": "A hole."}
+    )
+    assert "The pressure falls while it grows." in html
+    assert "A hole." not in html
+
+
+def test_a_refusal_is_said_with_its_reason_and_the_law_still_stands() -> None:
+    html = shown(refused())
+    assert heading(html) == "not diagnosed No diagnosis could be made."
+    assert "fewer than two trials move" in html
+    assert '<h2 id="law">' in html
+
+
+def test_without_a_diagnosis_the_law_is_the_headline() -> None:
+    assert heading(page()).startswith("Damping exponent n =")
+    assert diagnosis_section(None) is None
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_diagnosis_with_nothing_but_a_verdict_makes_a_page(verdict: str) -> None:
+    bare = {"verdict": verdict, "effects": [], "answer_set": [], "rounds": []}
+    assert heading(page(diagnosis=DiagnosisResult(bare))).startswith(verdict)
+
+
+def test_pictures_stand_in_the_parts_they_belong_to() -> None:
+    figures = [ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in DIAGNOSIS_FIGURES]
+    html = page(diagnosis=DiagnosisResult(diagnosis(), ladder("", "a")), figures=figures)
+    order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-missing_force"]
+    order += ['id="candidates"', "figure-candidates", 'id="tied"', "figure-cosines", 'id="drift"', "figure-drift"]
+    places = [html.index(f'id="{one}"' if one.startswith("figure") else f"<h2 {one}") for one in order]
+    assert places == sorted(places)
+    for key in DIAGNOSIS_FIGURES:
+        assert f'download="{key}.csv"' in html
+
+
+@pytest.mark.parametrize("place", ["effects", "answer_set", "explanation", "where", "notes", "reason", "next", "drift"])
+def test_whatever_stands_in_the_file_is_escaped(place: str) -> None:
+    content = diagnosis("ambiguous")
+    if place in ("effects", "answer_set", "where", "notes"):
+        content[place] = [EVIL]
+    if place == "explanation":
+        content["explanation"] = content["rounds"][0]["explanation"] = EVIL
+    if place == "reason":
+        content["rounds"][0]["ranking"][0] |= {"reason": EVIL, "effect": EVIL}
+    if place == "next":
+        content["next_experiment"] = next_experiment() | {"text": EVIL, "calibration": EVIL}
+    if place == "drift":
+        content["drift"] = [{"sentence": EVIL}]
+    html = shown(content)
+    assert EVIL not in html
+    assert not [tag for tag, _ in Tags(html).tags if tag == "script"]
+
+
+def test_numbers_are_said_in_units_that_read_well() -> None:
+    assert size(number("a.k", "k", 2500.0, 100.0, "Pa", "v")) == "k (v) = 2.50 ± 0.10 kPa"
+    assert size(number("a.k", "k", 2500.0, None, "Pa")) == "k = 2.50 kPa"
+
+
+def test_names_are_listed_as_a_person_says_them() -> None:
+    assert listed(["air_drag"]) == "air drag"
+    assert listed(["air_drag", "leak", "gravity"], "or") == "air drag, leak or gravity"
+    assert listed([]) == ""
+
+
+def test_the_next_experiment_may_be_a_sentence_alone() -> None:
+    entry = next_entry({"text": "Film a ruler."})
+    assert entry is not None
+    assert (entry["trials"], entry["separations"]) == (None, None)
+    assert next_entry(None) is None
