@@ -7,6 +7,7 @@ from pathlib import Path
 
 from vinetrack.workflow import (
     CAMPAIGN_FIGURES,
+    PAPER_FIGURES,
     code_hash,
     plan_or_stop,
     say_where_at_exit,
@@ -265,6 +266,43 @@ rule campaign_figures:
         " --log {log:q}"
 
 
+if plan.published:
+
+    rule paper:
+        """The paper's numbers and figures beside those of this experiment."""
+        input:
+            plan.sheets,
+            plan.per_trial("kinematics", ".csv"),
+            plan.result("steady.csv"),
+            plan.result("conditions.csv"),
+            plan.result("damping_points.csv"),
+            plan.result("damping.json"),
+            plan.result("scaling.json"),
+            plan.result("fit.json"),
+            plan.result("comparison.csv"),
+            plan.result("comparison"),
+        output:
+            plan.paper_tables,
+            [
+                report(
+                    path,
+                    caption=f"vinetrack/report/captions/{name}.rst",
+                    category="Beside the paper",
+                    labels={"figure": PAPER_FIGURES[name], "format": form},
+                )
+                for name, form, path in plan.paper_figures()
+            ],
+        log:
+            plan.result("logs", "paper.log"),
+        params:
+            code=code_hash("paper"),
+            experiment=plan.experiment,
+            results=plan.results,
+            settings=plan.stage_settings("figures"),
+        shell:
+            "vinetrack paper {params.experiment:q} {params.results:q} --settings {params.settings:q} --log {log:q}"
+
+
 if plan.clips:
 
     rule overlays:
@@ -303,6 +341,7 @@ rule report_page:
     input:
         plan.inputs,
         plan.figure_files(),
+        plan.paper_tables,
         plan.clips,
         plan.result("steady.csv"),
         plan.result("fit.json"),

@@ -21,6 +21,7 @@ FLOORS = (
     {"model", "motion"},
     {"design"},
     {"diagnosis"},
+    {"paper"},
     {"laboratory"},
     {"provenance", "figures"},
     {"report"},
@@ -32,7 +33,7 @@ FLOORS = (
 """From the ground up; a room may use its own floor and those below. `experiment` looks into tracks (video)."""
 
 HEAVY = {"matplotlib", "cv2", "skimage", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
-HEAVY_AT_IMPORT = {"model", "effects", "motion", "laboratory", "video", "diagnosis", "explorer", "design"}
+HEAVY_AT_IMPORT = {"model", "effects", "motion", "laboratory", "video", "diagnosis", "explorer", "design", "paper"}
 """Rooms that compute: whoever imports them wants what they stand on. All others must start at once."""
 
 

@@ -247,6 +247,17 @@ def figures(
 
 
 @app.command(rich_help_panel="Stages of the workflow")
+def paper(experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+    """Set the paper's published numbers and figures beside ours: paper.csv."""
+    with _sentences(log):
+        from vinetrack.report.paper import tally
+        from vinetrack.stages.paper import draw_paper, set_beside_paper
+
+        typer.echo(f"Beside the paper: {tally(set_beside_paper(_read(experiment), results))}")
+        draw_paper(results, _run_settings(settings).figures)
+
+
+@app.command(rich_help_panel="Stages of the workflow")
 def report(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:

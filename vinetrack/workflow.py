@@ -44,6 +44,28 @@ CAMPAIGN_FIGURES = {
 }
 """Figures of a whole experiment, by file name, with the label Snakemake's own report gives them."""
 
+PAPER_TABLES = (
+    "paper",
+    "paper_departures",
+    "paper_motions",
+    "paper_means",
+    "paper_positions",
+    "paper_pressures",
+    "paper_speeds",
+    "paper_speed_curves",
+)
+PAPER_FIGURES = {
+    "paper_fig4": "Fig. 4, position",
+    "paper_table2": "Table II, drawn",
+    "paper_fig5": "Fig. 5, final speed",
+    "paper_fig6": "Fig. 6, force and speed",
+    "paper_fig7": "Fig. 7, damping and size",
+    "paper_fig8": "Fig. 8, speed and size",
+    "paper_fig9": "Fig. 9, efficiency",
+    "paper_reservoir": "What a chamber loses",
+}
+"""What an experiment that is set beside the paper gets besides: tables, and figures with their labels."""
+
 SHARED_FILES = ("trials.csv", "experiment.yaml")
 
 _INTAKE = ("records.py", "constants.py", "tables.py", "columns.py", "sheet.py", "naming.py", "experiment.py")
@@ -53,6 +75,7 @@ STAGE_CODE = {
     "tracks": (*_ANALYSIS, "stages/pool.py"),
     "gather": (*_INTAKE, "stages", "motion"),
     "damping": ("tables.py", "stages", "motion"),
+    "paper": (*_INTAKE, "published.py", "stages", "figures", "motion", "effects", "model", "design", "paper"),
     "model": (*_INTAKE, "settings.py", "stages", "video", "motion", "effects", "model", "diagnosis"),
     "figures": ("tables.py", "stages", "figures", "report/verdict.py"),
     "overlays": (
@@ -135,6 +158,15 @@ class Plan:
         """Figures of the whole experiment: name, format and path."""
         return self._figures(CAMPAIGN_FIGURES, "")
 
+    @property
+    def paper_tables(self) -> list[str]:
+        """Tables that set the paper's numbers beside ours; none where they were not asked for."""
+        return [self.result(f"{name}.csv") for name in PAPER_TABLES] if self.published else []
+
+    def paper_figures(self) -> list[tuple[str, str, str]]:
+        """Figures that stand beside the paper's: name, format and path."""
+        return self._figures(PAPER_FIGURES, "") if self.published else []
+
     def trial_figures(self) -> list[tuple[str, str, str]]:
         """Figures of single trials: trial, format and path."""
         return self._figures(self.trials, "trial_")
@@ -142,7 +174,7 @@ class Plan:
     def figure_files(self) -> list[str]:
         """Paths of all figures."""
         figures = (*self.campaign_figures(), *self.trial_figures(), *self._figures(self.filmed, "strip_"))
-        return [path for _, _, path in figures]
+        return [path for _, _, path in (*figures, *self.paper_figures())]
 
     def _figures(self, names: Iterable[str], prefix: str) -> list[tuple[str, str, str]]:
         formats = self.settings.figures.formats

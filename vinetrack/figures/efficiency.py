@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.figures.numbers import interval, number
-from vinetrack.figures.style import MUTED, VINE_COLOURS, VINE_MARKERS, blank, look
+from vinetrack.figures.style import MUTED, VINE_COLOURS, VINE_MARKERS, blank, look, note_below
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,8 +50,7 @@ def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure:
             axes[row][0].set_ylabel("energy efficiency (%)")
             axes[row][-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0, fontsize=9)
         fig.suptitle(_title(family, len(families)), fontsize=11, x=0.01, ha="left")
-        if note:
-            fig.supxlabel(note, fontsize=10)
+        note_below(fig, note)
     return fig
 
 

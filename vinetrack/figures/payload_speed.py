@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.figures.style import VINE_COLOURS, VINE_MARKERS, blank, legend_above, look, rows
+from vinetrack.figures.style import VINE_COLOURS, VINE_MARKERS, blank, legend_above, look, note_below, rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,8 +46,7 @@ def draw_payload_speed(conditions: pd.DataFrame, model: pd.DataFrame, note: str 
             _draw_vine(ax, moved[moved["vine"] == vine], model[model["vine"] == vine], line)
         for ax in axes.flat[len(vines) :]:
             ax.set_visible(False)
-        if note:
-            fig.supxlabel(note, fontsize=10)
+        note_below(fig, note)
     return fig
 
 

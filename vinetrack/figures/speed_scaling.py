@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.figures.numbers import interval, number
-from vinetrack.figures.style import VINE_COLOURS, VINE_MARKERS, blank, legend_above, look
+from vinetrack.figures.style import VINE_COLOURS, VINE_MARKERS, blank, legend_above, look, note_below
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,8 +46,7 @@ def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure:
             left_out = len(families) - MAX_FAMILIES
             more = f", {left_out} more pressures in scaling.json" if left_out > 0 else ""
             legend_above(ax, n_columns=1, title=title + more, alignment="left", fontsize=9)
-        if note:
-            fig.supxlabel(note, fontsize=10)
+        note_below(fig, note)
     return fig
 
 

@@ -145,6 +145,12 @@ def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
         )
 
 
+def note_below(fig: Figure, note: str) -> None:
+    """Put a sentence under the whole figure, wrapped to its width; nothing where it is blank."""
+    if note:
+        fig.supxlabel(textwrap.fill(note, int(fig.get_figwidth() * 12.5)), fontsize=10)
+
+
 def plain_log_ticks(ax: Axes, which: str = "both") -> None:
     """Ticks at 1, 2, 5 written as plain numbers, so that less than a decade still has readable values."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator

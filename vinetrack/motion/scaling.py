@@ -84,7 +84,7 @@ def _family(group: list[str], sizes: Floats, vines: Mapping[str, Any], along: st
     return family
 
 
-def regress(x: Floats, y: Floats) -> dict[str, float | list[float]]:
+def regress(x: Floats, y: Floats) -> dict[str, Any]:
     """Straight line by least squares: slope and intercept with 95 % intervals (Student's t), R², p-value of the slope.
 
     Parameters

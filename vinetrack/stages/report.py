@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.experiment import Experiment
-    from vinetrack.report.build import Clip, ReportFigure
+    from vinetrack.report.build import Clip, ReportFigure, ReportSection
     from vinetrack.report.recordings import Recording
     from vinetrack.stages.diagnosed import Diagnosed
 
@@ -86,11 +86,34 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
         clip=_clip(results, diagnosed, trials),
         model=ModelResult(read_json(results.fit), read_result(results.comparison), read_result(results.model_check)),
         diagnosis=read_diagnosis(results, experiment),
+        sections=[_paper_section(results)] if experiment.settings.published else [],
     )
     page = build_report(content)
     write_json(results.provenance, provenance)
     write_text(results.report, page)
     return results.report
+
+
+def _paper_section(results: Results) -> ReportSection:
+    from vinetrack.report.build import ReportFigure
+    from vinetrack.report.paper import FIGURES as PAPER_FIGURES
+    from vinetrack.report.paper import paper_section
+
+    captions = files("vinetrack.report") / "captions"
+    figures = [
+        ReportFigure(
+            name,
+            title,
+            " ".join((captions / f"{name}.rst").read_text(encoding="utf-8").split()),
+            results.figure(name, ".svg").read_text(encoding="utf-8"),
+            data,
+            (results.folder / data).read_text(encoding="utf-8"),
+        )
+        for name, (title, data) in PAPER_FIGURES.items()
+        if results.figure(name, ".svg").exists()
+    ]
+    table, departures = (read_result(results.folder / f"{name}.csv") for name in ("paper", "paper_departures"))
+    return paper_section(table, departures, figures)
 
 
 def _drawn(results: Results, own_data: Mapping[str, str]) -> list[str]:

@@ -102,6 +102,16 @@ TEXT_COLUMNS = frozenset(
         "unit",
         "against",
         "sentence",
+        "row",
+        "where",
+        "quantity",
+        "setting",
+        "as_printed",
+        "mark",
+        "how",
+        "beside",
+        "figure",
+        "departure",
     }
 )
 COUNT_COLUMNS = frozenset({"n_frames", "points"})

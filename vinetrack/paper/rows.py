@@ -1,0 +1,106 @@
+"""One line of the table that sets published numbers beside ours, and what its marks mean."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import pandas as pd
+
+from vinetrack.published import SOURCE
+
+COMPUTED = "computed"
+SIMULATED = "simulated from printed parameters"
+MEASURED = "measured"
+NOT_CHECKABLE = "not checkable"
+
+MARKS = {
+    COMPUTED: f"follows by arithmetic, or by Eq. (2), from other numbers of {SOURCE}; ours is the corrected value "
+    "where the two differ",
+    SIMULATED: "found in virtual trials that were grown from the printed B and n: agreement checks the analysis, not "
+    "the paper",
+    MEASURED: "found in trials that were filmed",
+    NOT_CHECKABLE: "rests on something that is not printed: a setting, a scatter, or a B that had to be guessed",
+}
+
+PAPER_COLUMNS = (
+    "row",
+    "where",
+    "quantity",
+    "setting",
+    "unit",
+    "published",
+    "as_printed",
+    "ours",
+    "ours_low_95",
+    "ours_high_95",
+    "mark",
+    "how",
+    "beside",
+)
+TEXTS = frozenset(PAPER_COLUMNS) - {"published", "ours", "ours_low_95", "ours_high_95"}
+
+PREFERRED = "both_axes"
+"""The fit of the damping law whose numbers stand for ours."""
+
+nan = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperRow:
+    """A published number or statement and ours, in `unit`.
+
+    `row` names it for programs, `where` tells where it is printed, `as_printed` how; `published` is NaN where that is
+    no number. `low` and `high` bound ours with 95 %. `how` says where ours comes from; `beside`, what a departure from
+    the paper's own assumptions would do to it.
+    """
+
+    row: str
+    where: str
+    quantity: str
+    mark: str
+    how: str
+    setting: str = ""
+    unit: str = "1"
+    published: float = nan
+    as_printed: str = ""
+    ours: float = nan
+    low: float = nan
+    high: float = nan
+    beside: str = ""
+
+
+def as_table(rows: Iterable[PaperRow]) -> pd.DataFrame:
+    """Rows as `paper.csv` holds them, columns `PAPER_COLUMNS`.
+
+    Raises
+    ------
+    ValueError
+        If a row's name stands twice, or its mark is none.
+    """
+    entries = []
+    for row in rows:
+        entry = asdict(row)
+        entry["ours_low_95"], entry["ours_high_95"] = entry.pop("low"), entry.pop("high")
+        entry["as_printed"] = row.as_printed or (f"{row.published:g}" if math.isfinite(row.published) else "")
+        entries.append(entry)
+        if row.mark not in MARKS:
+            raise ValueError(f"row {row.row} has the mark {row.mark!r}")
+    table = pd.DataFrame(entries, columns=list(PAPER_COLUMNS))
+    twice = table.loc[table["row"].duplicated(), "row"].tolist()
+    if twice:
+        raise ValueError(f"rows stand twice: {', '.join(twice)}")
+    return table
+
+
+def number(value: Any) -> float:
+    """A number as JSON gives it back: NaN where it is null."""
+    return nan if value is None else float(value)
+
+
+def bounds(pair: Sequence[float | None] | None) -> tuple[float, float]:
+    """An interval as JSON gives it back."""
+    low, high = pair or (None, None)
+    return number(low), number(high)
