@@ -60,6 +60,7 @@ class Wants:
     vines: int = 1
     fast: bool = False
     wide_chamber: bool = False
+    quiet: bool = False
     angles: bool = False
     trials: tuple[int, int] = (24, 48)
 

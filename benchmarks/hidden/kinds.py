@@ -97,7 +97,7 @@ def _refill(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
 
 
 def _pressure_damping(draw: Draw, scene: Scene) -> Hidden:
-    beta = _either(draw, 3e-6, min(2.5e-5, 0.7 / scene.highest_Pa))
+    beta = _either(draw, 3e-6, min(1.5e-5, 0.7 / scene.highest_Pa))
     return Hidden({"beta": beta}, {"pressure_damping.beta": beta})
 
 
@@ -125,19 +125,19 @@ def _time_base(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
 
 
 def _pressure_gain(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
-    eps = _either(draw, 0.02, 0.15)
+    eps = _either(draw, 0.02, 0.07)
     return Hidden(values={"pressure_gain.eps": eps}, pressure_gain=eps)
 
 
 def _pressure_gauge(draw: Draw, scene: Scene) -> Hidden:
-    delta = _either(draw, 400, 3000)
+    delta = _either(draw, 400, 2500)
     if delta < -0.3 * scene.weakest_Pa:
         delta = -delta
     return Hidden(values={"pressure_gauge.delta": delta}, pressure_offset_Pa=delta)
 
 
 def _area_scale(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
-    eps = _either(draw, 0.01, 0.15)
+    eps = _either(draw, 0.01, 0.07)
     return Hidden(values={"area_scale.eps": eps}, diameter=eps)
 
 
@@ -151,11 +151,11 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "supply_refill": (_refill, Wants(chamber=True, wide_chamber=True)),
     "leak": (_one("leak.rate", "leak_rate", 0.005, 5.0), Wants()),
     "inlet_loss": (_one("inlet_loss.K", "K", 0.05, 3.0), Wants(inlet=True, fast=True)),
-    "gas_inertia": (_one("gas_inertia.factor", "gas", 0.7, 1.3), Wants(fast=True)),
-    "air_drag": (_one("air_drag.C_D", "C_D", 1.0, 30.0), Wants(fast=True)),
+    "gas_inertia": (_one("gas_inertia.factor", "gas", 0.7, 1.3), Wants(fast=True, quiet=True)),
+    "air_drag": (_one("air_drag.C_D", "C_D", 1.0, 6.0), Wants(fast=True, quiet=True)),
     "fold_inertia": (_one("fold_inertia.eta", "eta", 0.2, 1.0), Wants(fast=True)),
     "linear_damping": (_one("linear_damping.b", "b", 0.01, 1.0, lambda s: 0.5 * s.weakest_B), Wants()),
-    "pressure_damping": (_pressure_damping, Wants()),
+    "pressure_damping": (_pressure_damping, Wants(quiet=True)),
     "tail_friction": (
         _one("tail_friction.mu_w", "mu_w", 0.01, 6.0, lambda s: 1.2 * s.weakest_N / s.longest_m),
         Wants(),
@@ -165,15 +165,18 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
         _one("payload_friction.mu_p", "mu_p", 0.2, 2.0, lambda s: 0.5 * s.weakest_N / (s.payload_kg * 9.81)),
         Wants(payload=True),
     ),
-    "payload_drag": (_one("payload_drag.drag_area", "drag_area", 8e-4, 1e-2), Wants(payload=True, fast=True)),
+    "payload_drag": (
+        _one("payload_drag.drag_area", "drag_area", 5e-4, 4e-3),
+        Wants(payload=True, fast=True, quiet=True),
+    ),
     "wall_stretch": (_one("wall_stretch.kappa", "kappa", 5e-7, 1e-5), Wants()),
     "tail_stretch": (_one("tail_stretch.compliance", "compliance", 2e-9, 1e-7), Wants()),
     "latch_release": (_latch, Wants()),
     "length_scale": (_length_scale, Wants()),
     "time_base": (_time_base, Wants()),
-    "pressure_gain": (_pressure_gain, Wants()),
+    "pressure_gain": (_pressure_gain, Wants(quiet=True)),
     "pressure_gauge": (_pressure_gauge, Wants()),
-    "area_scale": (_area_scale, Wants()),
+    "area_scale": (_area_scale, Wants(quiet=True)),
     "perspective": (_perspective, Wants()),
 }
 """Every effect of the catalogue that a vine released at its full pressure can show."""

@@ -1,0 +1,22 @@
+"""Ripple: the film resists now more, now less along its length.
+
+    tail force −F sin(2π y/Λ + φ)
+
+In no catalogue. Only scoring gives it to the package, to learn how well the truth would have fitted.
+"""
+
+import math
+
+import numpy as np
+
+from vinetrack.effects import Parameter
+
+PARAMETERS = (
+    Parameter("F", "F", "N", 0.1, bounds=(-100.0, 100.0)),
+    Parameter("length", "Λ", "m", 0.05, bounds=(1e-3, 1.0), zero=0.05),
+    Parameter("phase", "φ", "1", 0.0, bounds=(-10.0, 10.0)),
+)
+
+
+def tail_force(s, rig, F, length, phase):  # noqa: ARG001
+    return -F * np.sin(2.0 * math.pi * s.lead_position / length + phase)
