@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinetrack.figures.strip import LARGEST_PX, draw_strip, flagged
+from vinetrack.figures.strip import LARGEST_PX, draw_strip, flagged, shrunk
 from vinetrack.figures.style import render
 from vinetrack.records import Track
+from vinetrack.report.compact import compact_svg
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 
@@ -73,6 +74,22 @@ def test_large_pictures_are_drawn_small() -> None:
     figure = draw_strip("a", tracking(n_along=1900, height=1200), 1e-3)
     shapes = [image.get_array().shape for ax in axes(figure) for image in ax.images]
     assert max(size for shape in shapes for size in shape) <= LARGEST_PX
+
+
+def test_a_smaller_picture_holds_the_means_of_the_larger() -> None:
+    picture = np.arange(50.0).reshape(5, 10)
+    picture[0, 0] = np.nan
+    small = shrunk(picture, 4)
+    assert small.shape == (3, 4)
+    assert small[0, 0] == pytest.approx(np.nanmean(picture[:2, :3]))
+    assert small[2, 3] == picture[4, 9]
+    assert shrunk(picture, 10) is picture
+
+
+def test_a_strip_weighs_little_in_a_page() -> None:
+    body, _, _ = compact_svg(render(draw_strip("a", tracking(900, 320), 1e-3), ["svg"])["svg"].decode(), "p", {})
+    assert len(body) < 40_000
+    assert "matrix(" in body
 
 
 def test_it_can_be_written_as_png_and_svg() -> None:

@@ -127,14 +127,16 @@ def _plain(node: ElementTree.Element) -> Element:
 
 
 def _rounded(value: str) -> str:
-    """A number, or the numbers in a transform, to two decimals; names are left alone."""
+    """A number, or the numbers in a transform, to two decimals, of a matrix to five; names are left alone."""
     if not re.fullmatch(r"[-\d.eE+]+|[a-z]+\([-\d.eE+ ,]+\)( [a-z]+\([-\d.eE+ ,]+\))*", value):
         return value
-    return re.sub(r"[-+]?\d+\.\d+(?:[eE][-+]?\d+)?", lambda match: _two_decimals(float(match[0])), value)
+    # A matrix stretches hundreds of pixels: two decimals would be off by some of them.
+    decimals = 5 if "matrix" in value or "scale" in value else 2
+    return re.sub(r"[-+]?\d+\.\d+(?:[eE][-+]?\d+)?", lambda match: _shorter(float(match[0]), decimals), value)
 
 
-def _two_decimals(value: float) -> str:
-    return f"{value:.2f}".rstrip("0").rstrip(".")
+def _shorter(value: float, decimals: int = 2) -> str:
+    return f"{value:.{decimals}f}".rstrip("0").rstrip(".")
 
 
 def _path(node: ElementTree.Element) -> list[Element]:
@@ -257,6 +259,6 @@ def _short_style(style: Style, colours: Mapping[str, str]) -> str:
         known = colours.get(value.lower(), value)
         number = re.fullmatch(r"(\d*\.\d+)(px)?", known)
         if number:
-            known = _two_decimals(float(number[1])) + (number[2] or "")
+            known = _shorter(float(number[1])) + (number[2] or "")
         pairs.append(f"{key}:{known}")
     return escape(";".join(pairs), quote=True)
