@@ -1,0 +1,123 @@
+"""Trials of Figs. 4 and 5 found in an experiment and held against Eq. (2), by tables written by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.integrate import solve_ivp
+
+from vinetrack.naming import with_names
+from vinetrack.paper.beside import (
+    eq2_speed_m_s,
+    final_speeds,
+    mean_motions,
+    position_conditions,
+    position_errors,
+    speed_conditions,
+    speed_curves,
+)
+from vinetrack.paper.departures import NONE, follow
+from vinetrack.records import Trial
+
+
+def trial(name: str, pressure_kPa: float, payload_g: float, thickness_um: float = 200.0) -> Trial:
+    return Trial(
+        name=name,
+        capture_fps=1069.0,
+        diameter_m=0.024,
+        thickness_m=thickness_um / 1e6,
+        length_m=0.28,
+        pressure_Pa=1e3 * pressure_kPa,
+        yield_pressure_Pa=3e3,
+        payload_kg=payload_g / 1e3,
+    )
+
+
+FIG4 = [trial("a", 28, 35.6), trial("b", 28, 35.6), trial("c", 7, 35.6)]
+FIG5 = [trial("d", 41, 10, 150), trial("e", 41, 10, 150), trial("f", 41, 50, 150)]
+OTHERS = [trial("g", 28, 20), trial("h", 41, 0, 150), trial("i", 20, 35.6), trial("j", 28, 35.6, 100)]
+TRIALS = with_names([*FIG4, *FIG5, *OTHERS])
+
+
+def test_trials_of_each_figure_are_found_by_what_was_set() -> None:
+    by_pressure = {kPa: [one.name for one in own] for kPa, own in position_conditions(TRIALS).items()}
+    assert by_pressure == {7.0: ["c"], 28.0: ["a", "b"]}
+    assert [[one.name for one in own] for own in speed_conditions(TRIALS).values()] == [["d", "e"], ["f"]]
+
+
+def moved(shift_m: float) -> pd.DataFrame:
+    """Two trials, 10 and 9 frames after release, whose mean lies `shift_m` ahead of Eq. (2)."""
+    plain = follow(TRIALS[0], NONE, 6.44)
+    parts = []
+    for name, stop in (("a", 150), ("b", 140)):
+        time_s = np.arange(-3, stop) / 1069
+        mean_m = np.interp(time_s, plain.time_s, plain.lead_position_m) + shift_m
+        columns = {"trial": name, "time_s": time_s, "replicates_mean_m": mean_m, "replicates_sigma_m": 0.001}
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def test_the_mean_counts_until_the_first_trial_ends() -> None:
+    conditions = position_conditions(TRIALS)
+    mean = mean_motions(conditions, {TRIALS[0].condition: moved(0.002)})
+    assert set(mean["pressure_kPa"]) == {28.0}
+    assert mean["time_s"].min() == pytest.approx(0.0)
+    assert mean["time_s"].max() == pytest.approx(139 / 1069)
+    assert (mean["n_trials"] == 2).all()
+
+
+def test_the_error_is_that_of_the_mean() -> None:
+    conditions = position_conditions(TRIALS)
+    mean = mean_motions(conditions, {TRIALS[0].condition: moved(0.002)})
+    comparison = pd.DataFrame(
+        {"condition": [TRIALS[0].condition], "rms_position_m": [0.004], "replicate_floor_m": [0.003]}
+    )
+    (row,) = position_errors(conditions, mean, comparison).itertuples()
+    assert row.rms_mean_m == pytest.approx(0.002, rel=1e-6)
+    assert (row.rms_single_m, row.floor_m, row.n_trials) == (0.004, 0.003, 2)
+
+
+def test_without_a_comparison_there_are_no_errors() -> None:
+    empty = mean_motions(position_conditions(TRIALS), {})
+    assert len(empty) == 0
+    nothing = pd.DataFrame(columns=["condition", "rms_position_m", "replicate_floor_m"])
+    assert len(position_errors(position_conditions(TRIALS), empty, nothing)) == 0
+
+
+def test_speeds_are_taken_at_12_cm_from_where_each_trial_rested() -> None:
+    """Speed 10 y beyond the rest: 1.2 m/s there, 1.4 where the origin lies 20 mm lower; mean 1.3, error 0.1."""
+    y = np.linspace(0, 0.28, 500)
+    kinematics = {name: pd.DataFrame({"lead_position_m": y, "lead_velocity_m_s": 10 * y}) for name in ("d", "e", "f")}
+    table = final_speeds(speed_conditions(TRIALS), kinematics, {"d": 0.0, "e": 0.02})
+    (row,) = table.itertuples()
+    assert (row.n_final, row.payload_g, row.pressure_kPa) == (2, pytest.approx(10), pytest.approx(41))
+    assert row.final_lead_velocity_m_s == pytest.approx(1.3, rel=1e-6)
+    assert row.final_lead_velocity_sigma_m_s == pytest.approx(0.1, rel=1e-4)
+
+
+def test_eq2_by_another_integrator() -> None:
+    """B in proportion to the wall: 6.44 × 150/200 = 4.83."""
+    one = TRIALS[3]
+    film, area = 1200 * math.pi * 0.024 * 150e-6, math.pi * 0.012**2
+
+    def rates(_: float, state: np.ndarray) -> list[float]:
+        x, v = state
+        m = film * 0.28 - film / 2 * x + 0.010
+        return [v, (0.5 * 38e3 * area - 0.5 * 4.83 * max(v, 0.0) ** 0.37) / m + 9.81]
+
+    def there(_: float, state: np.ndarray) -> float:
+        return float(state[0] - 0.24)
+
+    there.terminal = True  # type: ignore[attr-defined]
+    found = solve_ivp(rates, (0, 1), [0.0, 1e-9], events=there, method="LSODA", rtol=1e-9, atol=1e-12)
+    assert eq2_speed_m_s(one) == pytest.approx(found.y_events[0][0][1] / 2, rel=2e-3)
+
+
+def test_curves_run_from_the_least_payload_to_the_largest() -> None:
+    curve = speed_curves(speed_conditions(TRIALS), instants=3)
+    assert curve["payload_g"].tolist() == pytest.approx([10, 30, 50])
+    assert curve["final_lead_velocity_m_s"].is_monotonic_decreasing
+    assert curve["final_lead_velocity_m_s"].iloc[0] == pytest.approx(eq2_speed_m_s(TRIALS[3]))

@@ -1,0 +1,78 @@
+"""The paper's numbers as a section of the report: both tables, every row, and what is said of the marks."""
+
+from __future__ import annotations
+
+import math
+
+import pandas as pd
+
+from vinetrack.paper.departures import DEPARTURE_COLUMNS, DEPARTURES
+from vinetrack.paper.rows import COMPUTED, NOT_CHECKABLE, SIMULATED, PaperRow, as_table
+from vinetrack.report.paper import FIGURES, paper_section, tally
+
+nan = math.nan
+
+
+def rows() -> pd.DataFrame:
+    common = {"where": "somewhere", "how": "somehow"}
+    return as_table(
+        [
+            PaperRow(row="thickness_R1", quantity="wall", mark=SIMULATED, published=50.0, ours=50.0, **common),
+            PaperRow(row="press_R1", quantity="press", mark=NOT_CHECKABLE, published=110.0, **common),
+            PaperRow(
+                row="B_R1", quantity="B", mark=SIMULATED, published=0.57, ours=0.575, low=0.56, high=0.59, **common
+            ),
+            PaperRow(
+                row="position_rms_7kPa", quantity="rms", mark=SIMULATED, published=1.9, ours=0.32, unit="cm", **common
+            ),
+            PaperRow(row="p", quantity="p-value", mark=COMPUTED, published=0.32, ours=0.033, beside="a note", **common),
+        ]
+    )
+
+
+def departures() -> pd.DataFrame:
+    sizes = (0.057, 0.069, 0.095, 0.110, 0.114)
+    named = zip(DEPARTURES, sizes, strict=True)
+    return pd.DataFrame(
+        [("Fig. 4", 7.0, one.name, size, nan, nan) for one, size in named], columns=list(DEPARTURE_COLUMNS)
+    )
+
+
+def test_kinds_are_counted_and_explained() -> None:
+    assert tally(rows()) == "5 rows: 1 computed, 3 simulated from printed parameters, 1 not checkable."
+    section = paper_section(rows(), departures(), [])
+    text = " ".join(section.paragraphs)
+    assert "agreement checks the analysis, not the paper" in text
+    assert "found in trials that were filmed" not in text
+    assert "Neither is claimed to be the reason" in text
+
+
+def test_table_one_has_what_is_printed_and_ours() -> None:
+    one = paper_section(rows(), departures(), []).tables[0]
+    assert len(one.rows) == 4
+    assert one.rows[0] == ("1", "50.0", "–", "110", "–", "0.570", "0.575 (0.560 to 0.590)", "0.964", "–")
+    assert len(one.head) == len(one.rows[0])
+
+
+def test_table_two_sets_departures_beside_the_errors() -> None:
+    two = paper_section(rows(), departures(), []).tables[1]
+    by_pressure = {row[0]: row[1:] for row in two.rows}
+    assert list(by_pressure) == ["7", "14", "28", "41"]
+    assert by_pressure["7"][:5] == ("1.90", "0.320", "5.70 to 6.90", "9.50", "11.0 to 11.4")
+    assert by_pressure["7"][5:] == ("–",) * 5
+    assert all(len(row) == len(two.head) for row in two.rows)
+
+
+def test_every_row_is_there_with_its_mark() -> None:
+    whole = paper_section(rows(), departures(), []).tables[2]
+    assert len(whole.rows) == 5
+    assert whole.rows[-1] == (
+        "somewhere", "p-value", "", "", "0.32", "0.0330", COMPUTED, "somehow", "a note",
+    )  # fmt: skip
+
+
+def test_every_figure_has_a_caption() -> None:
+    from importlib.resources import files
+
+    for name in FIGURES:
+        assert len((files("vinetrack.report") / "captions" / f"{name}.rst").read_text(encoding="utf-8")) > 50
