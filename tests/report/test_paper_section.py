@@ -50,7 +50,7 @@ def test_kinds_are_counted_and_explained() -> None:
 def test_table_one_has_what_is_printed_and_ours() -> None:
     one = paper_section(rows(), departures(), []).tables[0]
     assert len(one.rows) == 4
-    assert one.rows[0] == ("1", "50.0", "–", "110", "–", "0.570", "0.575 (0.560 to 0.590)", "0.964", "–")
+    assert one.rows[0] == ("1", "50", "–", "110", "–", "0.57", "0.575 (0.560 to 0.590)", "0.964", "–")
     assert len(one.head) == len(one.rows[0])
 
 

@@ -50,7 +50,7 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
             "how fast the regulator refills, and how long the vines were, is not printed, and B and n of Fig. 6 may "
             "have taken up a part of it.",
         ],
-        tables=[_table_one(table), _table_two(table, departures), _every_row(table)],
+        tables=[table_one(table), table_two(table, departures), every_row(table)],
         figures=list(figures),
     )
 
@@ -64,13 +64,14 @@ def tally(table: pd.DataFrame) -> str:
     return f"{len(table)} rows: {', '.join(parts)}."
 
 
-def _table_one(table: pd.DataFrame) -> ReportTable:
+def table_one(table: pd.DataFrame) -> ReportTable:
+    """Table I of the paper, with what Fig. 6 found and what we did."""
     by_row = _by_row(table)
     body = [
         (
             str(scale),
-            *(number(published_of(by_row, f"{name}_R{scale}")) for name in ("thickness", "diameter", "press", "laser")),
-            number(published.DAMPING_B[scale]),
+            *(_shown(published_of(by_row, f"{name}_R{scale}")) for name in ("thickness", "diameter", "press", "laser")),
+            f"{published.DAMPING_B[scale]:g}",
             _ours(by_row.get(f"B_R{scale}")),
             number(published.DAMPING_R2[scale]),
             number(_value(by_row.get(f"R2_R{scale}"))),
@@ -91,7 +92,8 @@ def _table_one(table: pd.DataFrame) -> ReportTable:
     return ReportTable("Table I, with what Fig. 6 found", head, body, frozenset(range(1, len(head))))
 
 
-def _table_two(table: pd.DataFrame, departures: pd.DataFrame) -> ReportTable:
+def table_two(table: pd.DataFrame, departures: pd.DataFrame) -> ReportTable:
+    """Table II of the paper, with ours and with what departures from Eq. (2) would cause."""
     by_row = _by_row(table)
     body = []
     for pressure_kPa in sorted({*published.POSITION_RMS_CM, *published.FINAL_SPEED_RMS_M_S}):
@@ -120,7 +122,8 @@ def _table_two(table: pd.DataFrame, departures: pd.DataFrame) -> ReportTable:
     return ReportTable("Table II", head, body, frozenset(range(len(head))), note)
 
 
-def _every_row(table: pd.DataFrame) -> ReportTable:
+def every_row(table: pd.DataFrame) -> ReportTable:
+    """All of `paper.csv`."""
     head = ("where", "what", "setting", "unit", "printed", "here (95 %)", "mark", "how", "beside it")
     body = [
         (
@@ -156,7 +159,13 @@ def _ours(row: Any) -> str:
     if row is None or not math.isfinite(row.ours):
         return "–"
     bounds = interval((row.ours_low_95, row.ours_high_95))
-    return f"{number(row.ours)} ({bounds})" if bounds != "–" else number(row.ours)
+    return f"{_shown(row.ours)} ({bounds})" if bounds != "–" else _shown(row.ours)
+
+
+def _shown(value: float | None) -> str:
+    """A number to three digits, a whole one as it is."""
+    whole = value is not None and math.isfinite(value) and math.isclose(value, round(value), rel_tol=1e-9)
+    return f"{value:.0f}" if whole else number(value)
 
 
 def _range(size: Mapping[str, float], low: str, high: str) -> str:
