@@ -89,7 +89,7 @@ def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
         "where": ["The model fails most at 24 kPa."],
         "drift": [{"parameter": "eversion_damping.B", "sentence": "B rises by 39 ± 3 % from 60 kPa to 24 kPa."}],
         "next_experiment": next_experiment() if verdict == "ambiguous" else None,
-        "missing_force": {"text": "It looks like a constant."} if verdict == "unexplained" else None,
+        "missing_force": missing_force() if verdict == "unexplained" else None,
         "notes": [],
         "refused": None,
     }
@@ -104,6 +104,11 @@ def refused(reason: str = "fewer than two trials move") -> dict[str, Any]:
         "refused": reason,
         "explanation": f"No diagnosis could be made: {reason}",
     }
+
+
+def missing_force() -> dict[str, Any]:
+    law = {"law": "constant", "words": "the same everywhere", "explained": 0.93, "amplitude_N": 0.4, "sigma_N": 0.02}
+    return {"sentence": "It looks like a constant.", "laws": [law], "depends_on": {"growth": 0.95}}
 
 
 def next_experiment() -> dict[str, Any]:

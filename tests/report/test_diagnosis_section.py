@@ -161,6 +161,14 @@ def test_what_an_effect_is_is_said_beside_its_name() -> None:
     assert "A hole." not in html
 
 
+def test_a_missing_force_is_drawn_with_what_it_looks_like() -> None:
+    figures = [ReportFigure("missing_force", "The missing force", "c", SVG)]
+    html = page(diagnosis=DiagnosisResult(diagnosis("unexplained")), figures=figures)
+    assert html.index("It looks like a constant.") < html.index('id="figure-missing_force"')
+    for words in ("the same everywhere", "93 %", "0.400 ± 0.020"):
+        assert words in html
+
+
 def test_a_refusal_is_said_with_its_reason_and_the_law_still_stands() -> None:
     html = shown(refused())
     assert heading(html) == "not diagnosed No diagnosis could be made."

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.figures.numbers import number
+from vinetrack.figures.numbers import number, with_error
 from vinetrack.report.model import READABLE
 from vinetrack.report.section import ReportTable
 from vinetrack.report.verdict import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
@@ -61,7 +61,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "explanation": str(content.get("explanation") or ""),
         "ladder": ladder_table(result.ladder),
         "where": [str(line) for line in content.get("where") or []],
-        "force": _force(content.get("missing_force")),
+        "force": missing_force(content.get("missing_force")),
         "rounds": [_round(i, one) for i, one in enumerate(rounds)],
         "hidden": hidden_table(rounds[-1].get("ranking") or []) if rounds else None,
         "blind": _blind(rounds[0].get("ranking") or []) if rounds else [],
@@ -216,12 +216,21 @@ def _simulated(entry: Mapping[str, Any]) -> str:
     return f"{number(entry['mean'], 2)} ± {number(entry.get('sd'), 1)}"
 
 
-def _force(content: Mapping[str, Any] | None) -> list[str]:
-    """What is said of the force that is missing: its text, or its sentences."""
+def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What is said of the force that is missing, and the simple laws it was held against."""
     if not content:
-        return []
-    said = content.get("text") or content.get("sentences") or content.get("words") or ""
-    return [said] if isinstance(said, str) else [str(line) for line in said]
+        return None
+    rows = [
+        (
+            str(law.get("words") or law.get("law") or ""),
+            f"{100 * float(law['explained']):.0f} %" if known(law.get("explained")) else "–",
+            with_error(law.get("amplitude_N"), law.get("sigma_N")),
+        )
+        for law in content.get("laws") or []
+    ]
+    head = ("Simple law", "of what is missing it explains", "size (N)")
+    table = ReportTable("Which simple law it looks like", head, rows, frozenset({1, 2})) if rows else None
+    return {"sentence": str(content.get("sentence") or content.get("text") or ""), "laws": table}
 
 
 def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
