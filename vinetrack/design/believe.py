@@ -145,7 +145,7 @@ def _damping(making: _Making, said: Said, anchor: tuple[str, bool]) -> None:
         split = guess.split_leverage(trial.diameter_m, trial.thickness_m) - guess.split_leverage(*size)
     elif (scale := _printed_scale(trial)) is not None:
         making.know(DAMPING, published.DAMPING_B[scale], f"printed, {published.SOURCE}")
-        words = f"the error of the printed B is not printed; taken for {100 * guess.PRINTED_ERROR:.0f} %"
+        words = f"that of the printed B is not printed: taken for {100 * guess.PRINTED_ERROR:.0f} %"
         making.doubt("error of B", words, f"B printed|{trial.vine}", scaled(DAMPING, guess.PRINTED_ERROR))
         return
     else:
@@ -171,14 +171,14 @@ def _doubt_guess(making: _Making, split: float) -> None:
     """Errors of the guessed law of B: the scatter of the printed values about it, and t against D."""
     scatter = guess.damping_log_sigma(making.trial.diameter_m, making.trial.thickness_m)
     words = (
-        f"the four printed B scatter by {100 * guess.damping_scatter():.0f} % about the guessed law, which at this "
-        f"size makes {100 * scatter:.0f} % (Student's t, {guess.SCATTER_DOF} degrees of freedom)"
+        f"the four printed B scatter by {100 * guess.damping_scatter():.0f} % about it: {100 * scatter:.0f} % at this "
+        f"size (Student's t, {guess.SCATTER_DOF} degrees of freedom)"
     )
     making.doubt("guess of B", words, f"B scatter|{making.trial.vine}", heavy(DAMPING, scatter))
     if abs(split) > 1e-9:
         words = (
-            f"what t and D do apart is not printed: exponents off by {guess.SPLIT_SIGMA:g} against each other, "
-            f"{100 * abs(split) * guess.SPLIT_SIGMA:.0f} % of B at this t/D"
+            f"t and D apart are not printed: exponents ±{guess.SPLIT_SIGMA:g} against each other, "
+            f"{100 * abs(split) * guess.SPLIT_SIGMA:.0f} % at this t/D"
         )
         making.doubt("t against D", words, "B split", scaled(DAMPING, split * guess.SPLIT_SIGMA))
 
@@ -197,7 +197,7 @@ def _exponent(making: _Making, said: Said) -> None:
         return
     sigma = guess.exponent_sigma()
     making.know(EXPONENT, published.EXPONENT, f"printed, {published.SOURCE}")
-    words = f"n is known to {sigma:.2g}, from the printed R² of its fits"
+    words = f"±{sigma:.2g}, from the printed R² of the fits"
     making.doubt("error of n", words, "n printed", shifted(EXPONENT, sigma))
 
 
@@ -212,13 +212,13 @@ def _yield_pressure(making: _Making, anchor: tuple[str, bool]) -> None:
         making.know(YIELD, trial.yield_pressure_Pa, "given")
         sigma = trial.yield_pressure_sigma_Pa
         if sigma > 0:
-            words = f"the yield pressure is stated to {sigma / 1e3:.2g} kPa"
+            words = f"stated to {sigma / 1e3:.2g} kPa"
             making.doubt("stated P_y", words, f"P_y stated|{trial.vine}", shifted(YIELD, sigma))
     else:
         making.know(YIELD, guess.YIELD_PRESSURE_PA, "guess: the one that is printed, for another vine")
         words = (
-            f"the yield pressure is a guess: {published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine, nine of ten "
-            f"others within a factor {guess.YIELD_FACTOR:g} of it"
+            f"{published.YIELD_PRESSURE_KPA:g} kPa is printed for one vine; nine of ten others within a factor "
+            f"{guess.YIELD_FACTOR:g}"
         )
         making.doubt("guess of P_y", words, "P_y guess", scaled(YIELD, guess.yield_log_sigma()))
 
@@ -292,9 +292,9 @@ def _spreads(making: _Making, said: Said) -> tuple[float, float]:
         (pressure, damping), origin = said.spreads, "given:"
     making.know(PRESSURE, trial.pressure_Pa, "set")
     if pressure > 0:
-        words = f"pressure from trial to trial, {origin} {100 * pressure:.2g} %"
+        words = f"{origin} {100 * pressure:.2g} %"
         making.doubt("P from trial to trial", words, f"P trial|{trial.vine}", relative(PRESSURE, pressure))
     if damping > 0:
-        words = f"B from trial to trial, {origin} {100 * damping:.2g} %"
+        words = f"{origin} {100 * damping:.2g} %"
         making.doubt("B from trial to trial", words, f"B trial|{trial.vine}", scaled(DAMPING, damping))
     return pressure, damping

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 MOST_CURVES = len(VINE_COLOURS)
 _WIDTH_IN = 9.6
 _FAR_APART = 6.0
-"""Ratio of the slowest to the fastest above which time has a logarithmic axis, from a hundredth of the fastest on."""
+"""Ratio of the largest to the least above which an axis is logarithmic; that of time from 1 % of the fastest on."""
+
+_SLACK = 0.01
+"""Of the largest tension, that a tail must push with before it is worth a word."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,10 @@ def _label(axes: np.ndarray, drawn: Sequence[Picture], at_fraction: float) -> No
     speed.set_ylim(max(low, 0.0), high)
     speed.text(at_fraction - 0.015, 0.03, f"y/L = {at_fraction:g}", transform=speed.get_xaxis_transform(), ha="right",
                fontsize=9, color=MUTED)  # fmt: skip
-    if any(float(picture.curve["tension_low_90_N"].min()) < 0 for picture in drawn):
+    lows, highs = zip(
+        *((p.curve["tension_low_90_N"].min(), p.curve["tension_high_90_N"].max()) for p in drawn), strict=True
+    )
+    if min(lows) < -_SLACK * max(highs):
         tension.axhline(0.0, color=INK, lw=0.8)
         tension.set_title("below 0 the tail would have to push", fontsize=9.5, fontweight="normal", color=MUTED)
     ends = [float(picture.curve["time_s"].replace(np.inf, np.nan).max()) for picture in drawn]
@@ -124,13 +130,21 @@ def _draw_shares(ax: Axes, picture: Picture) -> None:
     for k, (_, start, stop) in enumerate(rows):
         ax.barh(k, stop - start, left=start, height=0.55, color=BLUE, alpha=0.85 if k == 0 else 0.4, lw=0)
     ax.axvline(median, color=INK, lw=1.0)
-    ax.set_yticks(range(len(rows)), [textwrap.fill(name.replace("_", " "), 15) for name, _, _ in rows], fontsize=8.8)
+    ax.set_yticks(range(len(rows)), [_folded(name) for name, _, _ in rows], fontsize=8.8)
     ax.invert_yaxis()
     ax.margins(x=0.06)
     ax.use_sticky_edges = False
+    if low > 0 and high > _FAR_APART * low:
+        ax.set_xscale("log")
+        plain_log_ticks(ax, "x")
     ax.grid(visible=False, axis="y")
     ax.set_xlabel(f"{picture.final_name} (m/s)")
     ax.set_title("What leaves it open", fontsize=10.5)
+
+
+def _folded(name: str) -> str:
+    """A name in lines of 15 letters; long names of effects are parted at their underscores."""
+    return textwrap.fill(name if len(name) <= 15 else name.replace("_", " "), 15)
 
 
 def _list_conditions(ax: Axes, pictures: Sequence[Picture]) -> None:

@@ -50,14 +50,13 @@ def draw_choice(films: Sequence[Film], name: str, y_over_L: float) -> Figure:
                           fontsize=10)  # fmt: skip
         curves.set_xlabel("diameter (mm)")
         curves.set_ylabel(label)
-        curves.set_ylim(bottom=0.0)
+        curves.set_ylim(0.0, 1.12 * max(film.band[1] for film in films))
         curves.set_title("best length and pressure at each diameter", fontsize=10, fontweight="normal")
         curves.legend(title="film", fontsize=9.5)
         bars.set_xlim(-0.6, len(films) - 0.4)
         bars.set_xticks(range(len(films)), [f"{film.thickness_um:g}" for film in films])
         bars.set_xlabel("film (µm)")
         bars.set_title("90 % band; how often it is the fastest", fontsize=10, fontweight="normal")
-        bars.margins(y=0.12)
         fig.subplots_adjust(left=0.1, right=0.985, top=0.9, bottom=0.2, wspace=0.08)
         fig.text(
             0.1, 0.02, "line, marker: median of what is believed; bar: nine draws in ten", color=MUTED, fontsize=8.8

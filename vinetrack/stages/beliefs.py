@@ -180,6 +180,15 @@ def warnings_of(ground: Ground) -> list[str]:
     return [str(problem) for problem in ground.planned.problems]
 
 
+def litres(volume_m3: float) -> str:
+    """A volume as people say it: litres, or millilitres where they are few.
+
+    >>> litres(3.7e-3), litres(3.534e-6)
+    ('3.7 L', '3.53 mL')
+    """
+    return f"{1e3 * volume_m3:.3g} L" if volume_m3 >= 1e-4 else f"{1e6 * volume_m3:.3g} mL"
+
+
 def trial_words(trial: Trial) -> str:
     """A trial as a person would write it.
 
@@ -192,7 +201,7 @@ def trial_words(trial: Trial) -> str:
     degrees = math.degrees(trial.growth_angle_rad)
     named = {0: "straight down", 90: "horizontally", 180: "straight up"}
     way = named.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
-    rig = "" if math.isnan(trial.chamber_m3) else f", chamber {1e3 * trial.chamber_m3:.4g} L"
+    rig = "" if math.isnan(trial.chamber_m3) else f", chamber {litres(trial.chamber_m3)}"
     rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
     return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {way}{rig}"
 

@@ -34,7 +34,7 @@ def campaign_lines(
     yield ""
     yield from _compared(found, beliefs, camera)
     if found.candidates.rejected:
-        yield f"{found.candidates.rejected} conditions were passed over: too slow or too quick to be filmed"
+        yield f"conditions passed over as too slow or too quick to be filmed: {found.candidates.rejected}"
 
 
 def _believed(belief: Belief) -> str:

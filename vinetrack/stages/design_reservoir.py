@@ -12,6 +12,7 @@ from vinetrack.stages.beliefs import (
     as_option,
     beliefs_of,
     check_figure,
+    litres,
     read_ground,
     shown,
     trial_words,
@@ -26,15 +27,6 @@ if TYPE_CHECKING:
     from vinetrack.records import Trial
 
 SIZED = ("diameter_mm", "length_mm", "pressure_kPa")
-
-
-def litres(volume_m3: float) -> str:
-    """A volume as people say it: litres, or millilitres where they are few.
-
-    >>> litres(3.7e-3), litres(3.534e-6)
-    ('3.7 L', '3.53 mL')
-    """
-    return f"{1e3 * volume_m3:.3g} L" if volume_m3 >= 1e-4 else f"{1e6 * volume_m3:.3g} mL"
 
 
 def design_reservoir(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.figures.numbers import number
 from vinetrack.stages.beliefs import (
     Asked,
     Ground,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from vinetrack.design.hazards import Neglected
     from vinetrack.figures.foresight import Picture
 
+LEAST_N = 0.01
 WORTH_SHOWING = 0.005
 """Relative change of the final speed below which an effect that is left out is not listed."""
 
@@ -130,13 +132,16 @@ def _one(found: Foretold) -> Iterator[str]:
 
 
 def _quantity_row(one: Quantity) -> tuple[str, str, str, str, str]:
-    from vinetrack.design.foresee import HOOP
-
+    """Name, place, median, band and unit; stresses in MPa, and forces in mN where all of them are that small."""
     place = "" if math.isnan(one.y_over_L) else f"{one.y_over_L:g}"
-    spread = "–" if one.low == one.high else f"{shown(one.low, one.unit)} to {shown(one.high, one.unit)}"
-    if one.name == HOOP:
-        return one.name, place, f"{one.median / 1e6:.3g}", spread, "MPa"
-    return one.name, place, shown(one.median, one.unit), spread, unit_of(one.unit)
+    values, unit = (one.low, one.median, one.high), one.unit
+    if unit == "Pa":
+        texts, unit = [number(value / 1e6) for value in values], "MPa"
+    elif unit == "N" and max(abs(value) for value in values) < LEAST_N:
+        texts, unit = [number(1e3 * value) for value in values], "mN"
+    else:
+        texts, unit = [shown(value, unit) for value in values], unit_of(unit)
+    return one.name, place, texts[1], "–" if one.low == one.high else f"{texts[0]} to {texts[2]}", unit
 
 
 def _share_row(name: str, low: float, high: float, words: str) -> tuple[str, str, str]:
@@ -183,8 +188,8 @@ def _several(found: Sequence[Foretold]) -> Iterator[str]:
         yield "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine"
     yield ""
     yield "uncertainties included:"
-    words = dict.fromkeys(share.words for one in found for share in one.sight.shares)
-    yield from (f"  {text}" for text in words)
+    words = dict.fromkeys((share.name, share.words) for one in found for share in one.sight.shares)
+    yield from (f"  {name}: {text}" for name, text in words)
     yield ""
     said = dict.fromkeys(text for one in found for text in one.hazards)
     for text in said:
