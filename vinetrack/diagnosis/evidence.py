@@ -135,9 +135,9 @@ def distance(one: Fit, other: Fit) -> float:
     return total
 
 
-def count(found: Fit) -> int:
-    """Free numbers that move anything."""
-    return sum(math.isfinite(number.sigma) for number in found.numbers)
+def complexity(one: Evidence) -> int:
+    """Parameters that its effects bring."""
+    return sum(len(effect.parameters) for effect in one.effects)
 
 
 def answer_set(hypotheses: Sequence[Evidence]) -> tuple[list[Evidence], dict[str, str]]:
@@ -155,8 +155,8 @@ def answer_set(hypotheses: Sequence[Evidence]) -> tuple[list[Evidence], dict[str
         simpler = [
             other
             for other in near
-            if count(other.fit) < count(one.fit)
-            and 2 * (one.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET
+            if 2 * (one.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET
+            and complexity(other) < complexity(one)
             and (_contains(one, other) or distance(other.fit, one.fit) < LIMIT_DISTANCE)
         ]
         if simpler:

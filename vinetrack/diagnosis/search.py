@@ -24,7 +24,7 @@ from vinetrack.model.model import Value
 from vinetrack.model.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.solve import Held, first_state, make_frame, solve, track_correlation
-from vinetrack.model.starts import align
+from vinetrack.model.starts import align, one_of_each_condition
 from vinetrack.records import Floats
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]
@@ -35,6 +35,7 @@ FIRST_ITERATIONS, MORE_ITERATIONS = 4, 10
 MOST_CLIMBED = 14
 """Trials of a climb: one of every condition, no more than this."""
 
+FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
 HOPELESS = 0.5
 """A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far."""
 
@@ -111,12 +112,7 @@ def _values(layout: Layout, theta: Floats) -> dict[str, Value]:
 
 def one_of_each(data: Sequence[FitTrial]) -> list[int]:
     """Places of one trial of every condition, the one with the most points; spread evenly where there are too many."""
-    best: dict[str, int] = {}
-    for i, item in enumerate(data):
-        condition = item.trial.condition
-        if condition not in best or item.time_s.size > data[best[condition]].time_s.size:
-            best[condition] = i
-    places = sorted(best.values())
+    places = one_of_each_condition(data)
     if len(places) <= MOST_CLIMBED:
         return places
     vines = {data[i].trial.vine for i in places}
@@ -168,13 +164,19 @@ def best_climb(slope: Slope, starts: Sequence[Start], goal: float) -> Climb | No
     return best
 
 
-def full_fit(found: Fit, climb: Climb) -> Fit | None:
-    """The hypothesis fitted to all trials from where its climb ended; None where it cannot be followed."""
+def full_fit(found: Fit, climb: Climb, best: float = -math.inf) -> Fit | None:
+    """The hypothesis fitted to all trials from where its climb ended; None where it cannot be followed.
+
+    One whose ln L is still far below the `best` after the first iterations is left unsettled.
+    """
     model = found.model
     for effect in climb.effects:
         model = model + effect
     try:
-        return refit(found, model, start=climb.values)
+        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False)
+        if fit.converged or fit.log_likelihood < best - FAR_BEHIND:
+            return fit
+        return refit(fit, most_iterations=MORE_OF_FIT, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 

@@ -123,7 +123,8 @@ class Search:
         if name in self.fitted and not math.isnan(climb.deviance):
             return
         self.report(f"fitting {name}")
-        fit = full_fit(self.questions.found, climb)
+        best = max((one.fit.log_likelihood for one in self.fitted.values()), default=-math.inf)
+        fit = full_fit(self.questions.found, climb, best)
         if fit is None:
             self.silent.add(name)
             return

@@ -185,6 +185,8 @@ def refit(
     hold_spreads: bool = False,
     hold_noise: bool = False,
     profile: bool = False,
+    most_iterations: int = MOST_ITERATIONS,
+    thorough: bool = True,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
@@ -197,6 +199,9 @@ def refit(
         Values of parameters to begin from, of a new effect above all: a time constant begun at zero stays there.
     hold_spreads, hold_noise
         Keep spreads and noise of the fit instead of estimating them again.
+    most_iterations, thorough
+        How long to go on, and whether a poor fit is tried once more with the noise of the tracks: what is only to be
+        ruled out need not settle.
     watch
         Told of every step of the iterations; what it raises ends the fit.
     """
@@ -222,13 +227,15 @@ def refit(
     try:
         if before.chi2_per_dof > POOR_FIT:
             own, _ = align(data, predictor, theta, first_own(data))
-            solution = _solve_from(predictor, theta, own, held, watch=watch)
+            solution = _solve_from(predictor, theta, own, held, most_iterations=most_iterations, watch=watch)
         else:
             frame = replace(make_frame(predictor, old.own), own_centre=before.solution.frame.own_centre)
-            solution = solve(predictor, frame, replace(old, theta=theta), held, warm=True, watch=watch)
+            state = replace(old, theta=theta)
+            solution = solve(predictor, frame, state, held, warm=True, most_iterations=most_iterations, watch=watch)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
-    solution = _or_once_more(predictor, solution, held, watch)
+    if thorough:
+        solution = _or_once_more(predictor, solution, held, watch)
     return assemble(predictor, solution, before.left_out, {**kept, "shared": shared, "held": held}, profile=profile)
 
 

@@ -44,7 +44,8 @@ def candidates(layout: Layout, data: Sequence[FitTrial], predictor: Predictor) -
     found: list[tuple[Floats, Floats]] = []
     for values in combined:
         theta = np.array([number.inside(value) for value, number in zip(values, layout.free, strict=True)])
-        found += _scan(layout, data, predictor, theta, own) if DAMPING in layout.keys else [(theta, own)]
+        starts = _scan(layout, data, predictor, theta, own) if DAMPING in layout.keys else [theta]
+        found += [(start, own) for start in starts]
     scored = []
     for theta, begin in found:
         try:
@@ -55,9 +56,19 @@ def candidates(layout: Layout, data: Sequence[FitTrial], predictor: Predictor) -
     return sorted(scored, key=lambda one: one[0])
 
 
+def one_of_each_condition(data: Sequence[FitTrial]) -> list[int]:
+    """Places of one trial of every condition, the one with the most points."""
+    best: dict[str, int] = {}
+    for i, item in enumerate(data):
+        condition = item.trial.condition
+        if condition not in best or item.time_s.size > data[best[condition]].time_s.size:
+            best[condition] = i
+    return sorted(best.values())
+
+
 def _scan(
     layout: Layout, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Floats
-) -> list[tuple[Floats, Floats]]:
+) -> list[Floats]:
     """For each exponent the best B of every vine."""
     speed = np.array([_speed(item) for item in data])
     drive = np.array([_drive(item) for item in data])
@@ -88,7 +99,7 @@ def _scan(
         values = values.copy()
         for k, (_, B) in best.items():
             values[k] = B
-        found.append((values, own))
+        found.append(values)
     return found
 
 
