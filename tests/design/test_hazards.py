@@ -57,9 +57,13 @@ def test_a_tail_that_would_have_to_push() -> None:
 
 
 def test_a_tail_that_may_go_slack_does() -> None:
-    found = hazards(
-        sight(tail_slack="free", diameter_mm=24, thickness_um=200, payload_g=35.6, pressure_kPa=14, growth_angle_deg=0)
+    loose = sight(
+        tail_slack="free", diameter_mm=24, thickness_um=200, payload_g=35.6, pressure_kPa=14, growth_angle_deg=0
     )
+    found = hazards(loose)
+    assert loose.final.name == "speed of the leading edge"
+    with pytest.raises(KeyError):
+        loose["ejection speed of the payload"]
     assert any("the tail goes slack on the way in every draw" in one for one in found)
     assert not any("would have to push" in one for one in found)
 

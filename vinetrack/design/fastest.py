@@ -15,7 +15,7 @@ import numpy as np
 
 from vinetrack.design.beliefs import Belief
 from vinetrack.design.believe import Said, believe
-from vinetrack.design.foresee import Foresight, foresee
+from vinetrack.design.foresee import Foresight, foresee, told_by_payload
 from vinetrack.design.from_fit import FitNumbers
 from vinetrack.design.guess import BURST_STRESS_PA, burst_pressure_Pa
 from vinetrack.design.runs import LONGEST_S, POINTS, run
@@ -149,7 +149,7 @@ def final_speeds(beliefs: Sequence[Belief], at_fraction: float) -> Floats:
     for k, (trial, end, one) in enumerate(zip(trials, ends, moved, strict=True)):
         if end.status != "ended":
             continue
-        if trial.payload_kg > 0:
+        if told_by_payload(trial):
             speeds[k] = trial.travel_ratio * one.lead_velocity_m_s[-1]
         else:
             speeds[k] = np.interp(at_fraction * trial.length_m, one.lead_position_m, one.lead_velocity_m_s)
@@ -179,7 +179,7 @@ def _odds(beliefs: Sequence[Belief], samples: int, seed: int, at_fraction: float
         trial = belief.trial
         runs = run(belief, np.array([at_fraction * trial.length_m]), samples, seed, with_tension=False)
         speeds.append(
-            runs.end_lead_velocity_m_s * trial.travel_ratio if trial.payload_kg > 0 else runs.lead_velocity_m_s[:, 0]
+            runs.end_lead_velocity_m_s * trial.travel_ratio if told_by_payload(trial) else runs.lead_velocity_m_s[:, 0]
         )
     winners = np.argmax(np.array(speeds), axis=0)
     return [float(np.mean(winners == k)) for k in range(len(beliefs))]

@@ -20,7 +20,7 @@ import pandas as pd
 from vinetrack.design.beliefs import BAND, Belief
 from vinetrack.design.guess import hoop_stress_Pa
 from vinetrack.design.runs import Runs, run
-from vinetrack.records import Floats
+from vinetrack.records import Floats, Trial
 
 SAMPLES = 1000
 SAMPLES_OF_A_SHARE = 400
@@ -99,7 +99,10 @@ class Foresight:
 
     @property
     def final(self) -> Quantity:
-        """The speed that matters: a payload's as it leaves, else the leading edge's at the fraction asked for."""
+        """The speed that matters: a payload's as it leaves, else the leading edge's at the fraction asked for.
+
+        Where the tail may go slack a payload has a speed of its own, which nobody follows: then the leading edge's.
+        """
         return self[final_name(self.belief)]
 
     def __getitem__(self, name: str) -> Quantity:
@@ -114,9 +117,14 @@ class Foresight:
         return pd.DataFrame(rows, columns=list(TABLE_COLUMNS))
 
 
+def told_by_payload(trial: Trial) -> bool:
+    """Whether the final speed is a payload's: not where a slack tail lets it go its own way."""
+    return trial.payload_kg > 0 and trial.tail_slack != "free"
+
+
 def final_name(belief: Belief) -> str:
     """Name of the speed that matters for this trial."""
-    return EJECTION if belief.trial.payload_kg > 0 else EDGE
+    return EJECTION if told_by_payload(belief.trial) else EDGE
 
 
 def foresee(
@@ -172,7 +180,8 @@ def _quantities(belief: Belief, runs: Runs, along: Floats, place: int) -> Iterat
         return Quantity(name, where, low, median, high, unit)
 
     if belief.trial.payload_kg > 0:
-        yield quantity(EJECTION, 1.0, r * runs.end_lead_velocity_m_s, "m/s")
+        if told_by_payload(belief.trial) or not runs.slack.any():
+            yield quantity(EJECTION, 1.0, r * runs.end_lead_velocity_m_s, "m/s")
         yield quantity(TO_THE_END, 1.0, runs.end_s, "s")
     yield quantity(EDGE, at, speed, "m/s")
     yield quantity(TAIL, at, r * speed, "m/s")
@@ -215,7 +224,7 @@ def _shares(belief: Belief, at_fraction: float, samples: int, seed: int) -> tupl
     place_m = np.array([at_fraction * belief.trial.length_m])
     for one in belief.uncertainties:
         runs = run(belief, place_m, samples, seed, only=[one.name], with_tension=False)
-        loaded = belief.trial.payload_kg > 0
+        loaded = told_by_payload(belief.trial)
         speed = belief.trial.travel_ratio * runs.end_lead_velocity_m_s if loaded else runs.lead_velocity_m_s[:, 0]
         low, _, high = band(speed)
         found.append(Share(one.name, one.words, float(low), float(high)))

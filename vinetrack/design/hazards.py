@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.design.beliefs import BAND, YIELD, Belief
-from vinetrack.design.foresee import EJECTION, Foresight
+from vinetrack.design.foresee import EJECTION, Foresight, told_by_payload
 from vinetrack.design.guess import BURST_STRESS_PA, burst_pressure_Pa, hoop_stress_Pa
 from vinetrack.design.runs import LONGEST_S, POINTS, follow
 from vinetrack.effects import Effect, EffectError, catalogue
@@ -96,7 +96,10 @@ def _slack(sight: Foresight) -> Iterator[str]:
         return
     often = "in every draw" if sight.slack > 0.995 else f"in {sight.slack:.0%} of the draws"
     if trial.tail_slack == "free":
-        yield f"the tail goes slack on the way {often}; speeds of the tail are then those of the film at the tip"
+        yield (
+            f"the tail goes slack on the way {often}: speeds of the tail are then those of the film at the tip, and a "
+            "payload falls by itself, at a speed that is not told"
+        )
         return
     payload = f" and the {EJECTION} is at least what is stated" if trial.payload_kg > 0 else ""
     yield (
@@ -171,6 +174,6 @@ def final_m_s(belief: Belief, model: Model, host: Model, at_fraction: float) -> 
         return 0.0
     times = end.end_time_s * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS)
     (moved,) = simulate_many(model, [trial], [times], host=host)
-    if trial.payload_kg > 0:
+    if told_by_payload(trial):
         return float(trial.travel_ratio * moved.lead_velocity_m_s[-1])
     return float(np.interp(at_fraction * trial.length_m, moved.lead_position_m, moved.lead_velocity_m_s))
