@@ -13,7 +13,9 @@ from matplotlib.figure import Figure
 from vinetrack.figures.before_after import AFTER, BEFORE, draw_before_after, rms_m
 from vinetrack.figures.candidates import MAX_ROWS, draw_candidates
 from vinetrack.figures.cosines import MAX_EFFECTS, draw_cosines
+from vinetrack.figures.drift import draw_drift
 from vinetrack.figures.ladder import draw_ladder
+from vinetrack.figures.missing_force import draw_missing_force
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION, render
 from vinetrack.figures.where import draw_where
 
@@ -115,7 +117,8 @@ def test_where_nothing_was_added_there_is_no_after() -> None:
 
 def ranking(*rows: tuple[str, str, str, float, bool]) -> pd.DataFrame:
     columns = ["effect", "kind", "status", "delta_chi2", "in_answer_set"]
-    return pd.DataFrame(rows, columns=columns).assign(plausible=True, size="k = 1.0 ± 0.1")
+    table = pd.DataFrame(rows, columns=columns).assign(plausible=True, size="k = 1.0 ± 0.1")
+    return table.assign(sigma=np.sqrt(np.maximum(table["delta_chi2"].astype(float), 0)))
 
 
 def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() -> None:
@@ -133,6 +136,14 @@ def test_candidates_are_bars_of_the_root_of_their_gain_the_answer_in_colour() ->
     assert "k = 1.0 ± 0.1" in ax.texts[0].get_text()
 
 
+def test_one_that_was_not_fitted_is_as_long_as_its_score_and_one_that_makes_it_worse_has_no_length() -> None:
+    table = ranking(
+        ("leak", "physical", "refitted", -67.0, False), ("air_drag", "physical", "screened", math.nan, False)
+    ).assign(sigma=[-4.1, -7.0])
+    (ax,) = draw_candidates([("q", table)]).axes
+    assert [bar.get_width() for bar in ax.patches] == [7.0, 0.0]
+
+
 def test_what_is_not_plausible_is_said_beside_its_size() -> None:
     table = ranking(("air_drag", "physical", "refitted", 9.0, False)).assign(plausible=False)
     assert "k = 1.0 ± 0.1 (not plausible)" in texts(draw_candidates([("q", table)]))
@@ -148,6 +159,50 @@ def test_the_longest_of_lists_is_cut_and_rounds_stand_below_each_other() -> None
 def test_no_candidate_is_said() -> None:
     assert draw_candidates([]).texts
     assert draw_candidates([("one", ranking())]).texts
+
+
+@pytest.mark.parametrize("draw", [draw_where, draw_drift, draw_missing_force])
+def test_a_table_that_is_not_there_is_said(draw) -> None:  # type: ignore[no-untyped-def]
+    assert draw(pd.DataFrame()).texts
+
+
+def groups() -> pd.DataFrame:
+    """B of one vine against pressure, before and after, and γ that only the larger model has."""
+    row = {"parameter": "eversion_damping.B", "vine": "v", "symbol": "B", "against": "pressure_Pa", "n_trials": 2}
+    rows = [
+        row | {"model": model, "level": 1e3 * kPa, "ratio": 1 + slope * (kPa - 40) / 40, "ratio_sigma": 0.02}
+        for model, slope in (("before", -0.3), ("after", 0.0))
+        for kPa in (24, 36, 60)
+    ]
+    gamma = {"parameter": "reservoir_depletion.gamma", "symbol": "γ", "against": "vine", "level": math.nan}
+    return pd.DataFrame([*rows, rows[-1] | gamma])
+
+
+def test_a_parameter_that_drifts_is_drawn_against_what_it_should_not_know() -> None:
+    (ax,) = draw_drift(groups(), "air drag").axes
+    assert ax.get_xlabel() == "pressure (kPa)"
+    assert ax.get_title(loc="left") == "B against pressure, N = 6"
+    before, after = (container.lines[0] for container in ax.containers)
+    assert before.get_xdata() == pytest.approx([24, 36, 60])
+    assert before.get_ydata() == pytest.approx([1.12, 1.03, 0.85])
+    assert after.get_ydata() == pytest.approx([1, 1, 1])
+
+
+def test_values_that_differ_between_vines_stand_side_by_side() -> None:
+    table = groups().assign(against="vine", level=math.nan).iloc[[0, 1]].assign(vine=["thin", "thick"])
+    (ax,) = draw_drift(table).axes
+    assert [label.get_text() for label in ax.get_xticklabels()] == ["thin", "thick"]
+
+
+def test_the_missing_force_is_drawn_against_each_thing_it_may_hang_on() -> None:
+    point = {"value": 0.1, "force_N": 0.4, "sigma_N": 0.05, "condition": ""}
+    against = ("lead_position_m", "tail_velocity_m_s", "time_s", "pressure_Pa")
+    rows = [point | {"against": name, "condition": c} for name in against for c in ("", "a", "b")]
+    fig = draw_missing_force(pd.DataFrame(rows))
+    labels = ["growth y (mm)", "tail speed ẋ (m/s)", "time since release (ms)", "pressure (kPa)"]
+    assert [ax.get_xlabel() for ax in fig.axes] == labels
+    assert fig.axes[0].containers[0].lines[0].get_xdata() == pytest.approx([100.0])
+    assert in_bounds(fig)
 
 
 def cells(after: float = 0.1e-3) -> pd.DataFrame:

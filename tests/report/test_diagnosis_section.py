@@ -107,11 +107,21 @@ def test_adequate_says_what_could_still_hide() -> None:
     assert facts(diagnosis("adequate"), None)[0].question == "Most suspicious"
 
 
+def test_unexplained_names_the_nearest_candidate_and_why_it_is_not_the_answer() -> None:
+    fact = facts(diagnosis("unexplained"), None)[0]
+    assert (fact.question, fact.answer) == ("Nearest candidate", "leak")
+    assert fact.note == "19 σ better, but needs more gas than there is"
+
+
 def test_what_could_still_hide_is_in_the_unit_of_its_number() -> None:
     row = candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")})
     table = hidden_table([row])
     assert table is not None
     assert table.rows == [("leak", "k", "2.50 kPa")]
+    unfitted = candidate("leak", 1.0, numbers=[], largest={"leak.k": 2500.0, "leak.j": 1.0})
+    table = hidden_table([unfitted], {"leak.k": ("κ", "Pa")})
+    assert table is not None
+    assert table.rows == [("leak", "κ", "2.50 kPa"), ("leak", "j", "1.00 SI")]
     assert hidden_table([candidate("leak", 1.0)]) is None
 
 

@@ -1,7 +1,7 @@
 """The candidates: by how much each explains the trajectories better than the model in use, and at which size.
 
 One panel a round. Those that the data cannot tell from the best are filled in colour; a hollow bar was predicted from
-the sensitivities and not fitted.
+the sensitivities and not fitted: then its size is the score in standard deviations.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
     Parameters
     ----------
     rounds : of each the question in words, and a table with a row a candidate, best first: `effect, kind, status,
-        delta_chi2, in_answer_set, plausible, size` (fitted numbers in words, blank where there are none).
+        delta_chi2, sigma, in_answer_set, plausible, size` (fitted numbers in words, blank where there are none).
     """
     from matplotlib.figure import Figure
 
@@ -52,14 +52,18 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
         axes = fig.subplots(len(drawn), 1, squeeze=False, height_ratios=heights_in)[:, 0]
         for ax, (title, table) in zip(axes, drawn, strict=True):
             _draw_round(ax, title, table)
-        axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ, for a single number)")
+        axes[-1].set_xlabel("√Δχ²: how much better the trajectories are explained (σ)")
         _legend(fig, [table for _, table in drawn])
     return fig
 
 
 def _drawable(table: pd.DataFrame) -> pd.DataFrame:
-    known = table[table["delta_chi2"].astype(float).notna()]
-    return known.sort_values("delta_chi2", ascending=False, kind="stable").head(MAX_ROWS)
+    """Rows with a height, the answer first and then the highest."""
+    gain = np.sqrt(np.maximum(table["delta_chi2"].to_numpy(dtype=float), 0.0))
+    height = np.where(np.isfinite(gain), gain, np.abs(table["sigma"].to_numpy(dtype=float)))
+    ranked = table.assign(height=height, in_answer_set=table["in_answer_set"].astype(bool))
+    known = ranked[np.isfinite(height)]
+    return known.sort_values(["in_answer_set", "height"], ascending=False, kind="stable").head(MAX_ROWS)
 
 
 def role(row: Any) -> str:
@@ -70,7 +74,7 @@ def role(row: Any) -> str:
 
 
 def _draw_round(ax: Axes, title: str, table: pd.DataFrame) -> None:
-    heights = np.sqrt(np.maximum(table["delta_chi2"].to_numpy(dtype=float), 0.0))
+    heights = table["height"].to_numpy(dtype=float)
     longest = max(float(heights.max()), 1.0)
     for i, (row, height) in enumerate(zip(rows(table), heights, strict=True)):
         colour = ROLES[role(row)][1]

@@ -44,12 +44,12 @@ def draw_drift(groups: pd.DataFrame, added: str = "") -> Figure:
     """
     from matplotlib.figure import Figure
 
-    known = groups[np.isfinite(groups["ratio"].astype(float))]
+    known = groups[np.isfinite(groups["ratio"].astype(float))] if len(groups) else groups
+    if not len(known):
+        return blank("No parameter could be asked whether it drifts.")
     # What only the larger model has can show no drift that was mended.
     asked = known[known["model"] == "before"] if (known["model"] == "before").any() else known
     panels = list(dict.fromkeys(zip(asked["parameter"], asked["against"], strict=True)))[:MAX_PANELS]
-    if not panels:
-        return blank("No parameter could be asked whether it drifts: there is one condition, or none was fitted.")
     vines = [vine for vine in dict.fromkeys(known["vine"]) if vine]
     markers = {vine: VINE_MARKERS[i % len(VINE_MARKERS)] for i, vine in enumerate(vines)} | {"": "o"}
     n_columns = min(len(panels), 3)

@@ -37,10 +37,10 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
     """
     from matplotlib.figure import Figure
 
-    labels = list(dict.fromkeys(table["condition_label"]))[:MAX_ROWS]
-    shown = [column for column in _COLUMNS if np.isfinite(table[column].to_numpy(dtype=float)).any()]
-    if not labels or not shown:
+    shown = [c for c in _COLUMNS if len(table) and np.isfinite(table[c].to_numpy(dtype=float)).any()]
+    if not shown:
         return blank("There is no prediction to hold against a measurement.")
+    labels = list(dict.fromkeys(table["condition_label"]))[:MAX_ROWS]
     known_mm = 1e3 * np.abs(table[shown].to_numpy(dtype=float))
     full_mm = max(float(np.nanpercentile(known_mm, 97)), 1e-6)
     with look():

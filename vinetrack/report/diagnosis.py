@@ -32,13 +32,15 @@ DIAGNOSIS_FIGURES = {
 class DiagnosisResult:
     """`diagnosis.json`, `ladder.csv` and the values of every number along it; None where a part does not exist.
 
-    `summaries` says of effects by name what each is, in a sentence.
+    `summaries` says of effects by name what each is, in a sentence; `units` of parameters (`effect.parameter`) their
+    symbol and unit.
     """
 
     content: Mapping[str, Any]
     ladder: pd.DataFrame | None = None
     moved: pd.DataFrame | None = None
     summaries: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 
 def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
@@ -63,7 +65,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "where": [str(line) for line in content.get("where") or []],
         "force": missing_force(content.get("missing_force")),
         "rounds": [_round(i, one) for i, one in enumerate(rounds)],
-        "hidden": hidden_table(rounds[-1].get("ranking") or []) if rounds else None,
+        "hidden": hidden_table(rounds[-1].get("ranking") or [], result.units) if rounds else None,
         "blind": _blind(rounds[0].get("ranking") or []) if rounds else [],
         "tied": tied_pairs(content.get("cosines") or {}),
         "next": next_experiment(content.get("next_experiment")),
@@ -131,23 +133,23 @@ def round_question(one: Mapping[str, Any]) -> str:
     return f"what does {listed(list(one.get('model') or []))} lack?"
 
 
-def hidden_table(ranking: Sequence[Mapping[str, Any]]) -> ReportTable | None:
+def hidden_table(
+    ranking: Sequence[Mapping[str, Any]], units: Mapping[str, tuple[str, str]] | None = None
+) -> ReportTable | None:
     """For every candidate the largest size that could still hide, one-sided 95 %."""
     rows = []
     for row in ranking:
-        units = {str(entry["parameter"]).split(".")[-1]: entry for entry in row.get("numbers") or []}
+        of = {str(n["parameter"]).split(".")[-1]: (str(n["symbol"]), str(n["unit"])) for n in row.get("numbers") or []}
         for name, largest in (row.get("largest") or {}).items():
             if not known(largest):
                 continue
-            entry = units.get(str(name).split(".")[-1])
-            unit, factor = READABLE.get(entry["unit"], (entry["unit"], 1.0)) if entry else ("", 1.0)
-            symbol = entry["symbol"] if entry else str(name)
-            rows.append((plain(row["effect"]), symbol, f"{number(factor * float(largest))} {unit}".strip()))
+            short = str(name).split(".")[-1]
+            symbol, unit = of.get(short) or (units or {}).get(f"{row['effect']}.{short}") or (short, "SI")
+            shown, factor = READABLE.get(unit, (unit, 1.0))
+            rows.append((plain(row["effect"]), symbol, f"{number(factor * float(largest))} {shown}".strip()))
     if not rows:
         return None
-    note = (
-        "A larger effect than this would have been seen (one-sided 95 %). Numbers without a unit here are in SI units."
-    )
+    note = "A larger effect than this would have been seen (one-sided 95 %)."
     return ReportTable("What could still hide", ("Candidate", "number", "largest size"), rows, frozenset({2}), note)
 
 

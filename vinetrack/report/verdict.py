@@ -113,6 +113,9 @@ def _sure(diagnosis: Mapping[str, Any], ranking: Sequence[Mapping[str, Any]]) ->
     if verdict == "adequate":
         note = f"the best of {len(tested)} candidates: {plain(best['effect'])}" if best else ""
         return Fact("Most suspicious", f"{_sigmas(best)} σ", note) if best else None
+    if verdict == "unexplained" and best is not None:
+        note = f"{_sigmas(best)} σ better" + (f", but {best['reason']}" if best.get("reason") else "")
+        return Fact("Nearest candidate", plain(best["effect"]), note)
     inside = [row for row in tested if row.get("in_answer_set")]
     best = max(inside, key=lambda row: float(row["delta_chi2"]), default=None)
     if best is None:

@@ -5,6 +5,7 @@ Every part may be missing: a folder without a diagnosis, one that was refused, a
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from vinetrack.effects import Effect
     from vinetrack.experiment import Experiment
     from vinetrack.report.diagnosis import DiagnosisResult
 
@@ -91,16 +93,20 @@ def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult 
         return None
     content = read_json(results.diagnosis)
     ladder, moved = _table(results.ladder), _table(results.diagnosed("moved.csv"))
+    ranked = [str(row["effect"]) for one in content.get("rounds") or [] for row in one.get("ranking") or []]
+    named = [*(content.get("effects") or []), *(content.get("answer_set") or [])]
+    effects = _effects([*named, *ranked], experiment)
     return DiagnosisResult(
         content,
         ladder if len(ladder) else None,
         moved if len(moved) else None,
-        _summaries([*(content.get("effects") or []), *(content.get("answer_set") or [])], experiment),
+        {name: effects[name].summary for name in named if name in effects},
+        {f"{name}.{p.name}": (p.symbol, p.unit) for name, effect in effects.items() for p in effect.parameters},
     )
 
 
-def _summaries(names: Sequence[str], experiment: Experiment) -> dict[str, str]:
-    """What effects are, in a sentence each, by name; nothing of one whose file has gone."""
+def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
+    """Effects by name; without those whose file has gone."""
     from vinetrack.effects import EffectError, find_effect, own_effects
 
     try:
@@ -108,11 +114,9 @@ def _summaries(names: Sequence[str], experiment: Experiment) -> dict[str, str]:
     except EffectError:
         own = {}
     found = {}
-    for name in names:
-        try:
-            found[name] = find_effect(name, own).summary
-        except EffectError:
-            continue
+    for name in dict.fromkeys(names):
+        with contextlib.suppress(EffectError):
+            found[name] = find_effect(name, own)
     return found
 
 
