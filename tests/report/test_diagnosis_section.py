@@ -171,6 +171,15 @@ def test_what_an_effect_is_is_said_beside_its_name() -> None:
     assert "A hole." not in html
 
 
+def test_what_drifts_is_said_once_and_what_does_not_is_not() -> None:
+    content = diagnosis()
+    content["where"].append(content["drift"][0]["sentence"])
+    content["drift"].append({"sentence": "n rises by 1 %.", "significant": False})
+    html = shown(content)
+    assert html.count("B rises by 39 ± 3 %") == 1
+    assert "n rises by 1 %." not in html
+
+
 def test_a_missing_force_is_drawn_with_what_it_looks_like() -> None:
     figures = [ReportFigure("missing_force", "The missing force", "c", SVG)]
     html = page(diagnosis=DiagnosisResult(diagnosis("unexplained")), figures=figures)

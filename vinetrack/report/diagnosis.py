@@ -49,6 +49,11 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         return None
     content = result.content
     rounds = list(content.get("rounds") or [])
+    drifting = [
+        str(row["sentence"])
+        for row in content.get("drift") or []
+        if row.get("sentence") and row.get("significant", True)
+    ]
     return {
         "badge": BADGES.get(str(content.get("verdict")), BADGES["none"]),
         "kind": str(content.get("verdict")) if content.get("verdict") in BADGES else "none",
@@ -62,14 +67,14 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "facts": facts(content, result.ladder),
         "explanation": str(content.get("explanation") or ""),
         "ladder": ladder_table(result.ladder),
-        "where": [str(line) for line in content.get("where") or []],
+        "where": [str(line) for line in content.get("where") or [] if str(line) not in drifting],
         "force": missing_force(content.get("missing_force")),
         "rounds": [_round(i, one) for i, one in enumerate(rounds)],
         "hidden": hidden_table(rounds[-1].get("ranking") or [], result.units) if rounds else None,
         "blind": _blind(rounds[0].get("ranking") or []) if rounds else [],
         "tied": tied_pairs(content.get("cosines") or {}),
         "next": next_experiment(content.get("next_experiment")),
-        "drift": [str(row["sentence"]) for row in content.get("drift") or [] if row.get("sentence")],
+        "drift": drifting,
         "moved": moved_table(result.moved),
         "notes": [str(note) for note in content.get("notes") or []],
     }

@@ -174,19 +174,31 @@ def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame
     """Every trial with predictions, columns `CURVE_COLUMNS`: time since release, positions from the origin."""
     import pandas as pd
 
-    fitted = (read_json(results.fit).get("trials") or {}) if results.fit.exists() else {}
     parts = []
+    compared: dict[str, pd.DataFrame] = {}
     for trial, condition in zip(conditions["trial"], conditions["condition"], strict=True):
         path = results.predictions(trial)
         table = read_result(path) if path.exists() else None
         if table is None or not len(table):
             continue
-        own = fitted.get(trial) or {}
-        origin_m = own.get("origin_m", float(np.nanmin(table["lead_position_m"])))
-        time_s = table["time_s"] - own.get("release_s", _first_moving_s(table, origin_m))
+        if condition not in compared:
+            there = bool(condition) and results.trajectories(condition).exists()
+            compared[condition] = read_result(results.trajectories(condition)) if there else pd.DataFrame()
+        release_s, origin_m = _start(trial, table, compared[condition])
         positions = {name: table[name] - origin_m for name in CURVE_COLUMNS[3:]}
+        time_s = table["time_s"] - release_s
         parts.append(pd.DataFrame({"trial": trial, "condition": condition, "time_s": time_s, **positions}))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
+
+
+def _start(trial: str, table: pd.DataFrame, compared: pd.DataFrame) -> tuple[float, float]:
+    """Release and origin of a trial: as the comparison has them, which begins with the same point; else as seen."""
+    same = compared[compared["trial"] == trial] if len(compared) else compared
+    time_s, position_m = float(table["time_s"].iloc[0]), float(table["lead_position_m"].iloc[0])
+    if len(same) == len(table):
+        return time_s - float(same["time_s"].iloc[0]), position_m - float(same["lead_position_m"].iloc[0])
+    origin_m = float(np.nanmin(table["lead_position_m"]))
+    return _first_moving_s(table, origin_m), origin_m
 
 
 def _first_moving_s(table: pd.DataFrame, origin_m: float) -> float:

@@ -131,21 +131,42 @@ def tables_of(found: Diagnosis) -> dict[str, pd.DataFrame]:
             "along_time.csv": failure.along_time,
             "along_position.csv": failure.along_position,
             "along_speed.csv": failure.along_speed,
+            "drift_groups.csv": drift_groups(failure, found.fits[-1] if len(found.fits) > 1 else None),
         }
     if found.force_table is not None:
         tables["missing_force.csv"] = found.force_table
     return tables
 
 
-def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
-    """What the first and the last model say of every trial, with the release and origin each gives it, by its name.
+def drift_groups(failure: Failure, after: Fit | None) -> pd.DataFrame:
+    """What suits every group of trials best under the first model and, where something was added, under the last."""
+    import pandas as pd
 
+    from vinetrack.diagnosis.drift import drift
+
+    parts = [failure.drift.groups.assign(model="before")]
+    if after is not None:
+        try:
+            parts.append(drift(after).groups.assign(model="after"))
+        except Exception as error:
+            log.info("the drift under the last model is not known: %s", _reason(error))
+    return pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
+
+
+def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
+    """What the first and the last model say of every trial, by its name.
+
+    As in `comparison.csv` and the ladder: a release and an origin of the trial's own, and nothing else.
     `model_after_m` is NaN where nothing was added.
     """
     import pandas as pd
 
+    from vinetrack.diagnosis.ladder import in_sample
+
+    first = in_sample(before).trials
+    last = in_sample(after).trials if after is not before else first
     tables = {}
-    for one, other in zip(before.trials, after.trials, strict=True):
+    for one, other in zip(first, last, strict=True):
         later = other.predicted_position_m if after is not before else np.full(one.time_s.size, np.nan)
         columns = (one.time_s, one.lead_position_m, one.predicted_position_m, later)
         tables[one.name] = pd.DataFrame(dict(zip(PREDICTION_COLUMNS, columns, strict=True)))
