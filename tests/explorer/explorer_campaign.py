@@ -10,6 +10,9 @@ import csv
 import json
 from pathlib import Path
 
+import av
+import numpy as np
+import pandas as pd
 from typer.testing import CliRunner
 
 from vinetrack.cli import app
@@ -72,10 +75,62 @@ def write_diagnosis(results: Path) -> Path:
             "matrix": [[1.0, 0.97, 0.2], [0.97, 1.0, -0.75], [0.2, -0.75, None]],
         },
         "next_experiment": {
-            "words": "Grow the 24 mm vine at 60 kPa from a chamber of 4 L.",
-            "trials": [{"pressure_kPa": 60.0, "chamber_l": 4.0, "separation_sigma": 12.3}],
+            "text": "Grow the 24 mm vine at 60 kPa from a chamber of 4 L.",
+            "trials": [
+                {
+                    "pressure_kPa": 60.0,
+                    "payload_g": 0.0,
+                    "diameter_mm": 24.0,
+                    "thickness_um": 200.0,
+                    "chamber_l": 4.0,
+                    "replicates": 3,
+                    "new_vine": False,
+                    "changed": ["chamber_l"],
+                },
+            ],
+            "separation_sigma": {"reservoir_depletion | leak": 12.3},
+            "calibration": None,
         },
     }
     path = results / "diagnosis.json"
     path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def film_of(experiment: Path, results: Path, trial: str) -> Path:
+    """Make one trial of a results folder one that was filmed: a bright bar whose right end is where the track has it.
+
+    4 px a millimetre, the axis along row 48 from column 20.
+    """
+    track = pd.read_csv(results / "tracks" / f"{trial}.csv", keep_default_na=False, na_values=["", "NaN"])
+    position_m = track["lead_position_m"].interpolate(limit_direction="both").to_numpy()
+    edge_px = 20 + 4e3 * (position_m - position_m[0])
+    path = experiment / "videos" / f"{trial}.mp4"
+    write_bars(path, 20 + edge_px)
+    track.assign(edge_px=edge_px, flag="").to_csv(results / "tracks" / f"{trial}.csv", index=False)
+    analysed = results / "analysed" / f"{trial}.json"
+    axis = {"axis": {"from_px": [20, 48], "to_px": [940, 48], "width_px": 30}}
+    analysed.write_text(json.dumps(json.loads(analysed.read_text()) | axis))
+    sheet = experiment / "trials.csv"
+    head, *rows = sheet.read_text().splitlines()
+    rows = [
+        f"{row},videos/{trial}.mp4".replace(f"tracks/{trial}.csv", "") if row.startswith(f"{trial},") else f"{row},"
+        for row in rows
+    ]
+    sheet.write_text("\n".join([f"{head},video", *rows]) + "\n")
+    return path
+
+
+def write_bars(path: Path, ends_px: np.ndarray, width: int = 960, height: int = 96) -> Path:
+    """A clip with a bright bar on dark grey in every frame, from the left to where it ends."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for end_px in ends_px:
+            picture = np.full((height, width), 40, np.uint8)
+            picture[30:66, : max(round(float(end_px)), 0)] = 200
+            frame = av.VideoFrame.from_ndarray(np.stack([picture] * 3, axis=2), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
     return path

@@ -6,9 +6,9 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
+from explorer_campaign import write_bars
 
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.recording import Film, View, view_of
@@ -16,17 +16,8 @@ from vinetrack.stages.results import Results
 
 
 def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) -> Path:
-    """A bright bar on dark grey whose right end moves by 8 px a frame."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for k in range(count):
-            picture = np.full((height, width), 40, np.uint8)
-            picture[30:66, : 20 + 8 * k] = 200
-            frame = av.VideoFrame.from_ndarray(np.stack([picture] * 3, axis=2), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    return path
+    """A bar whose right end moves by 8 px a frame."""
+    return write_bars(path, 20 + 8.0 * np.arange(count), width, height)
 
 
 def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.diagnosis.hypotheses import host_for
 from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.model.fit_data import FitTrial, prepare
 from vinetrack.model.left_out import FEWEST_AT_REST
@@ -125,8 +126,8 @@ class Campaign:
 
     @cached_property
     def host(self) -> Model:
-        """All effects in one: its compiled form serves every model that a person may choose."""
-        return Model(tuple(self.effects.values()))
+        """All effects in one, as in a diagnosis: its compiled form serves every model that a person may choose."""
+        return host_for(Model(()), self.effects.values())
 
     def of_condition(self, condition: str) -> list[int]:
         """Places of the trials of a condition among `trials`."""

@@ -7,10 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vinetrack.stages.results import Results, ResultsError, read_json
-
 if TYPE_CHECKING:
-    from vinetrack.experiment import Experiment
     from vinetrack.explorer.campaign import Campaign
     from vinetrack.explorer.choice import Choice
 
@@ -45,25 +42,11 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
         If the experiment cannot be read.
     """
     from vinetrack.explorer.campaign import read_campaign
+    from vinetrack.stages.behind import experiment_behind
     from vinetrack.stages.effects import effects_of
 
     read = experiment_behind(folder, experiment)
     return read_campaign(folder, read, effects_of(read.folder))
-
-
-def experiment_behind(folder: Path, experiment: Path | None = None) -> Experiment:
-    """The experiment that a results folder was made from, by its `provenance.json`; see `open_campaign`."""
-    from vinetrack.experiment import read_experiment
-
-    results = Results(folder)
-    if not folder.is_dir():
-        raise ResultsError(f"{folder} is no folder: name the one that snakemake made, results/NAME")
-    if not results.provenance.exists():
-        raise ResultsError(f"{folder} is no results folder: it has no {results.provenance.name}; run snakemake first")
-    where = experiment or Path(str(read_json(results.provenance)["experiment"]))
-    if not where.is_dir():
-        raise ResultsError(f"{where}, the experiment of {folder}, has moved: say where it is with --experiment PATH")
-    return read_experiment(where)
 
 
 def explore(folder: Path, experiment: Path | None, wanted: Wanted, say: Callable[[str], None]) -> None:

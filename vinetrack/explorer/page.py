@@ -267,7 +267,6 @@ class Page:
         self.plots.set_curves(self.curves, self.chooser.shown)
         self.plots.set_earlier(self.ground.curves if self._differs() else None, self.chooser.shown)
         self._show_errors()
-        self.film.set_curves(self.curves, self.ground.curves)
         self._say_headline()
 
     def _show_errors(self) -> None:
@@ -283,6 +282,7 @@ class Page:
         self._words_pending = False
         self._say_headline()
         if self.curves is not None:
+            self.film.set_curves(self.curves, self.ground.curves)
             self.film.refresh()
         _set(self.numbers, numbers_words(self.campaign, self.last, self.rungs, self._touched))
         _set(self.tied, tied_panel(self.campaign, self.story, self.last))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
+import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ from vinetrack.explorer.ground import Ground
 LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 5070, 30
 QUIET = ("bokeh", "tornado")
+SWITCH_S = 1e-3
 KEEP_ALIVE_MS = 20_000
 
 
@@ -93,6 +95,8 @@ def serve(ground: Ground, say: Callable[[str], None], port: int | None = None, *
     """
     for name in QUIET:
         logging.getLogger(name).setLevel(logging.ERROR)
+    # A fit in the background then hands over between two strokes of a pen, not after.
+    sys.setswitchinterval(SWITCH_S)
     server = start_server(ground, port)
     where = address(server)
     ground.begin()

@@ -18,6 +18,7 @@ from vinetrack.model.fit_result import Number, decimals
 
 AT_THE_FLOOR = 1.15
 MOST_PAIRS = 6
+MOST_COMPARED = 8
 
 
 @dataclass(frozen=True)
@@ -115,10 +116,7 @@ def tied_panel(campaign: Campaign, story: Story | None, fitted: Fitted | None) -
         if len(story.answer_set) > 1:
             names = ", ".join(name.replace("_", " ") for name in story.answer_set)
             parts.append(f"<p>Not to be told apart: <b>{escaped(names)}</b>.</p>")
-        pairs = story.most_tied()[:MOST_PAIRS]
-        if pairs:
-            rows = [(_spaced(one), _spaced(other), f"{cosine:+.2f}") for one, other, cosine in pairs]
-            parts.append(table(rows, ("effect", "looks like", "cosine"), (2,)))
+        parts.append(cosine_grid(story))
     if fitted is not None:
         pairs_words = tied_words(fitted.fit)
         parts.append("<h3>In the last fit</h3>")
@@ -128,42 +126,76 @@ def tied_panel(campaign: Campaign, story: Story | None, fitted: Fitted | None) -
     return "".join(parts)
 
 
+def cosine_grid(story: Story) -> str:
+    """How alike the marks of the likeliest candidates are: 1 the same, 0 nothing alike, −1 the opposite."""
+    names = [name for name in story.best if name in story.cosine_names]
+    names += [name for one, other, _ in story.most_tied() for name in (one, other)]
+    names = list(dict.fromkeys(names))[:MOST_COMPARED]
+    if len(names) < 2:
+        return ""
+    place = [story.cosine_names.index(name) for name in names]
+    head = "".join(f"<th class='up'><span>{escaped(_spaced(name))}</span></th>" for name in names)
+    body = "".join(
+        f"<tr><th>{escaped(_spaced(name))}</th>" + "".join(_cosine_cell(story.cosines[i][k]) for k in place) + "</tr>"
+        for name, i in zip(names, place, strict=True)
+    )
+    caption = "<small>Cosines of what effects do to the trajectories: near ±1 they cannot be told apart.</small>"
+    return f"<div class='scroll'><table class='cosines'><tr><th></th>{head}</tr>{body}</table></div>{caption}"
+
+
+def _cosine_cell(cosine: float) -> str:
+    """Blue for alike, vermillion for opposite, the deeper the more."""
+    if not math.isfinite(cosine):
+        return "<td>–</td>"
+    strength = min(abs(cosine), 1.0) ** 2
+    colour = f"rgba(0,114,178,{strength:.2f})" if cosine > 0 else f"rgba(213,94,0,{strength:.2f})"
+    ink = "#fff" if strength > 0.6 else "inherit"
+    return f"<td style='background:{colour};color:{ink}'>{cosine:+.2f}</td>"
+
+
 def _spaced(name: str) -> str:
     return name.replace("_", " ")
 
 
 def next_panel(campaign: Campaign, story: Story | None) -> str:
     """What to film next, as the diagnosis says."""
-    if story is None or not story.next_experiment:
-        reason = (
-            "A diagnosis says which trial would tell best."
-            if story is None
-            else "The diagnosis asks for no further trial."
-        )
-        command = command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"]) if story is None else ""
-        return f"<p>{reason}</p>{command}"
-    return "".join(_said(key, value) for key, value in story.next_experiment.items())
+    if story is None:
+        command = command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
+        return f"<p>A diagnosis says which trial would tell best.</p>{command}"
+    advice = story.next_experiment
+    if not advice:
+        return "<p>The diagnosis asks for no further trial.</p>"
+    parts = [f"<p>{escaped(advice.get('text', ''))}</p>"]
+    rows = [_trial_row(trial) for trial in advice.get("trials", ())]
+    if rows:
+        parts.append(table(rows, ("vine", "pressure", "payload", "trials", "other"), (1, 2, 3)))
+    separations = [
+        (pair.replace(" | ", " from ").replace("_", " "), f"{sigma:.2g} σ")
+        for pair, sigma in (advice.get("separation_sigma") or {}).items()
+        if sigma is not None
+    ]
+    if separations:
+        parts.append(table(separations, ("tells", "by"), (1,)))
+    if advice.get("calibration"):
+        parts.append(f"<p>{escaped(advice['calibration'])}</p>")
+    return "".join(parts)
 
 
-def _said(key: str, value: Any) -> str:
-    """One entry of a next experiment: sentences as they are, trials as a table, numbers with their name."""
-    title = key.replace("_", " ")
-    if isinstance(value, str):
-        return f"<p>{escaped(value)}</p>" if " " in value else f"<p>{escaped(title)}: <b>{escaped(value)}</b></p>"
-    if isinstance(value, Mapping):
-        return "".join(_said(f"{key} {inner}" if key else inner, part) for inner, part in value.items())
-    if isinstance(value, list | tuple):
-        return _said_list(title, value)
-    shown = f"{value:.3g}" if isinstance(value, float) else str(value)
-    return "" if value is None else f"<p><small>{escaped(title)}</small> <b>{escaped(shown)}</b></p>"
+OTHER_SETTINGS = {"chamber_l": "chamber {:.3g} L", "inlet_mm": "inlet {:.3g} mm", "growth_angle_deg": "angle {:.3g}°"}
 
 
-def _said_list(title: str, values: Sequence[Any]) -> str:
-    if values and all(isinstance(value, Mapping) for value in values):
-        keys = [key for key in values[0] if not isinstance(values[0][key], list | tuple | dict)]
-        rows = [[_cell(value.get(key)) for key in keys] for value in values]
-        return f"<p><small>{escaped(title)}</small></p>" + table(rows, [key.replace("_", " ") for key in keys])
-    return f"<p><small>{escaped(title)}</small> {escaped(', '.join(map(_cell, values)))}</p>" if values else ""
+def _trial_row(trial: Mapping[str, Any]) -> tuple[str, ...]:
+    """One condition to make, in the units of the sheet; what differs from the rig so far is said."""
+    size = f"{_cell(trial.get('diameter_mm'))} mm × {_cell(trial.get('thickness_um'))} µm"
+    changed = trial.get("changed") or ()
+    other = [words.format(trial[key]) for key, words in OTHER_SETTINGS.items() if key in changed and trial.get(key)]
+    return (
+        f"{size}{' (new)' if trial.get('new_vine') else ''}",
+        f"{_cell(trial.get('pressure_kPa'))} kPa",
+        f"{_cell(trial.get('payload_g') or 0)} g",
+        _cell(trial.get("replicates", 1)),
+        ", ".join(other),
+    )
 
 
 def _cell(value: Any) -> str:

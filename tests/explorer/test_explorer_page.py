@@ -1,0 +1,261 @@
+"""The page without a browser: what a person does to its models, and what the page makes of it."""
+
+from __future__ import annotations
+
+import base64
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bokeh.document import Document
+from explorer_campaign import SETTINGS, write_diagnosis
+
+from vinetrack.explorer.campaign import Campaign
+from vinetrack.explorer.command import open_campaign
+from vinetrack.explorer.ground import Ground
+from vinetrack.explorer.page import Page
+from vinetrack.settings import read_experiment_settings
+
+GAMMA = "size_reservoir_depletion.gamma"
+
+
+@pytest.fixture(scope="module")
+def ground(campaign: Campaign) -> Ground:
+    grown = Ground(campaign).begin()
+    grown.wait(240)
+    assert grown.trouble == ""
+    return grown
+
+
+class Browser:
+    """Stands for the browser: a document whose callbacks are run by hand."""
+
+    def __init__(self, ground: Ground) -> None:
+        self.document = Document()
+        self.page = Page(ground, self.document)
+        self.turn()
+
+    def model(self, name: str) -> Any:
+        found = self.document.get_model_by_name(name)
+        assert found is not None, name
+        return found
+
+    def text(self, name: str) -> str:
+        return str(self.model(name).text)
+
+    def turn(self) -> None:
+        """Run everything that is due once."""
+        for callback in list(self.document.session_callbacks):
+            if type(callback).__name__ != "PeriodicCallback":
+                self.document.callbacks.remove_session_callback(callback)
+                callback.callback()
+
+    def until(self, asked: Callable[[], bool], seconds: float = 60) -> None:
+        end = time.monotonic() + seconds
+        while not asked():
+            assert time.monotonic() < end
+            self.turn()
+            time.sleep(0.01)
+
+    def click(self, name: str) -> None:
+        from bokeh.events import ButtonClick
+
+        button = self.model(name)
+        button._trigger_event(ButtonClick(button))
+
+
+@pytest.fixture
+def browser(ground: Ground) -> Iterator[Browser]:
+    opened = Browser(ground)
+    yield opened
+    opened.page.close()
+
+
+def error_of(browser: Browser) -> list[float]:
+    return list(browser.model("error_bars").data["now"])
+
+
+def test_it_opens_with_the_model_in_use(browser: Browser) -> None:
+    assert browser.text("headline").startswith("<h1>Base model: ")
+    assert "off by" in browser.text("headline")
+    assert len(browser.model("model_curves").data["xs"]) == 3
+    assert len(browser.model("residual_curves").data["xs"]) == 6
+    assert "vinetrack compare" in browser.text("commands")
+    assert "no diagnosis yet" in browser.text("tied").lower()
+    assert browser.model("tick_gravity").disabled
+    assert browser.model("tick_inlet_loss").disabled
+    assert "N·(s/m)ⁿ" in browser.text("numbers")
+
+
+def test_a_slider_puts_its_effect_in_and_moves_the_curves(browser: Browser) -> None:
+    before = [list(part) for part in browser.model("model_curves").data["ys"]]
+    browser.model(GAMMA).value = 1.2
+    browser.turn()
+    assert browser.model("tick_reservoir_depletion").active
+    assert [list(part) for part in browser.model("model_curves").data["ys"]] != before
+    assert "reservoir depletion" in browser.text("headline")
+    browser.turn()
+    assert "--set reservoir_depletion.gamma=1.2" in browser.text("commands")
+
+
+def test_many_moves_of_a_slider_are_drawn_as_one(browser: Browser) -> None:
+    drawn = []
+    browser.model("model_curves").on_change("data", lambda _attr, _old, _new: drawn.append(1))
+    for value in (1.1, 1.2, 1.3):
+        browser.model(GAMMA).value = value
+    browser.turn()
+    assert len(drawn) == 1
+
+
+def test_conditions_and_trials_can_be_chosen(browser: Browser) -> None:
+    browser.model("conditions").active = [0]
+    assert browser.model("residual_curves").data["condition"] == ["24 kPa", "24 kPa"]
+    assert browser.model("error_bars").data["alpha"][2] > browser.model("error_bars").data["alpha"][0]
+    browser.model("trials").active = [0]
+    assert len(browser.model("residual_curves").data["xs"]) == 1
+    browser.click("choose_none")
+    assert browser.model("model_curves").data["xs"] == []
+    browser.click("choose_all")
+    assert len(browser.model("residual_curves").data["xs"]) == 6
+    browser.model("error_bars").selected.indices = [2]
+    assert browser.model("conditions").active == [0]
+    browser.model("error_bars").selected.indices = [2]
+    assert browser.model("conditions").active == [0, 1, 2]
+
+
+def test_a_refit_brings_the_error_down_and_says_what_it_found(browser: Browser) -> None:
+    before = error_of(browser)
+    browser.model("tick_reservoir_depletion").active = True
+    browser.turn()
+    browser.click("refit")
+    assert "refitting" in browser.text("status")
+    assert browser.model("refit").label == "Stop"
+    browser.until(lambda: browser.model("refit").label == "Refit")
+    browser.turn()
+    assert all(now < was for now, was in zip(error_of(browser), before, strict=True))
+    assert "fitted: <b>1.4" in browser.text("found_reservoir_depletion.gamma")
+    assert "for 1 number more" in browser.text("numbers")
+    assert "vinetrack add reservoir_depletion" in browser.text("commands")
+    assert browser.text("status") == ""
+    browser.model("tick_reservoir_depletion").active = False
+    browser.turn()
+    browser.turn()
+    assert "Sizes were moved since" in browser.text("numbers")
+    browser.click("as_fitted")
+    assert browser.model("tick_reservoir_depletion").active
+
+
+def test_a_fit_can_be_stopped(browser: Browser) -> None:
+    browser.model("tick_supply_refill").active = True
+    browser.click("refit")
+    browser.click("refit")
+    assert browser.model("refit").label == "Refit"
+    assert "stopped" in browser.text("status")
+    browser.model("tick_supply_refill").active = False
+
+
+def test_moving_a_size_ends_a_fit_that_is_under_way(browser: Browser) -> None:
+    browser.model("tick_supply_refill").active = True
+    browser.click("refit")
+    browser.model("size_air_drag.C_D").value = 2.0
+    assert browser.model("refit").label == "Refit"
+    assert "given up" in browser.text("status")
+
+
+def test_of_a_track_only_the_page_says_so_and_shows_where_the_edge_was(browser: Browser) -> None:
+    assert "there is no recording to show" in browser.text("film_caption")
+    assert "tracked" in browser.text("film_caption")
+    browser.model("film_frame").value = 40
+    said = browser.text("film_caption")
+    browser.model("film_frame").value = 80
+    assert browser.text("film_caption") != said
+    assert browser.page.plots.instant.visible
+    browser.model("film_trial").value = "d24_36kPa_1"
+    assert "d24_36kPa_1 came as a track" in browser.text("film_caption")
+    browser.click("film_play")
+    assert "pause" in browser.model("film_play").label
+    browser.click("film_play")
+    assert "play" in browser.model("film_play").label
+
+
+@pytest.mark.parametrize(("form", "head"), [("csv", b"model,condition"), ("svg", b"<?xml"), ("png", b"\x89PNG")])
+def test_figure_and_data_can_be_taken_along(browser: Browser, form: str, head: bytes) -> None:
+    browser.click(f"export_{form}")
+    given = browser.page.keep._download.data
+    assert given["name"] == [f"vines_explorer.{form}"]
+    assert base64.b64decode(given["body"][0]).startswith(head)
+
+
+def test_the_model_is_saved_with_the_comments_around_it(campaign: Campaign, tmp_path: Path) -> None:
+    experiment = tmp_path / "vines"
+    shutil.copytree(campaign.experiment.folder, experiment)
+    page = Browser(Ground(open_campaign(campaign.folder, experiment)).begin())
+    page.page.ground.wait(240)
+    page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))
+    page.model("tick_reservoir_depletion").active = True
+    page.click("save")
+    assert "Saved." in page.text("saved")
+    assert "--save" in page.text("saved")
+    text = (experiment / "experiment.yaml").read_text(encoding="utf-8")
+    assert text.startswith(SETTINGS)
+    assert read_experiment_settings(experiment / "experiment.yaml").model[-1] == "reservoir_depletion"
+    (experiment / "experiment.yaml").write_text("model: [\n", encoding="utf-8")
+    page.click("save")
+    assert "is not YAML" in page.text("saved")
+    page.page.close()
+
+
+def test_a_diagnosis_appears_by_itself(campaign: Campaign, ground: Ground, tmp_path: Path) -> None:
+    folder = tmp_path / "vines"
+    shutil.copytree(campaign.folder, folder)
+    own = Ground(open_campaign(folder, campaign.experiment.folder))
+    own.curves, own.errors_m, own.fitted = ground.curves, ground.errors_m, ground.fitted
+    page = Browser(own)
+    write_diagnosis(folder)
+    page.page._look_again()
+    assert "Not to be told apart: <b>reservoir depletion, leak</b>" in page.text("tied")
+    assert "+0.97" in page.text("tied")
+    assert "chamber of 4 L" in page.text("next")
+    assert "chamber 4 L" in page.text("next")
+    assert "reservoir depletion from leak" in page.text("next")
+    page.page.close()
+    again = Browser(own)
+    groups = [group.children[0].label for group in again.page.panel.root.children]
+    assert groups[0] == "Suspected by the diagnosis"
+    again.page.close()
+    (folder / "diagnosis.json").write_text("[]", encoding="utf-8")
+    torn = Browser(own)
+    assert "No diagnosis yet" in torn.text("tied")
+    torn.page.close()
+
+
+def test_a_model_that_cannot_be_followed_is_said_and_the_curves_stay(
+    browser: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vinetrack.model.simulate import SimulationError
+
+    def refuse(*_: object) -> None:
+        raise SimulationError("Trial a: too hard.")
+
+    before = error_of(browser)
+    monkeypatch.setattr("vinetrack.explorer.page.follow", refuse)
+    browser.model(GAMMA).value = 1.1
+    browser.turn()
+    assert "too hard" in browser.text("status")
+    assert error_of(browser) == before
+
+
+def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
+    from vinetrack.explorer.choice import chosen, first_choice
+
+    ground = Ground(campaign, chosen(campaign, first_choice(campaign), ["leak"], [], ["leak.rate=0.2"])).begin()
+    ground.wait(240)
+    page = Browser(ground)
+    page.turn()
+    assert page.model("tick_leak").active
+    assert page.model("size_leak.rate").value == pytest.approx(0.2)
+    assert "leak" in page.text("headline")
+    page.page.close()
