@@ -58,7 +58,7 @@ def test_table_two_sets_departures_beside_the_errors() -> None:
     two = paper_section(rows(), departures(), []).tables[1]
     by_pressure = {row[0]: row[1:] for row in two.rows}
     assert list(by_pressure) == ["7", "14", "28", "41"]
-    assert by_pressure["7"][:5] == ("1.90", "0.320", "5.70 to 6.90", "9.50", "11.0 to 11.4")
+    assert by_pressure["7"][:5] == ("1.9", "0.320", "5.70 to 6.90", "9.50", "11.0 to 11.4")
     assert by_pressure["7"][5:] == ("–",) * 5
     assert all(len(row) == len(two.head) for row in two.rows)
 

@@ -73,7 +73,7 @@ def table_one(table: pd.DataFrame) -> ReportTable:
             *(_shown(published_of(by_row, f"{name}_R{scale}")) for name in ("thickness", "diameter", "press", "laser")),
             f"{published.DAMPING_B[scale]:g}",
             _ours(by_row.get(f"B_R{scale}")),
-            number(published.DAMPING_R2[scale]),
+            f"{published.DAMPING_R2[scale]:g}",
             number(_value(by_row.get(f"R2_R{scale}"))),
         )
         for scale in published.DAMPING_B
@@ -105,7 +105,7 @@ def table_two(table: pd.DataFrame, departures: pd.DataFrame) -> ReportTable:
             one = by_row.get(f"{row}_{pressure_kPa:g}kPa")
             own = departures[(departures["figure"] == figure) & (abs(departures["pressure_kPa"] - pressure_kPa) < 1e-6)]
             size = {str(cause.departure): factor * float(getattr(cause, column)) for cause in rows(own)}
-            cells += [number(None if one is None else one.published), number(_value(one))]
+            cells += ["–" if one is None else f"{one.published:g}", number(_value(one))]
             cells += [_range(size, "depletion_slow", "depletion_fast"), number(size.get("slack"))]
             cells += [_range(size, "depletion_slow_slack", "depletion_fast_slack")]
         body.append(tuple(cells))
