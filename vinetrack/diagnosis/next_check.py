@@ -31,7 +31,7 @@ from vinetrack.model.solve import Held, Solution, make_frame, solve
 from vinetrack.model.starts import align, first_own
 from vinetrack.records import Floats
 
-MOST_ITERATIONS = 30
+MOST_ITERATIONS = 20
 FURTHEST_DRAW = 2.0
 """Standard deviations by which a number that is taken for true may lie from its best value: beyond, what is linear
 about a fit is not to be trusted."""
@@ -73,33 +73,33 @@ class Bench:
     cameras: Sequence[Camera]
 
 
-def expected(bench: Bench, design: Sequence[int], draws: int, seed: int) -> Floats:
-    """Rise of −2 ln L, shape (draws, n, n): (true, refitted); NaN where a refit is lost.
+def expected(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
+    """Rise of −2 ln L, shape (n_draws, n, n): (true, refitted); NaN where a refit is lost.
 
     Deviations of the trials are one standard deviation either way, in turns, so that few draws show the average.
     """
     return _rises(bench, design, draws, seed, thorough=False)
 
 
-def observed(bench: Bench, design: Sequence[int], draws: int, seed: int) -> Floats:
+def observed(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: int) -> Floats:
     """As `expected`, with true numbers and deviations drawn at random and every trajectory simulated in the refits."""
     return _rises(bench, design, draws, seed, thorough=True)
 
 
-def _rises(bench: Bench, design: Sequence[int], draws: int, seed: int, *, thorough: bool) -> Floats:
+def _rises(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool) -> Floats:
     n = len(bench.hypotheses)
-    rises = np.full((draws, n, n), math.nan)
+    rises = np.full((len(draws), n, n), math.nan)
     now = np.array([-2 * one.fit.log_likelihood for one in bench.hypotheses])
-    for draw, a in np.ndindex(draws, n):
-        rng = np.random.default_rng([seed, int(thorough), draw, a])
+    for k, a in np.ndindex(len(draws), n):
+        rng = np.random.default_rng([seed, int(thorough), draws[k], a])
         truth = bench.hypotheses[a]
         theta = drawn(truth, rng) if thorough else truth.theta
-        signs = rng.standard_normal((len(design), 2)) if thorough else _in_turns(design, draw)
+        signs = rng.standard_normal((len(design), 2)) if thorough else _in_turns(design, draws[k])
         filmed = film(truth, design, bench.conditions, bench.cameras, theta, signs * truth.spread, rng)
         seen = [(place, item) for place, item in zip(design, filmed, strict=True) if item is not None]
         if seen:
             then = np.array([_refitted(one, seen, thorough=thorough) for one in bench.hypotheses])
-            rises[draw, a] = then - now - (then[a] - now[a])
+            rises[k, a] = then - now - (then[a] - now[a])
     return rises
 
 
@@ -119,7 +119,7 @@ def separation(rises: Floats) -> Floats:
 def drawn(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
     """True numbers as the trials so far leave them open, those of new vines as far as guesses err."""
     old = hypothesis.fit.predictor.layout.start.size
-    values, vectors = np.linalg.eigh(hypothesis.information[:old, :old])
+    values, vectors = np.linalg.eigh(hypothesis.views[0].information[:old, :old])
     known = values > 1e-9 * values[-1]
     scale = np.where(known, 1 / np.sqrt(np.where(known, values, 1.0)), 0.0)
     away = np.clip(rng.standard_normal(old), -FURTHEST_DRAW, FURTHEST_DRAW)
@@ -142,11 +142,11 @@ def _refitted(hypothesis: Hypothesis, seen: Sequence[tuple[int, FitTrial]], *, t
         # Spreads and noise stay until the numbers have moved: what is only not yet fitted must not pass for scatter.
         told = Held(state.spread, (state.rho, state.variance))
         found = solve(quick, frame, state, told, warm=True, most_iterations=MOST_ITERATIONS)
-        found = solve(quick, frame, found.state, warm=True, most_iterations=MOST_ITERATIONS)
+        whole: Predictor = quick
         if thorough:
             whole = Predictor(layout, quick.data, quick.host)
             whole.steps = quick.new.steps.copy()
-            found = solve(whole, frame, found.state, warm=True, most_iterations=MOST_ITERATIONS)
+        found = solve(whole, frame, found.state, warm=True, most_iterations=MOST_ITERATIONS)
     except SimulationError:
         return math.nan
     return -2 * log_likelihood(found)

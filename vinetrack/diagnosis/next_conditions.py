@@ -173,7 +173,9 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
         low, high = (1e3 * kPa for kPa in limits.pressure_kPa)
     stress_Pa = hoop_stress_Pa(1.0, rig.diameter_m, rig.thickness_m)
     if math.isfinite(stress_Pa):
-        held = [trial.pressure_Pa for trial in used if trial.vine == rig.vine]
+        # A guess of what film holds must not forbid what it has held; what the user says of it may.
+        told = "hoop_stress_MPa" in limits.model_fields_set
+        held = [trial.pressure_Pa for trial in used if trial.vine == rig.vine and not told]
         high = min(high, max([1e6 * limits.hoop_stress_MPa / stress_Pa, *held]))
     if payload_kg == 0 and math.isfinite(rig.yield_pressure_Pa):
         low = max(low, ABOVE_YIELD * rig.yield_pressure_Pa)

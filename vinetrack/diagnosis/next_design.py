@@ -1,16 +1,16 @@
-"""Which further trials separate hypotheses best: the expected Δχ² of the wrong one, refitted to old and new trials.
+"""Which further trials separate hypotheses best: by how much −2 ln L of the wrong one will rise, to first order.
 
 If a is true, new trials show what a predicts. Hypothesis b, refitted to all, is left with
 
-    D² = min over δ of  Σ_new |W (y_a − y_b − X δ − Z u)|² + |u/s|² + δᵀ I δ − 2 gᵀ δ
+    D² = min over δ, s of  Σ_new |W (y_a − y_b − X δ − Z u)|² + |u/s|² + δᵀ I_s δ − 2 g_sᵀ δ + (rise with s)
 
-with X and Z its sensitivities to the free numbers and to what every trial has of its own, s the spreads of the latter,
-W what whitens the noise, I the information of the trials so far and g their slope (not zero where b sits at a bound).
-That is what −2 ln L would differ by more than it does now, on average; √D² is a separation in standard deviations. The
-smaller of a against b and b against a counts.
+with X and Z its sensitivities to the free numbers and to what every trial has of its own, W what whitens the noise, I_s
+the information of the trials so far and g_s their slope (not zero where b sits at a bound). The spreads s of pressure
+and B are estimated along, so that a misfit which looks like scatter is passed off as scatter. √D² is a separation in
+standard deviations. The smaller of a against b and b against a counts.
 
 Which trials to make is the exact design problem; it is solved by exchange, one trial after the other replaced by the
-best there is (Fedorov 1972, Theory of Optimal Experiments).
+best there is (Fedorov 1972, Theory of Optimal Experiments). No more than one new vine is asked for.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from vinetrack.diagnosis.next_conditions import Condition
 from vinetrack.diagnosis.next_film import Camera, Course, blank
-from vinetrack.diagnosis.next_predict import Hypothesis
-from vinetrack.model.mixed import LEAST_SPREAD, SPREAD_COLUMNS, solve_each
+from vinetrack.diagnosis.next_predict import Hypothesis, View
+from vinetrack.model.mixed import SPREAD_COLUMNS, solve_each
 from vinetrack.model.sensitivity import OWN
 from vinetrack.records import Floats
 
@@ -41,38 +41,64 @@ BOUND_PASSES = 4
 
 
 @dataclass(frozen=True)
-class Answers:
-    """What one trial of every condition tells of one hypothesis, what a trial has of its own eliminated.
+class Side:
+    """One hypothesis as the one that is refitted: the trials so far, and one trial of every condition.
 
-    `information`, shape (n_conditions, n_free, n_free), is of the hypothesis' own numbers; `pull`, shape (n_conditions,
-    n_free, n_hypotheses), how the motion by each of the others draws at them; `gap`, shape (n_conditions,
-    n_hypotheses), the sum of squares between its motion and theirs.
+    Over the views of its scatter (first axis): `known`, shape (n_views, n_free, n_free), `leans`, (n_views, n_free) and
+    `rise`, (n_views,) from the trials so far; `information`, (n_views, n_conditions, n_free, n_free), of a trial; how
+    the motion by each of the hypotheses pulls at the numbers, `pull`, (n_views, n_conditions, n_free, n), and is left
+    over, `gap`, (n_views, n_conditions, n); and what a trial like the others adds to the rise, `each`, (n_views,
+    n_conditions). `down` and `up`, shape (n_free,), are how far numbers may go.
     """
 
+    known: Floats
+    leans: Floats
+    rise: Floats
     information: Floats
     pull: Floats
     gap: Floats
+    each: Floats
+    down: Floats
+    up: Floats
+
+    def narrowed(self, allowed: NDArray[np.int_]) -> Side:
+        """With some of the conditions only, and the numbers that they or the trials so far say something of."""
+        felt = np.any(self.information[0][allowed].diagonal(axis1=1, axis2=2) > 0, axis=0)
+        use = np.flatnonzero(felt | (np.abs(self.leans[0]) > 0) | (np.count_nonzero(self.known[0], axis=0) > 1))
+        return Side(
+            self.known[:, use][:, :, use],
+            self.leans[:, use],
+            self.rise,
+            self.information[:, allowed][:, :, use][:, :, :, use],
+            self.pull[:, allowed][:, :, use],
+            self.gap[:, allowed],
+            self.each[:, allowed],
+            self.down[use],
+            self.up[use],
+        )
 
 
-def all_answers(
+def all_sides(
     hypotheses: Sequence[Hypothesis],
     conditions: Sequence[Condition],
     cameras: Sequence[Camera],
     runs: Sequence[Course],
-) -> list[Answers]:
-    """The answers of every hypothesis; sensitivities are those at its best values so far."""
+) -> list[Side]:
+    """Every hypothesis with what one trial of each condition would answer at its best values so far."""
     data = hypotheses[0].fit.predictor.data
     times, weights = zip(*(_times(lens, run) for lens, run in zip(cameras, runs, strict=True)), strict=True)
     items = [blank(one, t, data, 1e-3 * t) for one, t in zip(conditions, times, strict=True)]
     own = np.zeros((len(conditions), OWN))
-    columns = [np.stack(one.predictor(range(len(conditions)), items).linearise(one.theta, own)) for one in hypotheses]
+    predictors = [one.predictor(range(len(conditions)), items) for one in hypotheses]
+    columns = [np.stack(p.linearise(one.theta, own)) for p, one in zip(predictors, hypotheses, strict=True)]
     heavy = np.sqrt(np.stack(weights))[:, :, None]
     # The last column is placeholder − motion; differences of two hypotheses are free of the placeholder.
     motions = np.stack([-one[:, :, -1] for one in columns], axis=2)
-    return [
-        _answers(one, mine * heavy, (motions - motions[:, :, [k]]) * heavy)
-        for k, (one, mine) in enumerate(zip(hypotheses, columns, strict=True))
-    ]
+    sides = []
+    for k, (one, mine, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
+        feels = np.column_stack([predictor.feels_pressure, predictor.feels_damping])
+        sides.append(_side(one, mine * heavy, (motions - motions[:, :, [k]]) * heavy, feels))
+    return sides
 
 
 def _times(lens: Camera, run: Course) -> tuple[Floats, Floats]:
@@ -89,51 +115,68 @@ def _times(lens: Camera, run: Course) -> tuple[Floats, Floats]:
     return np.concatenate([[-lens.frame_s], moving, [last_s]]), weights
 
 
-def _answers(hypothesis: Hypothesis, columns: Floats, gaps: Floats) -> Answers:
-    """Products of the columns with the own numbers of a trial eliminated, placed among all free numbers."""
-    keys = columns.shape[2] - OWN - 1
+def _side(hypothesis: Hypothesis, columns: Floats, gaps: Floats, feels: NDArray[np.bool_]) -> Side:
     # Smooth curves under AR(1) noise count as under white noise of variance σ²_innovation/(1 − ρ)².
     scale = (1 - hypothesis.rho) / np.sqrt(hypothesis.variance)
     both = scale * np.concatenate([columns[:, :, :-1], gaps], axis=2)
     products = np.swapaxes(both, 1, 2) @ both
-    own = products[:, :OWN, :OWN] + np.diag(own_precision(hypothesis)) + 1e-9 * np.eye(OWN)
+    seen = [_left(hypothesis, view, products) for view in hypothesis.views]
+    information, pull, gap = (np.stack(part) for part in zip(*seen, strict=True))
+    wider = np.array([view.factors for view in hypothesis.views])
+    down, up = hypothesis.room
+    return Side(
+        known=np.stack([view.information for view in hypothesis.views]),
+        leans=np.stack([view.slope for view in hypothesis.views]),
+        rise=np.array([view.rise for view in hypothesis.views]),
+        information=information,
+        pull=pull,
+        gap=gap,
+        each=(2 * np.log(wider) + 1 / wider**2 - 1) @ feels.T.astype(float),
+        down=down,
+        up=up,
+    )
+
+
+def _left(hypothesis: Hypothesis, view: View, products: Floats) -> tuple[Floats, Floats, Floats]:
+    """Information, pull and gap with the own numbers of a trial eliminated, placed among all free numbers."""
+    precision = np.full(OWN, 1e-9)
+    precision[list(SPREAD_COLUMNS)] = 1 / np.array(view.spread) ** 2
+    own = products[:, :OWN, :OWN] + np.diag(precision)
     rest = products[:, OWN:, OWN:] - products[:, OWN:, :OWN] @ solve_each(own, products[:, :OWN, OWN:])
-    n, size = columns.shape[0], hypothesis.theta.size
     index = hypothesis.layout.index
-    wide = np.zeros((n, size + 1, size + 1))
+    n, keys, size = len(products), index.shape[1], hypothesis.theta.size
     every = np.arange(n)
+    wide = np.zeros((n, size + 1, size + 1))
     np.add.at(wide, (every[:, None, None], index[:, :, None], index[:, None, :]), rest[:, :keys, :keys])
-    pull = np.zeros((n, size + 1, gaps.shape[2]))
+    pull = np.zeros((n, size + 1, rest.shape[2] - keys))
     np.add.at(pull, (every[:, None], index), rest[:, :keys, keys:])
-    return Answers(wide[:, :size, :size], pull[:, :size], np.einsum("nkk->nk", rest[:, keys:, keys:]))
+    return wide[:, :size, :size], pull[:, :size], np.einsum("nkk->nk", rest[:, keys:, keys:])
 
 
-def own_precision(hypothesis: Hypothesis) -> Floats:
-    """Precision of release, origin and deviations of a trial, shape (4,): only the last two are known beforehand."""
-    precision = np.zeros(OWN)
-    for place, spread in zip(SPREAD_COLUMNS, hypothesis.spread, strict=True):
-        precision[place] = 1 / max(spread, LEAST_SPREAD) ** 2
-    return precision
-
-
-def separations(hypotheses: Sequence[Hypothesis], answers: Sequence[Answers], counts: Floats) -> Floats:
-    """Separation of every ordered pair (true, refitted) by each design, σ, shape (n_designs, n, n); 0 on the diagonal.
+def separations(sides: Sequence[Side], designs: NDArray[np.int_]) -> Floats:
+    """Separation of every ordered pair (true, refitted), σ, shape (n_designs, n, n); 0 on the diagonal.
 
     Parameters
     ----------
-    counts : array, shape (n_designs, n_conditions): trials of each condition
+    designs : array, shape (n_designs, n_trials): places among the conditions, one a trial
     """
-    n = len(hypotheses)
-    found = np.zeros((counts.shape[0], n, n))
-    for b, (hypothesis, answer) in enumerate(zip(hypotheses, answers, strict=True)):
-        information = np.tensordot(counts, answer.information, axes=1) + hypothesis.information
-        pulls = np.tensordot(counts, answer.pull, axes=1)
-        gaps = counts @ answer.gap
-        for a in range(n):
-            if a != b:
-                taken = _best_refit(information, pulls[:, :, a] + hypothesis.slope, *hypothesis.room)
-                found[:, a, b] = np.sqrt(np.maximum(gaps[:, a] - taken, 0.0))
-    return found
+    n = len(sides)
+    found = np.zeros((len(designs), n, n))
+    for b, side in enumerate(sides):
+        for view in range(len(side.rise)):
+            information = side.known[view] + _over_trials(side.information[view], designs)
+            pull = side.leans[view][:, None] + _over_trials(side.pull[view], designs)
+            left = _over_trials(side.gap[view], designs) + side.rise[view]
+            left += _over_trials(side.each[view], designs)[:, None]
+            for a in range(n):
+                if a != b:
+                    square = left[:, a] - _best_refit(information, pull[:, :, a], side.down, side.up)
+                    found[:, a, b] = square if view == 0 else np.minimum(found[:, a, b], square)
+    return np.sqrt(np.maximum(found, 0.0))
+
+
+def _over_trials(one: Floats, designs: NDArray[np.int_]) -> Floats:
+    return np.asarray(sum(one[designs[:, k]] for k in range(designs.shape[1])))
 
 
 def _best_refit(square: Floats, slope: Floats, down: Floats, up: Floats) -> Floats:
@@ -170,28 +213,30 @@ def worth(between: Floats) -> Floats:
     return np.asarray(np.sum(square / (square + WELL_SEPARATED**2), axis=1))
 
 
-def best_design(
-    hypotheses: Sequence[Hypothesis],
-    answers: Sequence[Answers],
-    allowed: NDArray[np.int_],
-    trials: int,
-) -> NDArray[np.int_]:
-    """The conditions (places, one a trial, rising) that separate best, among those `allowed`."""
-    n = answers[0].gap.shape[0]
-    alone = np.zeros((allowed.size, n))
-    alone[np.arange(allowed.size), allowed] = trials
-    first = allowed[int(np.argmax(worth(separations(hypotheses, answers, alone))))]
-    design = np.full(trials, first)
+def best_design(sides: Sequence[Side], allowed: NDArray[np.int_], trials: int) -> tuple[NDArray[np.int_], float]:
+    """The trials (places among the conditions, rising) that separate best, among those `allowed`, and their worth."""
+    narrow = [side.narrowed(allowed) for side in sides]
+    alone = np.repeat(np.arange(allowed.size)[:, None], trials, axis=1)
+    good = worth(separations(narrow, alone))
+    design, best = alone[int(np.argmax(good))].copy(), float(np.max(good))
     for _ in range(MOST_PASSES):
-        before = design.copy()
+        before = best
         for place in range(trials):
-            counts = np.zeros((allowed.size, n))
-            counts += np.bincount(np.delete(design, place), minlength=n)
-            counts[np.arange(allowed.size), allowed] += 1
-            good = worth(separations(hypotheses, answers, counts))
-            now = good[np.flatnonzero(allowed == design[place])[0]]
-            if np.max(good) > GAIN * now:
-                design[place] = allowed[int(np.argmax(good))]
-        if np.array_equal(before, design):
+            tried = np.repeat(design[None], allowed.size, axis=0)
+            tried[:, place] = np.arange(allowed.size)
+            good = worth(separations(narrow, tried))
+            if np.max(good) > GAIN * best:
+                design, best = tried[int(np.argmax(good))], float(np.max(good))
+        if best <= before:
             break
-    return np.sort(design)
+    return np.sort(allowed[design]), best
+
+
+def likeliest_vines(
+    sides: Sequence[Side], conditions: Sequence[Condition], places: NDArray[np.int_], trials: int, most: int
+) -> list[str]:
+    """New vines, best first, by what the best of their conditions alone would separate."""
+    narrow = [side.narrowed(places) for side in sides]
+    alone = np.repeat(np.arange(places.size)[:, None], trials, axis=1)
+    order = np.argsort(-worth(separations(narrow, alone)))
+    return list(dict.fromkeys(conditions[places[k]].trial.vine for k in order))[:most]

@@ -17,7 +17,7 @@ from vinetrack.diagnosis.next_conditions import Condition
 from vinetrack.model.fit_data import FitTrial
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.free import DAMPING, YIELD_PRESSURE, Free, Layout
-from vinetrack.model.mixed import marginal, normal_equations
+from vinetrack.model.mixed import LARGEST_SPREAD, LEAST_SPREAD, marginal, normal_equations
 from vinetrack.model.sensitivity import Predictor
 from vinetrack.records import Floats, Trial
 
@@ -26,23 +26,43 @@ OPEN = 1.0
 wide that any trial with the vine says more."""
 
 
+WIDER = ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0))
+"""Factors on the spreads of pressure and B that a refit may come to: a wrong hypothesis explains by scatter what it
+can."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What the trials so far say of a hypothesis' numbers if pressure and B scatter by `spread` from trial to trial.
+
+    `information`, shape (n_free, n_free), and `slope`, shape (n_free,), of half the sum of squares at the best values;
+    the slope is not zero at a bound. `rise` is by how much −2 ln L rises when the spreads are these instead of those
+    fitted, `factors` how much wider they are.
+    """
+
+    spread: tuple[float, float]
+    factors: tuple[float, float]
+    information: Floats
+    slope: Floats
+    rise: float
+
+
 @dataclass(frozen=True)
 class Hypothesis:
     """One of the fits that are tied, carried to further conditions.
 
     `layout` places the free numbers in the conditions' trials: those of the fit first, then those of new vines. All
-    numbers are scaled as the fit holds them: `theta` their best values, shape (n_free,), `information` what is known of
-    them and `slope` how the sum of squares of the trials so far leans there (not zero at a bound). `spread_of_new` is
-    how far the numbers of new vines may truly lie from their values here. `rho` and `variance` are the noise's
-    correlation and the variance of its innovations, m²; `spread` the relative ones of pressure and B.
+    numbers are scaled as the fit holds them, `theta` their best values, shape (n_free,). `views` tell what is known of
+    them from the trials so far, as fitted and with more scatter. `spread_of_new` is how far the numbers of new vines
+    may truly lie from their values here. `rho` and `variance` are the noise's correlation and the variance of its
+    innovations, m²; `spread` the relative ones of pressure and B.
     """
 
     name: str
     fit: Fit
     layout: Layout
     theta: Floats
-    information: Floats
-    slope: Floats
+    views: tuple[View, ...]
     spread_of_new: Floats
     rho: float
     variance: float
@@ -68,9 +88,7 @@ class Hypothesis:
 def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
     """A fit carried to these conditions."""
     old = fit.predictor.layout
-    state, frame = fit.solution.state, fit.solution.frame
-    part = marginal(fit.solution.grams, frame, state)
-    information, slope, _, _ = normal_equations(part, frame, state, state.spread)
+    state = fit.solution.state
     numbers, index = list(old.free), []
     places: dict[tuple[str, str], int] = {}
     for condition in conditions:
@@ -84,11 +102,6 @@ def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
                 row[column] = places[spot]
         index.append(row)
     added = numbers[len(old.free) :]
-    size = len(numbers)
-    wider = np.zeros((size, size))
-    wider[: len(old.free), : len(old.free)] = information
-    open_ends = [1 / OPEN**2 + (one.scale / one.prior_sd) ** 2 for one in added]
-    wider[range(len(old.free), size), range(len(old.free), size)] = open_ends
     moved = [damping_scatter() if one.key == DAMPING else _stated_sd(one) for one in added]
     base = np.array([_base_row(fit, condition) for condition in conditions])
     return Hypothesis(
@@ -96,13 +109,38 @@ def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
         fit=fit,
         layout=Layout(old.model, tuple(numbers), old.keys, np.array(index).reshape(len(conditions), -1), base),
         theta=np.concatenate([state.theta, [one.inside(one.start) for one in added]]),
-        information=wider,
-        slope=np.concatenate([slope, np.zeros(len(added))]),
+        views=_views(fit, np.array([1 / OPEN**2 + (one.scale / one.prior_sd) ** 2 for one in added])),
         spread_of_new=np.array(moved),
         rho=state.rho,
         variance=float(np.exp(np.mean(np.log(state.variance)))),
         spread=state.spread,
     )
+
+
+def _views(fit: Fit, precision_of_new: Floats) -> tuple[View, ...]:
+    """What the trials so far say, with all the scatter that a refit may come to; new numbers by their priors alone."""
+    state, frame = fit.solution.state, fit.solution.frame
+    part = marginal(fit.solution.grams, frame, state)
+    found: dict[tuple[float, float], View] = {}
+    plain = 0.0
+    for factors in WIDER:
+        spread = tuple(
+            min(s * factor, most) if can and s > LEAST_SPREAD else s
+            for s, factor, most, can in zip(state.spread, factors, LARGEST_SPREAD, fit.solution.estimable, strict=True)
+        )
+        pair = (max(spread[0], LEAST_SPREAD), max(spread[1], LEAST_SPREAD))
+        if pair in found:
+            continue
+        information, slope, square, log_det = normal_equations(part, frame, state, pair)
+        old, size = slope.size, slope.size + precision_of_new.size
+        wide = np.zeros((size, size))
+        wide[:old, :old] = information
+        wide[range(old, size), range(old, size)] = precision_of_new
+        plain = plain if found else square + log_det
+        wider = (pair[0] / max(state.spread[0], LEAST_SPREAD), pair[1] / max(state.spread[1], LEAST_SPREAD))
+        leans = np.concatenate([slope, np.zeros(size - old)])
+        found[pair] = View(pair, wider, wide, leans, square + log_det - plain)
+    return tuple(found.values())
 
 
 def _stated_sd(number: Free) -> float:

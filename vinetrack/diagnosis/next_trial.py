@@ -12,15 +12,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.diagnosis.next_check import Bench, expected, observed, separation
-from vinetrack.diagnosis.next_conditions import EFFORTS, NEW_VINE, Condition, conditions
-from vinetrack.diagnosis.next_design import all_answers, best_design, separations, worth
+from vinetrack.diagnosis.next_conditions import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, conditions
+from vinetrack.diagnosis.next_design import Side, all_sides, best_design, likeliest_vines, worth
 from vinetrack.diagnosis.next_film import camera_of, courses
 from vinetrack.diagnosis.next_predict import carry
 from vinetrack.diagnosis.next_words import calibration_for, only_measurement, outlook, trials_in_words
@@ -38,8 +39,12 @@ ENOUGH = 8.0
 """Standard deviations beyond which no more effort, such as a vine that has to be made, is asked for."""
 
 MOST_HYPOTHESES = 5
-DRAWS_EXPECTED, DRAWS_OBSERVED = 2, 3
-MUCH_BETTER = 1.2
+DRAWS_OBSERVED, DRAWS_WHERE_PLAIN = 3, 2
+PLAIN = 20.0
+"""Standard deviations beyond which fewer draws will do to check what is foretold."""
+
+GAIN = 1.01
+MOST_VINES_TRIED = 2
 
 
 @dataclass(frozen=True)
@@ -51,36 +56,56 @@ class NextExperiment:
     names of what differs from the rig so far. Empty where no trials are recommended.
 
     `separation_sigma` holds, by pair (`"a | b"`), the separation to expect once the trials are made and all are fitted
-    together, in standard deviations: the smaller of a against b and b against a. `simulated_sigma` mean and standard
-    deviation of what the check by simulation gave. `alternatives` are the next best sets of trials with their
-    separations. `calibration` says what to measure, where that is needed or would do as well.
+    together, in standard deviations: the smaller of what it is if a is true and if b is true, which `if_true_sigma`
+    gives by pair and name. `simulated_sigma` holds mean and standard deviation of what the check by simulation gave, of
+    the smaller again. `alternatives` are the next best sets of trials with their separations. `calibration` says what
+    to measure, where that is needed or would do as well.
     """
 
     text: str
     trials: tuple[Mapping[str, Any], ...] = ()
     separation_sigma: Mapping[str, float] = field(default_factory=dict)
+    if_true_sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     simulated_sigma: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     alternatives: tuple[Mapping[str, Any], ...] = ()
     calibration: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As `diagnosis.json` holds it."""
-        return {
-            "text": self.text,
-            "trials": [dict(trial) for trial in self.trials],
-            "separation_sigma": dict(self.separation_sigma),
-            "simulated_sigma": {pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()},
-            "alternatives": [dict(other) for other in self.alternatives],
-            "calibration": self.calibration,
-        }
+        """As `diagnosis.json` holds it; what is not known is null."""
+        found: dict[str, Any] = _without_nan(
+            {
+                "text": self.text,
+                "trials": [dict(trial) for trial in self.trials],
+                "separation_sigma": dict(self.separation_sigma),
+                "if_true_sigma": {pair: dict(ways) for pair, ways in self.if_true_sigma.items()},
+                "simulated_sigma": {
+                    pair: {"mean": mean, "sd": sd} for pair, (mean, sd) in self.simulated_sigma.items()
+                },
+                "alternatives": [dict(other) for other in self.alternatives],
+                "calibration": self.calibration,
+            }
+        )
+        return found
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @dataclass(frozen=True)
 class _Option:
-    """A set of trials (places among the conditions, one a trial) and the separation it should bring, shape (n, n)."""
+    """A set of trials (places among the conditions, one a trial) and how −2 ln L should rise; see `expected`."""
 
     design: tuple[int, ...]
-    between: Floats
+    rises: Floats
+
+    @property
+    def between(self) -> Floats:
+        return separation(self.rises)
 
     @property
     def worth(self) -> float:
@@ -118,8 +143,8 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
             text=f"Measure before making more trials: {_list(names)} are errors of measurement. {advice}",
             calibration=advice,
         )
-    bench, answers = _bench(tied, names, limits)
-    options = _options(bench, answers, limits, seed)
+    bench, sides = _bench(tied, names, limits)
+    options = _options(bench, sides, limits, seed)
     if not options:
         advice = calibration_for(list(itertools.combinations(tied, 2)))
         return NextExperiment(text=f"No trial within the limits can be made and followed. {advice}", calibration=advice)
@@ -135,16 +160,17 @@ def _judge(tied: Sequence[Fit]) -> None:
 
 
 def hypothesis_names(tied: Sequence[Fit]) -> list[str]:
-    """Each hypothesis by the effects that not all of them have."""
+    """Each hypothesis by the effects that not all of them have, numbered where that is not enough."""
     common = set.intersection(*(set(fit.model.names) for fit in tied))
-    return [" + ".join(name for name in fit.model.names if name not in common) or "nothing more" for fit in tied]
+    names = [" + ".join(name for name in fit.model.names if name not in common) or "nothing more" for fit in tied]
+    return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
 
 
 def _list(names: Sequence[str]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
 
 
-def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[Any]]:
+def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[Side]]:
     """Hypotheses, every condition worth filming, and what a trial of each would answer."""
     data = tied[0].predictor.data
     every = conditions(data, limits)
@@ -157,27 +183,37 @@ def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[B
         return Bench((), (), ()), []
     chosen, lenses, ways = (list(column) for column in zip(*kept, strict=True))
     hypotheses = [carry(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
-    return Bench(hypotheses, chosen, lenses), all_answers(hypotheses, chosen, lenses, ways)
+    return Bench(hypotheses, chosen, lenses), all_sides(hypotheses, chosen, lenses, ways)
 
 
-def _options(bench: Bench, answers: list[Any], limits: Limits, seed: int) -> list[_Option]:
-    """The best set of trials by every effort that gains over the lesser ones, with what to expect of it."""
-    efforts = np.array([one.effort for one in bench.conditions])
+def _options(bench: Bench, sides: list[Side], limits: Limits, seed: int) -> list[_Option]:
+    """The best set of trials by every effort that gains over the lesser ones, with what to expect of it.
+
+    One effort beyond what is enough is looked at, to have something to compare with.
+    """
     found: list[_Option] = []
     before = -math.inf
-    for effort in EFFORTS:
-        allowed = np.flatnonzero(efforts <= effort)
-        if not (efforts == effort).any():
-            continue
-        design = best_design(bench.hypotheses, answers, allowed, limits.trials)
-        counts = np.bincount(design, minlength=len(efforts)).astype(float)
-        foretold = float(worth(separations(bench.hypotheses, answers, counts[None]))[0])
-        if foretold <= before * 1.01:
-            continue
-        before = foretold
-        rises = expected(bench, design.tolist(), DRAWS_EXPECTED, seed)
-        found.append(_Option(tuple(design.tolist()), separation(rises)))
+    for allowed in _by_effort(bench, sides, limits.trials):
+        if any(option.weakest >= ENOUGH for option in found[:-1]):
+            break
+        design, foretold = best_design(sides, allowed, limits.trials)
+        if foretold > GAIN * before:
+            before = foretold
+            found.append(_Option(tuple(design.tolist()), expected(bench, design.tolist(), [0], seed)))
     return found
+
+
+def _by_effort(bench: Bench, sides: list[Side], trials: int) -> Iterator[NDArray[np.int_]]:
+    """Conditions to choose from: on the rig so far, on others too, and with one or another new vine besides."""
+    efforts = np.array([one.effort for one in bench.conditions])
+    for effort in (SAME_RIG, OTHER_RIG):
+        if (efforts == effort).any():
+            yield np.flatnonzero(efforts <= effort)
+    new = np.flatnonzero(efforts == NEW_VINE)
+    if new.size:
+        vines = np.array([one.trial.vine for one in bench.conditions])
+        for vine in likeliest_vines(sides, bench.conditions, new, trials, MOST_VINES_TRIED):
+            yield np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
 def _by_pair(between: Floats) -> dict[tuple[int, int], float]:
@@ -195,10 +231,12 @@ def _choice(options: Sequence[_Option]) -> _Option:
 
 def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperiment:
     best = _choice(options)
+    best = _Option(best.design, np.concatenate([best.rises, expected(bench, best.design, [1], seed)]))
     names = [one.name for one in bench.hypotheses]
     to_expect = _by_pair(best.between)
     worth_it = max(to_expect.values()) >= SEPARATES
-    checked = _checked(observed(bench, best.design, DRAWS_OBSERVED, seed)) if worth_it else {}
+    draws = range(DRAWS_WHERE_PLAIN if min(to_expect.values()) > PLAIN else DRAWS_OBSERVED)
+    checked = _checked(observed(bench, best.design, draws, seed)) if worth_it else {}
     left = [place for place, sigma in to_expect.items() if min(sigma, checked.get(place, (sigma,))[0]) < SEPARATES]
     worth_it = worth_it and len(left) < len(to_expect)
     fits = [one.fit for one in bench.hypotheses]
@@ -206,10 +244,15 @@ def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperi
     sigmas = {_pair(names, place): sigma for place, sigma in to_expect.items()}
     seen = {_pair(names, place): both for place, both in checked.items()}
     trials = _entries(bench.conditions, best.design)
+    if_true = {
+        _pair(names, (a, b)): {names[a]: float(best.between[a, b]), names[b]: float(best.between[b, a])}
+        for a, b in to_expect
+    }
     return NextExperiment(
-        text=_text(trials, sigmas, seen, [_pair(names, place) for place in left], advice, worth_it=worth_it),
+        text=_text(trials, outlook(if_true, seen), [_pair(names, place) for place in left], advice, worth_it=worth_it),
         trials=trials if worth_it else (),
         separation_sigma=sigmas,
+        if_true_sigma=if_true,
         simulated_sigma=seen,
         alternatives=tuple(
             {
@@ -217,7 +260,7 @@ def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperi
                 "separation_sigma": {_pair(names, p): s for p, s in _by_pair(option.between).items()},
             }
             for option in sorted(options, key=lambda one: -one.worth)
-            if option is not best
+            if option.design != best.design
         ),
         calibration=advice or None,
     )
@@ -275,8 +318,7 @@ def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
 
 def _text(
     trials: Sequence[Mapping[str, Any]],
-    sigmas: Mapping[str, float],
-    seen: Mapping[str, tuple[float, float]],
+    promise: str,
     left: Sequence[str],
     advice: str,
     *,
@@ -286,9 +328,9 @@ def _text(
     if not worth_it:
         return (
             f"No trials within the limits separate what is tied by {SEPARATES:g} σ; the best would separate"
-            f" {outlook(sigmas, seen)}. {advice}".rstrip()
+            f" {promise}. {advice}".rstrip()
         )
-    text = f"Make {trials_in_words(trials)}. Together with the trials so far they separate {outlook(sigmas, seen)}."
+    text = f"Make {trials_in_words(trials)}. Together with the trials so far they separate {promise}."
     if any(trial["new_vine"] for trial in trials):
         text += " B of the new vine is a guess here and is fitted; its yield pressure has to be measured."
     if left:

@@ -10,6 +10,8 @@ from vinetrack.effects import Effect
 from vinetrack.effects._words import remedy, told_apart
 from vinetrack.model.fit_result import Fit
 
+MUCH_MORE = 1.5
+
 WITH_TRACE = (
     "Record the pressure at the vine during growth and give it with the track: what the chamber does is then measured,"
     " and only the other is left to explain what remains."
@@ -73,11 +75,17 @@ def _trial_in_words(trial: Mapping[str, Any]) -> str:
     return f"{words}, {' and '.join(changed)}" if changed else words
 
 
-def outlook(pairs: Mapping[str, float], simulated: Mapping[str, tuple[float, float]]) -> str:
-    """What the trials are expected to tell, pair by pair."""
+def outlook(
+    if_true: Mapping[str, Mapping[str, float]], simulated: Mapping[str, tuple[float, float]] | None = None
+) -> str:
+    """What the trials are expected to tell, pair by pair; what it is if the other is true only where that is more."""
     parts = []
-    for pair, sigma in pairs.items():
-        mean, sd = simulated.get(pair, (math.nan, math.nan))
-        seen = f" (simulated: {mean:.2g} ± {max(sd, 0.1):.1g} σ)" if math.isfinite(mean) else ""
-        parts.append(f"{pair.replace(' | ', ' from ')} by {sigma:.2g} σ{seen}")
+    for pair, ways in if_true.items():
+        least, most = sorted(ways, key=ways.__getitem__)
+        notes = [f"{ways[most]:.2g} σ if {most} is true"] if ways[most] > MUCH_MORE * max(ways[least], 1.0) else []
+        mean, sd = (simulated or {}).get(pair, (math.nan, math.nan))
+        if math.isfinite(mean):
+            notes.append(f"simulated: {mean:.2g}" + (f" ± {max(sd, 0.1):.1g} σ" if math.isfinite(sd) else " σ"))
+        behind = f" ({'; '.join(notes)})" if notes else ""
+        parts.append(f"{pair.replace(' | ', ' from ')} by {ways[least]:.2g} σ{behind}")
     return ", ".join(parts)
