@@ -23,6 +23,9 @@ POINTS = 400
 MOST_TENSIONS = 300
 """Draws whose forces are looked at one by one, a third of a millisecond each."""
 
+ROUNDING = 1e-9
+"""Of the drive, below which a tension is none: forces of a slack tail cancel to rounding."""
+
 SLACK_SHARE = 0.01
 """Of the drive ½PA that a tail must lack before it counts as slack: the mere weight of a bare tail does no harm."""
 
@@ -116,14 +119,16 @@ def _forces(
         model = replace(belief.model, values=dict(zip(names, rows[i].tolist(), strict=True)))
         one = moved[i]
         terms = evaluate(model, trial, one.time_s, one.lead_position_m, one.lead_velocity_m_s)
+        drive_N = trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
+        tension = np.where(np.abs(terms.tension_N) < ROUNDING * drive_N, 0.0, terms.tension_N)
         reached = places_m <= one.lead_position_m[-1]
-        tension_N[i, reached] = np.interp(places_m[reached], one.lead_position_m, terms.tension_N)
+        tension_N[i, reached] = np.interp(places_m[reached], one.lead_position_m, tension)
         pressure_Pa[i, reached] = np.interp(places_m[reached], one.lead_position_m, terms.pressure_Pa)
         moving = (one.lead_position_m <= places_m[-1]) & (one.lead_velocity_m_s > 0)
         if moving.any():
-            least_N[i] = np.min(terms.tension_N[moving])
-        limit_N = -SLACK_SHARE * trial.pressure_Pa * trial.area_m2 / trial.travel_ratio
-        slack[i] = math.isfinite(one.slack_from_s) if trial.tail_slack == "free" else least_N[i] < limit_N
+            least_N[i] = np.min(tension[moving])
+        free = trial.tail_slack == "free"
+        slack[i] = math.isfinite(one.slack_from_s) if free else least_N[i] < -SLACK_SHARE * drive_N
     return tension_N, pressure_Pa, least_N, slack
 
 
