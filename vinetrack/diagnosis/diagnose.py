@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,12 +32,13 @@ from vinetrack.diagnosis.result import (
     Round,
 )
 from vinetrack.diagnosis.words import dropped_in_words, explain
-from vinetrack.effects import Effect
+from vinetrack.effects import Effect, EffectError
 from vinetrack.model.fit import fit as fit_model
 from vinetrack.model.fit_data import FitError, Pairs, pairs_of
 from vinetrack.model.fit_result import Fit, Number
 from vinetrack.model.model import Model, base_model, make_model
 from vinetrack.model.sensitivity import Predictor
+from vinetrack.model.simulate import SimulationError
 from vinetrack.records import Track, Trial
 
 if TYPE_CHECKING:
@@ -335,20 +336,51 @@ def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:
     report("errors before and after")
     try:
         return replace(result, ladder=ladder(result.fits, ("", *result.effects)))
-    except FitError as error:
+    except (FitError, SimulationError, np.linalg.LinAlgError) as error:
         return replace(result, notes=(*result.notes, f"The ladder of errors could not be made: {error}"))
 
 
 def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Diagnosis:
-    """What to do next where something is tied."""
+    """Where the first model fails, the force it lacks if nothing known mends it, and what to do where effects tie."""
+    result = _located(result, report) if result.verdict != ADEQUATE else result
+    if UNEXPLAINED in (result.verdict, result.final_verdict):
+        result = _with_missing_force(result, report)
     last = result.rounds[-1]
-    if last.verdict not in (AMBIGUOUS, ARTEFACT, UNEXPLAINED) or len(last.fits) < 2:
+    tied = list(last.fits.values())
+    if last.verdict == ARTEFACT and len(tied) == 1 and last.fit is not None:
+        tied.insert(0, last.fit)
+    if last.verdict not in (AMBIGUOUS, ARTEFACT) or len(tied) < 2:
         return result
     from vinetrack.diagnosis.next_trial import next_experiment
 
     report("looking for the next experiment")
     try:
-        advice: Any = next_experiment(list(last.fits.values()), limits)
-    except (FitError, ValueError) as error:
+        return replace(result, next_experiment=next_experiment(tied, limits).to_json())
+    except (FitError, EffectError, SimulationError, np.linalg.LinAlgError) as error:
         return replace(result, notes=(*result.notes, f"No next experiment could be worked out: {error}"))
-    return replace(result, next_experiment=advice.to_json())
+
+
+def _located(result: Diagnosis, report: Report) -> Diagnosis:
+    """Where the first model fails, and which of its numbers drift."""
+    from vinetrack.diagnosis.locate import locate
+
+    report("where it fails")
+    try:
+        failure = locate(result.fits[0])
+    except (FitError, SimulationError, np.linalg.LinAlgError) as error:
+        return replace(result, notes=(*result.notes, f"Where the model fails could not be worked out: {error}"))
+    drift = [{str(key): value for key, value in row.items()} for row in failure.drift.table.to_dict("records")]
+    return replace(result, failure=failure, where=failure.sentences(), drift=drift)
+
+
+def _with_missing_force(result: Diagnosis, report: Report) -> Diagnosis:
+    """The force that the first model lacks, and what simple law it looks like."""
+    from vinetrack.diagnosis.missing_force import missing_force
+
+    report("drawing the missing force")
+    try:
+        force = missing_force(result.fits[0])
+    except (FitError, SimulationError, np.linalg.LinAlgError) as error:
+        return replace(result, notes=(*result.notes, f"The missing force could not be drawn: {error}"))
+    explanation = f"{result.explanation} {force.sentence}"
+    return replace(result, missing_force=force.to_json(), force_table=force.table, explanation=explanation)

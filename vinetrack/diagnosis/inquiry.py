@@ -10,11 +10,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vinetrack.diagnosis.evidence import Evidence, answer_set
-from vinetrack.diagnosis.question import FIRST_LEVEL, LATER_LEVEL, Questions, question
+from vinetrack.diagnosis.question import FAR_OFF, FIRST_LEVEL, LATER_LEVEL, Questions, question
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, UNEXPLAINED
+from vinetrack.diagnosis.search import from_other_starts, without
 from vinetrack.diagnosis.singles import Report, Search, pairs
 from vinetrack.effects import Effect
 from vinetrack.model.fit_result import Fit
+
+NO_BETTER = 1.0
+"""Difference in ln L that counts as a better minimum."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +39,26 @@ class Finding:
     note: str = ""
 
 
-def inquire(found: Fit, effects: Sequence[Effect], report: Report) -> list[Finding]:
-    """The findings of all rounds, the first about the fit itself."""
+def inquire(found: Fit, effects: Sequence[Effect], report: Report, *, anew: int = 2) -> list[Finding]:
+    """The findings of all rounds, the first about the fit itself.
+
+    A fit may have ended in a local minimum, from which any effect seems to help. So one that is far off is begun again
+    elsewhere before it is questioned, and again from where the best hypothesis ended: if it then does better without
+    the effect, all is asked `anew` of that.
+    """
+    if found.chi2_per_dof > FAR_OFF:
+        report("fitting the model from other starts")
+        found = from_other_starts(found)
     report("questioning the model")
     questions = question(found, effects, FIRST_LEVEL)
     if not questions.something:
         return [Finding(ADEQUATE, questions)]
     search = Search(questions, report)
     tried = search.singles()
+    if tried and anew:
+        rival = without(found, best_of(tried).fit)
+        if rival is not None and rival.log_likelihood > found.log_likelihood + NO_BETTER:
+            return inquire(rival, effects, report, anew=anew - 1)
     alone = _alone(questions, search, tried)
     if alone is not None:
         return alone

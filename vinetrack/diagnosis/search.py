@@ -18,7 +18,7 @@ from vinetrack.effects import Effect
 from vinetrack.model.fit import refit
 from vinetrack.model.fit_data import FitError, FitTrial
 from vinetrack.model.fit_result import Fit
-from vinetrack.model.free import YIELD_PRESSURE, Layout, make_layout
+from vinetrack.model.free import EXPONENT, YIELD_PRESSURE, Layout, make_layout
 from vinetrack.model.mixed import deviance, marginal
 from vinetrack.model.model import Value
 from vinetrack.model.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
@@ -177,6 +177,25 @@ def full_fit(found: Fit, climb: Climb, best: float = -math.inf) -> Fit | None:
         if fit.converged or fit.log_likelihood < best - FAR_BEHIND:
             return fit
         return refit(fit, most_iterations=MORE_OF_FIT, thorough=False)
+    except (FitError, SimulationError, np.linalg.LinAlgError):
+        return None
+
+
+def from_other_starts(found: Fit) -> Fit:
+    """The same model fitted from where climbs from several exponents end, if that is better; else the fit itself."""
+    slope = Slope(found)
+    starts: list[Start] = [((), {})]
+    if EXPONENT in found.model.parameter_names and EXPONENT not in found.options["fixed"]:
+        starts += [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
+    climb = best_climb(slope, starts, math.inf)
+    other = None if climb is None else full_fit(found, climb, found.log_likelihood)
+    return other if other is not None and other.log_likelihood > found.log_likelihood else found
+
+
+def without(found: Fit, other: Fit) -> Fit | None:
+    """The model of a fit begun from the numbers of another fit, which holds it; None where it cannot be followed."""
+    try:
+        return refit(other, found.model, most_iterations=FIRST_OF_FIT, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 

@@ -11,12 +11,16 @@ from vinetrack.diagnosis.question import LATER_LEVEL, Questions, question
 from vinetrack.diagnosis.search import Climb, Slope, best_climb, full_fit, start_of, starts_of
 from vinetrack.effects import Effect
 from vinetrack.model.fit_result import Fit
+from vinetrack.model.model import Value
 
 Report = Callable[[str], None]
 """Told in a few words what is being done."""
 
 WEAK = 100.0
 """Δχ² up to which what the sensitivities predict is good to a per cent: hypotheses are then fitted without a climb."""
+
+WORSE = -1.0
+"""An effect added can do no harm: Δχ² below this is a fit that has lost its way."""
 
 WITHIN_REACH = 16.0
 ALIKE = 0.95
@@ -118,6 +122,16 @@ class Search:
             if name in self.fitted and self.fitted[name].delta_chi2 > 0.7 * self.questions.promise(name):
                 break
 
+    def _smallest(self, effects: Sequence[Effect]) -> dict[str, Value]:
+        """Values at which the effects hardly act."""
+        values: dict[str, Value] = {}
+        for effect in effects:
+            places = self.questions.of(effect.name)
+            if places:
+                shape = self.questions.answers.shapes[places[0]]
+                values |= start_of(shape, math.copysign(abs(shape.step), float(self.questions.gains[1][places[0]])))
+        return values
+
     def _fit(self, climb: Climb) -> None:
         name = "+".join(climb.names)
         if name in self.fitted and not math.isnan(climb.deviance):
@@ -129,8 +143,16 @@ class Search:
             self.silent.add(name)
             return
         found = weigh(self.questions.found, climb.effects, fit)
+        if found.delta_chi2 < WORSE:
+            # The smaller model is in this one: it was led astray by its start, and begins again where the other ended.
+            fit = full_fit(self.questions.found, Climb(climb.effects, math.nan, self._smallest(climb.effects)), best)
+            found = max((found, *([weigh(self.questions.found, climb.effects, fit)] if fit else [])), key=_gain)
         if name not in self.fitted or found.delta_chi2 > self.fitted[name].delta_chi2:
             self.fitted[name] = found
+
+
+def _gain(one: Evidence) -> float:
+    return one.delta_chi2
 
 
 def pairs(before: Fit, firsts: Sequence[Evidence], effects: Sequence[Effect], report: Report) -> list[Evidence]:

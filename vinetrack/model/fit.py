@@ -35,6 +35,7 @@ from vinetrack.model.solve import (
     first_state,
     make_frame,
     solve,
+    track_correlation,
 )
 from vinetrack.model.starts import align, candidates, first_own
 from vinetrack.records import Floats, Track
@@ -48,7 +49,8 @@ POOR_FIT = 3.0
 """χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried."""
 
 MOST_STARTS = 3
-ITERATIONS_ONCE_MORE = 25
+ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 12
+GUIDING_SPREADS = (0.01, 0.03)
 
 
 def fit(
@@ -127,7 +129,8 @@ def _solve_from_scratch(predictor: Predictor, held: Held, watch: Watch | None) -
     """The best of the solutions from the likeliest starts; the first will do where it explains the data."""
     found: list[Solution] = []
     reason = ""
-    for _, theta, own in candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]:
+    starts = candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]
+    for _, theta, own in starts:
         try:
             found.append(_solve_from(predictor, theta, own, held, watch=watch))
         except SimulationError as error:
@@ -137,7 +140,33 @@ def _solve_from_scratch(predictor: Predictor, held: Held, watch: Watch | None) -
             break
     if not found:
         raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
-    return _or_once_more(predictor, min(found, key=_deviance), held, watch)
+    best = min(found, key=_deviance)
+    if not chi2_per_dof(predictor, best) > POOR_FIT:
+        return best
+    for _, theta, own in starts:
+        guided = _guided(predictor, theta, own, held, watch)
+        if guided is not None:
+            best = min((best, guided), key=_deviance)
+        if not chi2_per_dof(predictor, best) > POOR_FIT:
+            break
+    return best
+
+
+def _guided(predictor: Predictor, theta: Floats, own: Floats, held: Held, watch: Watch | None) -> Solution | None:
+    """A solution led by what is missed: the noise is as correlated as in the tracks until the numbers have settled.
+
+    Free, the correlation takes slow misfit in, and holds the numbers where they are.
+    """
+    if held.noise is not None:
+        return None
+    guide = Held(spread=held.spread or GUIDING_SPREADS, correlation=track_correlation(predictor.data))
+    state = first_state(predictor.data, theta, own)
+    try:
+        first = solve(predictor, make_frame(predictor, own), state, guide, warm=True, most_iterations=GUIDED_ITERATIONS)
+        own, _ = align(predictor.data, predictor, first.state.theta, first_own(predictor.data))
+        return _solve_from(predictor, first.state.theta, own, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+    except SimulationError:
+        return None
 
 
 def _solve_from(
