@@ -34,7 +34,7 @@ CAMPAIGN_FIGURES = {
     "overview": "All trials",
     "model_comparison": "Model and measurement",
     "model_residuals": "What the model leaves",
-    "ladder": "The error falls",
+    "ladder": "The ladder of errors",
     "before_after": "The worst condition",
     "where": "Where it fails",
     "missing_force": "The missing force",

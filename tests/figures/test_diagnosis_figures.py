@@ -100,7 +100,7 @@ def test_a_condition_is_drawn_before_and_after_with_its_errors() -> None:
     growth, left = draw_before_after("24 kPa", table, "air drag").axes
     assert [text.get_text() for text in growth.get_legend().get_texts()] == [
         "measured, N = 2",
-        "before: off by 8.0 mm rms",
+        "model you came with: 8.0 mm rms",
         "with air drag: 1.0 mm rms",
     ]
     assert {to_hex(line.get_color()) for line in left.lines} >= {BEFORE.lower(), AFTER.lower()}
@@ -227,7 +227,9 @@ def test_the_misfit_is_coloured_by_side_and_numbered_where_it_is_beyond_scatter(
 
 
 def test_one_panel_is_enough_where_nothing_was_added() -> None:
-    assert len(draw_where(cells(after=math.nan)).axes) == 1
+    fig = draw_where(cells(after=math.nan))
+    assert len(fig.axes) == 1
+    assert in_bounds(fig)
 
 
 def test_rows_name_the_condition_and_how_many_trials_it_has() -> None:

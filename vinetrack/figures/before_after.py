@@ -88,7 +88,7 @@ def _legend(ax: Axes, trials: pd.DataFrame, n_trials: int, has_after: bool, adde
     measured: dict[str, Any] = {"color": MUTED, "marker": ".", "ls": "none", "ms": 8}
     handles = [
         Line2D([], [], label=f"measured, N = {n_trials}", **measured),
-        Line2D([], [], color=BEFORE, ls=BEFORE_LINE, label=f"before: off by {_off(trials, 'model_before_m')}"),
+        Line2D([], [], color=BEFORE, ls=BEFORE_LINE, label=f"model you came with: {_off(trials, 'model_before_m')}"),
     ]
     if has_after:
         after = f"with {added}" if added else "after"

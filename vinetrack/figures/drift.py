@@ -62,7 +62,7 @@ def draw_drift(groups: pd.DataFrame, added: str = "") -> Figure:
             _draw_panel(ax, chosen, str(against), markers)
         for ax in axes.flat[len(panels) :]:
             ax.set_visible(False)
-        fig.supylabel("value over that of the common law", fontsize=11)
+        fig.supylabel("value / common law", fontsize=11)
         _legend(fig, known, markers, added)
     return fig
 

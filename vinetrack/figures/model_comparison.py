@@ -31,7 +31,7 @@ def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, p
     ----------
     comparison : one row a condition with `condition, condition_label, vine, rms_position_m, ratio`.
     trajectories : by condition, `trial, time_s, lead_position_m, model_position_m, replicates_mean_m,
-        replicates_sigma_m`.
+        replicates_sigma_m`, and where effects were added `model_after_m`.
     """
     return _panels(comparison, trajectories, _draw_positions, "time since release (ms)", "growth (mm)")
 
@@ -68,6 +68,8 @@ def _panels(
         fig.supxlabel(x_label, fontsize=11)
         fig.supylabel(y_label, fontsize=11)
         title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
+        if draw is _draw_positions and "model_after_m" in trajectories[shown[0].condition]:
+            title += "; dashed: this model, full: with the effects that were added"
         wrapped = textwrap.fill(title, int(n_columns * panel_in * 11))
         fig.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
     return fig
@@ -118,6 +120,8 @@ def _draw_positions(ax: Axes, table: pd.DataFrame, colour: str, n_points: int) -
     for part in parts:
         ax.plot(1e3 * part["time_s"], 1e3 * part["lead_position_m"], color=colour, lw=0.8)
     ax.plot(1e3 * longest["time_s"], 1e3 * longest["model_position_m"], color=INK, lw=1.5, ls=(0, (4, 2)))
+    if "model_after_m" in longest:
+        ax.plot(1e3 * longest["time_s"], 1e3 * longest["model_after_m"], color=INK, lw=1.5)
 
 
 def _draw_residuals(ax: Axes, table: pd.DataFrame, colour: str, n_points: int) -> None:

@@ -74,7 +74,7 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
     def in_px(mm: Any) -> Any:
         return mm / (1e3 * m_per_px)
 
-    top = ax.secondary_xaxis(-0.17, functions=(in_mm, in_px))
+    top = ax.secondary_xaxis(-0.21, functions=(in_mm, in_px))
     top.set_xlabel("along the growth axis (mm)")
     legend_above(ax, 2)
     ax.set_title(title, loc="right", fontsize=10, color=MUTED, fontweight="normal")

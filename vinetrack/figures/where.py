@@ -53,7 +53,7 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
             ax.set_title(words, fontsize=10)
             ax.set_xlabel("along the growth (%)")
         axes[0].set_yticks(range(len(labels)), _row_names(table, labels), fontsize=9)
-        _legend(fig, full_mm)
+        _legend(fig, full_mm, 3 if len(shown) > 1 else 2)
     return fig
 
 
@@ -85,7 +85,7 @@ def _draw_cells(ax: Axes, table: pd.DataFrame, column: str, labels: Sequence[str
     ax.tick_params(axis="y", length=0)
 
 
-def _legend(fig: Figure, full_mm: float) -> None:
+def _legend(fig: Figure, full_mm: float, n_columns: int) -> None:
     from matplotlib.patches import Patch
 
     handles = [
@@ -93,4 +93,4 @@ def _legend(fig: Figure, full_mm: float) -> None:
         Patch(facecolor=BEHIND, alpha=0.85, label="measured is behind"),
         Patch(facecolor=MUTED, alpha=0.2, label=f"full colour: {full_mm:.2g} mm; numbers in mm, where beyond scatter"),
     ]
-    fig.legend(handles=handles, loc="outside upper left", ncols=3, fontsize=9, handlelength=1.3)
+    fig.legend(handles=handles, loc="outside upper left", ncols=n_columns, fontsize=9, handlelength=1.3)

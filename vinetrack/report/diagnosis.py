@@ -70,7 +70,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "where": [str(line) for line in content.get("where") or [] if str(line) not in drifting],
         "force": missing_force(content.get("missing_force")),
         "rounds": [_round(i, one) for i, one in enumerate(rounds)],
-        "hidden": hidden_table(rounds[-1].get("ranking") or [], result.units) if rounds else None,
+        "hidden": _hidden(content, result.units),
         "blind": _blind(rounds[0].get("ranking") or []) if rounds else [],
         "tied": tied_pairs(content.get("cosines") or {}),
         "next": next_experiment(content.get("next_experiment")),
@@ -136,6 +136,12 @@ def _round(index: int, one: Mapping[str, Any]) -> dict[str, Any]:
 def round_question(one: Mapping[str, Any]) -> str:
     """What a round asks, in words."""
     return f"what does {listed(list(one.get('model') or []))} lack?"
+
+
+def _hidden(content: Mapping[str, Any], units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
+    """What could still hide, which means something only where nothing more is missing."""
+    rounds = list(content.get("rounds") or [])
+    return hidden_table(rounds[-1].get("ranking") or [], units) if content.get("final_verdict") == "adequate" else None
 
 
 def hidden_table(

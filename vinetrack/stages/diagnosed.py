@@ -41,6 +41,7 @@ class Diagnosed:
     """
 
     ladder: pd.DataFrame
+    trials: pd.DataFrame
     before_after: pd.DataFrame
     where: pd.DataFrame
     cells: pd.DataFrame
@@ -69,16 +70,17 @@ def read_diagnosed(results: Results, conditions: pd.DataFrame) -> Diagnosed | No
     trials = predicted_trials(results, conditions)
     worst = worst_condition(trials)
     rounds = list(content.get("rounds") or [])
-    cosines = content.get("cosines") or (rounds[0].get("cosines") if rounds else None) or {}
+    cosines = in_order_of_rank(content.get("cosines") or {}, rounds)
     return Diagnosed(
         ladder=_table(results.ladder),
+        trials=trials,
         before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
         where=where_table(trials, labels, _table(results.diagnosed("along_position.csv"))),
         cells=cosine_cells(cosines),
         drift=_table(results.diagnosed("drift_groups.csv")),
         force=_table(results.diagnosed("missing_force.csv")),
         rounds=[(question(i, rounds), ranking_table(one)) for i, one in enumerate(rounds)],
-        cosines=(list(cosines.get("effects") or []), list(cosines.get("matrix") or [])),
+        cosines=(list(cosines["effects"]), list(cosines["matrix"])),
         worst=worst,
         added=listed(list(content.get("effects") or [])),
         labels=labels,
@@ -143,6 +145,19 @@ def draw_diagnosed(found: Diagnosed | None) -> dict[str, Figure]:
         "cosines": draw_cosines(*found.cosines),
         "drift": draw_drift(found.drift, found.added),
     }
+
+
+def with_after(trajectories: Mapping[str, pd.DataFrame], found: Diagnosed | None) -> dict[str, pd.DataFrame]:
+    """Trajectories by condition with what the last model says of them, where effects were added."""
+    if found is None or not found.added or not len(found.trials):
+        return dict(trajectories)
+    later = {str(trial): part["model_after_m"].to_numpy() for trial, part in found.trials.groupby("trial", sort=False)}
+    whole = {}
+    for condition, table in trajectories.items():
+        parts = [later.get(str(trial), np.empty(0)) for trial in dict.fromkeys(table["trial"])]
+        after_m = np.concatenate(parts)
+        whole[condition] = table.assign(model_after_m=after_m) if after_m.size == len(table) else table
+    return whole
 
 
 def figure_tables(found: Diagnosed | None) -> dict[str, pd.DataFrame]:
@@ -324,6 +339,15 @@ def ranking_table(one: Mapping[str, Any]) -> pd.DataFrame:
     ]
     columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
     return pd.DataFrame(rows, columns=columns)
+
+
+def in_order_of_rank(cosines: Mapping[str, Any], rounds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The matrix of cosines with the answer first, then as the first round ranks its candidates."""
+    names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
+    ranking = list(rounds[0].get("ranking") or []) if rounds else []
+    places = {row["effect"]: (not row.get("in_answer_set"), i) for i, row in enumerate(ranking)}
+    order = sorted(range(len(matrix)), key=lambda i: places.get(names[i], (True, len(ranking))))
+    return {"effects": [names[i] for i in order], "matrix": [[matrix[i][j] for j in order] for i in order]}
 
 
 def cosine_cells(cosines: Mapping[str, Any]) -> pd.DataFrame:

@@ -73,7 +73,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     from vinetrack.figures.scaling import draw_scaling
     from vinetrack.figures.speed_scaling import draw_speed_scaling
     from vinetrack.figures.style import METHOD_NAMES
-    from vinetrack.stages.diagnosed import draw_diagnosed, read_diagnosed
+    from vinetrack.stages.diagnosed import draw_diagnosed, read_diagnosed, with_after
 
     results = Results(folder)
     damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)
@@ -86,7 +86,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
     compared = label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
-    scaling = read_json(results.scaling)
+    scaling, diagnosed = read_json(results.scaling), read_diagnosed(results, described)
     drawings: dict[str, Figure] = {
         "damping_law": draw_damping_law(points, damping),
         "exponents": draw_exponents(damping),
@@ -95,9 +95,9 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
         "efficiency": draw_efficiency(scaling),
         "payload_speed": draw_payload_speed(read_result(results.conditions), read_result(results.payload_model)),
         "overview": draw_overview(described, moved),
-        "model_comparison": draw_model_comparison(compared, trajectories),
+        "model_comparison": draw_model_comparison(compared, with_after(trajectories, diagnosed)),
         "model_residuals": draw_model_residuals(compared, trajectories),
-        **draw_diagnosed(read_diagnosed(results, described)),
+        **draw_diagnosed(diagnosed),
     }
     for name, figure in drawings.items():
         _write(figure, partial(results.figure, name), settings)

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from vinetrack.stages.diagnosed import Diagnosed
 
 FIGURES = {
-    "ladder": ("The error falls", ""),
-    "before_after": ("The worst condition, before and after", ""),
+    "ladder": ("The ladder of errors", ""),
+    "before_after": ("The worst condition", ""),
     "damping_law": ("Steady force and steady speed", "damping_points.csv"),
     "exponents": ("The exponent and the coefficients, by both methods", "damping.json"),
     "scaling": ("How damping grows with size", "scaling.json"),
