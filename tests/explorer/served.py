@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -113,15 +114,18 @@ class Visitor:
         x, y, _ = self.place(name, inside)
         self.chrome.click(x, y)
 
-    def drag(self, name: str, path: list[float], pause_s: float = 0.03) -> None:
-        """Drag the handle of a slider through parts of its whole width, to the right where positive."""
+    def drag(self, name: str, path: list[float], after: Callable[[], None]) -> None:
+        """Drag the handle of a slider through parts of its whole width, to the right where positive.
+
+        `after` is called after every move, the button still down.
+        """
         _, _, whole = self.place(name, ".noUi-target")
         x, y, _ = self.place(name, ".noUi-handle")
         self.chrome.mouse("move", x, y)
         self.chrome.mouse("press", x, y)
         for part in path:
             self.chrome.mouse("move", x + part * whole, y, held=True)
-            time.sleep(pause_s)
+            after()
         self.chrome.mouse("release", x + path[-1] * whole, y)
 
     def time_redraws(self, slider: str) -> None:
@@ -143,3 +147,14 @@ class Visitor:
         """What was noted."""
         found: list[float] = self.chrome.run("redraws_ms")
         return found
+
+    def one_redraw(self) -> None:
+        """Wait, within the page, until one more redraw was noted; for two seconds at most."""
+        self.chrome.run(
+            """(async () => {
+              const count = window.redraws_seen ?? 0;
+              const end = performance.now() + 2000;
+              while (redraws_ms.length <= count && performance.now() < end) await new Promise((r) => setTimeout(r, 2));
+              window.redraws_seen = redraws_ms.length;
+            })()"""
+        )

@@ -31,7 +31,7 @@ COALESCE_MS = 4
 """A redraw waits this long, so that all moves of a slider that have come in by then are drawn as one."""
 
 WORDS_MS = 150
-"""Words follow a slider at reading speed; the headline's number alone keeps up with the curves."""
+"""Words follow a slider at reading speed: every change of them has the browser lay out the page anew."""
 
 LOOK_AGAIN_MS = 2000
 """How often the page looks whether there is a new diagnosis."""
@@ -213,6 +213,7 @@ class Page:
         self._waiting.reach(step)
         self._clock()
         self._follow(at_numbers(self.choice, step.values))
+        self._say_soon()
 
     def _fit_done(self, fitted: Fitted) -> None:
         if self._job is None:
@@ -246,6 +247,9 @@ class Page:
         self._redraw_pending = False
         if self.ground.curves is not None:
             self._follow(self.choice)
+        self._say_soon()
+
+    def _say_soon(self) -> None:
         if not self._words_pending:
             self._words_pending = True
             self.document.add_timeout_callback(self._say, WORDS_MS)
@@ -267,7 +271,6 @@ class Page:
         self.plots.set_curves(self.curves, self.chooser.shown)
         self.plots.set_earlier(self.ground.curves if self._differs() else None, self.chooser.shown)
         self._show_errors()
-        self._say_headline()
 
     def _show_errors(self) -> None:
         floors = self.campaign.floors_m
@@ -280,7 +283,7 @@ class Page:
     def _say(self) -> None:
         """Everything that is in words."""
         self._words_pending = False
-        self._say_headline()
+        _set(self.headline, headline(self.campaign, self.choice, self.errors_m, self.ground.errors_m))
         if self.curves is not None:
             self.film.set_curves(self.curves, self.ground.curves)
             self.film.refresh()
@@ -288,9 +291,6 @@ class Page:
         _set(self.tied, tied_panel(self.campaign, self.story, self.last))
         _set(self.next, next_panel(self.campaign, self.story))
         _set(self.said, self.keep.commands())
-
-    def _say_headline(self) -> None:
-        _set(self.headline, headline(self.campaign, self.choice, self.errors_m, self.ground.errors_m))
 
     def _clock(self) -> None:
         """The line of what is going on; it is alive while anything is."""

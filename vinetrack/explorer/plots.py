@@ -24,6 +24,7 @@ class Plots:
     def __init__(self, campaign: Campaign, chosen: Callable[[str], None]) -> None:
         self.campaign, self._chosen = campaign, chosen
         self._earlier_drawn: object = None
+        self._curves_drawn: tuple[int, ...] | None = None
         empty: dict[str, Any] = {"xs": [], "ys": []}
         self._band = ColumnDataSource({**empty, "colour": []})
         self._measured = ColumnDataSource({**empty, "colour": [], "trial": [], "condition": []})
@@ -120,13 +121,17 @@ class Plots:
         self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
 
     def set_curves(self, curves: Curves, shown: Sequence[int]) -> None:
-        """What the model says now."""
-        self._model.data = modelled(self.campaign, curves, shown)
-        left = residuals(self.campaign, curves, shown)
+        """What the model says now; of lines that are drawn already only what has moved is sent."""
+        lines, left = modelled(self.campaign, curves, shown), residuals(self.campaign, curves, shown)
         low, high = symmetric(left)
         if high != self.residual.y_range.end:
             self.residual.y_range.update(start=low, end=high)
-        self._left.data = left
+        if tuple(shown) == self._curves_drawn:
+            self._model.data["ys"] = lines["ys"]
+            self._left.data["ys"] = left["ys"]
+        else:
+            self._curves_drawn = tuple(shown)
+            self._model.data, self._left.data = lines, left
 
     def set_errors(
         self,
@@ -141,7 +146,9 @@ class Plots:
         end = round_up(1.04 * max(known, default=1.0))
         if end != self.errors.x_range.end:
             self.errors.x_range.end = end
-        self._bars.data = rows
+        for key, values in rows.items():
+            if values != self._bars.data[key]:
+                self._bars.data[key] = values
 
 
 def round_up(value: float) -> float:
