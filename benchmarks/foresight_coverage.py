@@ -10,7 +10,8 @@ same       a vine of the fit at a pressure between those filmed
 beyond     the same at twice the highest pressure that was filmed
 longer     a vine of the same diameter and wall, 1.5 times as long, with a payload
 
-Seeds 0–9 were used while this was built; seeds from 3000 score.
+Seeds 0–9 were used while this was built; seeds 3000–3079 showed that the error of the spreads counts; seeds from
+3100 score.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--campaigns", type=int, default=80)
-    parser.add_argument("--first-seed", type=int, default=3000)
+    parser.add_argument("--first-seed", type=int, default=3100)
     given = parser.parse_args()
     seeds = range(given.first_seed, given.first_seed + given.campaigns)
     table = pd.DataFrame([row for seed in tqdm(seeds) for row in measure(seed)])

@@ -100,10 +100,13 @@ def test_a_fit_to_few_trials_is_believed_no_more_than_its_own_intervals_say() ->
     assert np.std(draws[N]) == pytest.approx(0.01 * 2.776 / 1.960, rel=0.02)
 
 
-def test_spreads_from_trial_to_trial_are_those_of_the_fit() -> None:
-    belief = believe(vine_of_the_fit(), None, fit_numbers(fitted(), "a"))
-    draws = belief.draw(40_000, 1, only=["P from trial to trial", "B from trial to trial"])
-    assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3, rel=0.02)
+def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials() -> None:
+    """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
+    content = fitted(trials={str(k): {} for k in range(13)})
+    content["spreads"]["B"]["estimated"] = False
+    belief = believe(vine_of_the_fit(), None, fit_numbers(content, "a"))
+    draws = belief.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
+    assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3 * np.sqrt(10 / 8), rel=0.02)
     assert np.std(np.log(draws[B])) == pytest.approx(0.05, rel=0.02)
 
 

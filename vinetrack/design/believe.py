@@ -13,7 +13,7 @@ from vinetrack import published
 from vinetrack.design import guess
 from vinetrack.design.beliefs import PRESSURE, YIELD, Belief, Draws, Move, Size, Uncertainty, wanted_model
 from vinetrack.design.from_fit import FitNumbers, alike, nearest_vine, numbers_of, same_vine, yield_place
-from vinetrack.design.moves import even, heavy, relative, scaled, shifted
+from vinetrack.design.moves import even, relative, scaled, shifted
 from vinetrack.effects import BASE_EFFECTS, Effect
 from vinetrack.model.fit_data import FitError
 from vinetrack.model.free import DAMPING, EXPONENT
@@ -174,7 +174,7 @@ def _doubt_guess(making: _Making, split: float) -> None:
         f"the four printed B scatter by {100 * guess.damping_scatter():.0f} % about it: {100 * scatter:.0f} % at this "
         f"size (Student's t, {guess.SCATTER_DOF} degrees of freedom)"
     )
-    making.doubt("guess of B", words, f"B scatter|{making.trial.vine}", heavy(DAMPING, scatter))
+    making.doubt("guess of B", words, f"B scatter|{making.trial.vine}", scaled(DAMPING, scatter, guess.SCATTER_DOF))
     if abs(split) > 1e-9:
         words = (
             f"t and D apart are not printed: exponents ±{guess.SPLIT_SIGMA:g} against each other, "
@@ -284,17 +284,17 @@ def _spreads(making: _Making, said: Said) -> tuple[float, float]:
     fit, trial = making.fit, making.trial
     stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else guess.PRESSURE_SPREAD
     pressure = stated if math.isfinite(stated) else guess.PRESSURE_SPREAD
-    damping, origin = guess.DAMPING_SPREAD, "taken for"
+    damping, origin, dof = guess.DAMPING_SPREAD, "taken for", {"pressure": math.inf, "B": math.inf}
     if fit is not None and fit.spreads:
         pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
-        origin = f"found in {fit.source}:"
+        origin, dof = f"found in {fit.source}:", {**dof, **fit.spread_dof}
     if said.spreads is not None:
-        (pressure, damping), origin = said.spreads, "given:"
+        (pressure, damping), origin, dof = said.spreads, "given:", {"pressure": math.inf, "B": math.inf}
     making.know(PRESSURE, trial.pressure_Pa, "set")
     if pressure > 0:
-        words = f"{origin} {100 * pressure:.2g} %"
-        making.doubt("P from trial to trial", words, f"P trial|{trial.vine}", relative(PRESSURE, pressure))
+        move = relative(PRESSURE, pressure, dof["pressure"])
+        making.doubt("P from trial to trial", f"{origin} {100 * pressure:.2g} %", f"P trial|{trial.vine}", move)
     if damping > 0:
-        words = f"{origin} {100 * damping:.2g} %"
-        making.doubt("B from trial to trial", words, f"B trial|{trial.vine}", scaled(DAMPING, damping))
+        move = scaled(DAMPING, damping, dof["B"])
+        making.doubt("B from trial to trial", f"{origin} {100 * damping:.2g} %", f"B trial|{trial.vine}", move)
     return pressure, damping

@@ -20,6 +20,9 @@ from vinetrack.records import Floats, Trial
 if TYPE_CHECKING:
     from vinetrack.model.fit_result import Fit
 
+FEWEST_TO_SPARE = 3
+"""Degrees of freedom that a spread has at least: a fit does not estimate it with fewer trials to spare."""
+
 NORMAL_95 = 1.959963984540054
 _VINE = re.compile(r"([\d.]+)mm-([\d.]+)um(?:-([\d.]+)mm)?")
 
@@ -30,7 +33,8 @@ class FitNumbers:
 
     `mean`, `covariance` are those of the numbers as held; numbers that the fit left open have a variance of 0 and
     stand in `open`. The covariance is stretched so that its normal 95 % are the fit's own, which take Student's t.
-    `spreads` are those of pressure and B from trial to trial, relative; `values` the parameters of the model, SI.
+    `spreads` are those of pressure and B from trial to trial, relative, and `spread_dof` their degrees of freedom,
+    infinite where they were told to the fit.
     """
 
     source: str
@@ -42,6 +46,7 @@ class FitNumbers:
     covariance: Floats
     open: tuple[str, ...]
     spreads: Mapping[str, float]
+    spread_dof: Mapping[str, float]
     n_trials: int
 
     def place(self, key: str, vine: str = "") -> int | None:
@@ -91,6 +96,7 @@ def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
         [_stretch(number, bool(is_log)) for number, is_log in zip(numbers, log, strict=True)], dtype=float
     )
     known = np.isfinite(np.diag(covariance))
+    spare = float(max(len(content["trials"]) - len(numbers), FEWEST_TO_SPARE))
     held = np.where(known, slopes * stretch, 0.0)
     return FitNumbers(
         source=source,
@@ -102,6 +108,7 @@ def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
         covariance=np.nan_to_num(covariance, nan=0.0, posinf=0.0, neginf=0.0) * held[:, None] * held,
         open=tuple(number["symbol"] for number, is_known in zip(numbers, known, strict=True) if not is_known),
         spreads={name: float(spread["value"]) for name, spread in content["spreads"].items()},
+        spread_dof={name: spare if spread["estimated"] else math.inf for name, spread in content["spreads"].items()},
         n_trials=len(content["trials"]),
     )
 
@@ -138,7 +145,9 @@ def numbers_of(found: Fit) -> FitNumbers:
         "model": found.model.names,
         "numbers": numbers,
         "covariance": found.covariance,
-        "spreads": {name: {"value": spread.value} for name, spread in found.spreads.items()},
+        "spreads": {
+            name: {"value": spread.value, "estimated": spread.estimated} for name, spread in found.spreads.items()
+        },
         "trials": {trial.name: None for trial in found.trials},
     }
     return fit_numbers(content, "the fit")

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from vinetrack.design import guess
 from vinetrack.design.beliefs import Draws, Move, Size
+from vinetrack.records import Floats
 
-FARTHEST_SCATTER = 20.0
-"""Standard deviations at which a draw of Student's t is cut: a factor ten of B, beyond all vines."""
+FARTHEST = 20.0
+"""At which a deviate of Student's t is cut: a factor ten of a guessed B, beyond all vines."""
 
 
-def scaled(name: str, log_sigma: float) -> Move:
-    """Multiplied by a log-normal factor with this standard deviation of its logarithm."""
+def deviates(draw: np.random.Generator, count: int, dof: float = math.inf) -> Floats:
+    """Normal deviates, or Student's with so many degrees of freedom, shape (count,)."""
+    if math.isinf(dof):
+        return draw.standard_normal(count)
+    return np.clip(draw.standard_t(dof, count), -FARTHEST, FARTHEST)
+
+
+def scaled(name: str, log_sigma: float, dof: float = math.inf) -> Move:
+    """Multiplied by a factor whose logarithm has this standard deviation, or scale of Student's t."""
 
     def move(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draws[name] * np.exp(log_sigma * draw.standard_normal(draws[name].size))}
-
-    return move
-
-
-def heavy(name: str, log_sigma: float) -> Move:
-    """Multiplied by a factor whose logarithm follows Student's t on this scale."""
-
-    def move(draws: Draws, draw: np.random.Generator) -> Draws:
-        t = np.clip(draw.standard_t(guess.SCATTER_DOF, draws[name].size), -FARTHEST_SCATTER, FARTHEST_SCATTER)
-        return {**draws, name: draws[name] * np.exp(log_sigma * t)}
+        return {**draws, name: draws[name] * np.exp(log_sigma * deviates(draw, draws[name].size, dof))}
 
     return move
 
@@ -39,11 +38,11 @@ def shifted(name: str, sigma: float) -> Move:
     return move
 
 
-def relative(name: str, sigma: float) -> Move:
-    """Multiplied by one plus a normal deviate."""
+def relative(name: str, sigma: float, dof: float = math.inf) -> Move:
+    """Multiplied by one plus a deviate of this standard deviation, or scale of Student's t."""
 
     def move(draws: Draws, draw: np.random.Generator) -> Draws:
-        return {**draws, name: draws[name] * (1 + sigma * draw.standard_normal(draws[name].size))}
+        return {**draws, name: draws[name] * (1 + sigma * deviates(draw, draws[name].size, dof))}
 
     return move
 
