@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.experiment import Experiment
-    from vinetrack.report.build import Clip, ReportFigure, ReportSection
+    from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
     from vinetrack.report.recordings import Recording
     from vinetrack.stages.diagnosed import Diagnosed
 
@@ -54,30 +54,40 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
     ResultsError
         If a stage before this one has not run.
     """
-    from vinetrack.report.build import ReportContent, build_report
+    from vinetrack.report.build import build_report
+
+    results = Results(folder)
+    content = report_content(experiment, folder, settings)
+    page = build_report(content)
+    write_json(results.provenance, dict(content.provenance))
+    write_text(results.report, page)
+    return results.report
+
+
+def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
+    """Everything that a results folder has for the page.
+
+    Raises
+    ------
+    ResultsError
+        If a stage has not run.
+    """
+    from vinetrack.report.build import ReportContent
     from vinetrack.report.model import ModelResult
 
     results = Results(folder)
-    inputs = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace) if path]
-    target = getattr(experiment.settings.calibration, "image", None)
-    inputs += [experiment.folder / target] if target is not None else []
-    inputs += [experiment.folder / path for path in experiment.settings.effects]
-    shared = [path for name in ("trials.csv", "experiment.yaml") if (path := experiment.folder / name).exists()]
-    provenance = describe_run(
-        experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model
-    )
     trials = read_result(results.trials)
     drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
     filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
     diagnosed = read_diagnosed(results, describe_conditions(trials, experiment.trials))
     own_data = {name: _as_csv(table) for name, table in figure_tables(diagnosed).items()}
     own_data["model_comparison"] = _as_csv(_curves(results))
-    content = ReportContent(
+    return ReportContent(
         name=experiment.name,
         trials=trials,
         windows=read_result(results.steady),
         damping=read_json(results.damping),
-        provenance=provenance,
+        provenance=_provenance(experiment, settings),
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
         figures=[figure for name in _drawn(results, own_data) if (figure := _figure(results, name, own_data))],
         trial_figures=_trial_figures(results, drawn),
@@ -88,10 +98,15 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
         diagnosis=read_diagnosis(results, experiment),
         sections=[_paper_section(results)] if experiment.settings.published else [],
     )
-    page = build_report(content)
-    write_json(results.provenance, provenance)
-    write_text(results.report, page)
-    return results.report
+
+
+def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
+    inputs = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace) if path]
+    target = getattr(experiment.settings.calibration, "image", None)
+    inputs += [experiment.folder / target] if target is not None else []
+    inputs += [experiment.folder / path for path in experiment.settings.effects]
+    shared = [path for name in ("trials.csv", "experiment.yaml") if (path := experiment.folder / name).exists()]
+    return describe_run(experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model)
 
 
 def _paper_section(results: Results) -> ReportSection:
