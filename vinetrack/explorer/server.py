@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
+import socket
 import sys
 import threading
 import webbrowser
@@ -60,12 +61,11 @@ def start_server(ground: Ground, port: int | None = None) -> Server:
 
 
 def _serve(ground: Ground, port: int) -> Server:
-    from bokeh.server.util import bind_sockets
-
-    # Bound first, so that the port is known before it is said who may connect to it.
-    sockets, found = bind_sockets(LOOPBACK, port)
-    for one in sockets:
-        one.close()
+    # Found first, so that the port is known before it is said who may connect to it.
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((LOOPBACK, port))
+        found = int(probe.getsockname()[1])
     server = Server(
         {"/": application(ground)},
         address=LOOPBACK,

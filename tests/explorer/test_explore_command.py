@@ -1,0 +1,117 @@
+"""The command: what the page does without it, its refusals, and a server for this machine alone that Ctrl-C ends."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import urllib.request
+from pathlib import Path
+
+import pytest
+from explorer_campaign import SETTINGS, run
+from served import Served
+from tornado.ioloop import IOLoop
+from tornado.websocket import websocket_connect
+from typer.testing import CliRunner
+
+from vinetrack.cli import app
+from vinetrack.explorer.campaign import Campaign
+from vinetrack.settings import read_experiment_settings
+
+
+def refused(*arguments: object) -> str:
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert done.exit_code == 1
+    assert "Traceback" not in done.output
+    return done.output
+
+
+@pytest.fixture
+def copied(campaign: Campaign, tmp_path: Path) -> tuple[Path, Path]:
+    """Experiment and results that a test may write to."""
+    shutil.copytree(campaign.experiment.folder, tmp_path / "vines")
+    shutil.copytree(campaign.folder, tmp_path / "results")
+    (tmp_path / "results" / "provenance.json").write_text(json.dumps({"experiment": str(tmp_path / "vines")}))
+    return tmp_path / "vines", tmp_path / "results"
+
+
+def test_sizes_are_tried_and_written_without_a_page(copied: tuple[Path, Path], tmp_path: Path) -> None:
+    files = [tmp_path / f"curves.{form}" for form in ("csv", "svg", "png")]
+    exports = [word for path in files for word in ("--export", path)]
+    said = run("explore", copied[1], "--set", "reservoir_depletion.gamma=1.4", *exports)
+    lines = said.splitlines()
+    assert lines[0] == "base model + reservoir depletion"
+    assert lines[1].split() == ["condition", "model", "in", "use", "now", "replicates"]
+    assert lines[2].split() == ["mm", "mm", "mm"]
+    assert lines[6].startswith("all ")
+    assert all(path.stat().st_size > 1000 for path in files)
+    assert read_experiment_settings(copied[0] / "experiment.yaml").model[-1] == "yield_pressure"
+
+
+def test_a_refit_prints_what_it_found_and_save_writes_the_model(copied: tuple[Path, Path]) -> None:
+    said = run("explore", copied[1], "--add", "reservoir_depletion", "--refit", "--save")
+    assert "reservoir_depletion, fitted to 6 trials" in said
+    assert "−2 ln L fell by" in said
+    settings = copied[0] / "experiment.yaml"
+    assert f"Saved: {settings}" in said
+    assert settings.read_text(encoding="utf-8").startswith(SETTINGS)
+    assert read_experiment_settings(settings).model[-1] == "reservoir_depletion"
+    run("explore", copied[1], "--drop", "reservoir_depletion", "--save")
+    assert read_experiment_settings(settings).model[-1] == "yield_pressure"
+
+
+def test_what_cannot_be_done_is_one_sentence(copied: tuple[Path, Path], tmp_path: Path) -> None:
+    experiment, results = copied
+    assert "is no folder" in refused("explore", tmp_path / "nowhere")
+    assert "did you mean air_drag?" in refused("explore", results, "--add", "air_drg", "--save")
+    assert "is one of the base effects" in refused("explore", results, "--drop", "gravity", "--save")
+    assert "is no form of export" in refused("explore", results, "--export", tmp_path / "a.doc")
+    experiment.rename(tmp_path / "moved")
+    assert "has moved: say where it is with --experiment" in refused("explore", results, "--save")
+    assert "Saved" in run("explore", results, "--experiment", tmp_path / "moved", "--save")
+
+
+def test_a_port_that_is_taken_is_said(campaign: Campaign) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert f"Port {port} is taken" in refused("explore", campaign.folder, "--no-browser", "--port", port)
+
+
+async def _origin_of_elsewhere(address: str) -> str:
+    from tornado.httpclient import HTTPClientError, HTTPRequest
+
+    request = HTTPRequest(address.replace("http", "ws") + "ws", headers={"Origin": "http://example.org"})
+    try:
+        (await websocket_connect(request)).close()
+    except HTTPClientError as error:
+        return str(error.code)
+    return "let in"
+
+
+def test_the_server_is_for_this_machine_alone_and_ends_by_ctrl_c(campaign: Campaign) -> None:
+    with Served(campaign.folder, "--port", "0") as served:
+        address = served.address
+        with urllib.request.urlopen(address, timeout=60) as answer:
+            page = answer.read().decode("utf-8")
+        assert "vinetrack explorer" in page
+        assert "cdn.bokeh.org" not in page
+        port = int(address.rsplit(":", 1)[1].strip("/"))
+        with pytest.raises(OSError, match="refused"), socket.create_connection((_own_address(), port), timeout=5):
+            pass
+        assert IOLoop(make_current=False).run_sync(lambda: _origin_of_elsewhere(address)) == "403"
+        assert served.interrupt() == 0
+    assert served.lines[-1] == "Explorer ended."
+    assert not [line for line in served.lines if "Traceback" in line or "WARNING" in line]
+
+
+def _own_address() -> str:
+    """An address of this machine other than the loopback's; of a machine without any, one that nobody listens at."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return "127.0.0.2"
+        return str(probe.getsockname()[0])
