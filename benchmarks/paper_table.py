@@ -19,7 +19,7 @@ from vinetrack.stages.results import read_result
 def main(folder: Path) -> None:
     """Print Tables I and II and every row, each with its marks."""
     table, departures = read_result(folder / "paper.csv"), read_result(folder / "paper_departures.csv")
-    for one in (table_one(table), table_two(table, departures), every_row(table)):
+    for one in (table_one(table), *table_two(table, departures), *every_row(table)):
         print(f"### {one.title}\n")
         print(markdown(one), end="\n\n")
         if one.note:

@@ -23,9 +23,25 @@ def rows() -> pd.DataFrame:
                 row="B_R1", quantity="B", mark=SIMULATED, published=0.57, ours=0.575, low=0.56, high=0.59, **common
             ),
             PaperRow(
-                row="position_rms_7kPa", quantity="rms", mark=SIMULATED, published=1.9, ours=0.32, unit="cm", **common
+                row="position_rms_7kPa",
+                where="Fig. 4, Table II",
+                how="somehow",
+                quantity="rms",
+                mark=SIMULATED,
+                published=1.9,
+                ours=0.32,
+                unit="cm",
             ),
-            PaperRow(row="p", quantity="p-value", mark=COMPUTED, published=0.32, ours=0.033, beside="a note", **common),
+            PaperRow(
+                row="p",
+                quantity="p-value",
+                setting="of a fit",
+                mark=COMPUTED,
+                published=0.32,
+                ours=0.033,
+                beside="a note",
+                **common,
+            ),
         ]
     )
 
@@ -55,20 +71,20 @@ def test_table_one_has_what_is_printed_and_ours() -> None:
 
 
 def test_table_two_sets_departures_beside_the_errors() -> None:
-    two = paper_section(rows(), departures(), []).tables[1]
-    by_pressure = {row[0]: row[1:] for row in two.rows}
-    assert list(by_pressure) == ["7", "14", "28", "41"]
-    assert by_pressure["7"][:5] == ("1.9", "0.320", "5.70 to 6.90", "9.50", "11.0 to 11.4")
-    assert by_pressure["7"][5:] == ("–",) * 5
-    assert all(len(row) == len(two.head) for row in two.rows)
+    positions, speeds = paper_section(rows(), departures(), []).tables[1:3]
+    assert positions.rows[0] == ("7", "1.9", "0.320", "5.70 to 6.90", "9.50", "11.0 to 11.4")
+    assert positions.rows[1] == ("14", "0.29", "–", "–", "–", "–")
+    assert [row[:2] for row in speeds.rows] == [("14", "0.27"), ("28", "0.56"), ("41", "1.35")]
+    assert all(len(row) == len(table.head) for table in (positions, speeds) for row in table.rows)
 
 
 def test_every_row_is_there_with_its_mark() -> None:
-    whole = paper_section(rows(), departures(), []).tables[2]
-    assert len(whole.rows) == 5
-    assert whole.rows[-1] == (
-        "somewhere", "p-value", "", "", "0.32", "0.0330", COMPUTED, "somehow", "a note",
-    )  # fmt: skip
+    tables = paper_section(rows(), departures(), []).tables[3:]
+    assert sum(len(table.rows) for table in tables) == 5
+    (elsewhere,) = (table for table in tables if "pressures" in table.title)
+    assert elsewhere.rows[-1] == ("p-value, of a fit", "0.32", "0.0330", COMPUTED, "somehow; a note")
+    (fourth,) = (table for table in tables if table.title.startswith("Figs. 4 and 5"))
+    assert fourth.rows[0][:4] == ("rms (cm)", "1.9", "0.320", SIMULATED)
 
 
 def test_every_figure_has_a_caption() -> None:

@@ -74,7 +74,7 @@ def _draw_panel(ax: Axes, printed: dict[int, float], ours: dict[int, float], dep
         mec=BLUE,
         mew=1.8,
         ms=8,
-        label="ours, trials grown by Eq. (2)",
+        label="ours",
     )
     for k, (label, low_name, high_name, colour) in enumerate(_DEPARTURES):
         low, high = (np.array([_size(departures, kPa, name) for kPa in printed]) for name in (low_name, high_name))
