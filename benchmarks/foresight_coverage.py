@@ -1,6 +1,6 @@
 """Whether a prediction from a fit holds: how often the 90 % band of a final speed has the trial that is then made.
 
-    python benchmarks/foresight_coverage.py [--campaigns 80] [--first-seed 3000]
+    python benchmarks/foresight_coverage.py [--campaigns 80] [--first-seed 3100]
 
 Campaigns of 24 trials, two vines at four pressures, three trials each, are grown in the virtual laboratory (B scatters
 by 3 %, P by 1 %, noise 0.1 mm, yield pressures misread by 0.2 kPa), fitted, and kept as `fit.json` would keep them.

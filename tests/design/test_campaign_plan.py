@@ -31,7 +31,7 @@ def beliefs(*sizes: tuple[float, float, float], spreads: tuple[float, float] = (
 
 @pytest.fixture(scope="module")
 def planned() -> tuple[Candidates, Planned, Scope]:
-    scope = Scope(pressure_Pa=(9e3, 45e3), payloads_kg=(0.0, 0.0356))
+    scope = Scope(pressure_Pa=(14e3, 45e3), payloads_kg=(0.0, 0.0356))
     found = candidates(beliefs(*SIZES), scope, CAMERA)
     return found, plan(found, scope, 0.004, 0.02), scope
 
