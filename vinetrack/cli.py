@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vinetrack.cli_design import register
+from vinetrack.cli_design import register as register_design
 from vinetrack.cli_diagnose import register as register_diagnose
 from vinetrack.cli_explore import register as register_explore
 
@@ -37,8 +37,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-register(app)
 
 ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
@@ -153,6 +151,7 @@ def overlays(
 
 register_explore(app)
 register_diagnose(app)
+register_design(app)
 
 
 @app.command(rich_help_panel="Stages of the workflow")
