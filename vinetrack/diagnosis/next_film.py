@@ -13,8 +13,8 @@ from vinetrack.diagnosis.next_predict import Hypothesis
 from vinetrack.model.fit_data import END_FRACTION, FitError, FitTrial, prepare_trial
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.free import DAMPING, EXPONENT
-from vinetrack.model.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Job
-from vinetrack.model.simulate import Trajectory
+from vinetrack.model.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Job, Predictor
+from vinetrack.model.simulate import SimulationError, Trajectory
 from vinetrack.records import Floats, Track, Trial
 
 LONGEST = 1.5
@@ -103,15 +103,19 @@ def courses(
     items = [blank(one, t, data, t) for one, t in zip(conditions, times, strict=True)]
     every = range(len(conditions))
     own = np.zeros((len(conditions), OWN))
-    runs, jobs = [], []
+    runs: list[list[Trajectory | None]] = []
+    jobs: list[Job] = []
     for hypothesis in hypotheses:
         predictor = hypothesis.predictor(every, items)
         jobs = predictor.jobs(hypothesis.theta, own)
-        runs.append(predictor.run(jobs))
+        runs.append(_followed(predictor, jobs))
     allowed = max(LEAST_SLACK, _slackest_so_far(hypotheses[-1].fit))
     found: list[Course | None] = []
     for i, condition in enumerate(conditions):
-        mine = [run[i] for run in runs]
+        mine = [one for one in (run[i] for run in runs) if one is not None]
+        if len(mine) < len(runs):
+            found.append(None)
+            continue
         length_m = condition.trial.length_m
         near_s = min(_reaches(one, END_FRACTION * length_m, cameras[i].longest_s) for one in mine)
         grown_m = min(float(np.interp(near_s, one.time_s, one.lead_position_m)) for one in mine)
@@ -121,6 +125,17 @@ def courses(
         ends = max(one.end_time_s if one.status == "ended" else math.inf for one in mine)
         found.append(Course(near_s, ends) if worth and not doubtful and near_s > 8 * cameras[i].frame_s else None)
     return found
+
+
+def _followed(predictor: Predictor, jobs: Sequence[Job]) -> list[Trajectory | None]:
+    """Trajectories of all jobs, None for those that cannot be followed."""
+    try:
+        return list(predictor.run(jobs))
+    except SimulationError:
+        if len(jobs) == 1:
+            return [None]
+    middle = len(jobs) // 2
+    return _followed(predictor, jobs[:middle]) + _followed(predictor, jobs[middle:])
 
 
 def _reaches(moved: Trajectory, position_m: float, otherwise_s: float) -> float:

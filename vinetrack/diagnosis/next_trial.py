@@ -27,6 +27,7 @@ from vinetrack.diagnosis.next_predict import carry
 from vinetrack.diagnosis.next_words import calibration_for, only_measurement, outlook, trials_in_words
 from vinetrack.model.fit_data import FitError
 from vinetrack.model.fit_result import Fit
+from vinetrack.model.simulate import SimulationError
 from vinetrack.records import Floats, Trial
 from vinetrack.settings import Limits
 
@@ -131,7 +132,8 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     Raises
     ------
     FitError
-        If there are fewer than two fits, or they are not of the same trials.
+        If there are fewer than two fits, they are not of the same trials, or what they say of further trials cannot be
+        simulated.
     """
     limits = limits or Limits()
     _judge(tied)
@@ -183,7 +185,10 @@ def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[B
         return Bench((), (), ()), []
     chosen, lenses, ways = (list(column) for column in zip(*kept, strict=True))
     hypotheses = [carry(fit, name, chosen) for fit, name in zip(tied, names, strict=True)]
-    return Bench(hypotheses, chosen, lenses), all_sides(hypotheses, chosen, lenses, ways)
+    try:
+        return Bench(hypotheses, chosen, lenses), all_sides(hypotheses, chosen, lenses, ways)
+    except SimulationError as error:
+        raise FitError(f"Further trials cannot be followed by every hypothesis: {error}") from error
 
 
 def _options(bench: Bench, sides: list[Side], limits: Limits, seed: int) -> list[_Option]:
