@@ -1,0 +1,208 @@
+"""What is asked of one campaign, and the answer as one flat row: the package under test, and two baselines."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+import warnings
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from pathlib import Path
+
+import vinetrack as vt
+from hidden.campaigns import Hidden, Truth, make
+from hidden.kinds import MEASUREMENT
+from vinetrack.effects import Effect, EffectError, catalogue, load_effect
+from vinetrack.model.fit import FitError
+from vinetrack.model.fit_result import Fit, Number
+
+Row = dict[str, object]
+OUTSIDERS = Path(__file__).with_name("outsiders")
+
+
+@lru_cache
+def true_effects(names: tuple[str, ...], outsider: str) -> tuple[Effect, ...]:
+    """What is hidden, as effects of the package."""
+    own = (load_effect(OUTSIDERS / f"{outsider}.py"),) if outsider else ()
+    return (*(catalogue()[name] for name in names), *own)
+
+
+def outsider_values(truth: Truth) -> dict[str, float]:
+    """True parameters of an outsider, by the names of its file."""
+    f = truth.physics
+    values = {
+        "rough_patch": {"F": f.patch_F, "place": f.patch_y, "width": f.patch_width},
+        "ripple": {"F": f.ripple_F, "length": f.ripple_length, "phase": f.ripple_phase},
+        "stribeck": {"F": f.stribeck_F, "speed": f.stribeck_speed},
+        "growing_friction": {"rate": f.growing_F / f.growing_s},
+        "changed_film": {"delta": f.step_B, "place": f.step_y},
+        "ringing": {"swing": f.ringing, "rate": f.ringing_hz},
+    }
+    return {f"{truth.outsider}.{name}": value for name, value in values.get(truth.outsider, {}).items()}
+
+
+def true_fit(base: Fit, truth: Truth, leave_out: str = "") -> Fit:
+    """The base model with what is hidden, fitted from the true sizes; without `leave_out` of it."""
+    names = tuple(name for name in truth.effects if name != leave_out)
+    model = base.model
+    for effect in true_effects(names, truth.outsider):
+        model = model + effect
+    values = {**truth.values, **outsider_values(truth)}
+    start = {key: value for key, value in values.items() if key in model.parameter_names}
+    # What shapes an outsider is known to the one who hid it: only its size is fitted.
+    shape = list(outsider_values(truth))[1:]
+    return vt.refit(base, model, start=start, fixed=[*base.options["fixed"], *shape])
+
+
+def sigmas(better: Fit, worse: Fit) -> float:
+    """√(2 Δ ln L), negative where the better one is worse."""
+    gain = 2 * (better.log_likelihood - worse.log_likelihood)
+    return math.copysign(math.sqrt(abs(gain)), gain)
+
+
+def identity(campaign: Hidden) -> Row:
+    """What a campaign is."""
+    truth = campaign.truth
+    hidden = "+".join(truth.effects) or truth.outsider or ("dropped_frames" if truth.dropped_frames else "")
+    return {
+        "kind": campaign.kind,
+        "seed": campaign.seed,
+        "hidden": "" if truth.in_trace else hidden,
+        "is_outsider": bool(truth.outsider),
+        "n_trials": len(campaign.pairs),
+        "n_vines": len({trial.vine for trial, _ in campaign.pairs}),
+        "noise": truth.nuisances.noise,
+        "B_scatter": truth.nuisances.damping_scatter,
+        "P_scatter": truth.nuisances.pressure_scatter,
+    }
+
+
+def ask_vinetrack(kind: str, seed: int) -> Row:
+    """`vt.diagnose` on one campaign: verdict, effects, answer set, seconds, sizes; and how visible the truth was."""
+    campaign = make(kind, seed)
+    row = {"method": "vinetrack", **identity(campaign)}
+    begun = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        said = vt.diagnose(list(campaign.pairs), ladder=False, advice=False)
+        row["seconds"] = time.perf_counter() - begun
+        row |= {
+            "verdict": said.verdict,
+            "effects": "+".join(said.effects),
+            "answer": "|".join(said.answer_set),
+            "final": said.final_verdict,
+            "final_answer": "|".join(said.rounds[-1].answer_set),
+            "rounds": len(said.rounds),
+        }
+        row |= _visibility(said.fits[0], said.fits[-1], campaign.truth)
+    best = max((c.delta_chi2 for c in said.rounds[0].ranking if c.status == "refitted"), default=0.0)
+    best = max(best, 2 * (said.fits[-1].log_likelihood - said.fits[0].log_likelihood))
+    left = max(_number(row["sigma"]) ** 2 - best, 0.0)
+    row["sigma_left"] = math.sqrt(left) if math.isfinite(left) else math.nan
+    numbers = [number for c in said.rounds[0].ranking if c.status == "refitted" for number in c.numbers]
+    if len(campaign.truth.effects) > 1:
+        numbers = list(said.fits[-1].numbers)
+    row["sizes"] = json.dumps(_sizes(numbers, campaign.truth.values))
+    return row
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, (int, float)) else math.nan
+
+
+def _visibility(base: Fit, last: Fit, truth: Truth) -> Row:
+    """`sigma`: all that is hidden against the base model; `sigma_second`: the lesser of two, given the other."""
+    if truth.in_trace or not (truth.effects or truth.outsider):
+        return {"sigma": 0.0, "sigma_second": math.nan, "n_error": math.nan}
+    try:
+        true = true_fit(base, truth)
+        if set(last.model.names) == set(true.model.names) and last.log_likelihood > true.log_likelihood:
+            true = last
+    except (FitError, EffectError):
+        return {"sigma": math.nan, "sigma_second": math.nan}
+    second = math.nan
+    if len(truth.effects) > 1:
+        second = min(sigmas(true, true_fit(base, truth, name)) for name in truth.effects)
+    return {"sigma": sigmas(true, base), "sigma_second": second}
+
+
+def _sizes(numbers: Iterable[Number], truth: Mapping[str, float]) -> list[tuple[str, float, float, float, float, str]]:
+    """Parameter, truth, value and interval of every hidden size that was fitted."""
+    return [
+        (n.key, truth[n.key], float(n.value), float(n.low), float(n.high), n.method)
+        for n in numbers
+        if n.key in truth and math.isfinite(n.sigma)
+    ]
+
+
+def ask_bic(kind: str, seed: int, scatter: bool = True) -> Row:
+    """Every candidate added alone and refitted; the lowest BIC wins, whatever that means.
+
+    `scatter` lets the fits estimate the scatter of P and B and the correlation of the noise, as the package does;
+    without, every trial has its own release and origin and nothing else, and the noise is white.
+    """
+    campaign = make(kind, seed)
+    row = {"method": "bic" if scatter else "bic_plain", **identity(campaign)}
+    begun = time.perf_counter()
+    plain = {} if scatter else {"spreads": (1e-6, 1e-6), "noise": (_rest_noise_m(campaign), 0.0)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        base = vt.fit(vt.base_model(), campaign.pairs, profile=False, **plain)
+        points = sum(trial.time_s.size for trial in base.trials)
+        scores = {"": _bic(base, points)}
+        for effect in catalogue().values():
+            if effect.kind == "base" or effect.name == "static_yield":
+                continue
+            try:
+                after = vt.refit(base, base.model + effect, hold_spreads=not scatter, hold_noise=not scatter)
+            except (FitError, EffectError):
+                continue
+            scores[effect.name] = _bic(after, points)
+    best = min(scores, key=lambda name: scores[name])
+    row |= {"seconds": time.perf_counter() - begun, "verdict": _named(best), "answer": best, "effects": best}
+    near = [name for name in scores if scores[name] < scores[best] + 9]
+    return row | {"tied": "|".join(sorted(near, key=lambda name: scores[name]))}
+
+
+def _named(best: str) -> str:
+    if not best:
+        return "adequate"
+    return "artefact" if best in MEASUREMENT else "missing"
+
+
+def _bic(fit: Fit, points: int) -> float:
+    return len(fit.numbers) * math.log(points) - 2 * fit.log_likelihood
+
+
+def _rest_noise_m(campaign: Hidden) -> float:
+    """What somebody in a hurry would take for the noise: the median of the tracks' own."""
+    from statistics import median
+
+    from vinetrack.video.position_noise import position_noise
+
+    return median(position_noise(track.time_s, track.lead_position_m)[0] for _, track in campaign.pairs)
+
+
+def ask_sindy(kind: str, seed: int) -> Row:
+    """PySINDy on differentiated positions."""
+    from hidden.sindy import chosen
+
+    campaign = make(kind, seed)
+    row = {"method": "sindy", **identity(campaign)}
+    begun = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        names = chosen(campaign.pairs)
+    verdict = "adequate" if not names else "artefact" if set(names) <= set(MEASUREMENT) else "missing"
+    effects = "+".join(names)
+    row |= {"seconds": time.perf_counter() - begun, "verdict": verdict, "answer": "|".join(names), "effects": effects}
+    return row
+
+
+def ask_bic_plain(kind: str, seed: int) -> Row:
+    """See `ask_bic`."""
+    return ask_bic(kind, seed, scatter=False)
+
+
+METHODS = {"vinetrack": ask_vinetrack, "bic": ask_bic, "bic_plain": ask_bic_plain, "sindy": ask_sindy}
