@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vinetrack.settings import RunSettings
 
 SENTENCES = frozenset(
-    {"ResultsError", "EffectError", "TableError", "FitError", "SimulationError", "ChoiceError", "PortError"}
+    {"ResultsError", "EffectError", "TableError", "FitError", "SimulationError", "ChoiceError", "PageError"}
 )
 """Errors that say themselves what is wrong and what to do; by name, so that nothing is loaded to know them."""
 

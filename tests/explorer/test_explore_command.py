@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 import socket
@@ -78,6 +79,12 @@ def test_a_port_that_is_taken_is_said(campaign: Campaign) -> None:
         taken.listen()
         port = taken.getsockname()[1]
         assert f"Port {port} is taken" in refused("explore", campaign.folder, "--no-browser", "--port", port)
+
+
+def test_without_bokeh_the_page_says_what_to_install(campaign: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "bokeh" else found(name))
+    assert "pip install 'vinetrack[explorer]'" in refused("explore", campaign.folder)
 
 
 async def _origin_of_elsewhere(address: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from vinetrack.explorer.campaign import Campaign
     from vinetrack.explorer.choice import Choice
+
+
+class PageError(RuntimeError):
+    """The page cannot be served; one sentence with a remedy."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,7 @@ def explore(folder: Path, experiment: Path | None, wanted: Wanted, say: Callable
 
     Raises
     ------
-    ResultsError, ExperimentError, ChoiceError, PortError, FitError, EffectError, SimulationError
+    ResultsError, ExperimentError, ChoiceError, PageError, FitError, EffectError, SimulationError
         In one sentence each.
     """
     from vinetrack.explorer.choice import chosen, first_choice
@@ -65,6 +70,8 @@ def explore(folder: Path, experiment: Path | None, wanted: Wanted, say: Callable
         start = first_choice(campaign)
         choice = chosen(campaign, start, wanted.add, wanted.drop, wanted.sizes)
     if wanted.is_for_a_page:
+        if importlib.util.find_spec("bokeh") is None:
+            raise PageError("The page needs bokeh, which is not installed: pip install 'vinetrack[explorer]'.")
         from vinetrack.explorer.ground import Ground
         from vinetrack.explorer.server import serve
 

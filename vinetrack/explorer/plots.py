@@ -36,7 +36,7 @@ class Plots:
         self.errors = self._draw_errors()
 
     def _draw_motion(self) -> Any:
-        fig = plot(360, "time since release (ms)", "growth (mm)", name="motion", x_range=Range1d(), y_range=Range1d())
+        fig = plot(360, "since release (ms)", "growth (mm)", name="motion", x_range=Range1d(), y_range=Range1d())
         fig.patches("xs", "ys", source=self._band, fill_color="colour", fill_alpha=0.2, line_color=None)
         lines = fig.multi_line("xs", "ys", source=self._measured, line_color="colour", line_width=1.6, line_alpha=0.9)
         ghost = {"line_color": MUTED, "line_width": 1.5, "line_dash": [2, 3]}
@@ -85,6 +85,8 @@ class Plots:
             args={"names": names, "labels": labels}, code="return labels[names.indexOf(tick)] ?? tick"
         )
         fig.ygrid.visible = False
+        # Its buttons would lie over the first bar; a tap needs none.
+        fig.toolbar_location = None
         fig.yaxis.major_tick_line_color = None
         return fig
 

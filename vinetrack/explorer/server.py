@@ -17,6 +17,7 @@ from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
 from bokeh.server.server import Server
 
+from vinetrack.explorer.command import PageError
 from vinetrack.explorer.ground import Ground
 
 LOOPBACK = "127.0.0.1"
@@ -24,10 +25,6 @@ FIRST_PORT, PORTS = 5070, 30
 QUIET = ("bokeh", "tornado")
 SWITCH_S = 1e-3
 KEEP_ALIVE_MS = 20_000
-
-
-class PortError(RuntimeError):
-    """No port to serve on; one sentence with a remedy."""
 
 
 def application(ground: Ground) -> Application:
@@ -50,14 +47,14 @@ def start_server(ground: Ground, port: int | None = None) -> Server:
 
     Raises
     ------
-    PortError
+    PageError
         If it is taken.
     """
     tried = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
     for number in tried:
         with contextlib.suppress(OSError):
             return _serve(ground, number)
-    raise PortError(f"Port {port} is taken: give another with --port, or none to have one found.")
+    raise PageError(f"Port {port} is taken: give another with --port, or none to have one found.")
 
 
 def _serve(ground: Ground, port: int) -> Server:
@@ -90,7 +87,7 @@ def serve(ground: Ground, say: Callable[[str], None], port: int | None = None, *
 
     Raises
     ------
-    PortError
+    PageError
         If the port is taken.
     """
     for name in QUIET:
