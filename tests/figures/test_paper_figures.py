@@ -100,6 +100,13 @@ def test_trials_of_other_sizes_have_no_place_beside_fig_6() -> None:
     assert "printed size" in words(draw_paper_damping(points().iloc[-1:], damping(), {1: 0.57}, 0.37))
 
 
+def test_trials_that_never_get_steady_are_said_to() -> None:
+    never = points().assign(used=False, eligible=False)
+    assert "steady speed" in words(draw_paper_damping(never, damping(), {1: 0.57, 4: 6.44}, 0.37))
+    literal = draw_paper_damping(points().assign(used=False), damping(), {1: 0.57, 4: 6.44}, 0.37)
+    assert [ax.get_legend() is None for ax in literal.axes] == [False, True]
+
+
 def pressures() -> pd.DataFrame:
     y = np.linspace(0, 0.28, 5)
     parts = []

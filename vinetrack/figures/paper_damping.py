@@ -40,6 +40,8 @@ def draw_paper_damping(
     scaled = scaled[scaled["scale"] > 0]
     if not len(scaled):
         return blank("No trial of these is of a printed size.")
+    if not any((scaled[wanted] & (scaled[y] > 0) & (scaled[x] > 0)).any() for _, x, y, wanted, _ in _PANELS):
+        return blank("No trial of a printed size has a steady speed.")
     with look():
         fig = Figure(figsize=(12.0, 6.2), layout="constrained")
         axes = fig.subplots(1, 2, sharex=True, sharey=True)
@@ -53,7 +55,8 @@ def draw_paper_damping(
         axes[0].set_ylabel("growth force above yield (N)")
         for ax in axes:
             plain_log_ticks(ax)
-            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, fontsize=9)
+            if ax.get_legend_handles_labels()[0]:
+                ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, fontsize=9)
     return fig
 
 
