@@ -28,7 +28,7 @@ FLOORS = (
     {"stages"},
     {"explorer"},
     {"workflow"},
-    {"cli", "cli_design", "cli_explore"},
+    {"cli", "cli_design", "cli_diagnose", "cli_explore"},
 )
 """From the ground up; a room may use its own floor and those below. `experiment` looks into tracks (video)."""
 

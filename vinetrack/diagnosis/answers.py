@@ -22,6 +22,9 @@ AIMED_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
 """A step is good that moves a trajectory by this part of its travel, and done again where it moves it by more than the
 second or less than the third: beyond, curvature counts, below the integrator's error does."""
 
+STARTS = 0.1
+"""Part of its travel that a vine must still make with a whole effect put in."""
+
 SILENT_RESPONSE = 3e-6
 """Part of its travel by which a trajectory must answer to count as answering: the integrator is no better."""
 
@@ -71,7 +74,8 @@ def _answer(found: Fit, shape: Shape, plain: Sequence[Floats]) -> tuple[Shape, l
         change = _change(found, shape, plain)
         response = _response(found, change)
         if shape.whole:
-            return (shape, [one / shape.step for one in change]) if response > SILENT_RESPONSE else None
+            speaks = response > SILENT_RESPONSE and not _holds_back(plain, change)
+            return (shape, [one / shape.step for one in change]) if speaks else None
         if response <= SILENT_RESPONSE * 1e-3:
             return None
         if not LEAST_RESPONSE < response < LARGEST_RESPONSE:
@@ -84,6 +88,13 @@ def _answer(found: Fit, shape: Shape, plain: Sequence[Floats]) -> tuple[Shape, l
     except SimulationError:
         return None
     return (shape, [one / shape.step for one in change]) if response > SILENT_RESPONSE else None
+
+
+def _holds_back(plain: Sequence[Floats], change: Sequence[Floats]) -> bool:
+    """Whether some vine hardly starts any more, although it was seen to grow: no such size can hide."""
+    return any(
+        float(np.max(before + one)) < STARTS * float(np.max(before)) for before, one in zip(plain, change, strict=True)
+    )
 
 
 def _response(found: Fit, change: Sequence[Floats]) -> float:

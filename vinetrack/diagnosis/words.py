@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -152,6 +152,10 @@ def printed(found: Diagnosis) -> str:
     return "\n".join(lines)
 
 
+def _rows(table: pd.DataFrame) -> Iterator[Any]:
+    return iter(table.itertuples(index=False))
+
+
 def _headline(found: Diagnosis) -> str:
     if found.verdict == MISSING:
         return listed(list(found.effects)) + (" is missing" if len(found.effects) == 1 else " are missing")
@@ -183,7 +187,6 @@ def _ranking(one: Round) -> list[str]:
 
 
 def _ladder_table(ladder: pd.DataFrame) -> list[str]:
-    from vinetrack.figures.style import rows
     from vinetrack.terminal import table
 
     body = [
@@ -194,14 +197,13 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
                 for value in (row.rms_in_sample_m, row.rms_left_out_m, row.rms_highest_pressure_m, row.floor_m)
             ),
         )
-        for row in rows(ladder)
+        for row in _rows(ladder)
     ]
     return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))
 
 
 def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
     """What an effect put in by hand did to errors and numbers, as lines of aligned tables."""
-    from vinetrack.figures.style import rows
     from vinetrack.terminal import table as aligned
 
     gain = 2 * (after.log_likelihood - before.log_likelihood)
@@ -214,7 +216,7 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
         "numbers",
     ]
     changed: dict[tuple[str, str], dict[str, str]] = {}
-    for row in rows(numbers):
+    for row in _rows(numbers):
         unit, factor = SHOWN_AS.get(row.unit, (row.unit, 1.0))
         digits = decimals(row.sigma * factor) if math.isfinite(row.sigma) else 3
         title = f"{row.symbol} ({row.vine})" if row.vine else row.symbol

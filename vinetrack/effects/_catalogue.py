@@ -62,7 +62,7 @@ def load_effect(path: Path | str) -> Effect:
     """
     path = Path(path)
     module = load_module(path)
-    text = inspect.getdoc(module) or ""
+    text = (module.__doc__ or "").strip()  # not `getdoc`: where only the formula follows, it would lose its indent
     functions = {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))}
     effect = Effect(
         name=path.stem,

@@ -1,0 +1,220 @@
+"""The diagnosis of campaigns whose truth is known: one per verdict. Seeds from 7000 are used here alone."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hidden_truth import Pairs, grown
+
+import vinetrack as vt
+from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
+from vinetrack.effects import EffectError, own_effects
+
+OWN_EFFECT = '''"""Ratchet: a force that grows with the square root of the growth.
+
+    tail force −F √(y/0.1 m)
+"""
+
+import numpy as np
+
+from vinetrack.effects import Parameter
+
+PARAMETERS = (Parameter("F", "F", "N", 0.1, bounds=(0.0, 10.0), plausible=(0.0, 2.0), meaning="force at 0.1 m"),)
+
+
+def tail_force(s, rig, F):
+    return -F * np.sqrt(np.maximum(s.lead_position, 0.0) / 0.1)
+'''
+
+
+@pytest.fixture(scope="module")
+def nothing_missing() -> Diagnosis:
+    return vt.diagnose(grown(seed=7000))
+
+
+@pytest.fixture(scope="module")
+def depleted_pairs() -> Pairs:
+    return grown({"reservoir_depletion.gamma": 1.25}, seed=7100)
+
+
+@pytest.fixture(scope="module")
+def depleted(depleted_pairs: Pairs) -> Diagnosis:
+    return vt.diagnose(depleted_pairs)
+
+
+def test_nothing_missing_is_adequate(nothing_missing: Diagnosis) -> None:
+    assert nothing_missing.verdict == nothing_missing.final_verdict == "adequate"
+    assert nothing_missing.effects == nothing_missing.answer_set == ()
+    assert "nothing missing can be detected" in nothing_missing.explanation
+
+
+def test_adequate_says_how_large_an_effect_could_still_be(nothing_missing: Diagnosis) -> None:
+    ranking = {one.effect: one for one in nothing_missing.rounds[0].ranking}
+    friction = ranking["tail_friction"]
+    assert 0 < friction.largest["tail_friction.mu_w"] < 0.2
+    scale = ranking["length_scale"]
+    assert abs(scale.largest["length_scale.eps"]) < 0.05
+
+
+def test_a_size_that_could_hide_would_have_been_seen_three_times_larger(nothing_missing: Diagnosis) -> None:
+    largest = next(o for o in nothing_missing.rounds[0].ranking if o.effect == "tail_friction").largest
+    value = largest["tail_friction.mu_w"]
+    found = vt.diagnose(grown({"tail_friction.mu_w": 4 * value}, seed=7000), ladder=False, advice=False)
+    assert found.verdict in ("missing", "ambiguous")
+    assert "tail_friction" in found.answer_set
+
+
+def test_what_these_conditions_cannot_show_is_not_testable(nothing_missing: Diagnosis) -> None:
+    blind = {one.effect: one.reason for one in nothing_missing.rounds[0].ranking if one.status == NOT_TESTABLE}
+    assert "inlet_mm" in blind["inlet_loss"]
+    assert "payload_g" in blind["payload_drag"]
+    assert "static_yield" in blind
+
+
+def test_a_missing_effect_is_named_with_its_size(depleted: Diagnosis) -> None:
+    assert (depleted.verdict, depleted.final_verdict) == ("missing", "adequate")
+    assert depleted.effects == depleted.answer_set == ("reservoir_depletion",)
+    gamma = depleted.fit["gamma"]
+    assert abs(gamma.value - 1.25) < 3 * gamma.sigma
+    assert gamma.sigma < 0.02
+
+
+def test_the_larger_effect_that_holds_it_is_set_aside_and_says_why(depleted: Diagnosis) -> None:
+    refill = next(one for one in depleted.rounds[0].ranking if one.effect == "supply_refill")
+    assert not refill.in_answer_set
+    assert "reservoir_depletion" in refill.reason
+
+
+def test_the_ladder_falls_to_the_replicates(depleted: Diagnosis) -> None:
+    ladder = depleted.ladder
+    assert ladder is not None
+    assert list(ladder["added"]) == ["", "reservoir_depletion"]
+    before, after = ladder.iloc[0], ladder.iloc[1]
+    assert after["rms_left_out_m"] < 0.5 * before["rms_left_out_m"]
+    assert after["rms_in_sample_m"] < 2 * after["floor_m"]
+
+
+def test_n_and_B_come_home(depleted: Diagnosis) -> None:
+    before, after = depleted.fits[0]["n"], depleted.fits[1]["n"]
+    assert abs(after.value - 0.37) < 4 * after.sigma
+    assert abs(after.value - 0.37) < 0.5 * abs(before.value - 0.37)
+
+
+def test_the_answer_can_be_written_as_json(depleted: Diagnosis, tmp_path: Path) -> None:
+    from vinetrack.tables import write_json
+
+    write_json(tmp_path / "diagnosis.json", depleted.to_json())
+    read = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert read["verdict"] in VERDICTS
+    assert read["effects"] == ["reservoir_depletion"]
+    assert [one["verdict"] for one in read["rounds"]] == ["missing", "adequate"]
+    assert read["rounds"][0]["ranking"][0]["effect"] == "reservoir_depletion"
+    matrix = np.array(read["cosines"]["matrix"], dtype=float)
+    assert matrix.shape == (len(read["cosines"]["effects"]),) * 2
+    assert np.allclose(np.diag(matrix), 1)
+
+
+def test_printed_it_begins_with_the_verdict(depleted: Diagnosis) -> None:
+    text = str(depleted)
+    assert text.startswith("missing: reservoir_depletion is missing")
+    assert "γ = " in text
+    assert "position error" in text
+
+
+def test_a_fit_can_be_questioned_and_stays_as_it_is(depleted_pairs: Pairs) -> None:
+    fit = vt.fit(vt.base_model() + vt.effects.reservoir_depletion, depleted_pairs, profile=False)
+    before = fit["n"].value
+    found = vt.diagnose(fit, ladder=False, advice=False)
+    assert found.verdict == "adequate"
+    assert fit["n"].value == before
+
+
+def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do() -> None:
+    found = vt.diagnose(grown({"length_scale.eps": 0.06}, seed=7002, payload_g=35.6), ladder=False)
+    assert found.verdict == "artefact"
+    assert "length_scale" in found.answer_set
+    assert found.effects == ()
+    assert found.next_experiment is not None
+    assert found.next_experiment["calibration"]
+
+
+def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
+    trial, track = next((trial, track) for trial, track in depleted_pairs if trial.pressure_Pa == 40e3)
+    moving = int(np.searchsorted(track.lead_position_m, track.lead_position_m[0] + 0.05))
+    keep = np.arange(track.time_s.size) != moving
+    time_s = track.time_s[:-1]
+    cut = replace(
+        track,
+        time_s=time_s,
+        lead_position_m=track.lead_position_m[keep],
+        lead_position_sigma_m=track.lead_position_sigma_m[keep],
+        flag=track.flag[keep],
+        edge_px=track.edge_px[keep],
+    )
+    others = [(one, other) for one, other in depleted_pairs if one.name != trial.name]
+    found = vt.diagnose([(trial, cut), *others], ladder=False, advice=False)
+    assert (found.verdict, found.answer_set) == ("artefact", (DROPPED_FRAMES,))
+    assert trial.name in found.explanation
+    assert "reservoir_depletion" in found.notes[0]
+
+
+def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
+    path = tmp_path / "ratchet.py"
+    path.write_text(OWN_EFFECT)
+    own = own_effects([path])
+    pairs = _with_own(own["ratchet"], 0.25, seed=7003)
+    found = vt.diagnose(pairs, own=own, ladder=False, advice=False)
+    assert found.verdict == "missing"
+    assert found.effects == ("ratchet",)
+    size = found.fit["ratchet.F"]
+    assert abs(size.value - 0.25) < 4 * size.sigma
+
+
+def _with_own(effect: vt.effects.Effect, size: float, *, seed: int) -> Pairs:
+    """Trials grown with an effect that only its file knows: the laboratory's tracks moved by what the effect does."""
+    pairs = grown(seed=seed)
+    plain = vt.base_model()
+    fit = vt.fit(plain, pairs, profile=False)
+    model = fit.model + effect
+    values = {"ratchet.F": size}
+    moved = []
+    for (trial, track), one in zip(pairs, fit.trials, strict=True):
+        since = track.time_s - one.release_s
+        without = vt.simulate(fit.model, trial, since).lead_position_m
+        with_it = vt.simulate(model.with_values(values), trial, since).lead_position_m
+        moved.append((trial, replace(track, lead_position_m=track.lead_position_m + with_it - without)))
+    return moved
+
+
+def test_what_no_effect_explains_is_unexplained_and_drawn() -> None:
+    pairs = []
+    for trial, track in grown(seed=7004):
+        y = track.lead_position_m - track.lead_position_m[:5].mean()
+        bump = 1.5e-3 * np.sin(2 * math.pi * np.clip(y, 0, None) / 0.05) * (y > 0.03)
+        pairs.append((trial, replace(track, lead_position_m=track.lead_position_m + bump)))
+    found = vt.diagnose(pairs, ladder=False)
+    assert found.verdict == "unexplained"
+    assert found.effects == ()
+    assert found.missing_force is not None
+    assert found.force_table is not None
+    assert len(found.force_table)
+
+
+def test_an_unknown_candidate_is_an_error_that_suggests(depleted_pairs: Pairs) -> None:
+    with pytest.raises(EffectError, match="air_drag"):
+        vt.diagnose(depleted_pairs, candidates=["air_drage"])
+
+
+def test_a_measured_pressure_already_holds_what_happens_in_the_chamber() -> None:
+    pairs = [
+        (trial, replace(track, pressure_Pa=np.full(track.time_s.size, trial.pressure_Pa)))
+        for trial, track in grown(seed=7005)
+    ]
+    found = vt.diagnose(pairs, ladder=False, advice=False)
+    blind = {one.effect: one.reason for one in found.rounds[0].ranking if one.status == NOT_TESTABLE}
+    assert "already holds it" in blind["reservoir_depletion"]
