@@ -10,7 +10,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -130,7 +130,9 @@ def overlay(
     with _sentences(None):
         from vinetrack.stages.overlays import overlay_one
 
-        typer.echo(f"Clip: {overlay_one(results, trial, experiment, seconds)}")
+        with _busy(f"drawing over {trial}", None):
+            path = overlay_one(results, trial, experiment, seconds)
+        typer.echo(f"Clip: {path}")
 
 
 @app.command(rich_help_panel="Stages of the workflow")
@@ -169,7 +171,9 @@ def recording(
         read = _read(experiment)
         if trial not in [one.name for one in read.trials if one.video is not None]:
             raise typer.BadParameter(f"{trial!r} is no trial with a recording in {experiment}", param_hint="TRIAL")
-        typer.echo(analyse_recording(read, trial, results, _run_settings(settings)))
+        with _busy(f"tracking {trial}", log):
+            said = analyse_recording(read, trial, results, _run_settings(settings))
+        typer.echo(said)
 
 
 @app.command(rich_help_panel="Stages of the workflow")
@@ -208,7 +212,9 @@ def damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = 
         from vinetrack.report.words import headline
         from vinetrack.stages.damping import fit_law
 
-        typer.echo(headline(fit_law(results, _run_settings(settings).damping)))
+        with _busy("fitting the law and resampling its trials", log):
+            law = fit_law(results, _run_settings(settings).damping)
+        typer.echo(headline(law))
 
 
 @app.command(rich_help_panel="Stages of the workflow")
@@ -217,7 +223,8 @@ def model(experiment: ExperimentPath, results: ResultsPath, settings: SettingsTe
     with _sentences(log):
         from vinetrack.stages.model import comparison_lines, fit_model
 
-        fit_model(_read(experiment), results, _run_settings(settings))
+        with _busy("fitting the model", log):
+            fit_model(_read(experiment), results, _run_settings(settings))
         for line in comparison_lines(results):
             typer.echo(line)
 
@@ -242,7 +249,8 @@ def figures(
         if of != "campaign":
             draw_trials(read, results, chosen, threads)
         if of != "trials":
-            draw_campaign(read, results, chosen)
+            with _busy("drawing the experiment", log):
+                draw_campaign(read, results, chosen)
 
 
 @app.command(rich_help_panel="Stages of the workflow")
@@ -264,12 +272,20 @@ def report(
     with _sentences(log):
         from vinetrack.stages.report import write_report
 
-        path = write_report(
-            _read(experiment),
-            results,
-            _run_settings(settings).model_dump(mode="json", exclude={"experiment", "results"}),
-        )
+        with _busy("writing the report", log):
+            path = write_report(
+                _read(experiment),
+                results,
+                _run_settings(settings).model_dump(mode="json", exclude={"experiment", "results"}),
+            )
         typer.echo(f"Report: {path}")
+
+
+def _busy(what: str, log: Path | None) -> AbstractContextManager[object]:
+    """A sign of life while a stage runs; none in the workflow, where each has a log and Snakemake tells how it goes."""
+    from vinetrack.terminal import waiting
+
+    return waiting(what) if log is None else nullcontext()
 
 
 def _read(folder: Path) -> Experiment:
