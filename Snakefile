@@ -7,6 +7,7 @@ from pathlib import Path
 
 from vinetrack.workflow import (
     CAMPAIGN_FIGURES,
+    DIAGNOSIS_FIGURES,
     PAPER_FIGURES,
     code_hash,
     plan_or_stop,
@@ -249,7 +250,7 @@ rule campaign_figures:
             report(
                 path,
                 caption=f"vinetrack/report/captions/{name}.rst",
-                category="Experiment",
+                category="Diagnosis" if name in DIAGNOSIS_FIGURES else "Experiment",
                 labels={"figure": CAMPAIGN_FIGURES[name], "format": form},
             )
             for name, form, path in plan.campaign_figures()

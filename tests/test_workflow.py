@@ -124,6 +124,22 @@ def test_an_edit_of_a_stage_changes_its_hash_and_no_other(tmp_path: Path, monkey
     assert code_hash("figures") == figures
 
 
+def test_every_figure_has_a_caption_for_both_reports() -> None:
+    captions = workflow.PACKAGE / "report" / "captions"
+    figures = {*workflow.CAMPAIGN_FIGURES, *workflow.PAPER_FIGURES, "overlay", "strip", "trial_motion"}
+    assert not {name for name in figures if not (captions / f"{name}.rst").read_text(encoding="utf-8").strip()}
+    assert set(workflow.CAMPAIGN_FIGURES) >= workflow.DIAGNOSIS_FIGURES
+
+
+def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_path: Path) -> None:
+    folder = experiment(tmp_path / "v")
+    assert make_plan({"experiment": str(folder)}, tmp_path).clips == []
+    (folder / "a.mp4").write_bytes(b"film")
+    (folder / "trials.csv").write_text(SHEET.replace("track", "video,capture_fps") + "a,a.mp4,1000,12,100,300,20,3,\n")
+    assert make_plan({"experiment": str(folder)}, tmp_path).clips == ["results/v/overlays"]
+    assert make_plan({"experiment": str(folder), "overlays": {"of": "none"}}, tmp_path).clips == []
+
+
 def test_every_part_of_a_stages_code_exists() -> None:
     missing = {
         name for parts in workflow.STAGE_CODE.values() for name in parts if not (workflow.PACKAGE / name).exists()

@@ -44,6 +44,9 @@ CAMPAIGN_FIGURES = {
 }
 """Figures of a whole experiment, by file name, with the label Snakemake's own report gives them."""
 
+DIAGNOSIS_FIGURES = frozenset({"ladder", "before_after", "where", "missing_force", "candidates", "cosines", "drift"})
+"""Those of them that show the diagnosis: they have a folder of their own there."""
+
 PAPER_TABLES = (
     "paper",
     "paper_departures",
