@@ -196,8 +196,9 @@ rule diagnosis:
         unwatched=plan.unwatched,
         experiment=plan.experiment,
         results=plan.results,
+        settings=plan.stage_settings("steady", "velocity", "damping"),
     shell:
-        "vinetrack diagnosis {params.experiment:q} {params.results:q} --log {log:q}"
+        "vinetrack diagnosis {params.experiment:q} {params.results:q} --settings {params.settings:q} --log {log:q}"
 
 
 rule trial_figures:

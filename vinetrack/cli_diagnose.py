@@ -91,10 +91,13 @@ def add(
 def diagnosis_stage(
     experiment: Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")],
     results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
+    settings: Annotated[
+        str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")
+    ] = "{}",
     log: LogFile = None,
 ) -> None:
     """What the model lacks, as diagnosis.json, ladder.csv and the folder diagnosis."""
-    from vinetrack.cli import _sentences
+    from vinetrack.cli import _run_settings, _sentences
 
     with _sentences(log):
         from vinetrack.experiment import read_experiment
@@ -102,7 +105,7 @@ def diagnosis_stage(
         from vinetrack.workflow import find_experiment
 
         with _told() as report:
-            diagnose_results(read_experiment(find_experiment(experiment)), results, report)
+            diagnose_results(read_experiment(find_experiment(experiment)), results, report, _run_settings(settings))
         for line in diagnosis_lines(results):
             typer.echo(line)
 

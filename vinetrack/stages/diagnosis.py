@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.result import Diagnosis
     from vinetrack.experiment import Experiment
     from vinetrack.model.fit_result import Fit
+    from vinetrack.records import Track, Trial
+    from vinetrack.settings import RunSettings
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +38,9 @@ def _quiet(_: str) -> None:
     pass
 
 
-def diagnose_results(experiment: Experiment, folder: Path, report: Report = _quiet) -> dict[str, Any]:
+def diagnose_results(
+    experiment: Experiment, folder: Path, report: Report = _quiet, settings: RunSettings | None = None
+) -> dict[str, Any]:
     """Diagnose what a results folder holds; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`.
 
     Returns
@@ -56,7 +60,10 @@ def diagnose_results(experiment: Experiment, folder: Path, report: Report = _qui
     except Exception as error:
         return _write_refusal(results, experiment, _reason(error))
     log.info("%s: %s", found.verdict, found.explanation)
-    return write_diagnosis(results, found)
+    content = write_diagnosis(results, found)
+    report("the damping law with the pressure of every model")
+    _write_laws(results, found, pairs, settings)
+    return content
 
 
 def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report = _quiet) -> Diagnosis:
@@ -119,6 +126,24 @@ def write_diagnosis(results: Results, found: Diagnosis) -> dict[str, Any]:
     content = {**found.to_json(), "refused": None}
     write_json(results.diagnosis, content)
     return content
+
+
+def _write_laws(
+    results: Results, found: Diagnosis, pairs: Sequence[tuple[Trial, Track]], settings: RunSettings | None
+) -> None:
+    """The damping law redone with the pressure that every model of the ladder gives: how n and B come home."""
+    from vinetrack.motion.redo import LAW_COLUMNS, law_table, look_at_motions, redo_damping
+
+    path = results.folder / "diagnosis" / "damping_laws.csv"
+    laws: dict[str, Any] = {}
+    if len(found.fits) > 1:
+        motions = look_at_motions(pairs, settings)
+        for fit in found.fits:
+            try:
+                laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings).laws
+            except ValueError as error:
+                log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
+    write_csv(path, law_table(laws) if laws else empty_table(LAW_COLUMNS))
 
 
 def tables_of(found: Diagnosis) -> dict[str, pd.DataFrame]:
