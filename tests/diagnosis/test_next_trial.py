@@ -209,6 +209,13 @@ def test_errors_of_measurement_call_for_a_measurement_and_no_trials(dragged: tup
     assert found.text.startswith("Measure before making more trials: length_scale and time_base")
 
 
+def test_one_error_of_measurement_against_nothing_is_measured(dragged: tuple[Pairs, list[Fit]]) -> None:
+    (scaled,) = fits_of(dragged[0], "length_scale")
+    plain = vt.refit(scaled, vt.base_model())
+    text = next_experiment([plain, scaled]).text
+    assert text.startswith("Measure before making more trials: length_scale is an error of measurement. length_scale:")
+
+
 def test_an_error_of_measurement_among_physics_may_be_measured_instead(dragged: tuple[Pairs, list[Fit]]) -> None:
     found = next_experiment(fits_of(dragged[0], "air_drag", "length_scale"), Limits(trials=2, new_vines=False))
     assert "a ruler beside the vine" in str(found.calibration)

@@ -40,9 +40,14 @@ ENOUGH = 8.0
 """Standard deviations beyond which no more effort, such as a vine that has to be made, is asked for."""
 
 MOST_HYPOTHESES = 5
-DRAWS_OBSERVED, DRAWS_WHERE_PLAIN = 3, 2
+NOTHING = "nothing more"
+"""Name of the hypothesis that has no effect which others have not as well."""
+
+DRAWS_OBSERVED = {2: 3, 3: 2}
+"""Draws of the check by number of hypotheses, else one: every draw takes as many refits as that number squared."""
+
 PLAIN = 20.0
-"""Standard deviations beyond which fewer draws will do to check what is foretold."""
+"""Standard deviations beyond which one draw less will do."""
 
 GAIN = 1.01
 MOST_VINES_TRIED = 2
@@ -141,10 +146,10 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     names = hypothesis_names(tied)
     if only_measurement(tied):
         advice = calibration_for(list(itertools.combinations(tied, 2)))
-        return NextExperiment(
-            text=f"Measure before making more trials: {_list(names)} are errors of measurement. {advice}",
-            calibration=advice,
-        )
+        faults = [name for name in names if name != NOTHING]
+        are = "are errors" if len(faults) > 1 else "is an error"
+        text = f"Measure before making more trials: {_list(faults)} {are} of measurement. {advice}"
+        return NextExperiment(text=text, calibration=advice)
     bench, sides = _bench(tied, names, limits)
     options = _options(bench, sides, limits, seed)
     if not options:
@@ -164,7 +169,7 @@ def _judge(tied: Sequence[Fit]) -> None:
 def hypothesis_names(tied: Sequence[Fit]) -> list[str]:
     """Each hypothesis by the effects that not all of them have, numbered where that is not enough."""
     common = set.intersection(*(set(fit.model.names) for fit in tied))
-    names = [" + ".join(name for name in fit.model.names if name not in common) or "nothing more" for fit in tied]
+    names = [" + ".join(name for name in fit.model.names if name not in common) or NOTHING for fit in tied]
     return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
 
 
@@ -217,7 +222,8 @@ def _by_effort(bench: Bench, sides: list[Side], trials: int) -> Iterator[NDArray
     new = np.flatnonzero(efforts == NEW_VINE)
     if new.size:
         vines = np.array([one.trial.vine for one in bench.conditions])
-        for vine in likeliest_vines(sides, bench.conditions, new, trials, MOST_VINES_TRIED):
+        most = MOST_VINES_TRIED if len(sides) == 2 else 1
+        for vine in likeliest_vines(sides, bench.conditions, new, trials, most):
             yield np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
 
 
@@ -240,8 +246,8 @@ def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperi
     names = [one.name for one in bench.hypotheses]
     to_expect = _by_pair(best.between)
     worth_it = max(to_expect.values()) >= SEPARATES
-    draws = range(DRAWS_WHERE_PLAIN if min(to_expect.values()) > PLAIN else DRAWS_OBSERVED)
-    checked = _checked(observed(bench, best.design, draws, seed)) if worth_it else {}
+    draws = max(DRAWS_OBSERVED.get(len(names), 1) - (min(to_expect.values()) > PLAIN), 1)
+    checked = _checked(observed(bench, best.design, range(draws), seed)) if worth_it else {}
     left = [place for place, sigma in to_expect.items() if min(sigma, checked.get(place, (sigma,))[0]) < SEPARATES]
     worth_it = worth_it and len(left) < len(to_expect)
     fits = [one.fit for one in bench.hypotheses]
