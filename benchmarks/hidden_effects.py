@@ -93,13 +93,16 @@ def report(rows: list[Row]) -> None:
     print(f"\n{len(table)} answers about {len(table.drop_duplicates(['kind', 'seed']))} campaigns\n")
     print(tables.headline(table).to_string(), "\n")
     for method, group in table.groupby("method", sort=False):
-        print(f"\n== {method}: false alarms by regime\n{tables.false_alarms(group).to_string(index=False)}")
-        print(
-            f"\n== {method}: said to be missing / campaigns, by visibility\n{tables.by_effect(group).to_string(index=False)}"
-        )
+        show(f"{method}: false alarms by regime", tables.false_alarms(group))
+        show(f"{method}: said to be missing / campaigns, by visibility", tables.by_effect(group))
         print(f"\n== {method}: what was hidden, and what was said of it")
         print("\n".join(tables.confusion_lines(tables.confusion(group))))
-    print(f"\n== 95 % intervals of the hidden sizes\n{tables.coverage(table).to_string(index=False)}")
+    show("95 % intervals of the hidden sizes", tables.coverage(table))
+
+
+def show(title: str, table: pd.DataFrame) -> None:
+    """A table with its title."""
+    print(f"\n== {title}\n{table.to_string(index=False)}")
 
 
 def main() -> None:

@@ -149,7 +149,7 @@ def _perspective(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
 EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "reservoir_depletion": (_depletion, Wants(chamber=True, wide_chamber=True)),
     "supply_refill": (_refill, Wants(chamber=True, wide_chamber=True)),
-    "leak": (_one("leak.rate", "leak_rate", 0.005, 5.0), Wants()),
+    "leak": (_one("leak.rate", "leak_rate", 0.005, 5.0, lambda s: s.slowest_m_s / (3 * s.longest_m)), Wants()),
     "inlet_loss": (_one("inlet_loss.K", "K", 0.05, 3.0), Wants(inlet=True, fast=True)),
     "gas_inertia": (_one("gas_inertia.factor", "gas", 0.7, 1.3), Wants(fast=True, quiet=True)),
     "air_drag": (_one("air_drag.C_D", "C_D", 1.0, 6.0), Wants(fast=True, quiet=True)),

@@ -1,0 +1,121 @@
+"""Another simulator, written from the equations alone, says the same of every effect; its campaigns are what they say.
+
+It lives in `benchmarks/hidden` and shares no code with the model; what it makes is diagnosed in
+`tests/diagnosis/test_hidden_effects.py` and scored by `benchmarks/hidden_effects.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hidden import EFFECTS, KINDS, OUTSIDERS, make, write_folder
+from hidden.campaigns import Truth
+from hidden.motion import Physics, Tube, follow
+from hidden.questions import outsider_values, true_effects
+from hidden.verify import FRAME_S, SIZES, ours, trials
+
+import vinetrack as vt
+from vinetrack.effects import catalogue
+from vinetrack.model.fit_data import pairs_of
+from vinetrack.model.model import Model, make_model
+
+B, N = 6.44, 0.37
+TIMES = FRAME_S * np.arange(-3, 1200)
+
+
+def test_every_candidate_that_a_release_can_show_is_hidden_in_some_campaign():
+    candidates = {name for name, effect in catalogue().items() if effect.kind != "base"}
+    assert candidates - set(EFFECTS) == {"static_yield"}
+    assert set(SIZES) == {"", *EFFECTS}
+
+
+def with_only(effect: str) -> Model:
+    """The whole catalogue with one effect at its size and all others at none: compiled once for all tests here."""
+    whole = make_model(name for name in catalogue() if name != "static_yield")
+    none = {
+        f"{one.name}.{parameter.name}": parameter.zero
+        for one in whole
+        for parameter in one.parameters
+        if one.kind != "base"
+    }
+    size = {f"{effect}.{name}": value for name, value in SIZES[effect][1].items()}
+    return whole.with_values({**none, "eversion_damping.B": B, "eversion_damping.n": N, **size})
+
+
+@pytest.mark.parametrize("effect", SIZES, ids=lambda effect: effect or "base")
+def test_two_simulators_agree(effect):
+    for rig in ("payload, down", "horizontal, slow", "bent"):
+        trial = trials()[rig]
+        theirs = vt.simulate(with_only(effect), trial, TIMES, relative_tolerance=1e-7).observed_position_m
+        other = ours(effect, trial, TIMES, B, N)
+        seen = np.isfinite(other)
+        assert np.nanmax(other) > 0.2 * trial.length_m
+        np.testing.assert_allclose(other[seen], theirs[seen], atol=1e-8)
+
+
+OUTSIDE = {
+    "rough_patch": {"patch_F": 0.8, "patch_y": 0.1, "patch_width": 0.01},
+    "ripple": {"ripple_F": 0.4, "ripple_length": 0.05, "ripple_phase": 1.0},
+    "stribeck": {"stribeck_F": 0.6, "stribeck_speed": 2.0},
+    "growing_friction": {"growing_F": 0.8, "growing_s": 0.2},
+    "changed_film": {"step_B": 0.1, "step_y": 0.12},
+    "ringing": {"ringing": 0.05, "ringing_hz": 12.0},
+}
+
+
+@pytest.mark.parametrize("name", OUTSIDERS)
+def test_a_force_of_no_catalogue_is_the_one_that_scoring_knows(name):
+    trial = trials()["bare, down"]
+    physics = Physics(B=B, n=N, **OUTSIDE[name])
+    tube = Tube(
+        trial.pressure_Pa, trial.yield_pressure_Pa, trial.diameter_m, trial.thickness_m, trial.length_m, 0.0, 1.0
+    )
+    other, _ = follow(TIMES, tube, physics, np.empty((0, 3)))
+    truth = replace(make("null:few_trials", 900).truth, outsider=name, physics=physics)
+    values = {"eversion_damping.B": B, "eversion_damping.n": N, **outsider_values(truth)}
+    model = (vt.base_model() + true_effects((), name)[0]).with_values(values)
+    theirs = vt.simulate(model, trial, TIMES, relative_tolerance=1e-7).lead_position_m
+    seen = other[:, 1] < 0.95 * trial.length_m
+    plain, _ = follow(TIMES, tube, Physics(B=B, n=N), np.empty((0, 3)))
+    assert np.max(np.abs(other[seen, 1] - plain[seen, 1])) > 1e-3
+    # A film that changes from one millimetre to the next is a corner to one integrator and a step to the other.
+    np.testing.assert_allclose(other[seen, 1], theirs[seen], atol=2e-6 if name == "changed_film" else 1e-7)
+
+
+def test_a_campaign_follows_from_its_kind_and_seed():
+    one, same, other = make("air_drag", 900), make("air_drag", 900), make("air_drag", 901)
+    assert one.truth == same.truth
+    assert one.truth.values != other.truth.values
+    for (trial, track), (trial_again, track_again) in zip(one.pairs, same.pairs, strict=True):
+        assert trial.name == trial_again.name
+        np.testing.assert_array_equal(track.lead_position_m, track_again.lead_position_m)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_makes_a_campaign_of_the_size_it_says(kind):
+    campaign = make(kind, 902)
+    low, high = (8, 12) if kind == "null:few_trials" else (24, 48)
+    assert 0.8 * low <= len(campaign.pairs) <= high
+    truth: Truth = campaign.truth
+    assert bool(truth.effects or truth.outsider or truth.dropped_frames) != kind.startswith("null:")
+    for trial, track in campaign.pairs:
+        assert np.all(np.diff(track.time_s) > 0)
+        assert np.all(np.isfinite(track.lead_position_m))
+        assert trial.condition.startswith(trial.vine)
+
+
+def test_a_campaign_written_to_a_folder_is_read_back(tmp_path: Path):
+    campaign = make("bends:capstan_friction", 903)
+    write_folder(campaign, tmp_path)
+    experiment = vt.read_experiment(tmp_path)
+    assert not experiment.failed
+    pairs, left_out = pairs_of(experiment)
+    assert not left_out
+    for (trial, track), (read, read_track) in zip(campaign.pairs, pairs, strict=True):
+        for name in ("diameter_m", "pressure_Pa", "payload_kg", "chamber_m3", "inlet_m", "growth_angle_rad", "vine"):
+            assert getattr(read, name) == pytest.approx(getattr(trial, name), nan_ok=True)
+        assert len(read.bends) == len(trial.bends) > 0
+        np.testing.assert_allclose(read_track.lead_position_m, track.lead_position_m, atol=1e-7)
