@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hidden_truth import Pairs, grown
+from hidden_truth import Pairs, grown, sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
 from vinetrack.effects import EffectError, own_effects
+from vinetrack.laboratory.campaign import damping_values
+from vinetrack.records import Track
 
 OWN_EFFECT = '''"""Ratchet: a force that grows with the square root of the growth.
 
@@ -176,19 +178,25 @@ def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
 
 
 def _with_own(effect: vt.effects.Effect, size: float, *, seed: int) -> Pairs:
-    """Trials grown with an effect that only its file knows: the laboratory's tracks moved by what the effect does."""
-    pairs = grown(seed=seed)
-    plain = vt.base_model()
-    fit = vt.fit(plain, pairs, profile=False)
-    model = fit.model + effect
-    values = {"ratchet.F": size}
-    moved = []
-    for (trial, track), one in zip(pairs, fit.trials, strict=True):
-        since = track.time_s - one.release_s
-        without = vt.simulate(fit.model, trial, since).lead_position_m
-        with_it = vt.simulate(model.with_values(values), trial, since).lead_position_m
-        moved.append((trial, replace(track, lead_position_m=track.lead_position_m + with_it - without)))
-    return moved
+    """Trials grown with an effect that only its file knows; their B and P scatter, release lies between frames."""
+    draw = np.random.default_rng(seed)
+    trials = sheet()
+    coefficients = damping_values(trials)["eversion_damping.B"]
+    pairs = []
+    for trial in trials:
+        B = coefficients[trial.vine] * math.exp(0.02 * draw.standard_normal())
+        true = replace(trial, pressure_Pa=trial.pressure_Pa * (1 + 0.005 * draw.standard_normal()))
+        model = (vt.base_model() + effect).with_values(
+            {"eversion_damping.B": {trial.vine: B}, "eversion_damping.n": 0.37, f"{effect.name}.F": size}
+        )
+        since = np.arange(-20, 400) / trial.capture_fps + draw.uniform(0, 1) / trial.capture_fps
+        y = vt.simulate(model, true, since).lead_position_m
+        last = int(np.searchsorted(y, 0.9 * trial.length_m))
+        position_m = 0.03 + y[:last] + 1e-4 * draw.standard_normal(last)
+        nothing = np.full(last, np.nan)
+        flags = np.full(last, "", dtype=object)
+        pairs.append((trial, Track(since[:last] - since[0], position_m, nothing, flags, nothing)))
+    return pairs
 
 
 def test_what_no_effect_explains_is_unexplained_and_drawn() -> None:

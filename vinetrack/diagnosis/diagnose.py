@@ -114,7 +114,7 @@ def diagnose(
         pairs, left_out = pairs_of(source, tracks)
         pairs, dropped = _frames_put_right(pairs)
         report("fitting the model")
-        found = fit_model(model, pairs, host=host_for(model, questioned), profile=False)
+        found = fit_model(model, pairs, host=host_for(model, questioned), profile=False, thorough=False)
         found = replace(found, left_out={**left_out, **found.left_out})
     effects, blind = testable(questioned, found.predictor.data)
     findings = inquire(found, effects, report)

@@ -29,7 +29,9 @@ FEWEST_CLIMBED = 5
 REACH_OF_CLIMBS, SHARE_OF_REACH = 40.0, 0.1
 MOST_FITTED = 7
 STARTS_EACH = 3
-FIRSTS, PARTNERS = 3, 4
+FIRSTS, PARTNERS, SHARE_OF_BEST = 3, 4, 0.3
+"""Pairs are built on the three best effects alone, if they explain this part of what the best explains, with the four
+that promise most beside each."""
 
 
 @dataclass
@@ -41,6 +43,7 @@ class Search:
     climbs: dict[str, Climb] = field(default_factory=dict)
     fitted: dict[str, Evidence] = field(default_factory=dict)
     silent: set[str] = field(default_factory=set)
+    most_fitted: int = MOST_FITTED
 
     def __post_init__(self) -> None:
         self.slope = Slope(self.questions.found)
@@ -71,7 +74,7 @@ class Search:
         reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
         alike = [c for c in leaders if self.questions.cosine(c.names[0], best.names[0]) > ALIKE]
         chosen = [one for one in leaders if one.deviance - best.deviance < reach or one in alike]
-        for climb in chosen[: MOST_FITTED + 3 * all_of_them]:
+        for climb in chosen[: self.most_fitted + 3 * all_of_them]:
             self._fit(climb)
         return list(self.fitted.values())
 
@@ -158,9 +161,10 @@ def _gain(one: Evidence) -> float:
 def pairs(before: Fit, firsts: Sequence[Evidence], effects: Sequence[Effect], report: Report) -> list[Evidence]:
     """Fits of two effects together: to each of the best single ones, those that promise to mend what it leaves."""
     found: dict[frozenset[str], Evidence] = {}
-    for first in firsts[:FIRSTS]:
+    top = max((one.delta_chi2 for one in firsts), default=0.0)
+    for first in [one for one in firsts if one.delta_chi2 >= SHARE_OF_BEST * top][:FIRSTS]:
         later = question(first.fit, effects, LATER_LEVEL)
-        search = Search(later, report)
+        search = Search(later, report, most_fitted=PARTNERS)
         search.singles()
         ranked = sorted(search.fitted.values(), key=lambda one: -one.fit.log_likelihood)
         for second in ranked[:PARTNERS]:

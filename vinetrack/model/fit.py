@@ -66,6 +66,7 @@ def fit(
     noise: tuple[float, float] | None = None,
     profile: bool = True,
     host: Model | None = None,
+    thorough: bool = True,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit a model to all trials of an experiment.
@@ -91,6 +92,8 @@ def fit(
         Whether intervals near a bound are found by profile, which costs a few refits each.
     host
         A larger model whose compiled form serves this one and every `refit` that follows: nothing is compiled anew.
+    thorough
+        Whether a poor fit is begun from other starts too. One that will only be questioned for what it lacks need not.
     watch
         Told of every step of the iterations; what it raises ends the fit.
 
@@ -114,7 +117,7 @@ def fit(
     layout = make_layout(model.with_values(start or {}), data, fixed=fixed, free=free, shared=shared)
     predictor = Predictor(layout, data, host)
     held = _held(spreads, noise, data)
-    solution = _solve_from_scratch(predictor, held, watch)
+    solution = _solve_from_scratch(predictor, held, watch, thorough=thorough)
     return assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
 
 
@@ -125,23 +128,24 @@ def _held(spreads: tuple[float, float] | None, noise: tuple[float, float] | None
     return Held(spreads, (rho, np.full(len(data), sigma_m**2 * (1 - rho**2))))
 
 
-def _solve_from_scratch(predictor: Predictor, held: Held, watch: Watch | None) -> Solution:
+def _solve_from_scratch(predictor: Predictor, held: Held, watch: Watch | None, *, thorough: bool) -> Solution:
     """The best of the solutions from the likeliest starts; the first will do where it explains the data."""
     found: list[Solution] = []
     reason = ""
     starts = candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]
     for _, theta, own in starts:
         try:
-            found.append(_solve_from(predictor, theta, own, held, watch=watch))
+            most = MOST_ITERATIONS if thorough else ITERATIONS_ONCE_MORE
+            found.append(_solve_from(predictor, theta, own, held, most_iterations=most, watch=watch))
         except SimulationError as error:
             reason = str(error)
             continue
-        if found[-1].converged:
+        if found[-1].converged or not thorough:
             break
     if not found:
         raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
     best = min(found, key=_deviance)
-    if not chi2_per_dof(predictor, best) > POOR_FIT:
+    if not (thorough and chi2_per_dof(predictor, best) > POOR_FIT):
         return best
     for _, theta, own in starts:
         guided = _guided(predictor, theta, own, held, watch)
