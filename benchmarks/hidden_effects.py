@@ -38,7 +38,7 @@ from tqdm import tqdm
 Task = tuple[str, str, int]
 COLUMNS = (
     *("method", "kind", "seed", "hidden", "is_outsider", "n_trials", "n_vines", "noise", "B_scatter", "P_scatter"),
-    *("seconds", "verdict", "effects", "answer", "final", "final_answer", "rounds"),
+    *("seconds", "processor_s", "verdict", "effects", "answer", "final", "final_answer", "rounds"),
     *("sigma", "sigma_second", "sigma_left", "sizes", "tied", "failed"),
 )
 
@@ -87,7 +87,7 @@ def report(rows: list[Row]) -> None:
     for row in broken.itertuples():
         print(f"! {row.method} {row.kind} {row.seed}: {row.failed}")
     table = table[table["failed"].fillna("") == ""]
-    for name in ("seconds", "sigma", "sigma_second", "sigma_left"):
+    for name in ("seconds", "processor_s", "sigma", "sigma_second", "sigma_left"):
         table[name] = pd.to_numeric(table[name], errors="coerce")
     table = tables.judged(tables.visible(table))
     print(f"\n{len(table)} answers about {len(table.drop_duplicates(['kind', 'seed']))} campaigns\n")

@@ -119,6 +119,7 @@ def headline(rows: pd.DataFrame) -> pd.DataFrame:
             "outsiders above 8 σ called unexplained": share(outside["verdict"] == "unexplained"),
             "… of those with 8 σ left after the best answer": share(_left(outside)["verdict"] == "unexplained"),
             "seconds, median and 90 %": _seconds(group["seconds"]),
+            "… of processor time": _seconds(group["processor_s"]),
         }
     return pd.DataFrame(lines)
 
