@@ -15,7 +15,7 @@ import pytest
 from explorer_campaign import make_experiment, make_results
 
 from vinetrack.effects import Parameter
-from vinetrack.explorer.campaign import Campaign, condition_labels
+from vinetrack.explorer.campaign import Campaign, Seen, condition_labels
 from vinetrack.explorer.choice import ChoiceError, changed, chosen, first_choice, sized, slider_range
 from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.curves import errors_m, follow, overall_m
@@ -71,18 +71,21 @@ def test_a_motion_is_told_on_the_ruler_of_its_track(campaign: Campaign) -> None:
     assert math.isnan(motion.lead_position_m(np.array([99.0]))[0])
 
 
-def test_a_pressure_measured_along_moves_with_the_release(campaign: Campaign) -> None:
-    """A constant trace at the set pressure is the set pressure."""
+def traced(seen: Seen) -> Seen:
+    """With a pressure measured along that is the set one all the time."""
+    trace = (np.array([-1.0, 2.0]), np.full(2, seen.item.trial.pressure_Pa))
+    return replace(seen, item=replace(seen.item, trace=trace))
 
-    def traced(seen: object) -> object:
-        time_s = np.array([-1.0, 2.0])
-        item = replace(seen.item, trace=(time_s, np.full(2, seen.item.trial.pressure_Pa)))  # type: ignore[attr-defined]
-        return replace(seen, item=item)  # type: ignore[type-var]
 
-    other = replace(campaign, trials=tuple(traced(seen) for seen in campaign.trials))  # type: ignore[misc]
+def test_a_motion_that_follows_a_measured_pressure_keeps_its_release(campaign: Campaign) -> None:
+    other = replace(campaign, trials=tuple(map(traced, campaign.trials)))
     start = first_choice(campaign)
-    for one, same in zip(follow(campaign, sized(campaign, start)), follow(other, sized(other, start)), strict=True):
-        np.testing.assert_allclose(same.growth_m, one.growth_m, atol=2e-6)
+    bare, along = follow(campaign, sized(campaign, start)), follow(other, sized(other, start))
+    for seen, motion in zip(other.trials, along, strict=True):
+        assert motion.release_s == seen.release_s
+    assert errors_m(other, along) == pytest.approx(errors_m(campaign, bare), rel=2e-3)
+    far = sized(other, start.with_size("eversion_damping.n", 0.6))
+    assert [motion.release_s for motion in follow(other, far, along)] == [motion.release_s for motion in along]
 
 
 def test_twenty_four_trials_follow_a_slider_in_a_fraction_of_a_frame(campaign: Campaign) -> None:

@@ -2,8 +2,8 @@
 
 As in a comparison, a prediction has a release and an origin of its own and nothing else: the origin is where the vine
 is seen at rest; the release, and the origin where no rest was filmed, are where the mean square is least. Each trial
-is simulated once on a grid and shifted there; only where a pressure was measured along with the motion, whose shift
-is another motion, is it simulated again.
+is simulated once on a grid and shifted there. A motion that follows a pressure measured along with it has the clock of
+that pressure and cannot be shifted: its release stays that of the comparison.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ ROOM_FRAMES = 25
 SHIFTS = 12
 LARGEST_SHIFT_FRAMES = 5.0
 SETTLED_FRAMES = 1e-3
-TRACE_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -85,29 +84,22 @@ def follow(campaign: Campaign, sized: Sized, before: Curves | None = None) -> Cu
     SimulationError
         If the model cannot be followed at these sizes.
     """
-    trials = [with_yield(seen.item.trial, sized.yield_Pa) for seen in campaign.trials]
-    starts = [seen.release_s for seen in campaign.trials] if before is None else [one.release_s for one in before]
-    return _follow_part(campaign, campaign.trials, trials, sized.model, starts)
-
-
-def _follow_part(
-    campaign: Campaign, seen: Sequence[Seen], trials: Sequence[Trial], model: Model, starts: Sequence[float]
-) -> Curves:
-    grids = [_grid(one) for one in seen]
-    releases = list(starts)
-    found: list[Motion] = []
-    for _ in range(TRACE_ROUNDS):
-        traces = [_since(one, release_s) for one, release_s in zip(seen, releases, strict=True)]
-        moved = simulate_many(model, trials, grids, traces=traces, host=campaign.host)
-        found = [_laid(*one) for one in zip(seen, grids, moved, releases, strict=True)]
-        late = [
-            trace is not None and abs(one.release_s - release_s) > 0.1 * item.item.frame_s
-            for item, trace, one, release_s in zip(seen, traces, found, releases, strict=True)
+    seen = campaign.trials
+    starts = [one.release_s for one in seen]
+    if before is not None:
+        starts = [
+            own.release_s if one.item.trace is None else start
+            for own, one, start in zip(before, seen, starts, strict=True)
         ]
-        if not any(late):
-            break
-        releases = [one.release_s for one in found]
-    return tuple(found)
+    grids = [_grid(one) for one in seen]
+    moved = simulate_many(
+        sized.model,
+        [with_yield(one.item.trial, sized.yield_Pa) for one in seen],
+        grids,
+        traces=[_since(one) for one in seen],
+        host=campaign.host,
+    )
+    return tuple(_laid(*one) for one in zip(seen, grids, moved, starts, strict=True))
 
 
 def with_yield(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
@@ -122,9 +114,9 @@ def _grid(seen: Seen) -> Floats:
     return np.linspace(0.0, last_s, GRID_POINTS)
 
 
-def _since(seen: Seen, release_s: float) -> Trace | None:
+def _since(seen: Seen) -> Trace | None:
     trace = seen.item.trace
-    return None if trace is None else (trace[0] - release_s, trace[1])
+    return None if trace is None else (trace[0] - seen.release_s, trace[1])
 
 
 def _laid(seen: Seen, grid: Floats, moved: Trajectory, start_s: float) -> Motion:
@@ -137,7 +129,8 @@ def _laid(seen: Seen, grid: Floats, moved: Trajectory, start_s: float) -> Motion
         since = item.time_s - release_s
         left = item.lead_position_m - origin_m - np.interp(since, grid, position)
         # Before release the vine stands: its speed there is nothing.
-        slope = -np.interp(since, grid, speed, left=0.0, right=0.0)
+        held = item.trace is not None
+        slope = np.zeros(since.size) if held else -np.interp(since, grid, speed, left=0.0, right=0.0)
         later_s, higher_m = _step(slope, left, free_origin=not seen.origin_known)
         later_s = min(max(later_s, -longest_s), longest_s)
         release_s += later_s
