@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, moved, next_experiment, number, refused
+from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, laws, moved, next_experiment, number, refused
 from test_report import EVIL, SVG, Tags, page
 
 from vinetrack.report.build import ReportFigure
@@ -14,6 +14,7 @@ from vinetrack.report.diagnosis import (
     DiagnosisResult,
     diagnosis_section,
     hidden_table,
+    law_table,
     moved_table,
     tied_pairs,
 )
@@ -155,6 +156,18 @@ def test_how_the_numbers_moved_stands_side_by_side() -> None:
         ["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"],
         ["γ", "–", "1.1700 ± 0.0040"],
     ]
+
+
+def test_the_law_under_every_model_is_by_the_method_that_heads_the_report() -> None:
+    table = law_table(laws())
+    assert table is not None
+    rows = [tuple(row) for row in table.rows]
+    assert rows == [
+        ("as you came with it", "v", "0.4000", "0.35 to 0.45", "1.800", "1.70 to 1.90", "5"),
+        ("+ reservoir depletion", "v", "0.3700", "0.35 to 0.45", "1.800", "1.70 to 1.90", "5"),
+    ]
+    assert law_table(None) is None
+    assert "The damping law under every model" in shown(diagnosis(), laws=laws())
 
 
 def test_the_ladder_is_a_table_of_numbers_too() -> None:

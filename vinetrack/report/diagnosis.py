@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.figures.numbers import number, with_error
+from vinetrack.figures.numbers import interval, number, with_error
 from vinetrack.report.model import READABLE
 from vinetrack.report.section import ReportTable
 from vinetrack.report.verdict import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
+from vinetrack.report.words import PREFERRED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,8 +31,9 @@ DIAGNOSIS_FIGURES = {
 
 @dataclass(frozen=True)
 class DiagnosisResult:
-    """`diagnosis.json`, `ladder.csv` and the values of every number along it; None where a part does not exist.
+    """`diagnosis.json`, `ladder.csv`, the values of every number along it, and the damping law under every model.
 
+    None where a part does not exist.
     `summaries` says of effects by name what each is, in a sentence; `units` of parameters (`effect.parameter`) their
     symbol and unit.
     """
@@ -39,6 +41,7 @@ class DiagnosisResult:
     content: Mapping[str, Any]
     ladder: pd.DataFrame | None = None
     moved: pd.DataFrame | None = None
+    laws: pd.DataFrame | None = None
     summaries: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
@@ -76,6 +79,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "next": next_experiment(content.get("next_experiment")),
         "drift": drifting,
         "moved": moved_table(result.moved),
+        "laws": law_table(result.laws),
         "notes": [str(note) for note in content.get("notes") or []],
     }
 
@@ -261,3 +265,22 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
         cells.setdefault(key, {})[str(entry["added"])] = right
     rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]
     return ReportTable("How the numbers moved", head, rows, frozenset(range(1, len(head))))
+
+
+def law_table(laws: pd.DataFrame | None) -> ReportTable | None:
+    """The damping law from steady speeds, with the pressure along the way that each model gives."""
+    if laws is None or not len(laws):
+        return None
+    chosen = laws[laws["method"] == PREFERRED] if (laws["method"] == PREFERRED).any() else laws
+    first = set(str(chosen["model"].iloc[0]).split("+"))
+    rows = []
+    for entry in chosen.to_dict("records"):
+        added = [name for name in str(entry["model"]).split("+") if name not in first]
+        bounds = {key: [entry[f"{key}_low_95"], entry[f"{key}_high_95"]] for key in ("n", "B")}
+        row = (_step("+".join(added)), str(entry["vine"]), number(entry["n"], 4), interval(bounds["n"]))
+        rows.append((*row, number(entry["B"], 4), interval(bounds["B"]), f"{entry['n_trials']:.0f}"))
+    head = ("Model", "Vine", "n", "95 %", "B, N·(s/m)ⁿ", "95 %", "Trials")
+    note = (
+        "From steady speeds, as in the section on the damping law, with the pressure that each model has along the way."
+    )
+    return ReportTable("The damping law under every model", head, rows, frozenset(range(2, len(head))), note)

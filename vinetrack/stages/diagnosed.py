@@ -94,14 +94,16 @@ def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult 
     if not results.diagnosis.exists():
         return None
     content = read_json(results.diagnosis)
-    ladder, moved = _table(results.ladder), _table(results.diagnosed("moved.csv"))
+    paths = (results.ladder, results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
+    ladder, moved, laws = (table if len(table := _table(path)) else None for path in paths)
     ranked = [str(row["effect"]) for one in content.get("rounds") or [] for row in one.get("ranking") or []]
     named = [*(content.get("effects") or []), *(content.get("answer_set") or [])]
     effects = _effects([*named, *ranked], experiment)
     return DiagnosisResult(
         content,
-        ladder if len(ladder) else None,
-        moved if len(moved) else None,
+        ladder,
+        moved,
+        laws,
         {name: effects[name].summary for name in named if name in effects},
         {f"{name}.{p.name}": (p.symbol, p.unit) for name, effect in effects.items() for p in effect.parameters},
     )

@@ -112,6 +112,7 @@ TEXT_COLUMNS = frozenset(
         "beside",
         "figure",
         "departure",
+        "method",
     }
 )
 COUNT_COLUMNS = frozenset({"n_frames", "points"})
