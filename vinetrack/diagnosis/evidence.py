@@ -29,8 +29,8 @@ class Evidence:
     """One hypothesis refitted: the effects it adds to a fit, its own fit, and what came of it.
 
     `delta_chi2` is the fall of −2 ln L from the fit without them, `sigma` that in standard deviations, brought down
-    where trials scatter more than the model of the noise says. A size beyond what is `plausible` may lose a tie; one
-    that is not even `credible`, several times beyond, is no explanation.
+    where trials scatter more than the model of the noise says. A size beyond what is `plausible` is said to be; one that
+    is not even `credible`, several times beyond, loses a tie and is no explanation.
     """
 
     effects: tuple[Effect, ...]
@@ -163,9 +163,9 @@ def answer_set(hypotheses: Sequence[Evidence]) -> tuple[list[Evidence], dict[str
             aside["+".join(one.names)] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
         else:
             kept.append(one)
-    believed = [one for one in kept if one.plausible]
+    believed = [one for one in kept if one.credible]
     if believed and len(believed) < len(kept):
-        aside |= {"+".join(one.names): one.reason for one in kept if not one.plausible}
+        aside |= {"+".join(one.names): one.reason for one in kept if not one.credible}
         kept = believed
     return kept, aside
 

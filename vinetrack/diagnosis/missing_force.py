@@ -1,0 +1,341 @@
+"""The force that a model lacks: drawn against growth, speed, time and pressure, and held against simple laws.
+
+Nothing is differentiated. What a force would do to the positions is known (`vinetrack.diagnosis.force_answers`); the
+positions then say which force, by least squares with the noise of the tracks, release and origin of every trial free,
+its pressure and B free within what replicates scatter by, and B, n and all other numbers of the model free beside it.
+
+Part of any force can be taken over by B and n: between them and a force that is drawn freely the data do not decide.
+Where a simple law explains most of what is missing, B and n are put as this law has them; else where the fit left them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.diagnosis.force_answers import Motion, answers_to_forces, motions_of
+from vinetrack.diagnosis.force_fit import ForceFit, Gain
+from vinetrack.diagnosis.own_values import lay
+from vinetrack.diagnosis.simple_laws import Law, coarse_laws, finer_laws
+from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
+from vinetrack.model.fit_data import FitError
+from vinetrack.model.fit_result import Fit
+from vinetrack.model.simulate import SimulationError
+from vinetrack.records import Floats
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")
+LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi2", "bic")
+
+PIECES, EARLY = 15, (0.01, 0.03, 0.06)
+"""Smooth pieces of a force along the growth of one condition; and further knots in the first tenth of it."""
+
+FAMILIES = {"growth": 24, "speed": 10, "time": 10}
+"""Smooth pieces of a force that hangs on one thing alone, the same in all trials."""
+
+PARTS = 10
+"""Means over all conditions are taken in so many parts of each axis."""
+
+LIKE = 0.7
+"""Part of what is missing that a law must explain to be named."""
+
+SEEN = 5.0
+"""Errors that a force must be away from nothing: some hundred laws are tried."""
+
+DRAWN = 24
+"""Points of a curve."""
+
+UNTOLD = 2.0
+"""Times the usual error, beyond which a force is not drawn: near the end it has no time left to move anything."""
+
+MENDS = 0.5
+"""Part of the misfit that a smooth force in every condition must take away, to be a force at all."""
+
+EQUALLY = 0.05
+"""Laws that explain as much but for this part are named beside it."""
+
+
+Answers = Callable[[Sequence[Law]], list[Floats]]
+
+
+@dataclass(frozen=True)
+class MissingForce:
+    """What is missing, as a force on the tail, N.
+
+    `table`, columns `FORCE_COLUMNS`: the force of every condition (blank: mean over all) against `lead_position_m`,
+    `tail_velocity_m_s`, `time_s` and `pressure_Pa`. `laws`, columns `LAW_COLUMNS`, the best of each kind, best first;
+    `explained` is the part of what any smooth force could explain. `depends_on` gives the same for a force that hangs
+    on one thing alone.
+    """
+
+    table: pd.DataFrame
+    laws: pd.DataFrame
+    depends_on: Mapping[str, float]
+    sentence: str
+
+    def to_json(self) -> dict[str, Any]:
+        """As `diagnosis.json` holds it."""
+        return {
+            "sentence": self.sentence,
+            "laws": self.laws.head(6).to_dict("records"),
+            "depends_on": dict(self.depends_on),
+        }
+
+
+def missing_force(found: Fit) -> MissingForce:
+    """Find the force that a fit lacks.
+
+    Raises
+    ------
+    FitError
+        If the model cannot be followed.
+    """
+    try:
+        scatter = replicate_scatter(found, courses_of(found)[0])
+        begins = [found.solution.state.own, lay(found).own]
+        looks = [_look(found, ForceFit(found, own, scatter)) for own in begins]
+    except SimulationError as error:
+        raise FitError(f"The model cannot be followed: {error}") from error
+    # All is linear about where the trials' own numbers are: the better place leaves less that no force explains.
+    look = min(looks, key=lambda one: one.fit.chi2 - one.everything.chi2)
+    fit, motions, everything = look.fit, look.motions, look.everything
+
+    def answers(laws: Sequence[Law]) -> list[Floats]:
+        return answers_to_forces(found, fit.own, motions, lambda m: np.column_stack([one.along(m) for one in laws]))
+
+    ranked = _ranked(fit, answers, motions, everything)
+    families = _families(found, fit, motions)
+    whole = max([1e-300, everything.beyond, *families.values(), *(one.gain.beyond for one in ranked)])
+    laws = [replace(one, explained=one.gain.beyond / whole) for one in ranked]
+    depends = {name: beyond / whole for name, beyond in families.items()}
+    best = laws[0]
+    gauge = best.gain.numbers if best.explained >= LIKE and best.seen else np.zeros_like(best.gain.numbers)
+    drawn = fit.smooth(look.pieces, gauge)
+    return MissingForce(
+        table=_table(motions, look.longest, drawn),
+        laws=_law_table(laws),
+        depends_on=depends,
+        sentence=_sentence(laws, depends, _mended(fit, whole)),
+    )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """The trials laid out about one place: motions, what smooth pieces of force do, and what all of them explain."""
+
+    fit: ForceFit
+    motions: list[Motion]
+    longest: dict[str, float]
+    pieces: list[Floats]
+    everything: Gain
+
+
+def _look(found: Fit, fit: ForceFit) -> _Look:
+    motions = motions_of(found, fit.own)
+    longest = {motion.trial.condition: 0.0 for motion in motions}
+    for motion in motions:
+        longest[motion.trial.condition] = max(longest[motion.trial.condition], float(motion.lead_position_m.max()))
+    pieces = answers_to_forces(
+        found, fit.own, motions, lambda m: pieces_of(m.lead_position_m / longest[m.trial.condition])
+    )
+    return _Look(fit, motions, longest, pieces, fit.by_condition(pieces))
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A law with what it explains."""
+
+    law: Law
+    gain: Gain
+    bic: float
+    explained: float = 0.0
+
+    @property
+    def seen(self) -> bool:
+        """Whether its force is more than the errors of single trials could make."""
+        return math.hypot(*self.gain.amplitude) > SEEN * self.gain.sigma
+
+
+def curves(at: Floats, count: int) -> Floats:
+    """Cubic B-splines on 0 to 1, shape (n, count), evenly wide."""
+    return _splines(at, np.linspace(0.0, 1.0, count - 2))
+
+
+def pieces_of(at: Floats) -> Floats:
+    """The smooth pieces of a force along the growth, shape (n, PIECES): narrower at the start, where speed rises."""
+    return _splines(at, np.concatenate([[0.0, *EARLY], np.linspace(0.0, 1.0, PIECES - 2 - len(EARLY))[1:]]))
+
+
+def _splines(at: Floats, knots: Floats) -> Floats:
+    from scipy.interpolate import BSpline
+
+    ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
+    return np.asarray(BSpline.design_matrix(np.clip(at, 0.0, 1.0), ends, 3).toarray())
+
+
+def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[Motion], everything: Gain) -> list[_Judged]:
+    """The best law of each kind, best first."""
+
+    def gains(laws: Sequence[Law]) -> list[tuple[Law, Gain]]:
+        return list(zip(laws, fit.gains(answers(laws), [law.columns for law in laws]), strict=True))
+
+    found = gains(coarse_laws(motions))
+    most = max(everything.chi2, *(gain.chi2 for _, gain in found))
+    finer = [law for one in _best_of_kinds(_judged(fit, found, most)) for law in finer_laws(one.law, motions)]
+    found += gains(finer)
+    most = max(most, *(gain.chi2 for _, gain in found))
+    return sorted(_best_of_kinds(_judged(fit, found, most)), key=lambda one: (not one.seen, one.bic))
+
+
+def _judged(fit: ForceFit, found: Sequence[tuple[Law, Gain]], most: float) -> list[_Judged]:
+    return [_Judged(law, gain, fit.bic(gain.chi2, law.columns + law.shapes, most)) for law, gain in found]
+
+
+def _best_of_kinds(found: Sequence[_Judged]) -> list[_Judged]:
+    best: dict[str, _Judged] = {}
+    for one in found:
+        before = best.get(one.law.kind)
+        if before is None or (not one.seen, one.bic) < (not before.seen, before.bic):
+            best[one.law.kind] = one
+    return list(best.values())
+
+
+def _families(found: Fit, fit: ForceFit, motions: Sequence[Motion]) -> dict[str, float]:
+    """By how much χ² falls with a smooth force that hangs on one thing alone; or one constant a condition."""
+    along = {
+        "growth": lambda m: m.lead_position_m,
+        "speed": lambda m: m.tail_velocity_m_s,
+        "time": lambda m: m.time_s,
+    }
+    explained = {}
+    for name, count in FAMILIES.items():
+        top = max(float(along[name](motion).max()) for motion in motions)
+        answers = answers_to_forces(
+            found,
+            fit.own,
+            motions,
+            lambda m, a=along[name], t=top, n=count: curves(a(m) / t, n),  # type: ignore[misc]
+        )
+        explained[name] = fit.together(answers).beyond
+    constant = answers_to_forces(found, fit.own, motions, lambda m: np.ones((m.time_s.size, 1)))
+    explained["condition"] = fit.by_condition(constant).beyond
+    return explained
+
+
+def _table(
+    motions: Sequence[Motion], longest: Mapping[str, float], drawn: Mapping[str, tuple[Floats, Floats]]
+) -> pd.DataFrame:
+    """Force of every condition along its first trial's motion, and the mean over all."""
+    import pandas as pd
+
+    rows = []
+    for condition, (coefficients, covariance) in drawn.items():
+        motion = next(m for m in motions if m.trial.condition == condition)
+        at = np.linspace(0.04, 0.96, DRAWN) * motion.lead_position_m.max()
+        shape = pieces_of(at / longest[condition])
+        sigma = np.sqrt(np.einsum("nk,kl,nl->n", shape, covariance, shape))
+        told = sigma < UNTOLD * np.median(sigma)
+        at, force, sigma = at[told], (shape @ coefficients)[told], sigma[told]
+        when = np.interp(at, motion.lead_position_m, motion.time_s)
+        axes = {
+            "lead_position_m": at,
+            "tail_velocity_m_s": np.interp(when, motion.time_s, motion.tail_velocity_m_s),
+            "time_s": when,
+            "pressure_Pa": np.interp(when, motion.time_s, motion.pressure_Pa),
+        }
+        for against, values in axes.items():
+            rows += [(against, *one, condition) for one in zip(values, force, sigma, strict=True)]
+    table = pd.DataFrame(rows, columns=list(FORCE_COLUMNS))
+    means = [_mean(part) for _, part in table.groupby("against", sort=False)]
+    return pd.concat([table, *means], ignore_index=True)
+
+
+def _mean(part: pd.DataFrame) -> pd.DataFrame:
+    """Weighted means over all conditions in parts of an axis; errors no smaller than conditions differ."""
+    import pandas as pd
+
+    values = part["value"].to_numpy(float)
+    edges = np.linspace(values.min(), values.max(), PARTS + 1)
+    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, PARTS - 1)
+    rows = []
+    for k in np.unique(place):
+        chosen = part[place == k]
+        weight = 1 / chosen["sigma_N"].to_numpy(float) ** 2
+        force = chosen["force_N"].to_numpy(float)
+        mean = float(np.average(force, weights=weight))
+        conditions = len(set(chosen["condition"]))
+        scatter = math.sqrt(float(np.average((force - mean) ** 2, weights=weight)) / max(conditions - 1, 1))
+        formal = float(np.sqrt(1 / np.sum(weight)))
+        at = float(np.average(chosen["value"].to_numpy(float), weights=weight))
+        rows.append((part["against"].iloc[0], at, mean, max(formal, scatter if conditions > 1 else 0.0), ""))
+    return pd.DataFrame(rows, columns=list(FORCE_COLUMNS))
+
+
+def _law_table(laws: Sequence[_Judged]) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = [
+        (
+            one.law.kind,
+            one.law.words(one.gain.amplitude.tolist(), one.gain.sigma),
+            one.explained,
+            float(one.gain.amplitude[0]) if one.law.columns == 1 else float(np.hypot(*one.gain.amplitude)),
+            one.gain.sigma,
+            one.gain.chi2,
+            one.bic,
+        )
+        for one in laws
+    ]
+    return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
+
+
+def _mended(fit: ForceFit, whole: float) -> float:
+    """Part of the misfit that a force can mend; 1 where there is none beyond the noise."""
+    misfit = fit.chi2 - fit.points
+    return min(whole / misfit, 1.0) if misfit > fit.points else 1.0
+
+
+def _sentence(laws: Sequence[_Judged], depends: Mapping[str, float], mended: float) -> str:
+    """What it looks like, in a sentence or two."""
+    best = laws[0]
+    if mended < MENDS:
+        return (
+            f"No smooth force on the tail mends it: one of its own in every condition takes away {max(mended, 0.0):.0%}"
+            " of the misfit. Either it is no force, or the model is too far off to say."
+        )
+    words = best.law.words(best.gain.amplitude.tolist(), best.gain.sigma)
+    if not best.seen:
+        return "No further force on the tail can be told from how single trials differ."
+    if best.explained < LIKE:
+        name, part = max(depends.items(), key=lambda one: one[1])
+        whole = {
+            "growth": "where the tip is",
+            "speed": "the speed",
+            "time": "the time",
+            "condition": "the condition, and not on what happens in a trial",
+        }
+        found = (
+            f"What is missing looks like none of the simple laws: the best, {words},"
+            f" explains {best.explained:.0%} of it."
+        )
+        if part >= LIKE:
+            found += f" It hangs on {whole[name]}: a force of that alone explains {part:.0%}."
+        return found
+    # What not even a free force mends is the error of small forces where the force is none: laws are told apart less.
+    nearly = EQUALLY + max(1 - mended, 0.0)
+    others = [
+        one
+        for one in laws[1:]
+        if one.seen and one.explained > best.explained - nearly and one.law.shapes <= best.law.shapes
+    ]
+    said = f"What is missing looks like {words}; that explains {best.explained:.0%} of what any force could."
+    if others:
+        listed = "; ".join(one.law.words(one.gain.amplitude.tolist(), one.gain.sigma) for one in others[:2])
+        said += f" These data would nearly as well have: {listed}."
+    return said
