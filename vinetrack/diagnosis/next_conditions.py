@@ -31,6 +31,9 @@ HEADROOM = 1.25
 ABOVE_YIELD = 1.15
 """Nearer to the yield pressure its own error decides how a vine moves."""
 
+PRESSURE_STEP_PA = 100.0
+"""As finely as pressures are set."""
+
 PAYLOAD_KG = 0.05
 PRESSURES_LOOKED_AT = 6
 MOST_NEW_VINES = 10
@@ -176,7 +179,8 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
         # A guess of what film holds must not forbid what it has held; what the user says of it may.
         told = "hoop_stress_MPa" in limits.model_fields_set
         held = [trial.pressure_Pa for trial in used if trial.vine == rig.vine and not told]
-        high = min(high, max([1e6 * limits.hoop_stress_MPa / stress_Pa, *held]))
+        bursts_Pa = 1e6 * limits.hoop_stress_MPa / stress_Pa
+        high = min(high, max([PRESSURE_STEP_PA * math.floor(bursts_Pa / PRESSURE_STEP_PA), *held]))
     if payload_kg == 0 and math.isfinite(rig.yield_pressure_Pa):
         low = max(low, ABOVE_YIELD * rig.yield_pressure_Pa)
     if not low <= high:
@@ -184,7 +188,8 @@ def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Lim
     steps = np.geomspace(low, high, PRESSURES_LOOKED_AT) if high > 1.02 * low else np.array([high])
     relative = [t.pressure_sigma_Pa / t.pressure_Pa for t in used if t.pressure_Pa > 0]
     share = float(np.nanmedian(relative)) if np.isfinite(relative).any() else math.nan
-    return [(float(p), share * float(p)) for p in np.unique(np.clip(np.round(steps, -2), low, high).round(3))]
+    steps = np.clip(PRESSURE_STEP_PA * np.round(steps / PRESSURE_STEP_PA), low, high)
+    return [(float(pressure), share * float(pressure)) for pressure in np.unique(steps.round(3))]
 
 
 def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tuple[Trial, int]]:

@@ -20,15 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.diagnosis.next_check import Bench, expected, observed, separation
-from vinetrack.diagnosis.next_conditions import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, conditions
+from vinetrack.diagnosis.next_conditions import NEW_VINE, OTHER_RIG, SAME_RIG, conditions
 from vinetrack.diagnosis.next_design import Side, all_sides, best_design, likeliest_vines, worth
 from vinetrack.diagnosis.next_film import camera_of, courses
 from vinetrack.diagnosis.next_predict import carry
-from vinetrack.diagnosis.next_words import calibration_for, only_measurement, outlook, trials_in_words
+from vinetrack.diagnosis.next_words import calibration_for, entries, in_words, listed, only_measurement, outlook
 from vinetrack.model.fit_data import FitError
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.simulate import SimulationError
-from vinetrack.records import Floats, Trial
+from vinetrack.records import Floats
 from vinetrack.settings import Limits
 
 __all__ = ["Limits", "NextExperiment", "next_experiment"]
@@ -148,7 +148,7 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
         advice = calibration_for(list(itertools.combinations(tied, 2)))
         faults = [name for name in names if name != NOTHING]
         are = "are errors" if len(faults) > 1 else "is an error"
-        text = f"Measure before making more trials: {_list(faults)} {are} of measurement. {advice}"
+        text = f"Measure before making more trials: {listed(faults)} {are} of measurement. {advice}"
         return NextExperiment(text=text, calibration=advice)
     bench, sides = _bench(tied, names, limits)
     options = _options(bench, sides, limits, seed)
@@ -171,10 +171,6 @@ def hypothesis_names(tied: Sequence[Fit]) -> list[str]:
     common = set.intersection(*(set(fit.model.names) for fit in tied))
     names = [" + ".join(name for name in fit.model.names if name not in common) or NOTHING for fit in tied]
     return [name if names.count(name) == 1 else f"{name} ({k + 1})" for k, name in enumerate(names)]
-
-
-def _list(names: Sequence[str]) -> str:
-    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
 
 
 def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[Side]]:
@@ -254,20 +250,27 @@ def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperi
     advice = calibration_for([(fits[a], fits[b]) for a, b in left or _measured(fits)])
     sigmas = {_pair(names, place): sigma for place, sigma in to_expect.items()}
     seen = {_pair(names, place): both for place, both in checked.items()}
-    trials = _entries(bench.conditions, best.design)
+    trials = entries(bench.conditions, best.design)
     if_true = {
         _pair(names, (a, b)): {names[a]: float(best.between[a, b]), names[b]: float(best.between[b, a])}
         for a, b in to_expect
     }
     return NextExperiment(
-        text=_text(trials, outlook(if_true, seen), [_pair(names, place) for place in left], advice, worth_it=worth_it),
+        text=in_words(
+            trials,
+            outlook(if_true, seen),
+            [_pair(names, place) for place in left],
+            advice,
+            worth_it=worth_it,
+            least=SEPARATES,
+        ),
         trials=trials if worth_it else (),
         separation_sigma=sigmas,
         if_true_sigma=if_true,
         simulated_sigma=seen,
         alternatives=tuple(
             {
-                "trials": [dict(entry) for entry in _entries(bench.conditions, option.design)],
+                "trials": [dict(entry) for entry in entries(bench.conditions, option.design)],
                 "separation_sigma": {_pair(names, p): s for p, s in _by_pair(option.between).items()},
             }
             for option in sorted(options, key=lambda one: -one.worth)
@@ -299,54 +302,3 @@ def _checked(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
 
 def _pair(names: Sequence[str], place: tuple[int, int]) -> str:
     return f"{names[place[0]]} | {names[place[1]]}"
-
-
-def _entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
-    """The trials of a design as entries, one a condition."""
-    return tuple(
-        _entry(every[place], int(count))
-        for place, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
-    )
-
-
-def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
-    trial: Trial = condition.trial
-    return {
-        "pressure_kPa": trial.pressure_Pa / 1e3,
-        "payload_g": trial.payload_kg * 1e3,
-        "diameter_mm": trial.diameter_m * 1e3,
-        "thickness_um": trial.thickness_m * 1e6,
-        "length_mm": trial.length_m * 1e3,
-        "chamber_l": trial.chamber_m3 * 1e3,
-        "inlet_mm": trial.inlet_m * 1e3,
-        "growth_angle_deg": math.degrees(trial.growth_angle_rad),
-        "replicates": replicates,
-        "vine": trial.vine,
-        "new_vine": condition.effort == NEW_VINE,
-        "changed": list(condition.changed),
-    }
-
-
-def _text(
-    trials: Sequence[Mapping[str, Any]],
-    promise: str,
-    left: Sequence[str],
-    advice: str,
-    *,
-    worth_it: bool,
-) -> str:
-    """The advice in plain sentences."""
-    if not worth_it:
-        return (
-            f"No trials within the limits separate what is tied by {SEPARATES:g} σ; the best would separate"
-            f" {promise}. {advice}".rstrip()
-        )
-    text = f"Make {trials_in_words(trials)}. Together with the trials so far they separate {promise}."
-    if any(trial["new_vine"] for trial in trials):
-        text += " B of the new vine is a guess here and is fitted; its yield pressure has to be measured."
-    if left:
-        pairs = _list([pair.replace(" | ", " from ") for pair in left])
-        text += f" They will not tell {pairs}. {advice}"
-    elif advice:
-        text += f" A measurement would do as well: {advice}"
-    return text.rstrip()

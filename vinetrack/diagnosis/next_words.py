@@ -6,6 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from vinetrack.diagnosis.next_conditions import NEW_VINE, Condition
 from vinetrack.effects import Effect
 from vinetrack.effects._words import remedy, told_apart
 from vinetrack.model.fit_result import Fit
@@ -51,7 +54,7 @@ def calibration_for(pairs: Sequence[tuple[Fit, Fit]]) -> str:
     return " ".join(sentences)
 
 
-def trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
+def _trials_in_words(trials: Sequence[Mapping[str, Any]]) -> str:
     """The trials to make, as a list in one sentence."""
     return "; ".join(_trial_in_words(trial) for trial in trials)
 
@@ -89,3 +92,63 @@ def outlook(
         behind = f" ({'; '.join(notes)})" if notes else ""
         parts.append(f"{pair.replace(' | ', ' from ')} by {ways[least]:.2g} σ{behind}")
     return ", ".join(parts)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as a sentence lists them."""
+    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
+
+
+def entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
+    """The trials of a design as entries, one a condition."""
+    return tuple(
+        _entry(every[place], int(count))
+        for place, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
+    )
+
+
+def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
+    trial = condition.trial
+    settings = {
+        "pressure_kPa": trial.pressure_Pa / 1e3,
+        "payload_g": trial.payload_kg * 1e3,
+        "diameter_mm": trial.diameter_m * 1e3,
+        "thickness_um": trial.thickness_m * 1e6,
+        "length_mm": trial.length_m * 1e3,
+        "chamber_l": trial.chamber_m3 * 1e3,
+        "inlet_mm": trial.inlet_m * 1e3,
+        "growth_angle_deg": math.degrees(trial.growth_angle_rad),
+    }
+    return {
+        **{name: float(f"{value:.6g}") for name, value in settings.items()},
+        "replicates": replicates,
+        "vine": trial.vine,
+        "new_vine": condition.effort == NEW_VINE,
+        "changed": list(condition.changed),
+    }
+
+
+def in_words(
+    trials: Sequence[Mapping[str, Any]],
+    promise: str,
+    left: Sequence[str],
+    advice: str,
+    *,
+    worth_it: bool,
+    least: float,
+) -> str:
+    """The advice in plain sentences."""
+    if not worth_it:
+        return (
+            f"No trials within the limits separate what is tied by {least:g} σ; the best would separate"
+            f" {promise}. {advice}".rstrip()
+        )
+    text = f"Make {_trials_in_words(trials)}. Together with the trials so far they separate {promise}."
+    if any(trial["new_vine"] for trial in trials):
+        text += " B of the new vine is a guess here and is fitted; its yield pressure has to be measured."
+    if left:
+        pairs = listed([pair.replace(" | ", " from ") for pair in left])
+        text += f" They will not tell {pairs}. {advice}"
+    elif advice:
+        text += f" A measurement would do as well: {advice}"
+    return text.rstrip()
