@@ -143,5 +143,11 @@ def test_nothing_is_wider_than_the_window(visitor: Visitor, width: int) -> None:
     until(lambda: visitor.chrome.run("document.documentElement.scrollWidth") <= width, f"a page of {width} px", 20)
 
 
+def test_a_finger_scrolls_the_page_over_a_figure_too(visitor: Visitor) -> None:
+    for name in ("motion", "errors"):
+        events = f"Bokeh.index.find_one({visitor.model(name)}).canvas_view.events_el"
+        assert visitor.chrome.run(f"getComputedStyle({events}).touchAction") == "pan-y"
+
+
 def test_the_browser_had_nothing_to_complain_of(visitor: Visitor) -> None:
     assert visitor.chrome.complaints == []

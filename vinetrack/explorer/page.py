@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from bokeh.document import Document
-from bokeh.models import Button, Column, Row
+from bokeh.models import Button, Column, CustomJS, Row
 
 from vinetrack.explorer.choice import Choice, changed, sized
 from vinetrack.explorer.chooser import Chooser
@@ -37,6 +37,13 @@ LOOK_AGAIN_MS = 2000
 """How often the page looks whether there is a new diagnosis."""
 
 CLOCK_MS = 200
+
+LET_SCROLL = """
+for (const plot of plots) {
+  Bokeh.index.find_one(plot)?.canvas_view?.events_el?.style.setProperty("touch-action", "pan-y");
+}
+"""
+"""A finger that swipes over a figure scrolls the page, as everywhere else on it."""
 
 
 class Page:
@@ -88,6 +95,8 @@ class Page:
         roots += [self.plots.errors, self.panel.root, actions, self.numbers, self.tied, self.next]
         for root in (*roots, self.film.root, self.keep.root):
             self.document.add_root(root)
+        figures = [self.plots.motion, self.plots.residual, self.plots.errors, self.film.figure]
+        self.document.js_on_event("document_ready", CustomJS(args={"plots": figures}, code=LET_SCROLL))
         self.document.title = f"{campaign.name} – vinetrack explorer"
         self.document.theme = theme()
         self._set_template()
