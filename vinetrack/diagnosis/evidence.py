@@ -29,7 +29,7 @@ class Evidence:
     """One hypothesis refitted: the effects it adds to a fit, its own fit, and what came of it.
 
     `delta_chi2` is the fall of −2 ln L from the fit without them, `sigma` that in standard deviations, brought down
-    where trials scatter more than the model of the noise says. One beyond what is `plausible` is said to be; one that is
+    where trials scatter more than the model of the noise says. A size beyond what is `plausible` is said to be so; one
     not even `credible`, several times beyond, loses a tie and is no explanation.
     """
 
