@@ -78,6 +78,11 @@ def test_what_cannot_be_compiled_is_told(tmp_path: Path) -> None:
     assert "tail_force cannot be compiled" in refusal(tmp_path, text)
 
 
+def test_what_fails_wherever_it_is_asked_is_told_in_a_sentence(tmp_path: Path) -> None:
+    assert "tail_force cannot be compiled" in refusal(tmp_path, BRUSH.replace("return -q", 'open("x")\n    return -q'))
+    assert "tail_force cannot be compiled" in refusal(tmp_path, BRUSH.replace("s.tail_position)", "s.tail_place)"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [

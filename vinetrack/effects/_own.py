@@ -82,9 +82,9 @@ def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
         effect = load_effect(path)
         if effect.name in found:
             raise EffectError(f"{path}: there is another effect named {effect.name!r}, {found[effect.name].path}.")
-        faults = list(behaviour_faults(effect))
-        if faults:
-            raise EffectError(f"{path}: {faults[0]}.")
+        fault = next(behaviour_faults(effect), None)
+        if fault is not None:
+            raise EffectError(f"{path}: {fault}.")
         found[effect.name] = effect
     return found
 
