@@ -69,14 +69,16 @@ def _options(
 
 @app.command()
 def check(experiment: ExperimentPath) -> None:
-    """Check the sheet, settings, tracks and videos, in seconds, before any work."""
+    """Check the sheet, settings, effects, tracks and videos, in seconds, before any work."""
     with _sentences(None):
         from vinetrack.experiment import check_experiment, format_problems
+        from vinetrack.stages.effects import model_problems
         from vinetrack.terminal import severity_first
         from vinetrack.video.survey import survey
         from vinetrack.workflow import find_experiment
 
-        problems = check_experiment(find_experiment(experiment), survey)
+        folder = find_experiment(experiment)
+        problems = [*check_experiment(folder, survey), *model_problems(folder)]
         for line in format_problems(problems):
             typer.echo(severity_first(line))
         if any(problem.severity == "error" for problem in problems):

@@ -53,6 +53,40 @@ def effects_of(experiment: Path) -> Mapping[str, Effect]:
         raise ExperimentError([Problem(message=str(error), file="experiment.yaml", column="effects")]) from None
 
 
+def model_problems(experiment: Path) -> list[Problem]:
+    """What is wrong with the effects that an experiment names, in its model, its candidates or as files of its own.
+
+    Nothing where it keeps to the base model, or cannot be read, which the check of the sheet says.
+    """
+    from vinetrack.effects import EffectError, find_effect
+    from vinetrack.experiment import read_experiment
+    from vinetrack.model.model import make_model
+    from vinetrack.model.rig import check_needs
+    from vinetrack.settings import BASE_EFFECTS
+
+    try:
+        read = read_experiment(experiment, strict=False)
+    except ExperimentError:
+        return []
+    settings = read.settings
+    if settings.model == BASE_EFFECTS and not settings.effects and not settings.candidates:
+        return []
+    if not all((experiment / path).exists() for path in settings.effects):
+        return []
+    column = "effects"
+    try:
+        own = effects_of(experiment)
+        column = "candidates"
+        for name in settings.candidates or ():
+            find_effect(name, own)
+        column = "model"
+        check_needs(make_model(settings.model, own), *read.trials)
+    except EffectError as error:
+        message, _, remedy = str(error).rstrip(".").partition(": ")
+        return [Problem(message=message, file="experiment.yaml", column=column, remedy=remedy)]
+    return []
+
+
 def write_picture(effect: Effect, path: Path) -> None:
     """Draw what an effect does to the reference vine; the file's ending says in which form."""
     from vinetrack.figures.effect_picture import draw_effect
