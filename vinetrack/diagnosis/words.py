@@ -175,7 +175,7 @@ def _ranking(one: Round) -> list[str]:
         rows.append(
             (
                 ("* " if candidate.in_answer_set else "  ") + candidate.effect,
-                f"{candidate.delta_chi2:.1f}",
+                f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
                 f"{candidate.sigma:.1f}",
                 sizes_in_words(candidate.numbers) or "",
                 candidate.status if not candidate.reason else candidate.reason,
