@@ -5,8 +5,8 @@
     vt.diagnose(vt.fit(vt.base_model(), campaign.pairs))
     campaign.truth.effects
 
-Every campaign follows from its kind and its seed alone. Seeds 0–999 are for tuning; seeds from 10000 on score, and
-nothing may be tuned on those.
+Every campaign follows from its kind and its seed alone. Seeds 0–899 are for tuning, 900–999 for
+the tests; seeds from 10000 on score, and nothing may be tuned on those.
 """
 
 from hidden.campaigns import Hidden, Truth, make
