@@ -17,8 +17,9 @@ Baselines on the same campaigns (`--methods`): `bic`, every candidate fitted alo
 correlation estimated; `bic_plain`, the same without either; `sindy`, sparse regression on differentiated positions
 (`benchmarks/hidden/sindy.py`; needs `pip install pysindy`).
 
-With `--rows` every answer is kept as it comes; begun again, what is there is not asked again. Seeds 0–899 tune, 900–999 are
-the tests'; seeds from 10000 score, and nothing may be tuned on them. `--verify` holds the two simulators against each other, noise-free.
+With `--rows` every answer is kept as it comes; begun again, what is there is not asked again. Seeds 0–899 tune,
+900–999 are the tests', seeds from 10000 score: nothing may be tuned on those. `--verify` holds the two simulators
+against each other, noise-free.
 """
 
 from __future__ import annotations
