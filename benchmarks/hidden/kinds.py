@@ -97,7 +97,7 @@ def _refill(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
 
 
 def _pressure_damping(draw: Draw, scene: Scene) -> Hidden:
-    beta = _either(draw, 3e-6, min(1.5e-5, 0.7 / scene.highest_Pa))
+    beta = _either(draw, 2e-6, min(1e-5, 0.7 / scene.highest_Pa))
     return Hidden({"beta": beta}, {"pressure_damping.beta": beta})
 
 
@@ -125,19 +125,19 @@ def _time_base(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
 
 
 def _pressure_gain(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
-    eps = _either(draw, 0.02, 0.07)
+    eps = _either(draw, 0.01, 0.05)
     return Hidden(values={"pressure_gain.eps": eps}, pressure_gain=eps)
 
 
 def _pressure_gauge(draw: Draw, scene: Scene) -> Hidden:
-    delta = _either(draw, 400, 2500)
+    delta = _either(draw, 400, 2000)
     if delta < -0.3 * scene.weakest_Pa:
         delta = -delta
     return Hidden(values={"pressure_gauge.delta": delta}, pressure_offset_Pa=delta)
 
 
 def _area_scale(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
-    eps = _either(draw, 0.01, 0.07)
+    eps = _either(draw, 0.01, 0.05)
     return Hidden(values={"area_scale.eps": eps}, diameter=eps)
 
 
@@ -151,8 +151,8 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "supply_refill": (_refill, Wants(chamber=True, wide_chamber=True)),
     "leak": (_one("leak.rate", "leak_rate", 0.005, 5.0, lambda s: s.slowest_m_s / (3 * s.longest_m)), Wants()),
     "inlet_loss": (_one("inlet_loss.K", "K", 0.05, 3.0), Wants(inlet=True, fast=True)),
-    "gas_inertia": (_one("gas_inertia.factor", "gas", 0.7, 1.3), Wants(fast=True, quiet=True)),
-    "air_drag": (_one("air_drag.C_D", "C_D", 1.0, 6.0), Wants(fast=True, quiet=True)),
+    "gas_inertia": (_one("gas_inertia.factor", "gas", 0.8, 1.2), Wants(fast=True, quiet=True)),
+    "air_drag": (_one("air_drag.C_D", "C_D", 0.7, 3.0), Wants(fast=True, quiet=True)),
     "fold_inertia": (_one("fold_inertia.eta", "eta", 0.2, 1.0), Wants(fast=True)),
     "linear_damping": (_one("linear_damping.b", "b", 0.01, 1.0, lambda s: 0.5 * s.weakest_B), Wants()),
     "pressure_damping": (_pressure_damping, Wants(quiet=True)),
@@ -162,15 +162,15 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     ),
     "capstan_friction": (_capstan, Wants()),
     "payload_friction": (
-        _one("payload_friction.mu_p", "mu_p", 0.2, 2.0, lambda s: 0.5 * s.weakest_N / (s.payload_kg * 9.81)),
+        _one("payload_friction.mu_p", "mu_p", 0.1, 1.5, lambda s: 0.5 * s.weakest_N / (s.payload_kg * 9.81)),
         Wants(payload=True),
     ),
     "payload_drag": (
-        _one("payload_drag.drag_area", "drag_area", 5e-4, 4e-3),
+        _one("payload_drag.drag_area", "drag_area", 2e-4, 2e-3),
         Wants(payload=True, fast=True, quiet=True),
     ),
     "wall_stretch": (_one("wall_stretch.kappa", "kappa", 5e-7, 1e-5), Wants()),
-    "tail_stretch": (_one("tail_stretch.compliance", "compliance", 2e-9, 1e-7), Wants()),
+    "tail_stretch": (_one("tail_stretch.compliance", "compliance", 2e-8, 1e-7), Wants()),
     "latch_release": (_latch, Wants()),
     "length_scale": (_length_scale, Wants()),
     "time_base": (_time_base, Wants()),
@@ -179,7 +179,7 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "area_scale": (_area_scale, Wants(quiet=True)),
     "perspective": (_perspective, Wants()),
 }
-"""Every effect of the catalogue that a vine released at its full pressure can show."""
+"""Every effect of the catalogue that a vine released at its full pressure can show, at sizes that are plausible."""
 
 MEASUREMENT = ("length_scale", "time_base", "pressure_gain", "pressure_gauge", "area_scale", "perspective")
 
