@@ -258,12 +258,12 @@ def _ranking(finding: Finding, blind: Mapping[str, str]) -> list[Candidate]:
                     effect.name,
                     effect.kind,
                     SCREENED,
-                    math.nan if questions.far_off else questions.promise(effect.name),
+                    math.nan if questions.lost else questions.promise(effect.name),
                     z,
                     _predicted(questions, effect, place),
                     in_answer_set=effect.name in finding.answer,
                     reason=_behind(finding, effect.name),
-                    largest={} if questions.far_off else largest,
+                    largest={} if questions.lost else largest,
                 )
             )
     rows += [
@@ -290,7 +290,7 @@ def _known(value: float) -> float:
 
 def _predicted(questions: Questions, effect: Effect, place: int) -> tuple[Number, ...]:
     """The size that the sensitivities predict, with its error; nothing where the model is too far off for that."""
-    if place < 0 or not effect.parameters or questions.far_off:
+    if place < 0 or not effect.parameters or questions.lost:
         return ()
     size, sigma = float(questions.scores.size[place]), float(questions.scores.sigma[place])
     parameter = questions.answers.shapes[place].size

@@ -33,6 +33,10 @@ the gate is stricter, for a pair of effects can imitate what no catalogue holds.
 FAR_OFF = 4.0
 """χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
 
+LOST = 3e-3
+"""Part of its travel by which the median trial is missed where a fit has not found its way. A tracker whose frames
+agree to a hundredth of a millimetre may err by a few tenths along the way: far beyond their noise, and no physics."""
+
 TESTABLE_SIGMAS = 3.0
 """An effect whose largest plausible size would show by less than this cannot be tested here."""
 
@@ -83,7 +87,7 @@ class Questions:
     def something(self) -> bool:
         """Whether anything is missing, known or not."""
         return bool(
-            self.far_off
+            self.lost
             or self.structure.p < 0.1 * self.level
             or (self.possible.size and self.possible.max() > self.threshold)
         )
@@ -92,6 +96,12 @@ class Questions:
     def far_off(self) -> bool:
         """Whether the fit misses more than any noise could."""
         return self.found.chi2_per_dof > FAR_OFF
+
+    @property
+    def lost(self) -> bool:
+        """Whether it misses so much of the growth besides that no tracker's slow errors explain it either."""
+        parts = [trial.rms_m / max(float(np.ptp(trial.lead_position_m)), 1e-9) for trial in self.found.trials]
+        return self.far_off and float(np.median(parts)) > LOST
 
     @cached_property
     def gains(self) -> tuple[Floats, Floats]:

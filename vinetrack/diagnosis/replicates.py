@@ -17,6 +17,9 @@ from vinetrack.model.left_out import FEWEST_AT_REST
 from vinetrack.records import Floats
 from vinetrack.video.position_noise import rest_points
 
+TELLS_APART = 0.05
+"""Of a shift in time and one in position, the least singular value by which both are found."""
+
 ALIGNMENTS = 5
 """Rounds of shifting every replicate onto their mean; each round leaves about a tenth of what the one before left."""
 
@@ -143,7 +146,10 @@ def _about_their_mean(trials: Sequence[TrialFit], reference: TrialFit, time_s: F
             if np.count_nonzero(use) > 2:
                 free = 0.0 if at_rest[i] else 1.0
                 design = np.column_stack([-speed_m_s[use], np.full(np.count_nonzero(use), free)])
-                later_s, higher_m = np.linalg.lstsq(design, deviation_m[i, use], rcond=1e-9)[0]
+                # At constant speed later and higher are one: what only their difference could explain is left alone.
+                scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+                found = np.linalg.lstsq(design / scale, deviation_m[i, use], rcond=TELLS_APART)[0]
+                later_s, higher_m = found / scale
                 release_s[i] += np.clip(later_s, -2 * frames_s[i], 2 * frames_s[i])
                 origin_m[i] += higher_m
     return deviation_m

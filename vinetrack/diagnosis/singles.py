@@ -76,7 +76,21 @@ class Search:
         chosen = [one for one in leaders if one.deviance - best.deviance < reach or one in alike]
         for climb in chosen[: self.most_fitted + 3 * all_of_them]:
             self._fit(climb)
+        self._fit_what_is_contained()
         return list(self.fitted.values())
+
+    def _fit_what_is_contained(self) -> None:
+        """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
+        for one in list(self.fitted.values()):
+            for name in one.effects[-1].replaces:
+                simpler = [effect for effect in self.questions.effects if effect.name == name]
+                if not simpler:
+                    continue
+                values = {key: value for key, value in one.fit.model.values.items() if "." in key}
+                sizes = {key.split(".")[1]: value for key, value in values.items() if key.split(".")[0] in one.names}
+                kept = {key: value for key, value in values.items() if key.split(".")[0] in self.questions.found.model}
+                own = {f"{name}.{p.name}": sizes[p.name] for p in simpler[0].parameters if p.name in sizes}
+                self._fit(Climb((simpler[0],), math.nan, {**kept, **own}))
 
     def _worth_a_climb(self) -> list[str]:
         top = self.questions.promise(self.names[0]) if self.names else 0.0
@@ -114,6 +128,7 @@ class Search:
             if (near or alike or all_of_them) and name not in self.fitted and name not in self.silent:
                 self.report(f"fitting {name}")
                 self._fit_from_prediction(name)
+        self._fit_what_is_contained()
         return list(self.fitted.values())
 
     def _fit_from_prediction(self, name: str) -> None:

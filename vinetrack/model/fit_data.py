@@ -30,9 +30,22 @@ frame across the end of growth is a corner that no sensitivity describes. What l
 
 FRAMES_BEHIND_END = 2
 
+VAGUE, FEWEST_CLEAR, MOSTLY = 3.0, 0.3, 0.5
+"""A point is left out whose stated error exceeds that of the better half by this factor, as long as this part stays;
+the whole rest before the motion, where more than the last part of it is left out."""
+
 
 class FitError(ValueError):
     """A fit cannot be made; the message is one sentence with a remedy."""
+
+
+@dataclass(frozen=True)
+class VagueRest:
+    """A rest before the motion seen only vaguely, such as behind a door: when it ended, where it was, how surely."""
+
+    release_s: float
+    origin_m: float
+    sigma_m: float
 
 
 @dataclass(frozen=True)
@@ -41,7 +54,8 @@ class FitTrial:
 
     `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0
     where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
-    `trace` holds time, s, on the clock of the track and gauge pressure, Pa.
+    `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
+    pressure, Pa.
     """
 
     trial: Trial
@@ -52,6 +66,7 @@ class FitTrial:
     noise_m: float
     correlation: float
     trace: tuple[Floats, Floats] | None = None
+    vague_rest: VagueRest | None = None
 
     @cached_property
     def frame_s(self) -> float:
@@ -83,6 +98,8 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         although its pressure cannot do it.
     """
     usable = track.usable & ~_nearing_end(trial, track)
+    vague, vague_rest = _vague(track, usable)
+    usable &= ~vague
     time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
     if time_s.size < FEWEST_POINTS:
         raise FitError(f"{time_s.size} usable points, at least {FEWEST_POINTS} are needed")
@@ -113,7 +130,35 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         noise_m=noise_m,
         correlation=correlation,
         trace=trace,
+        vague_rest=vague_rest,
     )
+
+
+def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], VagueRest | None]:
+    """Points whose own stated error is several times that of the others, such as an edge half behind the door.
+
+    And what the rest before the motion still says where it is among them.
+    They would tell a tenth of what another tells, and count as much: one noise holds for all points of a trial.
+    """
+    sigma_m = track.lead_position_sigma_m
+    known = usable & np.isfinite(sigma_m)
+    if not known.any():
+        return np.zeros(usable.size, dtype=bool), None
+    better_m = sigma_m[known & (sigma_m <= np.median(sigma_m[known]))]
+    vague = known & (sigma_m > VAGUE * np.median(better_m))
+    places = np.flatnonzero(usable)
+    at_rest = places[: rest_points(track.lead_position_m[places])]
+    rest = None
+    if 0 < at_rest.size < places.size and np.mean(vague[at_rest]) > MOSTLY:
+        # The few that are left of such a rest would hold the origin alone.
+        vague[at_rest] = True
+        rest = VagueRest(
+            release_s=float(track.time_s[at_rest[-1]]),
+            origin_m=float(np.median(track.lead_position_m[at_rest])),
+            sigma_m=float(np.median(sigma_m[at_rest])),
+        )
+    enough = np.count_nonzero(usable & ~vague) >= max(FEWEST_POINTS, FEWEST_CLEAR * np.count_nonzero(usable))
+    return (vague, rest) if enough else (np.zeros(usable.size, dtype=bool), None)
 
 
 def _undriven(trial: Trial) -> bool:

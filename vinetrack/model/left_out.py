@@ -30,6 +30,9 @@ from vinetrack.records import Floats, Track, Trial
 if TYPE_CHECKING:
     from vinetrack.model.fit_result import Fit, TrialFit
 
+TOLD_APART = 1e-4
+"""Least eigenvalue, of a matrix of unit diagonal, at which release and origin are both found."""
+
 MOST_STEPS = 20
 SETTLED_FRAMES = 1e-3
 FEWEST_AT_REST = 5
@@ -96,7 +99,7 @@ def laid_on(found: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[P
 
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
     """Trials filmed long enough at rest to say where they began, shape (n_trials,)."""
-    return np.array([item.n_rest >= FEWEST_AT_REST for item in data], dtype=bool)
+    return np.array([item.n_rest >= FEWEST_AT_REST or item.vague_rest is not None for item in data], dtype=bool)
 
 
 def _prepared(trial: Trial, track: Track) -> FitTrial:
@@ -135,13 +138,19 @@ def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> t
     own, square = own.copy(), np.zeros((len(data), 2, 2))
     own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
     for i in np.flatnonzero(held).tolist():
-        own[i, ORIGIN] = np.mean(data[i].lead_position_m[: data[i].n_rest])
+        vague = data[i].vague_rest
+        own[i, ORIGIN] = np.mean(data[i].lead_position_m[: data[i].n_rest]) if vague is None else vague.origin_m
     moving = np.arange(len(data))
     for _ in range(MOST_STEPS):
         sums = _sums(predictor, own, moving, rho)
         square[moving] = sums[:, :2, :2]
         sums[held[moving], ORIGIN, :] = sums[held[moving], :, ORIGIN] = 0.0
-        step = np.einsum("nij,nj->ni", np.linalg.pinv(sums[:, :2, :2], hermitian=True), sums[:, :2, -1])
+        # At constant speed a later release and a higher origin are one: brought to a unit diagonal that is seen.
+        scale = 1 / np.sqrt(np.maximum(np.einsum("nkk->nk", sums[:, :2, :2]), 1e-300))
+        scale[held[moving], ORIGIN] = 0.0
+        even = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
+        inverse = np.linalg.pinv(even, rcond=TOLD_APART, hermitian=True) * scale[:, :, None] * scale[:, None, :]
+        step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])
         reach = 2 * frames[moving]
         step[:, RELEASE] = np.clip(step[:, RELEASE], -reach, reach)
         own[moving, :2] += step

@@ -96,10 +96,12 @@ def make_frame(predictor: Predictor, own: Floats) -> Frame:
     durations = np.array([item.time_s[-1] - item.time_s[0] for item in data])
     spans = np.array([np.ptp(item.lead_position_m) for item in data])
     frames = np.array([item.frame_s for item in data])
-    rests = np.array([item.n_rest > 0 for item in data])
+    rests = np.array([item.n_rest > 0 or item.vague_rest is not None for item in data])
+    vague = np.array([0.0 if item.vague_rest is None else item.vague_rest.sigma_m for item in data])
     release_sd = np.where(rests, RELEASE_ROOM_FRAMES * frames, 3 * durations)
     noise = np.array([item.noise_m for item in data])
-    origin_sd = np.where(rests, np.maximum(ORIGIN_ROOM_SIGMAS * noise, 1e-4 * spans), 3 * spans)
+    room = np.maximum(ORIGIN_ROOM_SIGMAS * np.maximum(noise, vague), 1e-4 * spans)
+    origin_sd = np.where(rests, room, 3 * spans)
     return Frame(
         index=layout.index,
         feels=np.column_stack([predictor.feels_pressure, predictor.feels_damping]),

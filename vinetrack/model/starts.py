@@ -27,6 +27,8 @@ def first_own(data: Sequence[FitTrial]) -> Floats:
         if item.n_rest > 0:
             own[i, RELEASE] = item.time_s[item.n_rest - 1]
             own[i, ORIGIN] = np.mean(item.lead_position_m[: max(item.n_rest - 1, 1)])
+        elif item.vague_rest is not None:
+            own[i, RELEASE], own[i, ORIGIN] = item.vague_rest.release_s, item.vague_rest.origin_m
         else:
             own[i, RELEASE], own[i, ORIGIN] = item.time_s[0], item.lead_position_m[0]
     return own
@@ -148,7 +150,7 @@ def align(data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Fl
     )
     best, misfit = own.copy(), np.zeros(len(data))
     for i, (item, (time_s, y)) in enumerate(zip(data, thin, strict=True)):
-        if item.n_rest > 0:
+        if item.n_rest > 0 or item.vague_rest is not None:
             shifts = item.frame_s * np.arange(-6, 3.01, 0.5)
         else:
             shifts = -np.geomspace(0.25 * item.frame_s, durations[i], 30)
