@@ -102,7 +102,8 @@ def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: p
 
 
 def test_a_clip_beside_the_page_is_linked_and_one_plays_in_it() -> None:
-    html = page(clips={"a": "overlays/a.mp4"}, clip=Clip("a", b"film", EVIL))
+    html = page(clips={"a": "overlays/a.mp4"}, clip=Clip("a", b"film", EVIL, b"frame"))
+    assert html.count("data:image/webp;base64,ZnJhbWU=") == 2
     assert '<a href="overlays/a.mp4">Its clip, beside this page</a>' in html
     assert 'src="data:video/mp4;base64,ZmlsbQ=="' in html
     assert EVIL not in html

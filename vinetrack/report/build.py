@@ -38,11 +38,15 @@ LARGEST_CLIP_BYTES = 2_500_000
 
 @dataclass(frozen=True)
 class Clip:
-    """A clip that plays in the page: the trial, the MP4 file, and what it shows."""
+    """A clip that plays in the page: the trial, the MP4 file, what it shows, and a WebP picture to stand for it.
+
+    The picture is seen until the clip plays, and on paper.
+    """
 
     trial: str
     mp4: bytes
     caption: str
+    poster: bytes = b""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,8 +138,13 @@ def _figures(content: ReportContent) -> dict[str, Any]:
 def _clip(clip: Clip | None) -> dict[str, str] | None:
     if clip is None or len(clip.mp4) > LARGEST_CLIP_BYTES:
         return None
-    source = "data:video/mp4;base64," + base64.b64encode(clip.mp4).decode("ascii")
-    return {"trial": clip.trial, "caption": clip.caption, "source": source}
+    source, poster = (base64.b64encode(part).decode("ascii") for part in (clip.mp4, clip.poster))
+    return {
+        "trial": clip.trial,
+        "caption": clip.caption,
+        "source": f"data:video/mp4;base64,{source}",
+        "poster": f"data:image/webp;base64,{poster}" if poster else "",
+    }
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:

@@ -190,7 +190,24 @@ def _clip(results: Results, diagnosed: Diagnosed | None, trials: pd.DataFrame) -
         edges += ", where the model that you came with has it (vermillion)"
         edges += f", and where it is with {diagnosed.added} (blue)" if diagnosed.added else ""
     caption = f"The recording, slowed down, with {edges}.{where}"
-    return Clip(name, results.overlay(name).read_bytes(), caption)
+    path = results.overlay(name)
+    return Clip(name, path.read_bytes(), caption, _poster(path))
+
+
+def _poster(path: Path) -> bytes:
+    """A frame two thirds into a clip, where models have come apart, as WebP; nothing of one that cannot be read."""
+    import io
+
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            pictures = [frame.to_image() for frame in container.decode(video=0)]
+    except av.error.FFmpegError:
+        return b""
+    file = io.BytesIO()
+    pictures[2 * len(pictures) // 3].save(file, "WEBP", quality=60)
+    return file.getvalue()
 
 
 def _recording(results: Results, name: str) -> Recording:
