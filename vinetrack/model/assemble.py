@@ -215,7 +215,7 @@ def _messages(
     if chi2 > MISSES:
         found.append(
             f"the model leaves {math.sqrt(chi2):.3g} times the noise of the tracks, with B and pressure of every trial"
-            " free to help: something is missing"
+            " free to help: something is missing, or tracks err slowly by more than their noise"
         )
     return found
 
