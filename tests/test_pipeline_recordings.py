@@ -177,11 +177,21 @@ def test_the_report_shows_every_strip_and_the_calibration(filmed: Filmed) -> Non
     for name in (*GOOD, "part"):
         assert f'aria-label="Strip of {name} with its tracked edge"' in page
         assert (filmed.results / "figures" / f"strip_{name}.png").read_bytes().startswith(b"\x89PNG")
-    axis = json.loads((filmed.results / "analysed" / f"{GOOD[0]}.json").read_text())["axis"]
+    axis = json.loads((filmed.results / "analysed" / f"{next(iter(GOOD))}.json").read_text())["axis"]
     assert np.hypot(*np.subtract(axis["to_px"], axis["from_px"])) > 100
     assert "ChArUco board" in page
     assert "kept apart from the random error" in page
     assert filmed.said.stdout.strip().splitlines()[-1] == "Report: results/vines/report.html"
+
+
+@pytest.mark.pipeline
+def test_a_recording_of_every_condition_has_a_clip_and_one_plays_in_the_report(filmed: Filmed) -> None:
+    tracked = {name: row["condition"] for name, row in filmed.rows.items() if row["status"] in ("ok", "warning")}
+    clips = [path.stem for path in (filmed.results / "overlays").glob("*.mp4")]
+    assert sorted(tracked[name] for name in clips) == sorted(set(tracked.values()))
+    page = (filmed.results / "report.html").read_text(encoding="utf-8")
+    assert page.count('src="data:video/mp4;base64,') == 1
+    assert all(f'href="overlays/{name}.mp4"' in page for name in clips)
 
 
 @pytest.mark.pipeline

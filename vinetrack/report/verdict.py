@@ -188,7 +188,7 @@ def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
     key, what = "rms_left_out_m", "Error on conditions left out"
     if not math.isfinite(float(first[key])):
         key, what = "rms_in_sample_m", "Error of position"
-    before, floor = 1e3 * float(first[key]), 1e3 * float(first["floor_m"])
+    before, floor = 1e3 * float(first[key]), 1e3 * float(last["floor_m"])
     answer = f"{number(before)} mm"
     if len(ladder) > 1:
         answer = f"{number(before)} → {number(1e3 * float(last[key]))} mm"
