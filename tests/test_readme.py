@@ -1,65 +1,85 @@
-"""What the README shows works as it stands there."""
+"""README and docs: links and pictures lead somewhere, commands exist, nothing names the machine it was written on."""
 
 from __future__ import annotations
 
-import json
 import re
+import shlex
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+import typer.main
+from doc_commands import Shown, pieces
 
 from vinetrack.cli import app
-from vinetrack.effects._own import own_effects
-from vinetrack.experiment import read_experiment
-from vinetrack.stages.tracks import model_of
 
-README = Path(__file__).parents[1] / "README.md"
-SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\na,a.csv,12,100,300,20,3\n"
-
-
-def block(language: str) -> str:
-    found = re.findall(rf"^```{language}\n(.*?)^```", README.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    assert len(found) == 1
-    return str(found[0])
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+GUIDE = ("tutorial", "own_effect", "verdicts", "limits", "physics_tracker", "film")
+LARGEST_PICTURE_BYTES = 200_000
+COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
-@pytest.fixture
-def experiment(tmp_path: Path) -> Path:
-    """A folder with the effect and the settings as the README writes them."""
-    (tmp_path / "spring_line.py").write_text(block("python"), encoding="utf-8")
-    (tmp_path / "experiment.yaml").write_text(block("yaml"), encoding="utf-8")
-    (tmp_path / "trials.csv").write_text(SHEET, encoding="utf-8")
-    (tmp_path / "a.csv").write_text("time_s,position_m\n" + "".join(f"{i / 1000},{i / 1e4}\n" for i in range(20)))
-    return tmp_path
+def links(page: Path) -> list[str]:
+    found = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+    return [link.split("#")[0] for link in found if not link.startswith(("http:", "https:", "#"))]
 
 
-def test_its_own_effect_is_read_and_keeps_its_worked_number(experiment: Path) -> None:
-    assert list(own_effects([experiment / "spring_line.py"])) == ["spring_line"]
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_and_pictures_lead_somewhere(page: Path) -> None:
+    assert [link for link in links(page) if not (page.parent / link).exists()] == []
 
 
-def test_its_settings_put_that_effect_in_the_model(experiment: Path) -> None:
-    model = model_of(read_experiment(experiment))
-    assert model.names == ("pressure_drive", "gravity", "eversion_damping", "yield_pressure", "spring_line")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_pictures_are_small_and_open(page: Path) -> None:
+    from PIL import Image
+
+    for name in links(page):
+        if name.endswith((".png", ".webp")):
+            path = page.parent / name
+            assert path.stat().st_size < LARGEST_PICTURE_BYTES, name
+            with Image.open(path) as image:
+                assert min(image.size) > 200, name
 
 
-def test_its_effect_is_explained_by_the_command_it_names(experiment: Path) -> None:
-    done = CliRunner().invoke(app, ["effects", "spring_line", "--experiment", str(experiment)])
-    assert done.exit_code == 0, done.output
-    assert "stiffness of the line" in done.output
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_commands_on_the_page_exist_with_their_options(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    lines = [line.strip().removeprefix("$ ") for line in text.splitlines() if line.startswith("    ")]
+    for line in lines:
+        words = line.removeprefix(".venv/bin/")
+        if not words.startswith("vinetrack ") or words.endswith("\\"):
+            continue
+        arguments = shlex.split(words.split("|")[0])[1:]
+        command = COMMANDS.get(arguments[0])
+        if command is None:
+            assert arguments[0].startswith(("--", "0", "1")), line
+            continue
+        command = getattr(command, "commands", {}).get(arguments[1], command) if len(arguments) > 1 else command
+        known = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+        asked = {word.split("=")[0] for word in arguments if re.match(r"--\w", word)}
+        assert asked - {"--help"} <= known, line
 
 
-def test_its_effect_goes_through_every_stage_and_stands_in_the_provenance(experiment: Path, tmp_path: Path) -> None:
-    results = tmp_path / "results"
-    for arguments in (
-        ["tracks", experiment, results],
-        ["gather", experiment, results],
-        ["damping", results],
-        ["model", experiment, results],
-        ["figures", experiment, results, "--settings", '{"figures": {"dpi": 50}}'],
-        ["report", experiment, results],
-    ):
-        done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
-        assert done.exit_code == 0, done.output
-    assert "spring_line" in json.loads((results / "fit.json").read_text())["model"]
-    assert "spring_line.py" in json.loads((results / "provenance.json").read_text())["inputs"]
+def test_every_page_of_the_docs_is_reached_from_the_readme() -> None:
+    assert {page.name for page in PAGES[1:]} <= {Path(link).name for link in links(PAGES[0])}
+
+
+def test_the_readme_is_short_and_shows_a_result_and_every_command_a_person_gives() -> None:
+    text = PAGES[0].read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    assert "![" in text.split("\n## ")[0]
+    for name, command in COMMANDS.items():
+        if command.rich_help_panel is None or "Stages" not in str(command.rich_help_panel):
+            assert f"`{name}" in text, name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_no_page_names_a_folder_of_the_machine_it_was_written_on(page: Path) -> None:
+    assert re.findall(r"(?<![\w.])/(?:tmp|home|root|work|Users)\b", page.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("name", ["tutorial", "own_effect", "verdicts"])
+def test_every_command_that_a_page_runs_shows_what_it_prints(name: str) -> None:
+    shown = [piece for piece in pieces((ROOT / "docs" / f"{name}.md").read_text("utf-8")) if isinstance(piece, Shown)]
+    assert shown
+    assert [one.lines[0] for one in shown if not one.output] == []
