@@ -73,6 +73,22 @@ def test_what_is_missing_comes_with_how_sure_how_large_and_what_it_did() -> None
     assert found["Damping exponent"].answer == "n = 0.3700 ± 0.0040"
 
 
+@pytest.mark.parametrize(
+    ("answers", "words"),
+    [
+        (("reservoir_depletion",), "the only one of 3 candidates that mends it"),
+        (("air_drag", "inlet_loss"), "2 of 4 candidates fit alike"),
+    ],
+)
+def test_where_no_other_was_fitted_it_says_of_how_many_it_is_the_answer(answers: tuple[str, ...], words: str) -> None:
+    content = diagnosis("missing" if len(answers) == 1 else "ambiguous")
+    rows = [candidate(name, 400.0, in_answer_set=True) for name in answers]
+    rows += [candidate(name, None, status="screened") for name in ("leak", "gas_inertia")]
+    rows.append(candidate("payload_drag", None, status="not testable here"))
+    content["rounds"][0]["ranking"] = rows
+    assert facts(content, None)[0].note == words
+
+
 def test_two_effects_are_named_in_order_each_with_its_size() -> None:
     content = diagnosis(effects=["reservoir_depletion", "tail_friction"])
     content["parameters"].append(number("tail_friction.f", "f", 3.0, 0.2, "N/m"))

@@ -120,7 +120,9 @@ def _sure(diagnosis: Mapping[str, Any], ranking: Sequence[Mapping[str, Any]]) ->
     best = max(inside, key=lambda row: float(row["delta_chi2"]), default=None)
     if best is None:
         return None
-    note = f"{len(tested)} candidates were tried"
+    tried = sum(row.get("status") != "not testable here" for row in ranking)
+    note = f"the only one of {tried} candidates that mends it" if tried > 1 else "the only candidate"
+    note = f"{len(inside)} of {tried} candidates fit alike" if len(inside) > 1 else note
     rival = max(others, key=lambda row: float(row["delta_chi2"]), default=None)
     if rival is not None:
         behind = float(best["delta_chi2"]) - float(rival["delta_chi2"])
