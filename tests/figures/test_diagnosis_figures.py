@@ -142,6 +142,8 @@ def test_one_that_was_not_fitted_is_as_long_as_its_score_and_one_that_makes_it_w
     ).assign(sigma=[-4.1, -7.0])
     (ax,) = draw_candidates([("q", table)]).axes
     assert [bar.get_width() for bar in ax.patches] == [7.0, 0.0]
+    wrong_sign = ranking(("fold_inertia", "physical", "screened", 900.0, False)).assign(sigma=0.0)
+    assert draw_candidates([("q", wrong_sign)]).axes[0].patches[0].get_width() == 0
 
 
 def test_what_is_not_plausible_is_said_beside_its_size() -> None:

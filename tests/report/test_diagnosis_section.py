@@ -124,6 +124,15 @@ def test_adequate_says_what_could_still_hide() -> None:
     assert facts(diagnosis("adequate"), None)[0].question == "Most suspicious"
 
 
+def test_the_most_suspicious_is_so_by_its_score_not_by_what_a_wrong_sign_would_gain() -> None:
+    content = diagnosis("adequate")
+    wrong = candidate("fold_inertia", 900.0, status="screened", sigma=0.0)
+    right = candidate("air_drag", 2.0, status="screened", sigma=1.4)
+    content["rounds"][0]["ranking"] = [wrong, right]
+    fact = facts(content, None)[0]
+    assert (fact.answer, fact.note) == ("1.4 σ", "the best of 2 candidates: air drag")
+
+
 def test_unexplained_names_the_nearest_candidate_and_why_it_is_not_the_answer() -> None:
     fact = facts(diagnosis("unexplained"), None)[0]
     assert (fact.question, fact.answer) == ("Nearest candidate", "leak")

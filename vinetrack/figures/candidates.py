@@ -60,7 +60,10 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
 def _drawable(table: pd.DataFrame) -> pd.DataFrame:
     """Rows with a height, the answer first and then the highest."""
     gain = np.sqrt(np.maximum(table["delta_chi2"].to_numpy(dtype=float), 0.0))
-    height = np.where(np.isfinite(gain), gain, np.abs(table["sigma"].to_numpy(dtype=float)))
+    score = np.abs(table["sigma"].to_numpy(dtype=float))
+    # What was only predicted may gain with the wrong sign, or where the noise was taken too small: its score knows.
+    fitted = (table["status"] == "refitted").to_numpy() & np.isfinite(gain)
+    height = np.where(fitted | ~np.isfinite(score), gain, score)
     ranked = table.assign(height=height, in_answer_set=table["in_answer_set"].astype(bool))
     known = ranked[np.isfinite(height)]
     return known.sort_values(["in_answer_set", "height"], ascending=False, kind="stable").head(MAX_ROWS)

@@ -111,7 +111,10 @@ def _sure(diagnosis: Mapping[str, Any], ranking: Sequence[Mapping[str, Any]]) ->
     others = [row for row in tested if not row.get("in_answer_set")]
     best = max(tested, key=lambda row: float(row["delta_chi2"]), default=None)
     if verdict == "adequate":
-        note = f"the best of {len(tested)} candidates: {plain(best['effect'])}" if best else ""
+        # By the score: what was only predicted may gain much with the wrong sign, and that counts for nothing.
+        scored = [row for row in ranking if known(row.get("sigma"))]
+        best = max(scored, key=lambda row: abs(float(row["sigma"])), default=None)
+        note = f"the best of {len(scored)} candidates: {plain(best['effect'])}" if best else ""
         return Fact("Most suspicious", f"{_sigmas(best)} σ", note) if best else None
     if verdict == "unexplained" and best is not None:
         note = f"{_sigmas(best)} σ better" + (f", but {best['reason']}" if best.get("reason") else "")
