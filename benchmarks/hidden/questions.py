@@ -18,6 +18,9 @@ from vinetrack.model.fit import FitError
 from vinetrack.model.fit_result import Fit, Number
 
 Row = dict[str, object]
+TIED = 9.0
+"""Δχ² within which the data do not decide between two hypotheses, each fitted alone."""
+
 OUTSIDERS = Path(__file__).with_name("outsiders")
 
 
@@ -155,7 +158,7 @@ def ask_bic(kind: str, seed: int, scatter: bool = True) -> Row:
         warnings.simplefilter("ignore")
         base = vt.fit(vt.base_model(), campaign.pairs, profile=False, **plain)
         points = sum(trial.time_s.size for trial in base.trials)
-        scores = {"": _bic(base, points)}
+        scores, chi2 = {"": _bic(base, points)}, {}
         for effect in catalogue().values():
             if effect.kind == "base" or effect.name == "static_yield":
                 continue
@@ -163,11 +166,11 @@ def ask_bic(kind: str, seed: int, scatter: bool = True) -> Row:
                 after = vt.refit(base, base.model + effect, hold_spreads=not scatter, hold_noise=not scatter)
             except (FitError, EffectError):
                 continue
-            scores[effect.name] = _bic(after, points)
+            scores[effect.name], chi2[effect.name] = _bic(after, points), -2 * after.log_likelihood
     best = min(scores, key=lambda name: scores[name])
     row |= {**_spent(begun, work), "verdict": _named(best), "answer": best, "effects": best}
-    near = [name for name in scores if scores[name] < scores[best] + 9]
-    return row | {"tied": "|".join(sorted(near, key=lambda name: scores[name]))}
+    tied = [name for name in chi2 if chi2[name] < min(chi2.values()) + TIED]
+    return row | {"tied": "|".join(sorted(tied, key=lambda name: chi2[name]))}
 
 
 def _named(best: str) -> str:
@@ -203,9 +206,36 @@ def ask_sindy(kind: str, seed: int) -> Row:
     return row | {**_spent(begun, work), "verdict": verdict, "answer": "|".join(names), "effects": "+".join(names)}
 
 
+def ask_left_out(kind: str, seed: int) -> Row:
+    """Error on left-out conditions with everything added that was found, against that of the true model."""
+    from vinetrack.diagnosis.ladder import ladder
+
+    campaign = make(kind, seed)
+    row = {"method": "left_out", **identity(campaign)}
+    begun, work = time.perf_counter(), time.process_time()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        said = vt.diagnose(list(campaign.pairs), advice=False)
+        row |= {**_spent(begun, work), "verdict": said.verdict, "effects": "+".join(said.effects)}
+        if set(said.effects) and said.ladder is not None and not campaign.truth.in_trace:
+            errors = said.ladder["rms_left_out_m"]
+            true = ladder((said.fits[0], true_fit(said.fits[0], campaign.truth)), ("", "truth"))["rms_left_out_m"]
+            row |= {
+                "left_out_before": float(errors.iloc[0] / true.iloc[-1]),
+                "left_out_after": float(errors.iloc[-1] / true.iloc[-1]),
+            }
+    return row
+
+
 def ask_bic_plain(kind: str, seed: int) -> Row:
     """See `ask_bic`."""
     return ask_bic(kind, seed, scatter=False)
 
 
-METHODS = {"vinetrack": ask_vinetrack, "bic": ask_bic, "bic_plain": ask_bic_plain, "sindy": ask_sindy}
+METHODS = {
+    "vinetrack": ask_vinetrack,
+    "left_out": ask_left_out,
+    "bic": ask_bic,
+    "bic_plain": ask_bic_plain,
+    "sindy": ask_sindy,
+}

@@ -23,7 +23,8 @@ def judged(rows: pd.DataFrame) -> pd.DataFrame:
     `wrong_name` one single effect is named, and it is not there; `fault_as_physics` a fault of the measurement is
     hidden and the answer is physics only.
     """
-    out = rows.fillna({"hidden": "", "effects": "", "answer": "", "final": "", "final_answer": ""}).copy()
+    words = ["hidden", "effects", "answer", "final", "final_answer"]
+    out = rows.assign(**{name: rows[name].astype(object).where(rows[name].notna(), "") for name in words})
     truth = [set(filter(None, text.split("+"))) for text in out["hidden"]]
     answer = [set(filter(None, text.split("|"))) for text in out["answer"]]
     out["null"] = out["hidden"] == ""
@@ -52,6 +53,32 @@ def visible(rows: pd.DataFrame) -> pd.DataFrame:
     known = known[~known.index.duplicated()]
     keys = pd.MultiIndex.from_frame(rows[["kind", "seed"]])
     return rows.assign(**{name: known[name].reindex(keys).to_numpy() for name in ("sigma", "sigma_second")})
+
+
+def tied_sizes(rows: pd.DataFrame) -> pd.Series:
+    """How many hypotheses the data leave tied, from exhaustive refits (the rows of `bic`), by kind and seed."""
+    known = rows[(rows["method"] == "bic") & (rows["tied"].notna() & (rows["tied"] != ""))]
+    return known.set_index(["kind", "seed"])["tied"].str.split("|").str.len()
+
+
+def surplus(rows: pd.DataFrame) -> float:
+    """By how many names answer sets are larger, in the mean, than what the data leave tied; NaN where not known."""
+    tied = tied_sizes(rows)
+    own = singles(rows[(rows["method"] == "vinetrack") & (rows["set_size"] > 0)])
+    own = own[own["sigma"] >= CLEAR].set_index(["kind", "seed"])["set_size"]
+    return float((own - tied).dropna().mean())
+
+
+def left_out(rows: pd.DataFrame) -> pd.DataFrame:
+    """Errors on left-out conditions in parts of the true model's, before and after, where effects were added."""
+    known = rows[(rows["method"] == "left_out") & rows["left_out_after"].notna() & (rows["sigma"] >= CLEAR)]
+    names = {"left_out_before": "base model", "left_out_after": "effects added"}
+    return pd.DataFrame(
+        [
+            {"model": names[name], "n": len(known), "median": known[name].median(), "90 %": known[name].quantile(0.9)}
+            for name in names
+        ]
+    )
 
 
 def share(values: pd.Series) -> str:
