@@ -76,7 +76,7 @@ def test_what_is_missing_comes_with_how_sure_how_large_and_what_it_did() -> None
 @pytest.mark.parametrize(
     ("answers", "words"),
     [
-        (("reservoir_depletion",), "the only one of 3 candidates that mends it"),
+        (("reservoir_depletion",), "3 candidates were tried"),
         (("air_drag", "inlet_loss"), "2 of 4 candidates fit alike"),
     ],
 )

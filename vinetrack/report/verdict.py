@@ -124,7 +124,7 @@ def _sure(diagnosis: Mapping[str, Any], ranking: Sequence[Mapping[str, Any]]) ->
     if best is None:
         return None
     tried = sum(row.get("status") != "not testable here" for row in ranking)
-    note = f"the only one of {tried} candidates that mends it" if tried > 1 else "the only candidate"
+    note = f"{tried} candidates were tried" if tried > 1 else "it was the only candidate"
     note = f"{len(inside)} of {tried} candidates fit alike" if len(inside) > 1 else note
     rival = max(others, key=lambda row: float(row["delta_chi2"]), default=None)
     if rival is not None:
