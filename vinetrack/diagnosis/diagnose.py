@@ -31,7 +31,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.words import dropped_in_words, explain
+from vinetrack.diagnosis.words import dropped_in_words, explain, listed
 from vinetrack.effects import Effect, EffectError
 from vinetrack.model.fit import fit as fit_model
 from vinetrack.model.fit_data import FitError, Pairs, pairs_of
@@ -196,6 +196,9 @@ def _conclude(found: Fit, findings: Sequence[Finding], blind: Mapping[str, str])
     for after in findings[1:]:
         fits.append(after.questions.found)
     explanation = " ".join(one.explanation for one in rounds)
+    lacking = [name for name, why in blind.items() if "`" in why]
+    if lacking and any(one.verdict == UNEXPLAINED for one in rounds):
+        explanation += f" Not tried, because the sheet does not say what they need: {listed(lacking)}."
     return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits))
 
 
@@ -258,7 +261,7 @@ def _ranking(finding: Finding, blind: Mapping[str, str]) -> list[Candidate]:
                     effect.name,
                     effect.kind,
                     SCREENED,
-                    math.nan if questions.lost else questions.promise(effect.name),
+                    _promised(finding, effect.name, z),
                     z,
                     _predicted(questions, effect, place),
                     in_answer_set=effect.name in finding.answer,
@@ -273,6 +276,13 @@ def _ranking(finding: Finding, blind: Mapping[str, str]) -> list[Candidate]:
     ]
     order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
     return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_known(row.delta_chi2)))
+
+
+def _promised(finding: Finding, name: str, z: float) -> float:
+    """Fall of −2 ln L that the sensitivities promise; of an adequate model, what the score says."""
+    if finding.verdict == ADEQUATE:
+        return z**2
+    return math.nan if finding.questions.lost else finding.questions.promise(name)
 
 
 def _behind(finding: Finding, name: str) -> str:

@@ -22,6 +22,7 @@ from vinetrack.diagnosis.screen import (
     structure_of,
 )
 from vinetrack.effects import Effect
+from vinetrack.model.fit import lost
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.solve import track_correlation
 from vinetrack.records import Floats
@@ -32,10 +33,6 @@ the gate is stricter, for a pair of effects can imitate what no catalogue holds.
 
 FAR_OFF = 4.0
 """χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
-
-LOST = 3e-3
-"""Part of its travel by which the median trial is missed where a fit has not found its way. A tracker whose frames
-agree to a hundredth of a millimetre may err by a few tenths along the way: far beyond their noise, and no physics."""
 
 TESTABLE_SIGMAS = 3.0
 """An effect whose largest plausible size would show by less than this cannot be tested here."""
@@ -100,8 +97,7 @@ class Questions:
     @property
     def lost(self) -> bool:
         """Whether it misses so much of the growth besides that no tracker's slow errors explain it either."""
-        parts = [trial.rms_m / max(float(np.ptp(trial.lead_position_m)), 1e-9) for trial in self.found.trials]
-        return self.far_off and float(np.median(parts)) > LOST
+        return self.far_off and lost(self.found.predictor, self.found.solution)
 
     @cached_property
     def gains(self) -> tuple[Floats, Floats]:

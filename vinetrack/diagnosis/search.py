@@ -173,10 +173,10 @@ def full_fit(found: Fit, climb: Climb, best: float = -math.inf) -> Fit | None:
     for effect in climb.effects:
         model = model + effect
     try:
-        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False)
+        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT)
         if fit.converged or fit.log_likelihood < best - FAR_BEHIND:
             return fit
-        return refit(fit, most_iterations=MORE_OF_FIT, thorough=False)
+        return refit(fit, most_iterations=MORE_OF_FIT)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 
@@ -195,7 +195,7 @@ def from_other_starts(found: Fit) -> Fit:
 def without(found: Fit, other: Fit) -> Fit | None:
     """The model of a fit begun from the numbers of another fit, which holds it; None where it cannot be followed."""
     try:
-        return refit(other, found.model, most_iterations=FIRST_OF_FIT, thorough=False)
+        return refit(other, found.model, most_iterations=FIRST_OF_FIT)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 

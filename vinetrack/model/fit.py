@@ -10,6 +10,7 @@ its own, whose spreads are estimated: left out, they would be taken for missing 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -45,12 +46,15 @@ if TYPE_CHECKING:
 
 __all__ = ["FitError", "fit", "predict", "refit"]
 
+LOST = 3e-3
+"""Part of its growth by which the median trial is missed where a model is far off."""
+
 POOR_FIT = 3.0
 """χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried."""
 
 MOST_STARTS = 3
-ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 12
-GUIDING_SPREADS = (0.01, 0.03)
+ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 20
+GUIDING_SPREADS = (5e-4, 1e-3)
 
 
 def fit(
@@ -145,30 +149,52 @@ def _solve_from_scratch(predictor: Predictor, held: Held, watch: Watch | None, *
     if not found:
         raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
     best = min(found, key=_deviance)
-    if not (thorough and chi2_per_dof(predictor, best) > POOR_FIT):
+    if not lost(predictor, best):
         return best
-    for _, theta, own in starts:
-        guided = _guided(predictor, theta, own, held, watch)
-        if guided is not None:
-            best = min((best, guided), key=_deviance)
-        if not chi2_per_dof(predictor, best) > POOR_FIT:
-            break
-    return best
+    guided = [_guided(predictor, theta, own, held, watch) for _, theta, own in (starts if thorough else starts[:1])]
+    return _sane(predictor, best, [one for one in guided if one is not None])
+
+
+def lost(predictor: Predictor, solution: Solution) -> bool:
+    """Whether a solution is far from the tracks: beyond their noise, and by a visible part of the growth.
+
+    A tracker whose frames agree to a hundredth of a millimetre may err by a few tenths along the way: far beyond their
+    noise, and no reason to begin elsewhere.
+    """
+    if not chi2_per_dof(predictor, solution) > POOR_FIT:
+        return False
+    parts = [
+        math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(item.lead_position_m)), 1e-9)
+        for columns, item in zip(solution.columns, predictor.data, strict=True)
+    ]
+    return float(np.median(parts)) > LOST
+
+
+def _sane(predictor: Predictor, free: Solution, guided: list[Solution]) -> Solution:
+    """The best of solutions of which the first may have taken for slow noise what the others had to fit.
+
+    Noise of correlation 1 wanders as it likes, and makes anything likely. So where a solution is lost, likelihood only
+    chooses among those whose noise is as correlated as that of the tracks.
+    """
+    found = [one for one in guided if not lost(predictor, one)]
+    return min(found or guided or [free], key=_deviance)
 
 
 def _guided(predictor: Predictor, theta: Floats, own: Floats, held: Held, watch: Watch | None) -> Solution | None:
     """A solution led by what is missed: the noise is as correlated as in the tracks until the numbers have settled.
 
-    Free, the correlation takes slow misfit in, and holds the numbers where they are.
+    All trials share their B and pressure as good as exactly: what is missed by much more than noise would else bend
+    each trial's own until n means nothing. So it stays where the model turns out to be far off all the same.
     """
     if held.noise is not None:
         return None
     guide = Held(spread=held.spread or GUIDING_SPREADS, correlation=track_correlation(predictor.data))
-    state = first_state(predictor.data, theta, own)
+    state, frame = first_state(predictor.data, theta, own), make_frame(predictor, own)
     try:
-        first = solve(predictor, make_frame(predictor, own), state, guide, warm=True, most_iterations=GUIDED_ITERATIONS)
+        first = solve(predictor, frame, state, guide, warm=True, most_iterations=GUIDED_ITERATIONS, watch=watch)
         own, _ = align(predictor.data, predictor, first.state.theta, first_own(predictor.data))
-        return _solve_from(predictor, first.state.theta, own, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+        free = _solve_from(predictor, first.state.theta, own, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+        return first if lost(predictor, free) else free
     except SimulationError:
         return None
 
@@ -187,20 +213,17 @@ def _solve_from(
     return solve(predictor, make_frame(predictor, own), state, held, most_iterations=most_iterations, watch=watch)
 
 
-def _or_once_more(predictor: Predictor, solution: Solution, held: Held, watch: Watch | None) -> Solution:
-    """A solution that fits poorly, or the better one found from its numbers with the noise of the tracks once more.
-
-    Slow misfit taken for correlated noise is a solution of its own kind, and can hide that the numbers could do better.
-    """
-    if not chi2_per_dof(predictor, solution) > POOR_FIT:
+def _found_again(predictor: Predictor, solution: Solution, held: Held, watch: Watch | None) -> Solution:
+    """A solution, or, where it is lost, the one led from its numbers by what is missed."""
+    if not lost(predictor, solution):
         return solution
+    theta = solution.state.theta
     try:
-        theta = solution.state.theta
         own, _ = align(predictor.data, predictor, theta, first_own(predictor.data))
-        again = _solve_from(predictor, theta, own, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
     except SimulationError:
         return solution
-    return min((solution, again), key=_deviance)
+    guided = _guided(predictor, theta, own, held, watch)
+    return solution if guided is None else _sane(predictor, solution, [guided])
 
 
 def _deviance(solution: Solution) -> float:
@@ -219,7 +242,6 @@ def refit(
     hold_noise: bool = False,
     profile: bool = False,
     most_iterations: int = MOST_ITERATIONS,
-    thorough: bool = True,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
@@ -232,9 +254,8 @@ def refit(
         Values of parameters to begin from, of a new effect above all: a time constant begun at zero stays there.
     hold_spreads, hold_noise
         Keep spreads and noise of the fit instead of estimating them again.
-    most_iterations, thorough
-        How long to go on, and whether a poor fit is tried once more with the noise of the tracks: what is only to be
-        ruled out need not settle.
+    most_iterations
+        How long to go on: what is only to be ruled out need not settle.
     watch
         Told of every step of the iterations; what it raises ends the fit.
     """
@@ -267,8 +288,7 @@ def refit(
             solution = solve(predictor, frame, state, held, warm=True, most_iterations=most_iterations, watch=watch)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
-    if thorough:
-        solution = _or_once_more(predictor, solution, held, watch)
+    solution = _found_again(predictor, solution, held, watch)
     return assemble(predictor, solution, before.left_out, {**kept, "shared": shared, "held": held}, profile=profile)
 
 
