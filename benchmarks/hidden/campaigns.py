@@ -11,13 +11,14 @@ import numpy as np
 
 from hidden import kinds as catalogue
 from hidden.designs import Setting, Wants, design
-from hidden.kinds import EFFECTS, OUTSIDERS, Scene
+from hidden.kinds import EFFECTS, INTERRUPTED, OUTSIDERS, Scene
 from hidden.kinds import Hidden as Change
 from hidden.motion import Floats, Physics, Tube, follow
 from hidden.nuisances import Nuisances, draw_nuisances, noise, regime, scatter
 from vinetrack.naming import with_names
 from vinetrack.records import Bend, Track, Trial
 
+ALL = {**EFFECTS, **INTERRUPTED}
 MOST_FRAMES = 1500
 FEWEST_MOVING = 12
 
@@ -92,7 +93,7 @@ def _parts(kind: str) -> tuple[tuple[str, ...], str, str]:
 
 
 def _wants(names: tuple[str, ...], outsider: str, kind: str) -> Wants:
-    parts = [EFFECTS[name][1] for name in names] + ([OUTSIDERS[outsider][1]] if outsider else [])
+    parts = [ALL[name][1] for name in names] + ([OUTSIDERS[outsider][1]] if outsider else [])
     return Wants(
         payload=True if any(part.payload for part in parts) else None,
         chamber=any(part.chamber for part in parts),
@@ -119,11 +120,11 @@ def _attempt(kind: str, seed: int, draw: np.random.Generator) -> Hidden | None:
     names, outsider, regime_name = _parts(kind)
     settings = design(draw, _wants(names, outsider, kind))
     how = _nuisances(kind, regime_name, draw)
-    if all(EFFECTS[name][1].quiet for name in names) and names and draw.uniform() < 0.6:
+    if all(ALL[name][1].quiet for name in names) and names and draw.uniform() < 0.6:
         # What is weak beside the scatter of a laboratory shows in a careful one.
         how = replace(how, damping_scatter=0.2 * how.damping_scatter, pressure_scatter=0.2 * how.pressure_scatter)
     scene = Scene.of(settings)
-    makers = [EFFECTS[name][0] for name in names] + ([OUTSIDERS[outsider][0]] if outsider else [])
+    makers = [ALL[name][0] for name in names] + ([OUTSIDERS[outsider][0]] if outsider else [])
     change = _joined([maker(draw, scene) for maker in makers])
     stated = _stated(settings, how, change, draw)
     physics = Physics(B=1.0, n=settings[0].vine.n, **change.physics)
@@ -240,7 +241,8 @@ def _film(
     # A clock that is wrong by ε shows (1 + ε) t: the frames themselves are that much closer.
     true_times = times / (1 + change.clock) - release_s / (1 + change.clock)
     bends = np.array([(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]).reshape(-1, 3)
-    out, ended_s = follow(true_times, tube, physics, bends)
+    program = _interrupted(true_times, tube, physics, bends, draw) if physics.static_yield else (None, None)
+    out, ended_s = follow(true_times, tube, physics, bends, *program)
     stop = _last_frame(out, true_times, ended_s, tube, how, draw)
     moving = np.flatnonzero(out[:stop, 1] > 0)
     if moving.size < FEWEST_MOVING or out[stop - 1, 1] < 0.25 * tube.length:
@@ -257,6 +259,20 @@ def _film(
     return _track(times[: keep.sum()], position[keep], out[:stop, 3][keep], how, draw), release_s, lost
 
 
+def _interrupted(
+    times: Floats, tube: Tube, physics: Physics, bends: Floats, draw: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """A pressure that is let down when a third is grown, and comes back slowly: times since release, and Pa."""
+    plain, _ = follow(times, tube, physics, bends)
+    reached = np.flatnonzero(plain[:, 1] > float(draw.uniform(0.25, 0.45)) * tube.length)
+    stop_s = times[reached[0]] if reached.size else times[-1] / 2
+    fall_s, pause_s, rise_s = 0.02, float(draw.uniform(0.02, 0.06)), float(draw.uniform(0.15, 0.35))
+    corners = np.cumsum([stop_s, fall_s, pause_s, rise_s])
+    low = 0.5 * tube.yield_pressure
+    grid = np.linspace(times[0], times[-1], 4 * times.size)
+    return grid, np.interp(grid, corners, [tube.pressure, low, low, tube.pressure])
+
+
 def _last_frame(
     out: Floats, times: Floats, ended_s: float, tube: Tube, how: Nuisances, draw: np.random.Generator
 ) -> int:
@@ -267,7 +283,9 @@ def _last_frame(
     elif how.sees_end and math.isfinite(ended_s):
         return min(times.size, int(np.searchsorted(times, ended_s)) + after)
     stop = int(np.searchsorted(out[:, 1], part * tube.length))
-    halted = np.flatnonzero((times > 0) & (out[:, 2] <= 0))
+    # One that stops for good is filmed a little longer; one whose pressure is let down and up again starts anew.
+    last_move = int(np.flatnonzero(out[:, 2] > 0)[-1]) if np.any(out[:, 2] > 0) else 0
+    halted = np.flatnonzero((np.arange(times.size) > last_move) & (times > 0))
     return min(stop, int(halted[0]) + 30 if halted.size else times.size, times.size)
 
 

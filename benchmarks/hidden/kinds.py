@@ -41,6 +41,7 @@ class Scene:
     weakest_B: float
     payload_kg: float
     weakest_Pa: float
+    highest_yield_Pa: float
     highest_Pa: float
 
     @classmethod
@@ -58,6 +59,7 @@ class Scene:
             min(one.vine.B for one in settings),
             max(one.payload_g for one in settings) / 1e3,
             1e3 * min(one.pressure_kPa - one.vine.yield_kPa for one in settings),
+            1e3 * max(one.vine.yield_kPa for one in settings),
             1e3 * max(one.pressure_kPa for one in settings),
         )
 
@@ -146,6 +148,11 @@ def _perspective(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
     return Hidden(values={"perspective.k": k}, bow_per_m=k)
 
 
+def _static_yield(draw: Draw, scene: Scene) -> Hidden:
+    P_s = scene.highest_yield_Pa + scene.weakest_Pa * float(draw.uniform(0.1, 0.6))
+    return Hidden({"static_yield": P_s}, {"static_yield.P_s": P_s})
+
+
 EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "reservoir_depletion": (_depletion, Wants(chamber=True, wide_chamber=True)),
     "supply_refill": (_refill, Wants(chamber=True, wide_chamber=True)),
@@ -180,6 +187,9 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "perspective": (_perspective, Wants()),
 }
 """Every effect of the catalogue that a vine released at its full pressure can show, at sizes that are plausible."""
+
+INTERRUPTED: dict[str, tuple[Maker, Wants]] = {"static_yield": (_static_yield, Wants())}
+"""Effects that show only where the pressure is let down and up again while the camera runs."""
 
 MEASUREMENT = ("length_scale", "time_base", "pressure_gain", "pressure_gauge", "area_scale", "perspective")
 
@@ -273,6 +283,7 @@ KINDS: tuple[str, ...] = (
     *("+".join(pair) for pair in PAIRS),
     *(f"outsider:{name}" for name in OUTSIDERS),
     "frames:dropped",
+    "trace:static_yield",
     "trace:reservoir_depletion",
     "trace:air_drag",
     "trace:tail_friction",
