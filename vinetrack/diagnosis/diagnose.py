@@ -265,7 +265,7 @@ def _ranking(finding: Finding, blind: Mapping[str, str]) -> list[Candidate]:
                     z,
                     _predicted(questions, effect, place),
                     in_answer_set=effect.name in finding.answer,
-                    reason=_behind(finding, effect.name),
+                    reason=_holds(effect, finding) or _behind(finding, effect.name),
                     largest={} if questions.lost else largest,
                 )
             )
@@ -283,6 +283,12 @@ def _promised(finding: Finding, name: str, z: float) -> float:
     if finding.verdict == ADEQUATE:
         return z**2
     return math.nan if finding.questions.lost else finding.questions.promise(name)
+
+
+def _holds(effect: Effect, finding: Finding) -> str:
+    """That an effect contains one that was found, where it does: it can be no worse, and need not be tried."""
+    held = [name for name in effect.replaces if name in finding.answer]
+    return f"it holds {held[0]} as a limit" if held else ""
 
 
 def _behind(finding: Finding, name: str) -> str:

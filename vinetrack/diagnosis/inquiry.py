@@ -67,7 +67,7 @@ def inquire(found: Fit, effects: Sequence[Effect], report: Report, *, anew: int 
     if alone is not None:
         return alone
     if not tried or best_of(tried).sigma < questions.threshold:
-        mends = questions.structure.p < 0.1 * FIRST_LEVEL or questions.lost
+        mends = questions.structure.p < 0.1 * FIRST_LEVEL or questions.off
         verdict = UNEXPLAINED if mends else ADEQUATE
         return [Finding(verdict, questions, tried=tuple(tried), search=search)]
     report("two effects together")

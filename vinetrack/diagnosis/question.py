@@ -22,7 +22,7 @@ from vinetrack.diagnosis.screen import (
     structure_of,
 )
 from vinetrack.effects import Effect
-from vinetrack.model.fit import lost
+from vinetrack.model.fit import lost, missed_part
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.solve import track_correlation
 from vinetrack.records import Floats
@@ -33,6 +33,9 @@ the gate is stricter, for a pair of effects can imitate what no catalogue holds.
 
 FAR_OFF = 4.0
 """χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
+
+OFF = 6e-4
+"""Part of its growth by which the median trial is missed where no tracker's slow errors explain it: 0.1 mm of 170 mm."""
 
 TESTABLE_SIGMAS = 3.0
 """An effect whose largest plausible size would show by less than this cannot be tested here."""
@@ -84,7 +87,7 @@ class Questions:
     def something(self) -> bool:
         """Whether anything is missing, known or not."""
         return bool(
-            self.lost
+            self.off
             or self.structure.p < 0.1 * self.level
             or (self.possible.size and self.possible.max() > self.threshold)
         )
@@ -95,9 +98,14 @@ class Questions:
         return self.found.chi2_per_dof > FAR_OFF
 
     @property
+    def off(self) -> bool:
+        """Whether it misses more than noise, and more of the growth than a tracker's slow errors amount to."""
+        return self.far_off and missed_part(self.found.predictor, self.found.solution) > OFF
+
+    @property
     def lost(self) -> bool:
         """Whether it misses so much of the growth besides that no tracker's slow errors explain it either."""
-        return self.far_off and lost(self.found.predictor, self.found.solution)
+        return lost(self.found.predictor, self.found.solution)
 
     @cached_property
     def gains(self) -> tuple[Floats, Floats]:

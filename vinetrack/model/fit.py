@@ -161,13 +161,16 @@ def lost(predictor: Predictor, solution: Solution) -> bool:
     A tracker whose frames agree to a hundredth of a millimetre may err by a few tenths along the way: far beyond their
     noise, and no reason to begin elsewhere.
     """
-    if not chi2_per_dof(predictor, solution) > POOR_FIT:
-        return False
+    return bool(chi2_per_dof(predictor, solution) > POOR_FIT and missed_part(predictor, solution) > LOST)
+
+
+def missed_part(predictor: Predictor, solution: Solution) -> float:
+    """Root mean square of what is missed, as part of the growth that was seen; of the median trial."""
     parts = [
         math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(item.lead_position_m)), 1e-9)
         for columns, item in zip(solution.columns, predictor.data, strict=True)
     ]
-    return float(np.median(parts)) > LOST
+    return float(np.median(parts))
 
 
 def _sane(predictor: Predictor, free: Solution, guided: list[Solution]) -> Solution:
