@@ -35,7 +35,7 @@ FAR_OFF = 4.0
 """χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
 
 OFF = 6e-4
-"""Part of its growth by which the median trial is missed where no tracker's slow errors explain it: 0.1 mm of 170 mm."""
+"""Part of its growth by which the median trial is missed beyond any tracker's slow errors: 0.1 mm of 170 mm."""
 
 TESTABLE_SIGMAS = 3.0
 """An effect whose largest plausible size would show by less than this cannot be tested here."""
