@@ -5,8 +5,10 @@ A repeated frame shows as a step of nothing in steady motion. Is the next step d
 dropped frame shows as one step of double length, and everything after it is one frame early.
 
 A jump is judged against the jump that a smooth motion with the track's own noise could show: by least squares of a
-parabola with a step on the nearest points on both sides. Nothing is called where the motion is slow beside the noise,
-where it speeds up so fast that a long step may be the motion itself (release), or where the times are irregular.
+parabola with a step on the nearest points on both sides. Times are moved only where one wild point would not explain
+it as well and points farther away agree: noise may have heavy tails. Nothing is called where the motion is slow beside
+the noise, where it speeds up so fast that a long step may be the motion itself (release), or where the times are
+irregular.
 """
 
 from __future__ import annotations
