@@ -58,6 +58,9 @@ def kept_rows(path: Path | None) -> list[Row]:
     """What an earlier run has written."""
     if path is None or not path.is_file():
         return []
+    with path.open(encoding="utf-8") as stream:
+        if stream.readline().strip().split(",") != list(COLUMNS):
+            raise SystemExit(f"{path} was written with other columns: give another name, or remove it.")
     return pd.read_csv(path, keep_default_na=False, na_values={"sigma": [""], "sigma_second": [""]}).to_dict("records")
 
 
