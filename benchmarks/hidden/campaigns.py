@@ -29,7 +29,6 @@ class Truth:
 
     `effects` are names of the catalogue, `outsider` something that no catalogue has, `values` the true parameters as
     `effect.parameter`, SI; `B` by vine, `physics` everything that acted, `change` what was wrong with the measurement.
-    `visible` is whether what was hidden shows in a pressure trace already, and so is not missing from the model.
     """
 
     kind: str

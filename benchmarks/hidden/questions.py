@@ -122,7 +122,7 @@ def _number(value: object) -> float:
 def _visibility(base: Fit, last: Fit, truth: Truth) -> Row:
     """`sigma`: all that is hidden against the base model; `sigma_second`: the lesser of two, given the other."""
     if truth.in_trace or not (truth.effects or truth.outsider):
-        return {"sigma": 0.0, "sigma_second": math.nan, "n_error": math.nan}
+        return {"sigma": 0.0, "sigma_second": math.nan}
     try:
         true = true_fit(base, truth)
         if set(last.model.names) == set(true.model.names) and last.log_likelihood > true.log_likelihood:
