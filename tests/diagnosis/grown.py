@@ -73,9 +73,17 @@ def pairs_of(virtual: Sequence[VirtualTrial]) -> Pairs:
     return [(one.stated, one.track) for one in virtual]
 
 
-def effect_file(folder: Path, name: str, force: str) -> Path:
-    """A user's effect with a tail force of size `a`, N, times this expression of `s` and `rig`."""
-    text = f'''"""A force that no catalogue has.
+def effect_file(folder: Path, name: str, forces: Sequence[str]) -> Path:
+    """A user's effect: a tail force of size `a`, N, times one of these expressions of `s` and `rig`, by `kind`.
+
+    One file for many forces is compiled once.
+    """
+    choices = "\n".join(
+        f"    if kind == {k}.0:\n        return a * ({force}) + 0.0 * s.time" for k, force in enumerate(forces)
+    )
+    text = f'''"""Forces that no catalogue has.
+
+Its size is a.
 
     tail force a · shape
 """
@@ -85,11 +93,15 @@ import numpy as np
 from vinetrack.effects import Parameter
 
 KIND = "physical"
-PARAMETERS = (Parameter("a", "a", "N", 0.0, bounds=(-100.0, 100.0), meaning="size"),)
+PARAMETERS = (
+    Parameter("a", "a", "N", 0.0, bounds=(-100.0, 100.0), meaning="size"),
+    Parameter("kind", "kind", "1", 0.0, bounds=(0.0, 100.0), meaning="which"),
+)
 
 
-def tail_force(s, rig, a):
-    return a * ({force})
+def tail_force(s, rig, a, kind):
+{choices}
+    return 0.0 * s.time
 '''
     path = folder / f"{name}.py"
     path.write_text(text, encoding="utf-8")

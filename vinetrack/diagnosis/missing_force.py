@@ -19,6 +19,7 @@ import numpy as np
 
 from vinetrack.diagnosis.force_answers import Motion, answers_to_forces, motions_of
 from vinetrack.diagnosis.force_fit import ForceFit, Gain
+from vinetrack.diagnosis.force_refine import refine
 from vinetrack.diagnosis.own_values import lay
 from vinetrack.diagnosis.simple_laws import Law, coarse_laws, finer_laws
 from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
@@ -53,6 +54,12 @@ DRAWN = 24
 
 UNTOLD = 2.0
 """Times the usual error, beyond which a force is not drawn: near the end it has no time left to move anything."""
+
+IN_FULL, ROUGH = 3, 1.5
+"""Laws that are fitted in full where the best linear fit leaves more than this times the noise; else the best alone."""
+
+WORTH, AS_PROMISED = 0.5, 1.5
+"""Part of χ² that a law must take away to be fitted in full, and by how much more it may then leave than promised."""
 
 MENDS = 0.5
 """Part of the misfit that a smooth force in every condition must take away, to be a force at all."""
@@ -109,7 +116,7 @@ def missing_force(found: Fit) -> MissingForce:
     def answers(laws: Sequence[Law]) -> list[Floats]:
         return answers_to_forces(found, fit.own, motions, lambda m: np.column_stack([one.along(m) for one in laws]))
 
-    ranked = _ranked(fit, answers, motions, everything)
+    ranked = _in_full(found, fit, motions, _ranked(fit, answers, motions, everything))
     families = _families(found, fit, motions)
     whole = max([1e-300, everything.beyond, *families.values(), *(one.gain.beyond for one in ranked)])
     laws = [replace(one, explained=one.gain.beyond / whole) for one in ranked]
@@ -191,6 +198,25 @@ def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[Motion], everythi
     found += gains(finer)
     most = max(most, *(gain.chi2 for _, gain in found))
     return sorted(_best_of_kinds(_judged(fit, found, most)), key=lambda one: (not one.seen, one.bic))
+
+
+def _in_full(found: Fit, fit: ForceFit, motions: Sequence[Motion], laws: list[_Judged]) -> list[_Judged]:
+    """The laws, the best fitted in full where that leaves hardly more than their linear fit promised.
+
+    Where the linear fit of the best leaves but noise, its rivals' will do.
+    """
+    rough = fit.chi2 - laws[0].gain.chi2 > ROUGH * fit.points
+    gains = [one.gain for one in laws]
+    for k, one in enumerate(laws[: IN_FULL if rough else 1]):
+        if not one.seen or one.gain.chi2 < WORTH * fit.chi2:
+            continue
+        full = refine(found, fit, motions, one.law, one.gain, thorough=k == 0)
+        if full is not None and full.chi2 < max(AS_PROMISED * (fit.chi2 - one.gain.chi2), fit.points):
+            gains[k] = Gain(fit.chi2 - full.chi2, full.amplitude, full.sigma, full.numbers, one.gain.terms)
+            laws = [*laws[:k], replace(one, law=full.law), *laws[k + 1 :]]
+    most = max(gain.chi2 for gain in gains)
+    judged = _judged(fit, list(zip((one.law for one in laws), gains, strict=True)), most)
+    return sorted(judged, key=lambda one: (not one.seen, one.bic))
 
 
 def _judged(fit: ForceFit, found: Sequence[tuple[Law, Gain]], most: float) -> list[_Judged]:

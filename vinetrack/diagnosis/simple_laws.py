@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,26 @@ class Law:
     by_area: float = 0.0
     largest: float = 1.0
 
+    @property
+    def shape_names(self) -> tuple[str, ...]:
+        """The numbers that shape it."""
+        return ("low", "high") if self.kind == "patch" else ("scale",) * self.shapes
+
+    def size_of(self, name: str) -> float:
+        """How much of a change of one of them is a large one."""
+        return self.high - self.low if self.kind == "patch" else float(getattr(self, name))
+
+    def shifted(self, name: str, by: float) -> Law:
+        """The law with one of them changed."""
+        return replace(self, **{name: getattr(self, name) + by})
+
+    def kept_inside(self, growth_m: float) -> Law:
+        """A patch no further beyond the growth than it is rounded."""
+        if self.kind != "patch":
+            return self
+        room = EDGE * (self.high - self.low)
+        return replace(self, low=max(self.low, -room), high=min(self.high, growth_m + room))
+
     def along(self, motion: Motion) -> Floats:
         """The force of amplitude 1 along a motion, N, shape (n_times, columns)."""
         size = (motion.trial.area_m2 / self.by_area if self.by_area else 1.0) / self.largest
@@ -68,7 +88,7 @@ class Law:
         return (
             _WORDS[self.kind].format(
                 size=size,
-                low=f"{1e3 * self.low:.0f}",
+                low=f"{1e3 * max(self.low, 0.0):.0f}",
                 high=f"{1e3 * self.high:.0f}",
                 scale_mm=_round(1e3 * self.scale),
                 scale_ms=_round(1e3 * self.scale),
