@@ -91,10 +91,10 @@ def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(results: Path)
     assert code == 0, output
     assert "air_drag added to" in output
     assert "highest pressure" in output
-    rows = list(csv.DictReader((results / "ladder.csv").open()))
+    rows = list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
     assert [row["added"] for row in rows] == ["", "reservoir_depletion", "air_drag"]
     run("add", "air_drag", results)
-    assert len(list(csv.DictReader((results / "ladder.csv").open()))) == 3
+    assert len(list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))) == 3
 
 
 def test_saved_it_stands_in_the_model_of_the_experiment(results: Path, experiment: Path) -> None:
