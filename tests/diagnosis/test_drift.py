@@ -1,6 +1,6 @@
 """Parameters that drift with what they should not know, on vines from the virtual laboratory.
 
-Seeds 100 to 140 were looked at while the tests of drift were built; those here, from 51, score.
+Seeds 100 to 140 and 300 to 347 were looked at while the tests of drift were built; those here, from 51, score.
 """
 
 from __future__ import annotations
@@ -26,8 +26,21 @@ def fitted(pairs: Pairs, model: Model | None = None) -> Fit:
 
 
 @pytest.fixture(scope="module")
-def depleting() -> Drift:
-    return drift(fitted(pairs_of(grown(sheet(), 51, ["reservoir_depletion"]))))
+def emptying() -> Pairs:
+    """Vines on a chamber that nothing refills."""
+    return pairs_of(grown(sheet(), 51, ["reservoir_depletion"]))
+
+
+@pytest.fixture(scope="module")
+def depleting(emptying: Pairs) -> Drift:
+    """n and the yield pressures are free, and take what they can upon themselves."""
+    return drift(fitted(emptying))
+
+
+@pytest.fixture(scope="module")
+def stretching() -> Drift:
+    """Vines whose wall gives way: the higher the pressure, the wider and faster they are."""
+    return drift(fitted(pairs_of(grown(sheet(), 51, ["wall_stretch"]))))
 
 
 @pytest.mark.parametrize("seed", [52, 53, 54])
@@ -37,26 +50,35 @@ def test_where_nothing_is_missing_nothing_drifts(seed: int) -> None:
     assert found.table["z"].max() < 3
 
 
-@pytest.mark.xfail(
-    reason="a base model that is far off is fitted otherwise now: to be held against it again", strict=False
-)
-def test_b_that_makes_up_for_an_emptying_chamber_knows_the_pressure(depleting: Drift) -> None:
-    row = depleting.table[(depleting.table["parameter"] == B) & depleting.table["vine"].str.startswith("24mm")].iloc[0]
+def test_b_that_makes_up_for_a_wall_that_stretches_knows_the_pressure(stretching: Drift) -> None:
+    table = stretching.table
+    row = table[(table["against"] == "pressure_Pa") & table["vine"].str.startswith("24mm")].iloc[0]
     assert row["significant"]
     assert (row["from_level"], row["to_level"]) == (48e3, 24e3)
     assert row["change"] > 5 * row["change_sigma"] > 0
-    assert any("B" in said and "to 24 kPa of pressure" in said for said in depleting.sentences)
+    assert any("B" in said and "to 24 kPa of pressure" in said for said in stretching.sentences)
 
 
-@pytest.mark.xfail(
-    reason="a base model that is far off is fitted otherwise now: to be held against it again", strict=False
-)
-def test_the_groups_behind_it_fall_with_the_pressure(depleting: Drift) -> None:
-    groups = depleting.groups
-    of_b = groups[(groups["parameter"] == B) & groups["vine"].str.startswith("24mm")].sort_values("level")
+def test_the_groups_behind_it_fall_with_the_pressure(stretching: Drift) -> None:
+    groups = stretching.groups[stretching.groups["against"] == "pressure_Pa"]
+    of_b = groups[groups["vine"].str.startswith("24mm")].sort_values("level")
     assert of_b["level"].tolist() == [24e3, 30e3, 38e3, 48e3]
     assert np.all(np.diff(of_b["ratio"]) < 0)
     assert np.all(of_b["ratio_sigma"] > 0.005)
+
+
+def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(depleting: Drift) -> None:
+    rows = depleting.table[depleting.table["against"] == "growth"]
+    assert rows["significant"].all()
+    assert (rows["to_level"] > rows["from_level"]).all()
+    assert any("larger in the second half of the growth" in said for said in depleting.sentences)
+
+
+def test_a_yield_pressure_pulled_from_the_sheet_is_said(depleting: Drift) -> None:
+    row = depleting.table[depleting.table["against"] == "sheet"].iloc[0]
+    assert row["significant"]
+    assert abs(row["change"]) == pytest.approx(row["z"] * 200.0)
+    assert any("of the sheet to" in said for said in depleting.sentences)
 
 
 def test_the_tables_have_their_columns_and_the_most_significant_first(depleting: Drift) -> None:
@@ -88,21 +110,19 @@ def test_every_trial_finds_the_b_it_was_grown_with() -> None:
     assert np.std(values.deviation) > 0.015
 
 
-@pytest.mark.xfail(
-    reason="a base model that is far off is fitted otherwise now: to be held against it again", strict=False
-)
 def test_a_number_that_all_share_is_asked_whether_it_suits_every_vine() -> None:
-    """The sheet says 3.7 L, but the second vine was grown on 2 L: its own γ would have to be larger."""
-    trials = sheet(chamber_m3=2e-3)
-    wrong = [
-        (replace(trial, chamber_m3=3.7e-3) if trial.diameter_m > 0.02 else trial, track)
-        for trial, track in pairs_of(grown(trials, 57, ["reservoir_depletion"]))
-    ]
-    model = vt.base_model() + vt.effects.reservoir_depletion
-    found = drift(fitted(wrong, model.with_values({"reservoir_depletion.gamma": 1.2})))
+    """The sheet says 3.7 L, but the wide vine was grown on 2.8 L: alone it would have 1.32 for the true γ of 1."""
+    isothermal = {"reservoir_depletion.gamma": 1.0}
+    narrow = [trial for trial in sheet() if trial.diameter_m < 0.02]
+    wide = [trial for trial in sheet(chamber_m3=2.8e-3) if trial.diameter_m > 0.02]
+    virtual = [one for part in (narrow, wide) for one in grown(part, 57, ["reservoir_depletion"], isothermal)]
+    pairs = [(replace(trial, chamber_m3=3.7e-3), track) for trial, track in pairs_of(virtual)]
+    found = drift(fitted(pairs, vt.base_model() + vt.effects.reservoir_depletion))
     row = found.table[(found.table["parameter"] == "reservoir_depletion.gamma") & (found.table["against"] == "vine")]
-    assert row["z"].iloc[0] > 3
-    assert any("γ" in said for said in found.sentences)
+    assert row["significant"].iloc[0]
+    values = found.groups[found.groups["parameter"].str.endswith("gamma") & (found.groups["against"] == "vine")]
+    assert sorted(values["value"]) == pytest.approx([1.0, 1.32], abs=0.08)
+    assert any(said.startswith("γ differs between the vines") for said in found.sentences)
 
 
 def test_vines_of_different_exponents_are_told() -> None:
@@ -122,8 +142,10 @@ def test_without_replicates_the_line_itself_says_how_values_scatter() -> None:
         return drift(fitted(pairs_of(grown(sheet(replicates=1), seed, effects))))
 
     assert once(59).sentences == ()
-    row = once(59, "reservoir_depletion").table.iloc[0]
-    assert row["dof"] in (2, 5) or np.isinf(row["dof"])
+    table = once(59, "reservoir_depletion").table
+    assert table["significant"].any()
+    against_pressure = table[(table["against"] == "pressure_Pa") & (table["vine"] != "")]
+    assert set(against_pressure["dof"]) == {2}
 
 
 def test_a_body_that_falls_has_nothing_to_drift() -> None:

@@ -111,7 +111,6 @@ def test_it_goes_into_a_file(patch: MissingForce) -> None:
     assert tuple(patch.laws.columns) == LAW_COLUMNS
 
 
-@pytest.mark.xfail(reason="one of two forces answers otherwise than the integrator: still to be looked at")
 def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(path: Path) -> None:
     """The integrator with a tolerance far below its usual: a narrow force lies between its usual steps."""
     model = vt.base_model() + vt.effects.reservoir_depletion

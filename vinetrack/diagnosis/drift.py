@@ -6,24 +6,29 @@ the pressure point to what is missing. The scatter of replicates says how far su
 and noise of the fit, which a model that fails inflates, are not asked.
 
 The common law was fitted to the same trials and has taken part of the drift upon itself (n most of it, where B would
-follow the pressure): what is found is what is left, and its z errs to the small side.
+follow the pressure): what is found is what is left, and its z errs to the small side. What it cannot take over is a B
+that would have to change along the growth; and it shows in a yield pressure that is pulled away from the sheet's
+(`vinetrack.diagnosis.drift_along`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.diagnosis.drift_tests import CONDITIONS, Against, Sums, as_deviate, constancy, sums_of
+from vinetrack.diagnosis.drift_along import against_the_sheet, along_growth
+from vinetrack.diagnosis.drift_tests import CONDITIONS, Against, Sums, Tested, as_deviate, constancy, sums_of
 from vinetrack.diagnosis.own_values import OwnValues, lay, own_values
+from vinetrack.diagnosis.scatter import LEAST_SPREAD, Scatter
+from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
 from vinetrack.model.fit_data import FitError
-from vinetrack.model.fit_result import SHOWN_AS, Fit
-from vinetrack.model.free import EXPONENT, YIELD_PRESSURE
+from vinetrack.model.fit_result import SHOWN_AS, Fit, Number, decimals
+from vinetrack.model.free import DAMPING, EXPONENT, YIELD_PRESSURE
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.subset import fit_subset
 from vinetrack.records import Floats
@@ -63,6 +68,8 @@ GROUP_COLUMNS = (
     "n_trials",
 )
 
+MOST_ITERATIONS = 15
+
 FALSE_ALARMS = 0.01
 """How often any drift at all is called significant where nothing drifts."""
 
@@ -72,8 +79,9 @@ class Drift:
     """What drifts, most significant first, and the values behind it; SI.
 
     `table`, columns `DRIFT_COLUMNS`, has a row a parameter, vine (blank: all) and condition: from `from_level` to
-    `to_level` of the nominal condition it rises by `change` ± `change_sigma` (`relative`: of itself). `z` is that in
-    standard errors by Student's t with `dof` degrees of freedom, `z_constancy` how unlikely groups so different are.
+    `to_level` of the nominal condition (`growth`: parts of it; `sheet`: what it states) it rises by `change` ±
+    `change_sigma` (`relative`: of itself). `z` is that in standard errors by Student's t with `dof` degrees of freedom,
+    `z_constancy` how unlikely groups so different are.
     `groups`, columns `GROUP_COLUMNS`, has the mean value of every group: `level` is the nominal condition, NaN where
     the groups are vines; `ratio` the value over that of the common law.
     """
@@ -89,17 +97,13 @@ class Drift:
         return tuple(significant["sentence"])
 
 
-@dataclass(frozen=True)
-class _Found:
-    """A row of the table and its p, with the rows of its groups."""
+def drift(found: Fit, scatter: Scatter | None = None) -> Drift:
+    """Ask every parameter whether it drifts with pressure, payload, angle, chamber, inlet, vine or along the growth.
 
-    row: dict[str, object]
-    p: float
-    groups: list[dict[str, object]] = field(default_factory=list)
-
-
-def drift(found: Fit) -> Drift:
-    """Ask every parameter whether it drifts with pressure, payload, angle, chamber, inlet or vine.
+    Parameters
+    ----------
+    scatter
+        What replicates differ by, where it is known already.
 
     Raises
     ------
@@ -109,7 +113,8 @@ def drift(found: Fit) -> Drift:
     import pandas as pd
 
     notes: list[str] = []
-    tests = list(_tests(found, notes))
+    scatter = scatter or replicate_scatter(found, courses_of(found)[0])
+    tests = list(_tests(found, scatter, notes))
     level = 1 - (1 - FALSE_ALARMS) ** (1 / max(len(tests), 1))
     tests.sort(key=lambda one: one.p)
     rows = [{**one.row, "significant": bool(one.p < level)} for one in tests]
@@ -121,24 +126,28 @@ def drift(found: Fit) -> Drift:
     )
 
 
-def _tests(found: Fit, notes: list[str]) -> Iterator[_Found]:
+def _tests(found: Fit, scatter: Scatter, notes: list[str]) -> Iterator[Tested]:
     keys = [key for key in found.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
-    laid = lay(found)
+    laid, damping = lay(found), None
     for key in keys:
         try:
             own = own_values(found, key, laid)
         except SimulationError:
             notes.append(f"{key} could not be found for single trials: the model cannot be followed there.")
             continue
+        damping = own if key == DAMPING else damping
         for against in CONDITIONS:
             yield from _against(own, against)
-        if not own.per_vine:
-            yield from _between_vines(own)
-    if EXPONENT in found.predictor.layout.keys:
-        yield from _exponents(found)
+    yield from _between_vines(found, scatter)
+    yield from against_the_sheet(found)
+    if damping is not None:
+        try:
+            yield from along_growth(found, laid, damping)
+        except SimulationError:
+            notes.append("B could not be followed along the growth: the model cannot be followed there.")
 
 
-def _against(own: OwnValues, against: Against) -> Iterator[_Found]:
+def _against(own: OwnValues, against: Against) -> Iterator[Tested]:
     """Rows of one parameter against one condition: each vine alone where it has values of its own, and all."""
     levels = np.array([against.level(trial) for trial in own.trials])
     usable = np.isfinite(levels) & np.isfinite(own.deviation)
@@ -163,7 +172,7 @@ def _against(own: OwnValues, against: Against) -> Iterator[_Found]:
 
 def _slope(
     own: OwnValues, against: Against, levels: Floats, sums: Sums, vine: str, groups: list[dict[str, object]]
-) -> _Found:
+) -> Tested:
     from scipy.stats import t as student
 
     square = float(np.sum(sums.weight * sums.x**2))
@@ -193,26 +202,31 @@ def _slope(
         "dof": sums.dof,
         "n_trials": int(sums.x.size),
     }
-    who = f"{own.symbol} of {vine}" if vine else own.symbol
-    if p <= p_groups:
-        row["sentence"] = (
-            f"{who} rises by {_amount(own, change, error)} from {against.shown(start)} to {against.shown(stop)}"
-            f" of {against.words} ({as_deviate(p):.1f} σ), though it should not know the {against.words}."
+    row["sentence"] = _said(own, against, row, steadily=p <= p_groups)
+    return Tested(row, min(1.0, 2 * min(p, p_groups)), groups)
+
+
+def _said(own: OwnValues, against: Against, row: Mapping[str, Any], *, steadily: bool) -> str:
+    """A row in words; `steadily` where a straight line says more than that groups differ."""
+    who = f"{own.symbol} of {row['vine']}" if row["vine"] else own.symbol
+    start, stop = against.shown(row["from_level"]), against.shown(row["to_level"])
+    if steadily:
+        return (
+            f"{who} rises by {_amount(own, row['change'], row['change_sigma'])} from {start} to {stop}"
+            f" of {against.words} ({row['z']:.1f} σ), though it should not know the {against.words}."
         )
-    else:
-        row["sentence"] = (
-            f"{who} is not the same at every {against.words} ({z_constancy:.1f} σ), without rising or falling steadily"
-            f" from {against.shown(low)} to {against.shown(high)}."
-        )
-    return _Found(row, min(1.0, 2 * min(p, p_groups)), groups)
+    low, high = sorted((row["from_level"], row["to_level"]))
+    return (
+        f"{who} is not the same at every {against.words} ({row['z_constancy']:.1f} σ), without rising or falling"
+        f" steadily from {against.shown(low)} to {against.shown(high)}."
+    )
 
 
 def _amount(own: OwnValues, change: float, error: float) -> str:
     """A change with its error, in per cent or in the unit it reads best in."""
-    if own.logarithmic:
-        return f"{100 * change:.2g} ± {100 * error:.1g} %"
-    unit, factor = SHOWN_AS.get(own.unit, (own.unit, 1.0))
-    return f"{change * factor:.2g} ± {error * factor:.1g} {unit}".rstrip()
+    unit, factor = ("%", 100.0) if own.logarithmic else SHOWN_AS.get(own.unit, (own.unit, 1.0))
+    digits = max(decimals(error * factor) - 1, 0)
+    return f"{change * factor:.{digits}f} ± {error * factor:.{digits}f} {unit}".rstrip()
 
 
 def _groups(
@@ -254,28 +268,6 @@ def _group_row(
     }
 
 
-def _between_vines(own: OwnValues) -> Iterator[_Found]:
-    """Whether a number that all trials share suits every vine."""
-    vines = np.array([trial.vine for trial in own.trials])
-    names = list(dict.fromkeys(vines))
-    usable = np.isfinite(own.deviation)
-    places = np.array([float(names.index(vine)) for vine in vines])
-    if len(names) < 2 or np.unique(places[usable]).size < 2:
-        return
-    sums = sums_of(own, places, places, usable)
-    if sums is None:
-        return
-    p, z = constancy(sums)
-    groups = []
-    for place, name in enumerate(names):
-        k = np.flatnonzero(usable & (places == place))
-        if k.size:
-            w = 1 / own.variance[k]
-            mean = float(np.average(own.deviation[k], weights=w))
-            groups.append(_group_row(own, None, math.nan, name, mean, math.sqrt(sums.variance / float(w.sum())), k))
-    yield _Found(_vine_row(own.key, own.symbol, own.unit, groups, z, sums.dof, int(usable.sum())), p, groups)
-
-
 def _vine_row(
     key: str, symbol: str, unit: str, groups: Sequence[dict[str, object]], z: float, dof: float, n_trials: int
 ) -> dict[str, object]:
@@ -307,43 +299,60 @@ def _vine_row(
     }
 
 
-def _exponents(found: Fit) -> Iterator[_Found]:
-    """Whether one n serves all: n of every vine alone, its B free."""
-    from scipy.stats import chi2 as chi_square
+def _between_vines(found: Fit, scatter: Scatter) -> Iterator[Tested]:
+    """Whether a number that all trials share suits every vine: each is fitted alone, with all its numbers free."""
+    shared = [n.key for n in found.numbers if not n.vine and n.key != YIELD_PRESSURE]
+    parts = list(_alone(found, scatter)) if shared else []
+    for key in shared:
+        own = [(vine, alone[key], len(alone.trials)) for vine, alone in parts]
+        own = [one for one in own if math.isfinite(one[1].sigma) and one[1].sigma > 0]
+        if len(own) > 1:
+            yield _apart(found[key], own)
 
-    parts = []
+
+def _alone(found: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
+    """Every vine of several pressures fitted alone; trials scatter as replicates do."""
+    spread = (max(scatter.pressure, LEAST_SPREAD[0]), max(scatter.damping, LEAST_SPREAD[1]))
+    state = replace(found.solution.state, spread=spread)
+    honest = replace(found, solution=replace(found.solution, state=state))
     for vine in dict.fromkeys(trial.trial.vine for trial in found.trials):
         members = [trial for trial in found.trials if trial.trial.vine == vine]
         if len({trial.trial.pressure_Pa for trial in members}) < 2:
             continue
+        names = [trial.name for trial in members]
         try:
-            number = fit_subset(found, [trial.name for trial in members])[EXPONENT]
+            yield (
+                vine,
+                fit_subset(honest, names, hold_spreads=True, hold_noise=True, most_iterations=MOST_ITERATIONS),
+            )
         except FitError:
             continue
-        if math.isfinite(number.sigma) and number.sigma > 0:
-            parts.append((vine, number, len(members)))
-    if len(parts) < 2:
-        return
-    value, sigma = (np.array([getattr(number, name) for _, number, _ in parts]) for name in ("value", "sigma"))
+
+
+def _apart(common: Number, own: Sequence[tuple[str, Number, int]]) -> Tested:
+    """The values of single vines against one for all."""
+    from scipy.stats import chi2 as chi_square
+
+    value, sigma = (np.array([getattr(number, name) for _, number, _ in own]) for name in ("value", "sigma"))
     mean = float(np.average(value, weights=1 / sigma**2))
-    square = float(np.sum((value - mean) ** 2 / sigma**2))
-    p = float(chi_square.sf(square, len(parts) - 1))
-    common = found[EXPONENT].value
-    groups: list[dict[str, object]] = [
-        {
-            "parameter": EXPONENT,
-            "vine": vine,
-            "symbol": number.symbol,
-            "unit": number.unit,
-            "against": "vine",
-            "level": math.nan,
-            "value": number.value,
-            "sigma": number.sigma,
-            "ratio": number.value / common if common else math.nan,
-            "ratio_sigma": number.sigma / common if common else math.nan,
-            "n_trials": count,
-        }
-        for vine, number, count in parts
-    ]
-    row = _vine_row(EXPONENT, "n", "1", groups, as_deviate(p), math.inf, sum(count for _, _, count in parts))
-    yield _Found(row, p, groups)
+    p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(own) - 1))
+    groups = [_alone_group(*one, common.value) for one in own]
+    count = sum(one[2] for one in own)
+    row = _vine_row(common.key, common.symbol, common.unit, groups, as_deviate(p), math.inf, count)
+    return Tested(row, p, groups)
+
+
+def _alone_group(vine: str, number: Number, count: int, common: float) -> dict[str, object]:
+    return {
+        "parameter": number.key,
+        "vine": vine,
+        "symbol": number.symbol,
+        "unit": number.unit,
+        "against": "vine",
+        "level": math.nan,
+        "value": number.value,
+        "sigma": number.sigma,
+        "ratio": number.value / common if common else math.nan,
+        "ratio_sigma": number.sigma / common if common else math.nan,
+        "n_trials": count,
+    }

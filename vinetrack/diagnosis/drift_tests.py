@@ -15,6 +15,10 @@ FEWEST_DEGREES = 2
 """Replicates beyond the first of their condition that can say how values scatter; else the line's own residuals do."""
 
 
+LEAST_SCATTER = 0.1
+"""Of the likely scatter of pressure and B: that replicates agree better is taken for chance."""
+
+
 @dataclass(frozen=True)
 class Against:
     """A condition that a parameter should not know: attribute of a trial, and how it is shown."""
@@ -92,7 +96,7 @@ def sums_of(own: OwnValues, x: Floats, levels: Floats, chosen: NDArray[np.bool_]
     for name, level in pairs:
         k = (block == name) & (levels[chosen] == level)
         chi2 += float(np.sum(w[k]) * np.average(ds[k], weights=w[k]) ** 2)
-    return Sums(xs, ds, w, max(variance, 1e-300), dof, chi2, len(pairs) - len(set(block)))
+    return Sums(xs, ds, w, max(variance, LEAST_SCATTER**2), dof, chi2, len(pairs) - len(set(block)))
 
 
 def constancy(sums: Sums) -> tuple[float, float]:
@@ -110,3 +114,12 @@ def as_deviate(p: float) -> float:
     from scipy.stats import norm
 
     return float(norm.isf(max(p, 1e-300) / 2))
+
+
+@dataclass(frozen=True)
+class Tested:
+    """A row of the table of drifts and how likely chance alone makes it, with the rows of its groups."""
+
+    row: dict[str, object]
+    p: float
+    groups: list[dict[str, object]]

@@ -10,16 +10,13 @@ from functools import cached_property
 
 import numpy as np
 
-from vinetrack.diagnosis.scatter import Scatter
+from vinetrack.diagnosis.scatter import LEAST_SPREAD, Scatter
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.mixed import SPREAD_COLUMNS, State, own_prior
 from vinetrack.model.sensitivity import OWN
 from vinetrack.model.solve import Held, floor, solve, track_correlation
 from vinetrack.model.whitened import whiten
 from vinetrack.records import Floats
-
-LEAST_SPREAD = (0.005, 0.015)
-"""Of pressure and B: replicates tell their sum much better than either."""
 
 PER_TRIAL = 10.0
 """Independent pieces of information that one trial counts for: its frames err together."""

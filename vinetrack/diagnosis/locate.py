@@ -126,7 +126,7 @@ def locate(found: Fit) -> Failure:
         along_position=_along("lead_position_m", of, whole, POSITION_COLUMNS, scatter),
         along_speed=_along("lead_velocity_m_s", of, whole, SPEED_COLUMNS, scatter),
         scatter=scatter,
-        drift=drift(found),
+        drift=drift(found, scatter),
     )
 
 

@@ -190,7 +190,8 @@ def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[Motion], everythi
     """The best law of each kind, best first."""
 
     def gains(laws: Sequence[Law]) -> list[tuple[Law, Gain]]:
-        return list(zip(laws, fit.gains(answers(laws), [law.columns for law in laws]), strict=True))
+        found = zip(laws, fit.gains(answers(laws), [law.columns for law in laws]), strict=True)
+        return [(law, gain) for law, gain in found if gain.terms or law.kind == "constant"]
 
     found = gains(coarse_laws(motions))
     most = max(everything.chi2, *(gain.chi2 for _, gain in found))
@@ -322,9 +323,9 @@ def _law_table(laws: Sequence[_Judged]) -> pd.DataFrame:
 
 
 def _mended(fit: ForceFit, whole: float) -> float:
-    """Part of the misfit that a force can mend; 1 where there is none beyond the noise."""
+    """Part of the misfit that a force can mend; NaN where there is none to speak of beyond the noise."""
     misfit = fit.chi2 - fit.points
-    return min(whole / misfit, 1.0) if misfit > fit.points else 1.0
+    return min(whole / misfit, 1.0) if misfit > fit.points else math.nan
 
 
 def _sentence(laws: Sequence[_Judged], depends: Mapping[str, float], mended: float) -> str:
@@ -336,6 +337,8 @@ def _sentence(laws: Sequence[_Judged], depends: Mapping[str, float], mended: flo
             " of the misfit. Either it is no force, or the model is too far off to say."
         )
     words = best.law.words(best.gain.amplitude.tolist(), best.gain.sigma)
+    if not best.seen and math.isfinite(mended):
+        return "What is missing is no simple law of force that single trials agree on."
     if not best.seen:
         return "No further force on the tail can be told from how single trials differ."
     if best.explained < LIKE:
@@ -354,7 +357,7 @@ def _sentence(laws: Sequence[_Judged], depends: Mapping[str, float], mended: flo
             found += f" It hangs on {whole[name]}: a force of that alone explains {part:.0%}."
         return found
     # What not even a free force mends is the error of small forces where the force is none: laws are told apart less.
-    nearly = EQUALLY + max(1 - mended, 0.0)
+    nearly = EQUALLY + float(np.nan_to_num(1 - mended))
     others = [
         one
         for one in laws[1:]

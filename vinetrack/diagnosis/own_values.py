@@ -31,7 +31,8 @@ class OwnValues:
     """One parameter, by trial; arrays have shape (n_trials,), SI, NaN where a trial does not feel it.
 
     `value` suits the trial best, `base` is that of the common law; `deviation` their difference, of the logarithms
-    where `logarithmic`. `variance` is what a likely scatter of pressure and B makes of it, up to a factor.
+    where `logarithmic`. `variance` is what a likely scatter of pressure and B makes of it, up to a factor. `own`, shape
+    (n_trials, 4), are the trials' own numbers that belong to these values.
     """
 
     key: str
@@ -44,6 +45,7 @@ class OwnValues:
     base: Floats
     deviation: Floats
     variance: Floats
+    own: Floats
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,14 @@ def own_values(found: Fit, key: str, laid: Laid) -> OwnValues:
         base=base,
         deviation=deviation,
         variance=_variance(laid, projected, scale),
+        own=_with_deviation(own, moved) if logarithmic else own,
     )
+
+
+def _with_deviation(own: Floats, moved: Floats) -> Floats:
+    changed = own.copy()
+    changed[:, DAMPING_DEVIATION] = moved
+    return changed
 
 
 def _parameter(found: Fit, key: str) -> Parameter:

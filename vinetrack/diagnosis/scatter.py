@@ -9,7 +9,6 @@ does not make them larger.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,6 +22,9 @@ from vinetrack.records import Floats
 
 FIRST_GUESS = (0.01, 0.03, 0.2)
 LEAST, LARGEST = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)
+LEAST_SPREAD = (0.005, 0.015)
+"""Of pressure and B, for whoever needs both: replicates tell their sum much better than either."""
+
 EXACT_M = 1e-6
 """Stretches are no better known than this, m."""
 
@@ -124,11 +126,11 @@ def unlikely(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) ->
     The sum of squares of the means in their own errors, for what Satterthwaite's approximation leaves of degrees of
     freedom: stretches err together. The scatter is itself known from `dof` replicates.
     """
+    from scipy.stats import chi2, norm
     from scipy.stats import f as fisher
-    from scipy.stats import norm
 
     sigma = np.sqrt(np.diag(covariance))
     degrees = mean.size**2 / float(np.sum((covariance / sigma[:, None] / sigma) ** 2))
     square = trials * float(np.mean((mean / sigma) ** 2))
-    p = float(fisher.sf(square, degrees, scatter.dof if scatter.dof else math.inf))
+    p = float(fisher.sf(square, degrees, scatter.dof) if scatter.dof else chi2.sf(square * degrees, degrees))
     return float(norm.isf(max(p, 1e-300)))

@@ -103,6 +103,8 @@ def _round(value: float) -> str:
 
 
 def _sized(value_N: float, sigma_N: float) -> str:
+    if not math.isfinite(sigma_N):
+        return "any size"
     digits = decimals(sigma_N)
     return f"{value_N:.{digits}f} ± {sigma_N:.{digits}f} N"
 

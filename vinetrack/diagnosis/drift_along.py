@@ -1,0 +1,201 @@
+"""Whether B changes along the growth, and whether the sheet's yield pressure is kept.
+
+What B would suit the first half of the growth of a trial, and what the second? The scatter of pressure and B from trial
+to trial is the same in both and drops out of their difference: an effect that builds up along the way, which n and the
+yield pressure may hide from every comparison between trials, shows here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.diagnosis.drift_tests import FEWEST_DEGREES, Tested, as_deviate
+from vinetrack.diagnosis.force_answers import Motion, answers_to_pushes, motions_of
+from vinetrack.diagnosis.own_values import Laid, OwnValues
+from vinetrack.model.fit_result import Fit, decimals
+from vinetrack.model.free import DAMPING, YIELD_PRESSURE
+from vinetrack.model.left_out import rest_is_seen
+from vinetrack.model.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
+from vinetrack.model.terms import evaluate
+from vinetrack.records import Floats, Trial
+
+STEP = 1e-3
+LEAST_SCATTER = 2e-3
+"""Of the rise of ln B in a single trial: that replicates agree better is taken for chance."""
+
+HALVES = (0.25, 0.75)
+"""Middles of the halves, as parts of the growth."""
+
+
+@dataclass(frozen=True)
+class _Halves:
+    """Deviation of ln B that suits each half of the growth of every trial, shape (n_trials, 2)."""
+
+    trials: tuple[Trial, ...]
+    deviation: Floats
+
+
+def along_growth(found: Fit, laid: Laid, values: OwnValues) -> Iterator[Tested]:
+    """Rows of B against the growth, for every vine and for all; `values` are those of B.
+
+    Raises
+    ------
+    SimulationError
+        If a trajectory cannot be followed.
+    """
+    if laid.predictor.damping_column < 0:
+        return
+    halves = _halves(found, laid, values.own)
+    vines = np.array([trial.vine for trial in halves.trials])
+    known = np.isfinite(halves.deviation).all(axis=1)
+    names = list(dict.fromkeys(vines[known]))
+    for vine in [*names, *([""] if len(names) > 1 else [])]:
+        chosen = np.flatnonzero(known & ((vines == vine) | (vine == "")))
+        tested = _tested(found, halves, str(vine), chosen)
+        if tested is not None:
+            yield tested
+
+
+def _halves(found: Fit, laid: Laid, own: Floats) -> _Halves:
+    """About each trial's own B: about the common one, its scatter would count in the second order."""
+    motions = motions_of(found, own)
+    data = laid.predictor.data
+    columns = laid.predictor.linearise(np.empty(0), own)
+    held = rest_is_seen(data)
+    middles = [
+        0.5 * float(np.max(np.interp(item.time_s - own[i, RELEASE], motion.time_s, motion.lead_position_m)))
+        for i, (item, motion) in enumerate(zip(data, motions, strict=True))
+    ]
+    pushes = [_pushes(*one) for one in zip(motions, middles, strict=True)]
+    deviation = np.full((len(data), 2), math.nan)
+    for i, answers in enumerate(answers_to_pushes(found, own, motions, pushes)):
+        others = columns[i][:, [RELEASE]] if held[i] else columns[i][:, [RELEASE, ORIGIN]]
+        if laid.predictor.feels_damping[i] and np.all(np.ptp(answers, axis=0) > 0):
+            deviation[i] = np.linalg.lstsq(np.column_stack([answers, others]), columns[i][:, -1], rcond=1e-9)[0][:2]
+    return _Halves(tuple(item.trial for item in data), deviation + own[:, [DAMPING_DEVIATION]])
+
+
+def _pushes(motion: Motion, middle_m: float) -> Floats:
+    """What a unit of ln B does to the tail's acceleration in each half of the growth, m/s², shape (n_times, 2)."""
+    value = motion.model.values[DAMPING]
+    assert isinstance(value, float)
+    more = motion.model.with_values({DAMPING: value * math.exp(STEP)})
+    y, v = motion.lead_position_m, motion.lead_velocity_m_s
+    changed = evaluate(more, motion.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
+    push = (changed - motion.free) / STEP
+    return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
+
+
+def _tested(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> Tested | None:
+    """The mean difference of the halves against how replicates differ in it."""
+    from scipy.stats import t as student
+
+    rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
+    scatter, dof = _scatter(rise, [halves.trials[i].condition for i in chosen])
+    scatter = max(scatter, LEAST_SCATTER)
+    if dof < FEWEST_DEGREES:
+        return None
+    mean, sigma = float(rise.mean()), scatter / math.sqrt(rise.size)
+    p = float(2 * student.sf(abs(mean) / sigma, dof))
+    change = math.expm1(abs(mean))
+    error = math.exp(abs(mean)) * sigma
+    start, stop = HALVES if mean >= 0 else HALVES[::-1]
+    where = ("first", "second") if mean >= 0 else ("second", "first")
+    who = f"B of {vine}" if vine else "B"
+    digits = max(decimals(100 * error) - 1, 0)
+    row = {
+        "parameter": DAMPING,
+        "vine": vine,
+        "symbol": "B",
+        "unit": "N·(s/m)ⁿ",
+        "against": "growth",
+        "from_level": start,
+        "to_level": stop,
+        "change": change,
+        "change_sigma": error,
+        "relative": True,
+        "z": as_deviate(p),
+        "z_constancy": as_deviate(p),
+        "dof": dof,
+        "n_trials": int(chosen.size),
+        "sentence": (
+            f"{who} would have to be {100 * change:.{digits}f} ± {100 * error:.{digits}f} % larger in the {where[1]}"
+            f" half of the growth than in the {where[0]} ({as_deviate(p):.1f} σ), though it should not change along"
+            " the way."
+        ),
+    }
+    return Tested(row, p, _groups(found, halves, vine, chosen) if vine else [])
+
+
+def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
+    """Standard deviation of replicates about their mean, or of all trials where there are none; degrees of freedom."""
+    names = np.array(conditions)
+    left = values.copy()
+    for name in set(conditions):
+        left[names == name] -= values[names == name].mean()
+    dof = values.size - len(set(conditions))
+    if dof < FEWEST_DEGREES:
+        left, dof = values - values.mean(), values.size - 1
+    return math.sqrt(float(np.sum(left**2)) / max(dof, 1)), dof
+
+
+def _groups(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[dict[str, object]]:
+    """Mean value of each half; the error is that of their difference, shared between them."""
+    rows: list[dict[str, object]] = []
+    conditions = [halves.trials[i].condition for i in chosen]
+    rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
+    sigma = max(_scatter(rise, conditions)[0], LEAST_SCATTER) / math.sqrt(2 * chosen.size)
+    base = float(found.model.parameters_for(vine)[found.model.parameter_names.index(DAMPING)])
+    for half, level in enumerate(HALVES):
+        ratio = math.exp(float(halves.deviation[chosen, half].mean()))
+        rows.append(
+            {
+                "parameter": DAMPING,
+                "vine": vine,
+                "symbol": "B",
+                "unit": "N·(s/m)ⁿ",
+                "against": "growth",
+                "level": level,
+                "value": base * ratio,
+                "sigma": base * ratio * sigma,
+                "ratio": ratio,
+                "ratio_sigma": ratio * sigma,
+                "n_trials": int(chosen.size),
+            }
+        )
+    return rows
+
+
+def against_the_sheet(found: Fit) -> Iterator[Tested]:
+    """Rows of yield pressures that the fit moved, beside the error that the sheet gives them."""
+    for number, free in zip(found.numbers, found.predictor.layout.free, strict=True):
+        if number.key != YIELD_PRESSURE or not math.isfinite(free.prior_sd):
+            continue
+        away = number.value - free.start
+        z = abs(away) / free.prior_sd
+        p = math.erfc(z / math.sqrt(2))
+        row = {
+            "parameter": number.key,
+            "vine": number.vine,
+            "symbol": number.symbol,
+            "unit": number.unit,
+            "against": "sheet",
+            "from_level": free.start,
+            "to_level": number.value,
+            "change": away,
+            "change_sigma": free.prior_sd,
+            "relative": False,
+            "z": z,
+            "z_constancy": z,
+            "dof": math.inf,
+            "n_trials": sum(trial.trial.vine == number.vine.split(",")[0] for trial in found.trials),
+            "sentence": (
+                f"{number.symbol} of {number.vine} is pulled from the {free.start / 1e3:.2f} ±"
+                f" {free.prior_sd / 1e3:.2f} kPa of the sheet to {number.value / 1e3:.2f} kPa ({z:.1f} σ)."
+            ),
+        }
+        yield Tested(row, p, [])
