@@ -120,7 +120,7 @@ def test_a_vine_that_the_fit_does_not_know_is_said_to_be_guessed(fitted: Path) -
 
 
 def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_path: Path) -> None:
-    own = Path(__file__).parents[1] / "README.md"
+    own = Path(__file__).parents[1] / "docs" / "own_effect.md"
     code = own.read_text().split("```python\n")[1].split("```")[0]
     experiment, results = tmp_path / "mine", tmp_path / "results"
     experiment.mkdir()

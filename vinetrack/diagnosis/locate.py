@@ -37,8 +37,9 @@ from vinetrack.records import Floats
 if TYPE_CHECKING:
     import pandas as pd
 
-FAILS = 3.0
-"""Standard deviations from which a condition is said to fail; the worst of many must be less likely still."""
+FAILS, MISSED = 3.0, 2.0
+"""Standard deviations from which a model is said to fail (one condition among many must be less likely still), and of
+a condition that is then said to be missed."""
 
 CONDITION_COLUMNS = (
     "vine",
@@ -82,19 +83,12 @@ class Failure:
 
     @property
     def fails(self) -> bool:
-        """Whether any condition is off the model by more than replicates explain."""
-        return bool((self.by_condition["z"] > self._threshold).any())
-
-    @property
-    def _threshold(self) -> float:
-        """Of as many conditions one goes beyond this as seldom as a single one beyond `FAILS`."""
-        from scipy.stats import norm
-
-        return float(norm.isf(norm.sf(FAILS) / max(len(self.by_condition), 1)))
+        """Whether the conditions are off the model by more than replicates explain: the worst, or all together."""
+        return _fail(self.by_condition["z"].to_numpy(float))
 
     def sentences(self) -> tuple[str, ...]:
         """Where it fails most, by how much, and what drifts, in plain words."""
-        return (*_where(self.by_condition, self._threshold), *self.drift.sentences)
+        return (*_where(self.by_condition, self.fails), *self.drift.sentences)
 
 
 def locate(found: Fit) -> Failure:
@@ -203,10 +197,20 @@ def _mean_rows(
     return rows
 
 
-def _where(table: pd.DataFrame, threshold: float) -> list[str]:
+def _fail(z: Floats) -> bool:
+    """Whether the largest of so many deviates, or all of them together by Fisher's way, are too unlikely."""
+    from scipy.stats import chi2, norm
+
+    level = float(norm.sf(FAILS))
+    p = norm.sf(z)
+    together = float(chi2.sf(-2 * np.sum(np.log(np.maximum(p, 1e-300))), 2 * z.size))
+    return bool(p.min() < level / z.size or together < level)
+
+
+def _where(table: pd.DataFrame, fails: bool) -> list[str]:
     """Sentences about conditions; the table has the worst first."""
-    failing = table[table["z"] > FAILS]
-    if not (table["z"] > threshold).any():
+    failing = table[table["z"] > min(MISSED, float(table["z"].iloc[0]) - 1e-9)]
+    if not fails:
         worst = table.sort_values("z").iloc[-1]
         return [
             "Nowhere does the mean of the replicates leave the model by more than they explain themselves"
