@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from explorer_campaign import make_experiment, make_results
+from explorer_campaign import DEMO, make_experiment, make_results
 
 from vinetrack.effects import Parameter
 from vinetrack.explorer.campaign import Campaign, Seen, condition_labels
@@ -21,6 +21,8 @@ from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.curves import errors_m, follow, overall_m
 from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, exported, model_words
 from vinetrack.explorer.series import bands, error_bars, measured, modelled, residuals, symmetric, thinned, vine_colours
+from vinetrack.laboratory.nature import read_nature
+from vinetrack.laboratory.tracks import grow
 from vinetrack.records import Trial
 from vinetrack.stages.results import ResultsError
 
@@ -99,9 +101,6 @@ def test_twenty_four_trials_follow_a_slider_in_a_fraction_of_a_frame(campaign: C
     assert (time.process_time() - begun) / 20 < 0.05
 
 
-@pytest.mark.xfail(
-    reason="a base model that is far off is fitted otherwise now: to be held against it again", strict=False
-)
 def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_path: Path) -> None:
     folder = tmp_path / "results"
     shutil.copytree(campaign.folder, folder)
@@ -111,8 +110,11 @@ def test_a_fit_that_was_refused_still_shows_the_trials(campaign: Campaign, tmp_p
     assert bare.floors_m == {}
     assert len(bare.trials) == 6
     assert first_choice(bare).numbers["eversion_damping.n"] == 0.37
-    for seen, known in zip(bare.trials, campaign.trials, strict=True):
-        assert seen.release_s == pytest.approx(known.release_s, abs=0.02)
+    true = {one.stated.name: one for one in grow(bare.experiment.trials, read_nature(DEMO))}
+    for seen in bare.trials:
+        # The last frame at rest, where 0.1 mm of noise hides the first two milliseconds of the motion.
+        assert seen.release_s == pytest.approx(true[seen.name].release_s, abs=2.5e-3)
+        assert seen.origin_m == pytest.approx(true[seen.name].origin_m, abs=1e-4)
 
 
 def test_a_folder_without_usable_trials_says_so(campaign: Campaign, tmp_path: Path) -> None:
