@@ -148,6 +148,16 @@ def test_nothing_is_wider_than_the_window(visitor: Visitor, width: int) -> None:
     until(lambda: visitor.chrome.run("document.documentElement.scrollWidth") <= width, f"a page of {width} px", 20)
 
 
+def test_page_and_figures_follow_a_dark_screen(visitor: Visitor) -> None:
+    """The ink is the page's own on either; a vine keeps its hue and turns lighter on the dark one."""
+    ink, vine = "$motion.below[0].axis_label_text_color", "$motion.renderers[1].glyph.line_color.transform.palette[0]"
+    for screen, colours in (("dark", ("#e6e9ee", "#3fa9ea")), ("light", ("#20242a", "#0072b2"))):
+        visitor.chrome.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": screen}])
+        visitor.until(f"{ink} === {colours[0]!r} && {vine} === {colours[1]!r}", f"the figures of a {screen} screen", 20)
+        back = visitor.chrome.run("getComputedStyle(document.body).backgroundColor")
+        assert (sum(map(int, back[4:-1].split(","))) < 150) == (screen == "dark")
+
+
 def test_a_finger_scrolls_the_page_over_a_figure_too(visitor: Visitor) -> None:
     for name in ("motion", "errors"):
         events = f"Bokeh.index.find_one({visitor.model(name)}).canvas_view.events_el"

@@ -15,8 +15,9 @@ CHIPS = """
 :host { max-height: 10.5rem; overflow-y: auto; }
 .bk-btn-group { display: flex; flex-wrap: wrap; gap: 4px; }
 .bk-btn-group > .bk-btn { flex: 0 1 auto; border-radius: 999px !important; margin: 0 !important; padding: 3px 10px; }
-.bk-btn-group > .bk-btn { border: 1px solid #d9dde3; background: #fff; color: #6a717c; }
-.bk-btn-group > .bk-btn.bk-active { background: #e3f0f8; border-color: #0072b2; color: #20242a; box-shadow: none; }
+.bk-btn-group > .bk-btn { border: 1px solid var(--grid); background: var(--card); color: var(--muted); }
+.bk-btn-group > .bk-btn.bk-active { background: var(--chosen); border-color: var(--accent); color: var(--ink); }
+.bk-btn-group > .bk-btn.bk-active { box-shadow: none; }
 """
 
 

@@ -7,11 +7,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bokeh.models import Div, InlineStyleSheet
+from bokeh.models import CategoricalColorMapper, CustomJS, Div, InlineStyleSheet
 from bokeh.plotting import figure
 from bokeh.themes import Theme
 
-from vinetrack.figures.style import BLUE, GRID, INK, MUTED
+from vinetrack.figures.page_tokens import TOKENS, page_tokens
+from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS
 
 TEMPLATES = Path(__file__).with_name("templates")
 SANS = 'system-ui, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif'
@@ -36,7 +37,6 @@ THEME: dict[str, Any] = {
         "Plot": {"background_fill_color": None, "border_fill_color": None, "outline_line_color": None},
         "Axis": _AXIS,
         "Grid": {"grid_line_color": GRID, "grid_line_width": 0.8},
-        "Slider": {"bar_color": BLUE},
     }
 }
 
@@ -53,7 +53,19 @@ def page_template() -> str:
 
 def page_style() -> str:
     """CSS of the page around the widgets."""
-    return (TEMPLATES / "page.css").read_text(encoding="utf-8")
+    return page_tokens() + (TEMPLATES / "page.css").read_text(encoding="utf-8")
+
+
+def screen_script(figures: Sequence[figure]) -> CustomJS:
+    """Has these figures follow a light or dark screen."""
+    code = (TEMPLATES / "screen.js").read_text(encoding="utf-8")
+    return CustomJS(args={"plots": list(figures), "tokens": TOKENS}, code=code)
+
+
+def vine_colour() -> dict[str, Any]:
+    """Colour of glyphs whose column `colour` holds that of their vine: a palette, so that a page can change it."""
+    colours = list(VINE_COLOURS)
+    return {"field": "colour", "transform": CategoricalColorMapper(factors=colours, palette=colours)}
 
 
 def sheet(more: str = "") -> InlineStyleSheet:
@@ -126,8 +138,10 @@ __all__ = [
     "page_template",
     "plot",
     "progress_bar",
+    "screen_script",
     "sheet",
     "table",
     "theme",
+    "vine_colour",
     "words",
 ]

@@ -17,13 +17,14 @@ from vinetrack.explorer.film_panel import FilmPanel
 from vinetrack.explorer.fitting import Fitted, Job, at_numbers, fit_choice
 from vinetrack.explorer.ground import Ground
 from vinetrack.explorer.keep_panel import KeepPanel
-from vinetrack.explorer.look import escaped, page_style, page_template, progress_bar, sheet, theme, words
+from vinetrack.explorer.look import escaped, page_style, page_template, progress_bar, screen_script, sheet, theme, words
 from vinetrack.explorer.panel import EffectPanel
 from vinetrack.explorer.plots import Plots
 from vinetrack.explorer.series import vine_colours
 from vinetrack.explorer.sides import Rung, headline, next_panel, numbers_words, rung_of, tied_panel
 from vinetrack.explorer.story import DIAGNOSIS, Story, read_story
 from vinetrack.explorer.waiting import Waiting
+from vinetrack.figures.page_tokens import follows_screen
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.solve import Step
 
@@ -97,6 +98,8 @@ class Page:
             self.document.add_root(root)
         figures = [self.plots.motion, self.plots.residual, self.plots.errors, self.film.figure]
         self.document.js_on_event("document_ready", CustomJS(args={"plots": figures}, code=LET_SCROLL))
+        # A recording keeps its greys, and the edges their colours over them.
+        self.document.js_on_event("document_ready", screen_script(figures[:-1]))
         self.document.title = f"{campaign.name} – vinetrack explorer"
         self.document.theme = theme()
         self._set_template()
@@ -110,7 +113,7 @@ class Page:
         self.document.template_variables.update(
             name=self.campaign.name,
             style=_Markup(page_style()),
-            vines=vine_colours(self.campaign),
+            vines=[(vine, follows_screen(colour)) for vine, colour in vine_colours(self.campaign)],
             tally=f"{trials} trials, {conditions} conditions" + (f", {out} left out" if out else ""),
         )
 

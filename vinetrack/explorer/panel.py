@@ -16,12 +16,15 @@ from vinetrack.explorer.look import escaped, sheet, words
 STEPS = 400
 HEADING = """
 :host { margin-top: .5rem; }
-.bk-btn { text-align: left; border: 0 !important; border-bottom: 1px solid #d9dde3 !important; border-radius: 0; }
+.bk-btn { text-align: left; border: 0 !important; border-bottom: 1px solid var(--grid) !important; border-radius: 0; }
 .bk-btn { background: none !important; box-shadow: none !important; font-weight: 650; padding: .3rem 0; width: 100%; }
-.bk-btn, .bk-btn.bk-active { color: #20242a !important; }
-.bk-btn::before { content: "▸ "; color: #6a717c; } .bk-btn.bk-active::before { content: "▾ "; }
+.bk-btn, .bk-btn.bk-active { color: var(--ink) !important; }
+.bk-btn::before { content: "▸ "; color: var(--muted); } .bk-btn.bk-active::before { content: "▾ "; }
 """
-TICK = ":host { font-weight: 600; } input { accent-color: #0072b2; width: 1rem; height: 1rem; margin-right: .4rem; }"
+TICK = """
+:host { font-weight: 600; }
+input { accent-color: var(--accent); width: 1rem; height: 1rem; margin-right: .4rem; }
+"""
 
 
 class Row:

@@ -10,7 +10,7 @@ from bokeh.models import ColumnDataSource, CustomJSTickFormatter, HoverTool, Ran
 
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.curves import Curves
-from vinetrack.explorer.look import INK, MUTED, plot
+from vinetrack.explorer.look import GRID, INK, MUTED, plot, vine_colour
 from vinetrack.explorer.series import bands, error_bars, extent, measured, modelled, residuals, symmetric
 
 ROW_PX = 25
@@ -37,8 +37,10 @@ class Plots:
 
     def _draw_motion(self) -> Any:
         fig = plot(360, "since release (ms)", "growth (mm)", name="motion", x_range=Range1d(), y_range=Range1d())
-        fig.patches("xs", "ys", source=self._band, fill_color="colour", fill_alpha=0.2, line_color=None)
-        lines = fig.multi_line("xs", "ys", source=self._measured, line_color="colour", line_width=1.6, line_alpha=0.9)
+        fig.patches("xs", "ys", source=self._band, fill_color=vine_colour(), fill_alpha=0.2, line_color=None)
+        lines = fig.multi_line(
+            "xs", "ys", source=self._measured, line_color=vine_colour(), line_width=1.6, line_alpha=0.9
+        )
         ghost = {"line_color": MUTED, "line_width": 1.5, "line_dash": [2, 3]}
         fig.multi_line("xs", "ys", source=self._earlier, **ghost)
         fig.multi_line("xs", "ys", source=self._model, line_color=INK, line_width=2, line_dash=[7, 4])
@@ -54,7 +56,7 @@ class Plots:
             230, "growth (mm)", "measured − model (mm)", name="residual", x_range=Range1d(), y_range=Range1d(-1, 1)
         )
         fig.add_layout(Span(location=0, dimension="width", line_color=INK, line_width=1.5, line_dash=[7, 4]))
-        lines = fig.multi_line("xs", "ys", source=self._left, line_color="colour", line_width=1.4)
+        lines = fig.multi_line("xs", "ys", source=self._left, line_color=vine_colour(), line_width=1.4)
         fig.add_tools(
             HoverTool(renderers=[lines], tooltips=[("trial", "@trial"), ("", "@condition")], line_policy="interp")
         )
@@ -65,8 +67,12 @@ class Plots:
         height = 70 + ROW_PX * max(len(names), 2)
         fig = plot(height, "rms error of position (mm)", "", name="errors", y_range=names, x_range=Range1d(0, 1))
         common = {"y": "condition", "source": self._bars}
-        fig.hbar(right="before", height=0.8, fill_color="#e6e9ee", line_color="#b9c0c9", **common)
-        bars = fig.hbar(right="now", height=0.44, fill_color="colour", line_color=None, fill_alpha="alpha", **common)
+        fig.hbar(
+            right="before", height=0.8, fill_color=GRID, fill_alpha=0.65, line_color=MUTED, line_alpha=0.5, **common
+        )
+        bars = fig.hbar(
+            right="now", height=0.44, fill_color=vine_colour(), line_color=None, fill_alpha="alpha", **common
+        )
         floors = fig.scatter(
             x="floor", marker="dash", angle=math.pi / 2, size=17, line_color=INK, line_width=2.6, **common
         )

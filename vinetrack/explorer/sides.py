@@ -13,6 +13,7 @@ from vinetrack.explorer.curves import overall_m
 from vinetrack.explorer.export import model_words
 from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
 from vinetrack.explorer.look import command_block, escaped, table
+from vinetrack.explorer.series import vine_colours
 from vinetrack.explorer.story import Story
 from vinetrack.model.fit_result import Number, decimals
 
@@ -56,8 +57,10 @@ def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[Run
     """The table of fitted numbers and the models fitted so far."""
     if fitted is None:
         return "<p class='muted'>The model in use is being fitted; its numbers come here.</p>"
-    rows = [_number_row(number) for number in fitted.fit.numbers]
-    parts = [table(rows, ("", "vine", "value", "error", "95 %", "unit"), (2, 3, 4))]
+    vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
+    known = vines if len(vines) > 1 else {}
+    rows = [_number_row(number, known.get(number.vine, number.vine) or "all") for number in fitted.fit.numbers]
+    parts = [table(rows, ("", "vine", "value", "error", "95 %"), (2, 3, 4))]
     if touched:
         parts.append('<p class="muted">Sizes were moved since: these are the numbers of the last fit.</p>')
     spreads = "; ".join(
@@ -73,14 +76,14 @@ def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[Run
     return "".join(parts)
 
 
-def _number_row(number: Number) -> tuple[str, ...]:
+def _number_row(number: Number, vine: str) -> tuple[str, ...]:
     unit, factor = SHOWN_UNITS.get(number.unit, (number.unit, 1.0))
+    name = f"{number.symbol}, {unit}" if unit else number.symbol
     if not math.isfinite(number.sigma):
-        return number.symbol, number.vine or "all", f"{number.value * factor:.4g}", "open", "", unit
+        return name, vine, f"{number.value * factor:.4g}", "open", ""
     digits = decimals(number.sigma * factor)
     value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
-    error = f"± {number.sigma * factor:.{digits}f}"
-    return number.symbol, number.vine or "all", value, error, f"{low} to {high}", unit
+    return name, vine, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}"
 
 
 def _ladder(campaign: Campaign, rungs: Sequence[Rung]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.figures.page_tokens import page_tokens
 from vinetrack.report.diagnosis import DIAGNOSIS_FIGURES, DiagnosisResult, diagnosis_section
 from vinetrack.report.model import ModelResult, model_section
 from vinetrack.report.recordings import LARGEST_SVG_BYTES, METHODS, SHARED_ERROR, Recording, calibration_table
@@ -94,7 +95,7 @@ def build_report(content: ReportContent) -> str:
     trials, n_left_out = trial_entries(content)
     return environment.get_template("report.html").render(
         name=content.name,
-        style=Markup((folder / "report.css").read_text(encoding="utf-8")),
+        style=Markup(page_tokens() + (folder / "report.css").read_text(encoding="utf-8")),
         headline=headline(content.damping),
         tally=tally(content.trials),
         exponents=exponent_table(content.damping),

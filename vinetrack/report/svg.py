@@ -7,18 +7,10 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.figures.style import BLUE, GREEN, GRID, INK, MUTED, PAPER, VERMILLION
+from vinetrack.figures.page_tokens import TOKENS
 from vinetrack.report.compact import compact_svg
 
-_THEMED = {
-    INK.lower(): "currentColor",
-    GRID.lower(): "var(--grid)",
-    MUTED.lower(): "var(--muted)",
-    PAPER.lower(): "var(--paper)",
-    BLUE.lower(): "var(--blue)",
-    VERMILLION.lower(): "var(--vermillion)",
-    GREEN.lower(): "var(--green)",
-}
+_THEMED = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
 
 
 def inline_svg(svg: str, prefix: str, description: str) -> str:
