@@ -17,6 +17,7 @@ from vinetrack.diagnosis.singles import Report, Search, pairs
 from vinetrack.effects import Effect
 from vinetrack.model.fit_result import Fit
 
+MOST_AGAIN = 2
 NO_BETTER = 1.0
 """Difference in ln L that counts as a better minimum."""
 
@@ -39,14 +40,14 @@ class Finding:
     note: str = ""
 
 
-def inquire(found: Fit, effects: Sequence[Effect], report: Report, *, anew: int = 2) -> list[Finding]:
+def inquire(found: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[Finding]:
     """The findings of all rounds, the first about the fit itself.
 
     A fit may have ended in a local minimum, from which any effect seems to help. So one that is far off is begun again
     elsewhere before it is questioned, and again from where the best hypothesis ended: if it then does better without
-    the effect, all is asked `anew` of that.
+    the effect, all is asked again of that, twice at most.
     """
-    if found.chi2_per_dof > FAR_OFF:
+    if found.chi2_per_dof > FAR_OFF and not again:
         report("fitting the model from other starts")
         found = from_other_starts(found)
     report("questioning the model")
@@ -55,10 +56,10 @@ def inquire(found: Fit, effects: Sequence[Effect], report: Report, *, anew: int 
         return [Finding(ADEQUATE, questions)]
     search = Search(questions, report)
     tried = search.singles()
-    if tried and anew:
+    if tried and again < MOST_AGAIN:
         rival = without(found, best_of(tried).fit)
-        if rival is not None and rival.log_likelihood > found.log_likelihood + NO_BETTER:
-            return inquire(rival, effects, report, anew=anew - 1)
+        if rival.log_likelihood > found.log_likelihood + NO_BETTER:
+            return inquire(rival, effects, report, again=again + 1)
     alone = _alone(questions, search, tried)
     if alone is not None:
         return alone

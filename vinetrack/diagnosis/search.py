@@ -15,7 +15,7 @@ import numpy as np
 
 from vinetrack.diagnosis.hypotheses import Shape
 from vinetrack.effects import Effect
-from vinetrack.model.fit import refit
+from vinetrack.model.fit import lost, refit
 from vinetrack.model.fit_data import FitError, FitTrial
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.free import EXPONENT, YIELD_PRESSURE, Layout, make_layout
@@ -36,6 +36,9 @@ MOST_CLIMBED = 14
 """Trials of a climb: one of every condition, no more than this."""
 
 FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
+LOWER = 1.0
+"""By how much −2 ln L of a climb must end lower for its start to be worth a fit."""
+
 HOPELESS = 0.5
 """A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far."""
 
@@ -173,31 +176,36 @@ def full_fit(found: Fit, climb: Climb, best: float = -math.inf) -> Fit | None:
     for effect in climb.effects:
         model = model + effect
     try:
-        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT)
-        if fit.converged or fit.log_likelihood < best - FAR_BEHIND:
+        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False)
+        if fit.converged or fit.log_likelihood < best - FAR_BEHIND or lost(fit.predictor, fit.solution):
             return fit
-        return refit(fit, most_iterations=MORE_OF_FIT)
+        return refit(fit, most_iterations=MORE_OF_FIT, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
 
 
 def from_other_starts(found: Fit) -> Fit:
     """The same model fitted from where climbs from several exponents end, if that is better; else the fit itself."""
+    if EXPONENT not in found.model.parameter_names or EXPONENT in found.options["fixed"]:
+        return found
+    return _from(found, [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)])
+
+
+def without(found: Fit, other: Fit) -> Fit:
+    """The model of a fit begun from the numbers of another fit, which holds it, if that is better; else the fit."""
+    names = set(found.model.parameter_names)
+    return _from(found, [((), {key: value for key, value in other.model.values.items() if key in names})])
+
+
+def _from(found: Fit, starts: Sequence[Start]) -> Fit:
+    """The model of a fit begun elsewhere, where a climb from there ends lower than one from where the fit stands."""
     slope = Slope(found)
-    starts: list[Start] = [((), {})]
-    if EXPONENT in found.model.parameter_names and EXPONENT not in found.options["fixed"]:
-        starts += [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
-    climb = best_climb(slope, starts, math.inf)
-    other = None if climb is None else full_fit(found, climb, found.log_likelihood)
+    here = slope.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
+    climb = best_climb(slope, starts, math.inf if here is None else here.deviance)
+    if climb is None or (here is not None and climb.deviance > here.deviance - LOWER):
+        return found
+    other = full_fit(found, climb, found.log_likelihood)
     return other if other is not None and other.log_likelihood > found.log_likelihood else found
-
-
-def without(found: Fit, other: Fit) -> Fit | None:
-    """The model of a fit begun from the numbers of another fit, which holds it; None where it cannot be followed."""
-    try:
-        return refit(other, found.model, most_iterations=FIRST_OF_FIT)
-    except (FitError, SimulationError, np.linalg.LinAlgError):
-        return None
 
 
 def starts_of(shapes: Iterable[tuple[Shape, float]]) -> list[Start]:

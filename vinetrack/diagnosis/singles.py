@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from vinetrack.diagnosis.evidence import Evidence, weigh
 from vinetrack.diagnosis.question import LATER_LEVEL, Questions, question
-from vinetrack.diagnosis.search import Climb, Slope, best_climb, full_fit, start_of, starts_of
+from vinetrack.diagnosis.search import MORE_ITERATIONS, Climb, Slope, best_climb, full_fit, start_of, starts_of
 from vinetrack.effects import Effect
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.model import Value
@@ -48,6 +48,7 @@ class Search:
     def __post_init__(self) -> None:
         self.slope = Slope(self.questions.found)
         self.goal = math.inf
+        self.reach = REACH_OF_CLIMBS
 
     @property
     def weak(self) -> bool:
@@ -71,9 +72,9 @@ class Search:
         best = leaders[0]
         base = self.slope.climb((), {}, iterations=4)
         gain = max((base.deviance if base else best.deviance) - best.deviance, 0.0)
-        reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
+        self.reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
         alike = [c for c in leaders if self.questions.cosine(c.names[0], best.names[0]) > ALIKE]
-        chosen = [one for one in leaders if one.deviance - best.deviance < reach or one in alike]
+        chosen = [one for one in leaders if one.deviance - best.deviance < self.reach or one in alike]
         for climb in chosen[: self.most_fitted + 3 * all_of_them]:
             self._fit(climb)
         self._fit_what_is_contained()
@@ -90,7 +91,16 @@ class Search:
                 sizes = {key.split(".")[1]: value for key, value in values.items() if key.split(".")[0] in one.names}
                 kept = {key: value for key, value in values.items() if key.split(".")[0] in self.questions.found.model}
                 own = {f"{name}.{p.name}": sizes[p.name] for p in simpler[0].parameters if p.name in sizes}
-                self._fit(Climb((simpler[0],), math.nan, {**kept, **own}))
+                if self._in_reach(simpler[0], {**kept, **own}):
+                    self._fit(Climb((simpler[0],), math.nan, {**kept, **own}))
+
+    def _in_reach(self, effect: Effect, values: Mapping[str, Value]) -> bool:
+        """Whether a few steps from these values come near the best climb; where none was made, it may."""
+        if not self.climbs:
+            return True
+        there = self.slope.climb((effect,), values, iterations=MORE_ITERATIONS)
+        best = min(one.deviance for one in self.climbs.values())
+        return there is not None and there.deviance - best < self.reach
 
     def _worth_a_climb(self) -> list[str]:
         top = self.questions.promise(self.names[0]) if self.names else 0.0
@@ -165,7 +175,9 @@ class Search:
             # The smaller model is in this one: it was led astray by its start, and begins again where the other ended.
             fit = full_fit(self.questions.found, Climb(climb.effects, math.nan, self._smallest(climb.effects)), best)
             found = max((found, *([weigh(self.questions.found, climb.effects, fit)] if fit else [])), key=_gain)
-        if name not in self.fitted or found.delta_chi2 > self.fitted[name].delta_chi2:
+        if found.delta_chi2 < WORSE:
+            self.silent.add(name)
+        elif name not in self.fitted or found.delta_chi2 > self.fitted[name].delta_chi2:
             self.fitted[name] = found
 
 

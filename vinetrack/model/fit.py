@@ -23,7 +23,7 @@ from vinetrack.model.fit_data import FitError, FitTrial, Pairs, pairs_of, prepar
 from vinetrack.model.fit_result import Fit, TrialFit
 from vinetrack.model.free import make_layout
 from vinetrack.model.left_out import predict_trials
-from vinetrack.model.mixed import deviance, marginal
+from vinetrack.model.mixed import Frame, State, deviance, marginal
 from vinetrack.model.model import Model, Value
 from vinetrack.model.sensitivity import Predictor
 from vinetrack.model.simulate import SimulationError
@@ -33,6 +33,7 @@ from vinetrack.model.solve import (
     Solution,
     Watch,
     chi2_per_dof,
+    cost,
     first_state,
     make_frame,
     solve,
@@ -54,6 +55,9 @@ POOR_FIT = 3.0
 
 MOST_STARTS = 3
 ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 20
+BAD_START = 1.5
+"""χ² per point from which a start misses by more than the noise of the fit it came from."""
+
 GUIDING_SPREADS = (5e-4, 1e-3)
 
 
@@ -183,7 +187,9 @@ def _sane(predictor: Predictor, free: Solution, guided: list[Solution]) -> Solut
     return min(found or guided or [free], key=_deviance)
 
 
-def _guided(predictor: Predictor, theta: Floats, own: Floats, held: Held, watch: Watch | None) -> Solution | None:
+def _guided(
+    predictor: Predictor, theta: Floats, own: Floats, held: Held, watch: Watch | None, *, freed: bool = True
+) -> Solution | None:
     """A solution led by what is missed: the noise is as correlated as in the tracks until the numbers have settled.
 
     All trials share their B and pressure as good as exactly: what is missed by much more than noise would else bend
@@ -195,6 +201,8 @@ def _guided(predictor: Predictor, theta: Floats, own: Floats, held: Held, watch:
     state, frame = first_state(predictor.data, theta, own), make_frame(predictor, own)
     try:
         first = solve(predictor, frame, state, guide, warm=True, most_iterations=GUIDED_ITERATIONS, watch=watch)
+        if not freed:
+            return first
         own, _ = align(predictor.data, predictor, first.state.theta, first_own(predictor.data))
         free = _solve_from(predictor, first.state.theta, own, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
         return first if lost(predictor, free) else free
@@ -216,7 +224,9 @@ def _solve_from(
     return solve(predictor, make_frame(predictor, own), state, held, most_iterations=most_iterations, watch=watch)
 
 
-def _found_again(predictor: Predictor, solution: Solution, held: Held, watch: Watch | None) -> Solution:
+def _found_again(
+    predictor: Predictor, solution: Solution, held: Held, watch: Watch | None, *, thorough: bool
+) -> Solution:
     """A solution, or, where it is lost, the one led from its numbers by what is missed."""
     if not lost(predictor, solution):
         return solution
@@ -225,7 +235,7 @@ def _found_again(predictor: Predictor, solution: Solution, held: Held, watch: Wa
         own, _ = align(predictor.data, predictor, theta, first_own(predictor.data))
     except SimulationError:
         return solution
-    guided = _guided(predictor, theta, own, held, watch)
+    guided = _guided(predictor, theta, own, held, watch, freed=thorough)
     return solution if guided is None else _sane(predictor, solution, [guided])
 
 
@@ -245,6 +255,7 @@ def refit(
     hold_noise: bool = False,
     profile: bool = False,
     most_iterations: int = MOST_ITERATIONS,
+    thorough: bool = True,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
@@ -259,6 +270,9 @@ def refit(
         Keep spreads and noise of the fit instead of estimating them again.
     most_iterations
         How long to go on: what is only to be ruled out need not settle.
+    thorough
+        Whether a fit far off that takes what it misses for slow noise is led on by what it misses until nothing moves;
+        else it is only led so far that it can be held against others.
     watch
         Told of every step of the iterations; what it raises ends the fit.
     """
@@ -287,12 +301,23 @@ def refit(
             solution = _solve_from(predictor, theta, own, held, most_iterations=most_iterations, watch=watch)
         else:
             frame = replace(make_frame(predictor, old.own), own_centre=before.solution.frame.own_centre)
-            state = replace(old, theta=theta)
+            state = _led_back(predictor, frame, replace(old, theta=theta), held)
             solution = solve(predictor, frame, state, held, warm=True, most_iterations=most_iterations, watch=watch)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
-    solution = _found_again(predictor, solution, held, watch)
+    solution = _found_again(predictor, solution, held, watch, thorough=thorough)
     return assemble(predictor, solution, before.left_out, {**kept, "shared": shared, "held": held}, profile=profile)
+
+
+def _led_back(predictor: Predictor, frame: Frame, state: State, held: Held) -> State:
+    """The state, or, where its numbers miss by far more than its noise, the one that this noise leads to.
+
+    With the noise to be found as well, all that a bad start misses would pass for noise, and hold the fit there.
+    """
+    if held.noise is not None or cost(predictor, frame, state) < BAD_START * float(np.sum(frame.points)):
+        return state
+    noise = Held(held.spread or state.spread, (state.rho, state.variance))
+    return solve(predictor, frame, state, noise, warm=True, most_iterations=GUIDED_ITERATIONS).state
 
 
 def _belongs(name: str, names: Iterable[str]) -> bool:

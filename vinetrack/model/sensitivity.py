@@ -70,11 +70,14 @@ class Predictor:
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
 
-    def run(self, jobs: Sequence[Job]) -> list[Trajectory]:
-        """Simulate at the instants of each job's trial."""
-        return self.run_as(self.layout.model, jobs, np.array([job.row for job in jobs]).reshape(len(jobs), -1))
+    def run(self, jobs: Sequence[Job], times_s: Floats | None = None) -> list[Trajectory]:
+        """Simulate at the instants of each job's trial, or at `times_s`."""
+        rows = np.array([job.row for job in jobs]).reshape(len(jobs), -1)
+        return self.run_as(self.layout.model, jobs, rows, times_s)
 
-    def run_as(self, model: Model, jobs: Sequence[Job], rows: Floats) -> list[Trajectory]:
+    def run_as(
+        self, model: Model, jobs: Sequence[Job], rows: Floats, times_s: Floats | None = None
+    ) -> list[Trajectory]:
         """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials."""
         places = np.array([job.trial for job in jobs], dtype=int)
         rigs = with_pressures(
@@ -87,7 +90,10 @@ class Predictor:
             model,
             rigs,
             [self.bends[job.trial] for job in jobs],
-            [item.time_s - job.release_s for item, job in zip(data, jobs, strict=True)],
+            [
+                (item.time_s if times_s is None else times_s) - job.release_s
+                for item, job in zip(data, jobs, strict=True)
+            ],
             traces=[
                 None if item.trace is None else (item.trace[0] - job.release_s, item.trace[1])
                 for item, job in zip(data, jobs, strict=True)

@@ -23,6 +23,7 @@ from vinetrack.model.mixed import (
 from vinetrack.model.sensitivity import DAMPING_DEVIATION, PRESSURE, RELEASE, Predictor
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.starts import first_own
+from vinetrack.model.unseen_release import release_again
 from vinetrack.model.whitened import all_products, at_correlation, whiten
 from vinetrack.records import Floats
 
@@ -31,6 +32,10 @@ SETTLED_DECREASE = 1e-2
 """A step that promises less than this of −2 ln L moves every number by under a twentieth of its error."""
 
 SETTLED_SPREAD = 0.02
+NEARLY_SETTLED, PATIENCE, MOST_LOOKS = 3.0, 4, 5
+"""Where a step promises less, or after so many steps, releases that no frame at rest shows are looked for elsewhere: a
+step only creeps along such a valley. So often at most."""
+
 EARLY_ITERATIONS, MOST_EARLY, FAR_OFF = 3, 9, 1e3
 """Spreads and the correlation of the noise stay those first assumed for three steps, and on while a step still promises
 more than this of −2 ln L: what is only not yet fitted must not pass for noise or scatter."""
@@ -45,6 +50,9 @@ LARGEST_RELEASE_STEP_FRAMES = 2.0
 RELEASE_ROOM_FRAMES, ORIGIN_ROOM_SIGMAS = 10.0, 10.0
 """Where the rest is seen it says of release and origin what it says through its points, a hundred times less a second
 time: that only counts where a wrong model would drag both along."""
+
+KNOWN_RELEASE_S = 1e-6
+"""The release of a vine whose pressure was let in while it was recorded: nothing to find."""
 
 FEWEST_TO_SPARE = 3
 """A spread is estimated where this many more trials feel it than there are numbers without a prior."""
@@ -97,15 +105,17 @@ def make_frame(predictor: Predictor, own: Floats) -> Frame:
     spans = np.array([np.ptp(item.lead_position_m) for item in data])
     frames = np.array([item.frame_s for item in data])
     rests = np.array([item.n_rest > 0 or item.vague_rest is not None for item in data])
+    known = rests | np.array([item.let_in for item in data])
     vague = np.array([0.0 if item.vague_rest is None else item.vague_rest.sigma_m for item in data])
     release_sd = np.where(rests, RELEASE_ROOM_FRAMES * frames, 3 * durations)
+    release_sd[[item.let_in for item in data]] = KNOWN_RELEASE_S
     noise = np.array([item.noise_m for item in data])
     room = np.maximum(ORIGIN_ROOM_SIGMAS * np.maximum(noise, vague), 1e-4 * spans)
     origin_sd = np.where(rests, room, 3 * spans)
     return Frame(
         index=layout.index,
         feels=np.column_stack([predictor.feels_pressure, predictor.feels_damping]),
-        own_centre=np.where(rests[:, None], first_own(data)[:, :2], own[:, :2]),
+        own_centre=np.where(known[:, None], first_own(data)[:, :2], own[:, :2]),
         own_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
         prior_mean=layout.start,
         prior_precision=layout.prior_precision,
@@ -180,6 +190,7 @@ def solve(
     early = not warm
     columns = predictor.linearise(state.theta, state.own)
     grams = _products(predictor, columns)
+    looks, looked = MOST_LOOKS, 0
     for iteration in range(1, most_iterations + 1):
         near = promised < FAR_OFF or iteration > MOST_EARLY
         search = early and iteration > EARLY_ITERATIONS and near
@@ -190,6 +201,14 @@ def solve(
         step, own_change, promised = newton_step(grams, frame, state, damping)
         if watch is not None:
             watch(_step_report(predictor, state, iteration, promised))
+        if looks and (promised < NEARLY_SETTLED or iteration >= looked + PATIENCE):
+            looked = iteration
+            jumped = release_again(predictor, frame, state)
+            if jumped is not None:
+                state, columns, grams = _from_there(predictor, jumped)
+                looks -= 1
+                continue
+            looks = min(looks, 1) if promised > SETTLED_DECREASE else 0
         if promised < SETTLED_DECREASE and moved < SETTLED_SPREAD and not early:
             converged = True
             break
@@ -204,6 +223,11 @@ def solve(
         columns = predictor.linearise(state.theta, state.own)
         grams = _products(predictor, columns)
     return Solution(state, frame, grams, tuple(columns), can, converged, iteration)
+
+
+def _from_there(predictor: Predictor, state: State) -> tuple[State, list[Floats], Floats]:
+    columns = predictor.linearise(state.theta, state.own)
+    return state, columns, _products(predictor, columns)
 
 
 def _step_report(predictor: Predictor, state: State, iteration: int, promised: float) -> Step:
