@@ -96,7 +96,7 @@ def test_an_effect_ticked_and_refitted_brings_the_error_down(visitor: Visitor) -
     # Of the mean square error that replicates do not explain, a tenth is left at most.
     beyond = np.mean(before**2) - np.mean(floors(visitor) ** 2)
     assert np.mean(errors(visitor) ** 2) - np.mean(floors(visitor) ** 2) < 0.1 * beyond
-    assert "no model can do better" in visitor.text("headline")
+    assert "nothing is left to explain" in visitor.text("headline")
     assert "vinetrack add reservoir_depletion" in visitor.text("commands")
 
 

@@ -18,9 +18,9 @@ READABLE = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
 
 EXPLAINED = (
     "The model in use is fitted to the positions of all trials at once. Each trial is then predicted with a release "
-    "and an origin of its own, at the nominal pressure and the vine's B: what is left is the error of position. What "
-    "replicates differ by is the floor that no model can go below; a ratio near 1 leaves nothing to find. Final speeds "
-    "of the leading edge are compared at the same growth."
+    "and an origin of its own, at the nominal pressure and the vine's B: what is left is the error of position. A "
+    "model that lacks nothing errs by what replicates differ by: a ratio near 1 leaves nothing to find, and with few "
+    "replicates it falls below 1 as easily by chance. Final speeds of the leading edge are compared at the same growth."
 )
 
 
