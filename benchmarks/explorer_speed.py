@@ -1,9 +1,9 @@
 """How long the explorer's page takes to answer: a slider moved, a refit begun.
 
 Run as `python benchmarks/explorer_speed.py [RESULTS] [MOVES]` on a results folder, by default `results/demo`, with 60
-moves of the size of `reservoir_depletion`, each waited for; needs a Chromium. Prints the time from a move to the painted
-frame (fastest, quartile, median, slowest), the part of it in which the curves are computed, and the time from a click on
-*Refit* to the first sign of progress, ms. The bounds are 150 and 500 ms.
+moves of the size of `reservoir_depletion`, each waited for; needs a Chromium. Prints the time from a move to the
+painted frame (fastest, quartile, median, slowest), the part of it in which the curves are computed, and the time from
+a click on *Refit* to the first sign of progress, ms. The bounds are 150 and 500 ms.
 """
 
 from __future__ import annotations
