@@ -65,6 +65,7 @@ def view(angle: float = 0.0) -> View:
         time_s=frames / 1000,
         edge_px=edge_px,
         lead_position_m=1e-3 * (edge_px - 10),
+        shake_px=np.where(frames == 3, 2.0, 0.0),
     )
 
 
@@ -84,6 +85,11 @@ def test_an_edge_is_drawn_across_the_axis() -> None:
     (xs, ys) = view(angle=np.pi / 2).across(20.0)
     np.testing.assert_allclose(xs, (90.0, 110.0))
     np.testing.assert_allclose(ys, (70.0, 70.0))
+
+
+def test_an_edge_goes_along_with_a_shaken_picture() -> None:
+    assert view().across(20.0, 3) == view().across(22.0)
+    assert view().across(20.0, 4) == view().across(20.0)
 
 
 def test_of_a_track_only_it_is_said_that_there_is_no_recording(campaign: Campaign) -> None:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from vinetrack.cli import app
 from vinetrack.experiment import read_experiment
-from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
 from vinetrack.settings import OverlaySettings
 from vinetrack.stages.overlays import (
     REST_FRAMES,
@@ -124,6 +124,28 @@ def test_a_prediction_that_ends_is_not_drawn_beyond_its_end(tmp_path: Path) -> N
     edges, _ = edges_of("a", Results(results), read_result(Results(results).track("a")))
     assert np.isfinite(edges[1].along_px[:40]).all()
     assert np.isnan(edges[1].along_px[40:]).all()
+
+
+def test_edges_go_along_with_a_shaken_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, results = campaign(tmp_path)
+    drawn: list[np.ndarray] = []
+
+    def seen(_view: object, picture: np.ndarray, frame: int, _time_ms: float, edges: list[Edge]) -> np.ndarray:
+        drawn.append(np.array([edge.along_px[frame] for edge in edges]))
+        return np.repeat(picture[:, :, None], 3, axis=2)
+
+    monkeypatch.setattr("vinetrack.figures.overlay.compose", seen)
+    overlay_one(results, "a", seconds=2)
+    still, drawn = drawn, []
+    path = results / "analysed" / "a.json"
+    content = json.loads(path.read_text())
+    shake_px = 2.0 * np.sin(np.arange(N))
+    content["axis"]["shake_px"] = shake_px.tolist()
+    path.write_text(json.dumps(content))
+    overlay_one(results, "a", seconds=2)
+    first = frames_to_show(read_result(Results(results).track("a"))).start
+    for k, (was, now) in enumerate(zip(still, drawn, strict=True)):
+        np.testing.assert_allclose(now - was, shake_px[first + k], atol=1e-9)
 
 
 def test_metres_turn_into_pixels_through_lens_and_tilt() -> None:

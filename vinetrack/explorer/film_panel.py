@@ -195,7 +195,7 @@ class FilmPanel:
         ]
         same = self._earlier is self._curves
         drawn = [
-            (view.across(px), colour, dash)
+            (view.across(px, frame), colour, dash)
             for px, colour, dash, at in edges
             if math.isfinite(px) and math.isfinite(at) and not (same and colour == EARLIER_EDGE)
         ]

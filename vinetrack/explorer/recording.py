@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.records import Floats, Trial
+from vinetrack.stages.overlays import shake_along
 from vinetrack.stages.results import Results, ResultsError, read_json, read_result
 
 if TYPE_CHECKING:
@@ -32,7 +33,8 @@ class View:
     """How positions along the growth axis lie in the picture of one recording, px of the recording.
 
     `edge_px`, shape (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and
-    `lead_position_m` are those of the track.
+    `lead_position_m` are those of the track. `shake_px`, shape (n_frames,), is how far along the axis a shaken camera
+    moved each picture.
     """
 
     trial: str
@@ -43,6 +45,7 @@ class View:
     time_s: Floats
     edge_px: Floats
     lead_position_m: Floats
+    shake_px: Floats
 
     def along_px(self, lead_position_m: Floats) -> Floats:
         """Where positions on the track's ruler lie along the axis; beyond the track, in a straight line.
@@ -60,8 +63,10 @@ class View:
         outside = (lead_position_m < position[0]) | (lead_position_m > position[-1])
         return np.where(outside, offset + scale * lead_position_m, inside)
 
-    def across(self, along_px: float) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Ends, x and y, of a line across the vine at a place along the axis."""
+    def across(self, along_px: float, frame: int | None = None) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Ends, x and y, of a line across the vine at a place along the axis; with `frame` in the picture as it is."""
+        if frame is not None and frame < self.shake_px.size:
+            along_px += float(self.shake_px[frame])
         (x0, y0), (dx, dy), half = self.from_px, self.direction, self.half_width_px
         x, y = x0 + along_px * dx, y0 + along_px * dy
         return (x - half * dy, x + half * dy), (y + half * dx, y - half * dx)
@@ -98,6 +103,7 @@ def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> View:
         time_s=table["time_s"].to_numpy(dtype=float),
         edge_px=table["edge_px"].to_numpy(dtype=float),
         lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
+        shake_px=shake_along(axis, len(table)),
     )
 
 

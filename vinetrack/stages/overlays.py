@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -189,6 +190,8 @@ def _pictures(
     tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(recording.width, recording.height)
     view = View(trial.name, axis, tube_px, (recording.width, recording.height), mm_per_px, slowed, settings.width_px)
     edges, release_s = edges_of(trial.name, results, track)
+    shake_px = shake_along(line, len(track))
+    edges = [replace(edge, along_px=edge.along_px + shake_px) for edge in edges]
     time_ms = 1e3 * (track["time_s"].to_numpy(dtype=float) - release_s)
     low = high = 0.0
     for frame, picture in enumerate(iterate_frames(recording)):
@@ -199,6 +202,19 @@ def _pictures(
         if high == low:
             low, high = (float(value) for value in np.percentile(picture, (0.5, 99.5)))
         yield compose(view, levels(picture, low, high), frame, float(time_ms[frame]), edges)
+
+
+def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
+    """How far along its axis each picture of a recording was moved by a shaken camera, px, shape (n_frames,).
+
+    Parameters
+    ----------
+    line : `axis` of `analysed/<trial>.json`; it says nothing of a camera that stood still.
+    """
+    shake_px = np.zeros(n_frames)
+    said = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
+    shake_px[: said.size] = said
+    return shake_px
 
 
 def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from vinetrack.stages.results import Results, read_json, read_result
 from vinetrack.stages.tracks import INTERNAL_FAULT, analyse, failed_row, write_empty
 from vinetrack.tables import write_bytes, write_json
@@ -89,7 +91,9 @@ def _add_view(results: Results, name: str, measurement: Measurement, image: str 
         "notes": [] if found is None else found.notes,
     }
     axis = measurement.tracking.axis
+    shake_px = measurement.tracking.shake_px
     line = {"from_px": axis.from_px, "to_px": axis.to_px, "width_px": axis.width_px}
+    line |= {"shake_px": shake_px.round(2)} if np.any(shake_px) else {}
     path = results.analysed(name)
     write_json(path, read_json(path) | {"calibration": entry, "axis": line})
 

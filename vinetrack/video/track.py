@@ -39,7 +39,8 @@ class Tracking:
 
     `kymograph`, shape (n_frames, n_along), is the strip's mean brightness across in grey levels; column j lies
     `j` px from `axis.from_px`. `edge_px` of the track counts along the same axis. `pictures` are (frame number,
-    picture) of the first, middle and last moving frame, full region, as the camera wrote them.
+    picture) of the first, middle and last moving frame, full region, as the camera wrote them. `shake_px`, shape
+    (n_frames,), is how far along the axis a shaken camera moved each picture: what is drawn on it goes along.
     """
 
     track: Track
@@ -149,9 +150,9 @@ def track_frames(
     track = _in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
     pictures = tuple((int(kept[i]), luma[i]) for i in chosen)
-    return Tracking(
-        track, strip.axis, _kymograph(strip), pictures, found.blur_px, found.exposure_frames, strip.shift_px
-    )
+    shake_px = np.zeros(len(frames))
+    shake_px[kept] = strip.shift_px[:, 0] if strip.steadied else 0.0
+    return Tracking(track, strip.axis, _kymograph(strip), pictures, found.blur_px, found.exposure_frames, shake_px)
 
 
 def capture_rate(trial: Trial, own: float | None) -> float:
