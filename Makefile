@@ -1,6 +1,6 @@
 # What each target does: `make help`. Everything happens in .venv; nothing else on the machine is touched.
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test lint
+.PHONY: help venv demo guide test lint
 
 BIN := .venv/bin
 STAMP := .venv/installed
@@ -13,6 +13,9 @@ venv: $(STAMP)  ## .venv with the locked version of everything, extras included
 
 demo: $(STAMP)  ## 24 recordings, made in the virtual laboratory on first use, to results/demo/report.html
 	@$(BIN)/snakemake --cores $(CORES)
+
+guide: demo  ## outputs and pictures of the docs, printed and drawn anew from the demonstration
+	$(BIN)/python benchmarks/guide_pages.py
 
 test: $(STAMP)  ## all tests
 	$(BIN)/python -m pytest -n $(CORES)

@@ -1,9 +1,11 @@
 """The commands of the guide run again: what stands below each on its page, and the guide's pictures.
 
+    make guide
     python benchmarks/guide_pages.py [--results results/demo] [--pages tutorial own_effect verdicts] [--no-pictures]
 
-Needs a finished demonstration (`make demo`), and a Chromium for the picture of the report. Everything runs in a scratch
-folder, on copies of the demonstration and its results. With the effect of docs/own_effect.md trials of two vines are
+Needs a finished demonstration (`make demo`, which `make guide` runs first), and a Chromium for the pictures of the
+report and of the explorer, whose caption follows what the page says. Everything runs in a scratch folder, on copies of
+the demonstration and its results. With the effect of docs/own_effect.md trials of two vines are
 grown in the virtual laboratory. Pages are rewritten in place; folders are shown relative, long lines wrapped.
 """
 
@@ -17,6 +19,7 @@ import shutil
 import sys
 import tempfile
 import textwrap
+import time
 from io import BytesIO
 from pathlib import Path
 
@@ -35,6 +38,11 @@ DOCS = ROOT / "docs"
 PAGES = ("tutorial", "own_effect", "verdicts")
 WIDTH = 116
 LARGEST_BYTES = 150_000
+EXPLORER_PX = (1400, 1330)
+CAPTION = (
+    "*The demonstration. The base model is off by {before} where replicates differ by {floor}; with reservoir "
+    "depletion ticked and refitted, {after} are left.*"
+)
 FIGURES = {"tutorial_strip": "strip_d24_30kPa_1", "tutorial_before_after": "before_after", "verdict_ladder": "ladder"}
 SEED, STIFFNESS_N_M = 41, 0.4
 
@@ -118,12 +126,12 @@ def wrapped(line: str) -> list[str]:
     return textwrap.wrap(line, WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
-def save_picture(png: bytes, name: str) -> None:
+def save_picture(png: bytes, name: str, width_px: int = 1200) -> None:
     """A picture for the docs: no wider than a page, few colours, small enough to be stored."""
     from PIL import Image
 
     image = Image.open(BytesIO(png)).convert("RGB")
-    image.thumbnail((1200, 1600), Image.Resampling.LANCZOS)
+    image.thumbnail((width_px, 1600), Image.Resampling.LANCZOS)
     for colours in (256, 128, 64):
         out = BytesIO()
         image.quantize(colours, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
@@ -144,6 +152,38 @@ def save_pictures(results: Path, scratch: Path) -> None:
     save_picture((scratch / "report.png").read_bytes(), "report")
 
 
+def save_explorer(results: Path, scratch: Path) -> None:
+    """The explorer once reservoir depletion was ticked and refitted, and the numbers of its caption."""
+    from chrome import Chrome
+    from served import Served, Visitor
+
+    with Served(results, "--port", "0") as served, Chrome(scratch / "explorer", *EXPLORER_PX) as browser:
+        page = Visitor(browser, served.address)
+        page.until("$numbers.text.includes('<table>')", "the fit of the model in use", 300)
+        before, floor = off_by(page.text("headline"))
+        page.click("tick_reservoir_depletion", "input")
+        page.until("$headline.text.includes('reservoir depletion')", "the effect to be in")
+        page.click("refit")
+        page.until("$refit.label === 'Refit' && $numbers.text.includes('1 number more')", "the refit", 300)
+        page.until("$film_figure.visible && $film_edges.data.xs.length === 3", "the recording", 120)
+        after, _ = off_by(page.text("headline"))
+        browser.run("scrollTo(0, 0)")
+        time.sleep(1)
+        browser.picture(scratch / "explorer.png")
+    save_picture((scratch / "explorer.png").read_bytes(), "explorer", 1120)
+    page_file = DOCS / "explorer.md"
+    caption = "\n".join(textwrap.wrap(CAPTION.format(before=before, floor=floor, after=after), 120))
+    text = page_file.read_text(encoding="utf-8")
+    page_file.write_text(re.sub(r"^\*The demonstration\..*?\*$", caption, text, flags=re.M | re.S), encoding="utf-8")
+
+
+def off_by(headline: str) -> tuple[str, str]:
+    """What a headline of the explorer says the model is off by, and replicates differ by."""
+    found = re.search(r"off by ([\d.]+ mm)<.*replicates differ by ([\d.]+ mm)", headline)
+    assert found is not None, headline
+    return found[1], found[2]
+
+
 def main() -> None:
     """Rewrite the pages."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -154,12 +194,13 @@ def main() -> None:
     results = asked.results.resolve()
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder).resolve()
-        if {"tutorial", "verdicts"} & set(asked.pages):
+        if {"tutorial", "verdicts"} & set(asked.pages) or not asked.no_pictures:
             stage_demonstration(results, scratch)
         if "own_effect" in asked.pages:
             stage_own_effect(scratch / "my_experiment")
         if not asked.no_pictures:
             save_pictures(results, scratch)
+            save_explorer(scratch / "results" / "demo", scratch)
         os.chdir(scratch)
         run = Runner(scratch)
         # The tutorial saves an effect to the model: what others print comes first.
