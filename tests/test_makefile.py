@@ -29,7 +29,7 @@ def make(folder: Path, *arguments: str, path: str | None = None) -> subprocess.C
 def test_help_is_the_default_and_lists_every_target(arguments: tuple[str, ...]) -> None:
     done = make(ROOT, *arguments)
     assert done.returncode == 0
-    assert {line.split()[1] for line in done.stdout.splitlines()} == {"help", "venv", "demo", "test", "lint"}
+    assert {line.split()[1] for line in done.stdout.splitlines()} == {"help", "venv", "demo", "guide", "test", "lint"}
 
 
 @needs_make
