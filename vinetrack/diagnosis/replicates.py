@@ -94,6 +94,9 @@ def frames_at_rest(trial: TrialFit) -> int:
 def first_that_counts(trial: TrialFit) -> int:
     """The frame where the first of model and measurement begins to move: rest would only dilute an error."""
     released = int(np.searchsorted(trial.time_s, trial.release_s))
+    # A pressure that is only let in moves nothing yet.
+    moved = np.flatnonzero(trial.predicted_position_m > trial.origin_m)
+    released = max(released, int(moved[0]) if moved.size else trial.time_s.size)
     return min(released, max(frames_at_rest(trial) - 1, 0), trial.time_s.size - 1)
 
 

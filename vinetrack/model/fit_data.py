@@ -24,6 +24,9 @@ GAP_FRAMES = 1.5
 
 MOVES_SIGMAS = 8.0
 
+RISEN = 0.5
+"""A trace that begins below this part of its median while the recording runs has been let in then and there."""
+
 END_FRACTION = 0.95
 """The last part of the growth is left out: there the mass of a bare vine goes to nothing, its speed diverges, and one
 frame across the end of growth is a corner that no sensitivity describes. What lies behind the end is kept."""
@@ -72,6 +75,14 @@ class FitTrial:
     def frame_s(self) -> float:
         """Spacing of the points, s."""
         return float(np.median(np.diff(self.time_s)))
+
+    @cached_property
+    def let_in(self) -> bool:
+        """Whether the pressure was let in while it was recorded: then the trace says what started the growth, and when.
+
+        Nothing else holds the vine, and a release of its own would pass for a threshold.
+        """
+        return self.trace is not None and bool(self.trace[1][0] < RISEN * np.median(self.trace[1]))
 
 
 Pairs = Iterable[tuple[Trial, Track]]

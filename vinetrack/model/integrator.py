@@ -16,6 +16,7 @@ Source of the method: Hairer & Wanner, Solving Ordinary Differential Equations I
 import numpy as np
 from numba import njit
 
+from vinetrack.model.corners import next_corner
 from vinetrack.model.radau import C1, C2, carry_on, quintic, radau_step
 from vinetrack.model.slack import TAUT, follow_slack
 
@@ -56,6 +57,7 @@ FREE = RATIO = 0
 # ---- what follows is set behind the rates of one model ----
 RUNNING, ENDED, STALLED, TOO_HARD = 0, 1, 2, 3
 MOST_STEPS = 20_000
+EASY = 0.1  # error, in tolerances, of a step cut short that leaves its length before the cut to be believed
 
 
 @njit(nogil=True)
@@ -223,7 +225,7 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, s
     z1 = z2 = z3 = 0.0
     have_guess = False
     h_before = 1.0
-    passed = 0
+    passed = corner = 0
     while True:
         if TAIL_FREE and loose:
             if slack_time != slack_time:
@@ -289,6 +291,12 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, s
         ahead = min(kink, stop) - x
         if v > 0 and h * v > 1.05 * ahead:
             h = 1.02 * ahead / v
+        wished = h
+        if trace_time.size > 0:
+            # Between its samples a trace is straight; a step across a corner of it would be refused again and again.
+            corner = next_corner(corner, time, trace_time, trace_pressure)
+            if corner < trace_time.size and time + h > trace_time[corner]:
+                h = trace_time[corner] - time
         if have_guess:
             # The last step's polynomial, carried on into this one, relative to where this one starts.
             r = h / h_before
@@ -378,7 +386,8 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, s
         z1, z2, z3 = w1, w2, w3
         have_guess = True
         h_before = h
-        h *= min(6.0, 0.9 * max(error, 1e-8) ** -0.25)
+        further = h * min(6.0, 0.9 * max(error, 1e-8) ** -0.25)
+        h = max(further, wished) if wished > h and error < EASY else further
 
 
 @njit(nogil=True)

@@ -24,7 +24,7 @@ from vinetrack.effects import Effect, Rig
 from vinetrack.effects import _base as effects_base
 from vinetrack.effects._catalogue import load_module
 
-TEXTS = tuple(Path(__file__).with_name(name) for name in ("radau.py", "slack.py", "integrator.py"))
+TEXTS = tuple(Path(__file__).with_name(name) for name in ("radau.py", "corners.py", "slack.py", "integrator.py"))
 """What is set behind the rates, in this order; `slack` only where a tail may go slack."""
 
 MARK = "# ---- what follows is set behind the rates of one model ----\n"

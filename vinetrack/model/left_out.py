@@ -137,6 +137,7 @@ def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> t
     held = rest_is_seen(data) & from_rest
     own, square = own.copy(), np.zeros((len(data), 2, 2))
     own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+    let_in = np.array([item.let_in for item in data], dtype=bool)
     for i in np.flatnonzero(held).tolist():
         vague = data[i].vague_rest
         own[i, ORIGIN] = np.mean(data[i].lead_position_m[: data[i].n_rest]) if vague is None else vague.origin_m
@@ -145,9 +146,10 @@ def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> t
         sums = _sums(predictor, own, moving, rho)
         square[moving] = sums[:, :2, :2]
         sums[held[moving], ORIGIN, :] = sums[held[moving], :, ORIGIN] = 0.0
+        sums[let_in[moving], RELEASE, :] = sums[let_in[moving], :, RELEASE] = 0.0
         # At constant speed a later release and a higher origin are one: brought to a unit diagonal that is seen.
         scale = 1 / np.sqrt(np.maximum(np.einsum("nkk->nk", sums[:, :2, :2]), 1e-300))
-        scale[held[moving], ORIGIN] = 0.0
+        scale[held[moving], ORIGIN] = scale[let_in[moving], RELEASE] = 0.0
         even = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
         inverse = np.linalg.pinv(even, rcond=TOLD_APART, hermitian=True) * scale[:, :, None] * scale[:, None, :]
         step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])

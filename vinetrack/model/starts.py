@@ -31,6 +31,9 @@ def first_own(data: Sequence[FitTrial]) -> Floats:
             own[i, RELEASE], own[i, ORIGIN] = item.vague_rest.release_s, item.vague_rest.origin_m
         else:
             own[i, RELEASE], own[i, ORIGIN] = item.time_s[0], item.lead_position_m[0]
+        if item.let_in:
+            assert item.trace is not None
+            own[i, RELEASE] = min(item.time_s[0], item.trace[0][0])
     return own
 
 
@@ -68,9 +71,7 @@ def one_of_each_condition(data: Sequence[FitTrial]) -> list[int]:
     return sorted(best.values())
 
 
-def _scan(
-    layout: Layout, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Floats
-) -> list[Floats]:
+def _scan(layout: Layout, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Floats) -> list[Floats]:
     """For each exponent the best B of every vine."""
     speed = np.array([_speed(item) for item in data])
     drive = np.array([_drive(item) for item in data])
@@ -135,7 +136,10 @@ def align(data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Fl
     """
     thin = [_thinned(item) for item in data]
     jobs = predictor.jobs(theta, own)
-    durations = [item.time_s[-1] - item.time_s[0] + 25 * item.frame_s for item in data]
+    durations = [
+        item.time_s[-1] - min(item.time_s[0], begin) + 25 * item.frame_s
+        for item, begin in zip(data, own[:, RELEASE], strict=True)
+    ]
     grids = [np.linspace(0.0, duration, 4 * POINTS_LOOKED_AT) for duration in durations]
     moved = simulate_many(
         predictor.layout.model,
@@ -150,7 +154,9 @@ def align(data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Fl
     )
     best, misfit = own.copy(), np.zeros(len(data))
     for i, (item, (time_s, y)) in enumerate(zip(data, thin, strict=True)):
-        if item.n_rest > 0 or item.vague_rest is not None:
+        if item.let_in:
+            shifts = np.zeros(1)
+        elif item.n_rest > 0 or item.vague_rest is not None:
             shifts = item.frame_s * np.arange(-6, 3.01, 0.5)
         else:
             shifts = -np.geomspace(0.25 * item.frame_s, durations[i], 30)
@@ -167,6 +173,6 @@ def align(data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Fl
 
 def _thinned(item: FitTrial) -> tuple[Floats, Floats]:
     """At most sixty points, most of them in motion."""
-    begin = max(item.n_rest - 5, 0)
+    begin = 0 if item.let_in else max(item.n_rest - 5, 0)
     take = np.unique(np.linspace(begin, item.time_s.size - 1, POINTS_LOOKED_AT).astype(int))
     return item.time_s[take], item.lead_position_m[take]
