@@ -36,7 +36,7 @@ MOST_CLIMBED = 14
 """Trials of a climb: one of every condition, no more than this."""
 
 FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
-LOWER = 1.0
+LOWER, LOWER_PER_POINT = 1.0, 0.02
 """By how much −2 ln L of a climb must end lower for its start to be worth a fit."""
 
 HOPELESS = 0.5
@@ -188,21 +188,30 @@ def from_other_starts(found: Fit) -> Fit:
     """The same model fitted from where climbs from several exponents end, if that is better; else the fit itself."""
     if EXPONENT not in found.model.parameter_names or EXPONENT in found.options["fixed"]:
         return found
-    return _from(found, [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)])
+    slope = Slope(found)
+    points = sum(item.time_s.size for item in slope.data)
+    return _from(slope, [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)], LOWER_PER_POINT * points)
 
 
 def without(found: Fit, other: Fit) -> Fit:
-    """The model of a fit begun from the numbers of another fit, which holds it, if that is better; else the fit."""
-    names = set(found.model.parameter_names)
-    return _from(found, [((), {key: value for key, value in other.model.values.items() if key in names})])
+    """The model of a fit begun from the numbers of another fit, which holds it, if that is better; else the fit.
+
+    It is fitted where a climb from there makes up for half of what the other fit is better by.
+    """
+    slope, names = Slope(found), set(found.model.parameter_names)
+    added = [effect for effect in other.model if effect.name not in found.model]
+    here = slope.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
+    there = slope.climb(added, other.model.values, iterations=1)
+    lower = math.inf if here is None or there is None else max(LOWER, 0.5 * (here.deviance - there.deviance))
+    return _from(slope, [((), {key: value for key, value in other.model.values.items() if key in names})], lower)
 
 
-def _from(found: Fit, starts: Sequence[Start]) -> Fit:
-    """The model of a fit begun elsewhere, where a climb from there ends lower than one from where the fit stands."""
-    slope = Slope(found)
+def _from(slope: Slope, starts: Sequence[Start], lower: float) -> Fit:
+    """The model of a fit begun elsewhere, where a climb from there ends lower by this than one from where it stands."""
+    found = slope.found
     here = slope.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
     climb = best_climb(slope, starts, math.inf if here is None else here.deviance)
-    if climb is None or (here is not None and climb.deviance > here.deviance - LOWER):
+    if climb is None or (here is not None and climb.deviance > here.deviance - lower):
         return found
     other = full_fit(found, climb, found.log_likelihood)
     return other if other is not None and other.log_likelihood > found.log_likelihood else found
