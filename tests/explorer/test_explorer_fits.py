@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from dataclasses import replace
@@ -15,6 +16,7 @@ from vinetrack.explorer.fitting import FAULT, Fitted, Job, first_fit, fit_choice
 from vinetrack.explorer.ground import Ground
 from vinetrack.explorer.waiting import Waiting
 from vinetrack.model.fit_data import FitError
+from vinetrack.model.fit_result import Fit
 from vinetrack.model.solve import Step, Watch
 
 GAMMA = "reservoir_depletion.gamma"
@@ -28,6 +30,21 @@ def first(campaign: Campaign) -> Fitted:
 def test_the_first_fit_is_that_of_the_workflow(campaign: Campaign, first: Fitted) -> None:
     for name, value in campaign.numbers.items():
         assert first.choice.numbers[name] == pytest.approx(value, rel=0.02)
+
+
+@pytest.mark.parametrize(("known", "asked"), [(-1e9, [False]), (1e9, [False, True]), (math.nan, [False, True])])
+def test_other_starts_are_tried_where_the_first_leads_not_to_the_known_fit(
+    campaign: Campaign, first: Fitted, monkeypatch: pytest.MonkeyPatch, known: float, asked: list[bool]
+) -> None:
+    seen: list[bool] = []
+
+    def fitted(*_: object, thorough: bool = True, **__: object) -> Fit:
+        seen.append(thorough)
+        return first.fit
+
+    monkeypatch.setattr("vinetrack.explorer.fitting.fit", fitted)
+    first_fit(replace(campaign, log_likelihood=known), first_choice(campaign))
+    assert seen == asked
 
 
 def test_the_missing_effect_is_found_and_the_error_falls_to_the_replicates(campaign: Campaign, first: Fitted) -> None:

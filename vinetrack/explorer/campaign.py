@@ -83,6 +83,7 @@ class Campaign:
     """Read from a results folder by `read_campaign`.
 
     `numbers` are those of the fit in `fit.json`, by name, SI; empty where it was refused, for the `refused` reason.
+    `log_likelihood` is that of the same fit, NaN where it was refused.
     `floors_m` holds by condition what replicates differ by, NaN where there is one alone. `unusable` gives effects
     that these trials cannot be asked about, and why.
     """
@@ -97,6 +98,7 @@ class Campaign:
     bands: Mapping[str, Band]
     floors_m: Mapping[str, float]
     numbers: Mapping[str, float]
+    log_likelihood: float
     refused: str
     effects: Mapping[str, Effect]
     unusable: Mapping[str, str]
@@ -174,6 +176,7 @@ def read_campaign(folder: Path, experiment: Experiment, own: Mapping[str, Effect
         bands=_bands(compared),
         floors_m=floors,
         numbers={_full_name(entry): float(entry["value"]) for entry in fitted.get("numbers", [])},
+        log_likelihood=float(math.nan if fitted.get("log_likelihood") is None else fitted["log_likelihood"]),
         refused=refused,
         effects=effects,
         unusable=_unusable(effects.values(), [item.trial for item in data]),

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 from vinetrack.diagnosis.compare import compare
 from vinetrack.effects import EffectError
@@ -51,6 +52,8 @@ class Fitted:
 def first_fit(campaign: Campaign, choice: Choice, watch: Watch | None = None) -> Fitted:
     """Fit the model in use, as the stage of the workflow does.
 
+    What that found is known, and where the first start leads there, others need not be tried.
+
     Raises
     ------
     FitError, EffectError, SimulationError
@@ -61,7 +64,10 @@ def first_fit(campaign: Campaign, choice: Choice, watch: Watch | None = None) ->
     # A falling body has nothing else to find.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
     bare = replace(model, values={})
-    found = fit(bare, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
+    begin = partial(fit, bare, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
+    found = begin(thorough=False)
+    if not found.log_likelihood > campaign.log_likelihood - CLEARLY_WORSE:
+        found = begin()
     return _weighed(campaign, choice, found, time.perf_counter() - begun)
 
 

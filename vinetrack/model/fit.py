@@ -54,7 +54,7 @@ POOR_FIT = 3.0
 """χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried."""
 
 MOST_STARTS = 3
-ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 20
+ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 40
 BAD_START = 1.5
 """χ² per point from which a start misses by more than the noise of the fit it came from."""
 
