@@ -219,9 +219,12 @@ def solve(
             if converged:
                 break
             continue
-        state = taken
-        columns = predictor.linearise(state.theta, state.own)
-        grams = _products(predictor, columns)
+        try:
+            columns = predictor.linearise(taken.theta, taken.own)
+        except SimulationError:
+            # A neighbour of the new place cannot be followed: what was reached before is worth more than nothing.
+            break
+        state, grams = taken, _products(predictor, columns)
     return Solution(state, frame, grams, tuple(columns), can, converged, iteration)
 
 

@@ -1,0 +1,137 @@
+"""Named models fitted to the recordings, and what each gains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import vinetrack as vt
+from tube.folder import REEL
+from tube.recordings import AREA_M2, Recording
+from vinetrack.diagnosis.ladder import in_sample, left_out
+from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.effects import load_effect
+from vinetrack.experiment import Experiment
+from vinetrack.model.fit_data import pairs_of
+from vinetrack.model.fit_result import Fit, TrialFit
+from vinetrack.model.model import Model, Value
+from vinetrack.records import Track, Trial
+
+PER_TUBE = {"static_yield.P_s": "vine"}
+"""A pressure to start belongs to a tube as its yield pressure does."""
+
+FRICTION_N_M, INERTIA_KG = 2.5, 0.2
+"""To begin from; also begun from what the catalogue says."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One model fitted to every tube by itself: fits by tube, predictions of all trials, error on left-out ones, m."""
+
+    name: str
+    fits: Mapping[str, Fit]
+    trials: tuple[TrialFit, ...]
+    left_out_m: float
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the position error, every trial alike, m."""
+        return math.sqrt(float(np.mean([self.rms_of(trial.name) ** 2 for trial in self.trials])))
+
+    def rms_of(self, name: str) -> float:
+        """Root mean square of the position error of one trial from where something moves, m."""
+        (one,) = (one for one in self.trials if one.name == name)
+        return float(np.sqrt(np.mean(one.residual_m[first_that_counts(one) :] ** 2)))
+
+
+def models() -> dict[str, Model]:
+    """The models by name, each the base model and more."""
+    base, effects = vt.base_model(), vt.effects
+    reel = load_effect(REEL)
+    return {
+        "Eq. (2)": base,
+        "+ static_yield": base + effects.static_yield,
+        "+ tail_friction": base + effects.tail_friction,
+        "+ capstan_friction": base + effects.capstan_friction,
+        "+ static_yield + tail_friction": base + effects.static_yield + effects.tail_friction,
+        "+ reel_inertia (own)": base + reel,
+        "+ tail_friction + reel_inertia (own)": base + effects.tail_friction + reel,
+        "+ static_yield + tail_friction + reel_inertia (own)": base
+        + effects.static_yield
+        + effects.tail_friction
+        + reel,
+    }
+
+
+def starts(model: Model, recordings: Sequence[Recording], vines: Mapping[str, str]) -> list[dict[str, Value]]:
+    """Values to begin from: those of the catalogue, and those the recordings show at a glance.
+
+    A vine that stops and starts has a minimum in every way of matching starts to starts; the likeliest is the one near
+    the pressures at which it was seen to start.
+    """
+    seen = {
+        vines[one.name]: next(event.pressure_Pa for event in one.events if event.kind == "start") for one in recordings
+    }
+    glance: dict[str, Value] = {
+        "static_yield.P_s": seen,
+        "tail_friction.mu_w": FRICTION_N_M,
+        "reel_inertia.M": INERTIA_KG,
+    }
+    glance = {key: value for key, value in glance.items() if key in model.parameter_names}
+    return [{}, glance] if glance else [{}]
+
+
+def fit_tubes(name: str, model: Model, experiment: Experiment, recordings: Sequence[Recording]) -> Outcome:
+    """A model fitted to every tube by itself.
+
+    The tubes differ in brake, supply and making; nothing says that they share a friction or an n.
+    """
+    pairs, _ = pairs_of(experiment)
+    tube_of = {one.name: one.tube for one in recordings}
+    fits: dict[str, Fit] = {}
+    trials: list[TrialFit] = []
+    left_m: list[float] = []
+    for tube in dict.fromkeys(one.tube for one in recordings):
+        members = [pair for pair in pairs if tube_of[pair[0].name] == tube]
+        fit, predicted = _best(name, model, members, recordings)
+        fits[tube] = fit
+        trials += predicted
+        left_m += [float(np.mean(one.residual_m**2)) for one in left_out(fit).trials] if len(members) > 1 else []
+    return Outcome(name, fits, tuple(trials), math.sqrt(float(np.mean(left_m))) if left_m else math.nan)
+
+
+def _best(
+    name: str, model: Model, pairs: Sequence[tuple[Trial, Track]], recordings: Sequence[Recording]
+) -> tuple[Fit, tuple[TrialFit, ...]]:
+    """The likeliest of the fits begun from all starts."""
+    vines = {trial.name: trial.vine for trial, _ in pairs}
+    shared = {key: how for key, how in PER_TUBE.items() if key in model.parameter_names}
+    found: list[Fit] = []
+    for start in starts(model, [one for one in recordings if one.name in vines], vines):
+        try:
+            found.append(vt.fit(model, pairs, shared=shared, start=start, profile=False))
+        except vt.FitError as error:
+            print(f"{name}, {', '.join(vines)}: a start was given up. {error}")
+    if not found:
+        raise vt.FitError(f"{name}: no start could be followed.")
+    fit = max(found, key=lambda one: one.log_likelihood)
+    return fit, in_sample(fit).trials
+
+
+def number(fit: Fit, key: str) -> float:
+    """A number of a fit to one tube, SI; NaN where it has none."""
+    return next((one.value for one in fit.numbers if one.key == key), math.nan)
+
+
+def threshold_kPa(fit: Fit, kind: str, length_m: float) -> float:
+    """Gauge pressure at which the model starts, or stops once nothing carries it on, this far grown, kPa.
+
+    Friction of the tail counts whole at the tail, the pressure a half: ½ (P − P_s) A = μ_s w y.
+    """
+    yields = number(fit, "yield_pressure.P_y")
+    value = yields if kind == "stop" else float(np.fmax(yields, number(fit, "static_yield.P_s")))
+    friction = float(np.nan_to_num(number(fit, "tail_friction.mu_w")))
+    return (value + 2 * friction * length_m / AREA_M2) / 1e3

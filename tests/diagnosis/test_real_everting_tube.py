@@ -1,0 +1,94 @@
+"""Recordings of a real everting tube that sticks and slips, made by others; skipped where VINETRACK_REAL_DATA is unset.
+
+Its authors fit a pressure to start above one to stop, and drag that rises with the length.
+"""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from pathlib import Path
+
+import pytest
+from tube.folder import write_folder
+from tube.models import Outcome, fit_tubes, models, threshold_kPa
+from tube.recordings import Recording, balance, read_recordings, thresholds
+
+import vinetrack as vt
+from vinetrack.diagnosis.result import ADEQUATE
+from vinetrack.experiment import Experiment
+
+FOLDER = os.environ.get("VINETRACK_REAL_DATA", "")
+pytestmark = [
+    pytest.mark.real,
+    pytest.mark.skipif(not FOLDER, reason="VINETRACK_REAL_DATA is unset: no real recordings to try"),
+]
+STICKS = "tube2_hi_2"
+MENDED = "+ static_yield + tail_friction + reel_inertia (own)"
+
+
+@cache
+def recordings() -> list[Recording]:
+    return read_recordings(Path(FOLDER) / "everting_tube")
+
+
+def sticking() -> list[Recording]:
+    return [one for one in recordings() if one.name == STICKS]
+
+
+@pytest.fixture(scope="module")
+def experiment(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
+    return vt.read_experiment(write_folder(sticking(), tmp_path_factory.mktemp("tube")))
+
+
+@pytest.fixture(scope="module")
+def outcomes(experiment: Experiment) -> dict[str, Outcome]:
+    named = models()
+    return {name: fit_tubes(name, named[name], experiment, sticking()) for name in ("Eq. (2)", MENDED)}
+
+
+def test_four_recordings_are_read_with_their_pressure():
+    assert [one.name for one in recordings()] == ["tube1_lo_1", "tube1_lo_2", "tube2_hi_2", "tube3_hi_1"]
+    assert all(0.5 < one.travel_m < 0.65 for one in recordings())
+    assert all(0 < one.pressure_Pa[0] < 1.1e3 for one in recordings())  # let in while recorded
+
+
+def test_it_starts_above_the_pressure_at_which_it_stops():
+    (one,) = sticking()
+    kinds = [event.kind for event in one.events]
+    assert kinds == ["start", "stop"] * 5 + ["start"]
+    pressures = [event.pressure_Pa for event in one.events]
+    assert all(start > stop + 1e3 for start, stop in zip(pressures[::2], pressures[1::2], strict=False))
+    start, stop = thresholds(one, "start"), thresholds(one, "stop")
+    assert start is not None
+    assert stop is not None
+    assert 5 < start[1] < 15  # kPa/m: friction along the length, not one threshold
+    assert 5 < stop[1] < 15
+
+
+def test_faster_growth_does_not_take_more_pressure():
+    # What Eq. (2) says it must: B > 0.
+    assert all(balance(one)["speed_kPa_s_m"] < 0.5 for one in recordings())
+
+
+def test_eq_2_is_not_called_adequate(experiment: Experiment):
+    asked = ("static_yield", "tail_friction", "capstan_friction")
+    said = vt.diagnose(experiment, candidates=asked, ladder=False, advice=False)
+    assert said.verdict != ADEQUATE
+    assert said.explanation
+
+
+def test_stick_slip_and_friction_along_the_length_mend_most_of_it(outcomes: dict[str, Outcome]):
+    before, after = outcomes["Eq. (2)"], outcomes[MENDED]
+    assert before.rms_m > 0.03
+    assert after.rms_m < before.rms_m / 2
+    assert after.fits["2"].chi2_per_dof > 100  # and it is still not what happened
+
+
+def test_fitted_thresholds_lie_near_those_read_off(outcomes: dict[str, Outcome]):
+    (one,) = sticking()
+    after = outcomes[MENDED]
+    for event in one.events:
+        if event.kind == "start":
+            modelled = threshold_kPa(after.fits[one.tube], "start", event.lead_position_m)
+            assert abs(modelled - event.pressure_Pa / 1e3) < 2.0
