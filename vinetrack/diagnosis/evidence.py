@@ -17,6 +17,7 @@ from vinetrack.records import Floats
 ANSWER_SET = 9.0
 """Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
 
+MOST_INFLATION = 6.0
 CREDIBLE = 3.0
 """How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag."""
 
@@ -30,7 +31,8 @@ class Evidence:
 
     `delta_chi2` is the fall of −2 ln L from the fit without them, `sigma` that in standard deviations, brought down
     where trials scatter more than the model of the noise says. A size beyond what is `plausible` is said to be so; one
-    not even `credible`, several times beyond, loses a tie and is no explanation.
+    not even `credible`, several times beyond, loses a tie and is no explanation. `inflation` is how many times more the
+    sizes scatter than the model of the noise says, in variance, at least 1: by so much differences of −2 ln L do, too.
     """
 
     effects: tuple[Effect, ...]
@@ -40,6 +42,7 @@ class Evidence:
     plausible: bool
     reason: str
     credible: bool = True
+    inflation: float = 1.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -69,6 +72,7 @@ def weigh(before: Fit, effects: Sequence[Effect], after: Fit) -> Evidence:
         plausible=plausible,
         reason=reason,
         credible=belief(effects, after, CREDIBLE)[0],
+        inflation=min(ratio**2, MOST_INFLATION),
     )
 
 
@@ -146,8 +150,9 @@ def answer_set(hypotheses: Sequence[Evidence]) -> tuple[list[Evidence], dict[str
     Set aside are those that hold a simpler one as a limit and are no better by 9 than it, and those that need a size
     beyond belief where another does not.
     """
-    best = max(one.fit.log_likelihood for one in hypotheses)
-    near = [one for one in hypotheses if 2 * (best - one.fit.log_likelihood) <= ANSWER_SET]
+    first = max(hypotheses, key=lambda one: one.fit.log_likelihood)
+    best, reach = first.fit.log_likelihood, ANSWER_SET * first.inflation
+    near = [one for one in hypotheses if 2 * (best - one.fit.log_likelihood) <= reach]
     near.sort(key=lambda one: -one.fit.log_likelihood)
     aside: dict[str, str] = {}
     kept = []

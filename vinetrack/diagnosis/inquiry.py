@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vinetrack.diagnosis.evidence import Evidence, answer_set
+from vinetrack.diagnosis.evidence import ANSWER_SET, MOST_INFLATION, Evidence, answer_set
 from vinetrack.diagnosis.question import FAR_OFF, FIRST_LEVEL, LATER_LEVEL, Questions, question
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, UNEXPLAINED
 from vinetrack.diagnosis.search import from_other_starts, without
@@ -87,11 +87,8 @@ def _alone(questions: Questions, search: Search, tried: Sequence[Evidence]) -> l
     best = best_of(tried)
     if best.sigma < questions.threshold:
         return None
-    kept, aside = answer_set(tried)
-    if not kept[0].credible:
-        return None
-    after = question(kept[0].fit, questions.effects, LATER_LEVEL)
-    if after.something:
+    kept, aside, after = _mending(tried, search)
+    if after is None:
         return None
     verdict = verdict_of(kept)
     first = Finding(
@@ -104,6 +101,35 @@ def _alone(questions: Questions, search: Search, tried: Sequence[Evidence]) -> l
         search,
     )
     return [first, Finding(ADEQUATE, after)] if verdict == MISSING else [first]
+
+
+def _mending(hypotheses: Sequence[Evidence], search: Search) -> tuple[list[Evidence], dict[str, str], Questions | None]:
+    """The hypotheses that cannot be excluded and leave nothing, why others were set aside, and what the best leaves.
+
+    One that leaves something is excluded, and with it whatever it was better by: where all of the answer set leave
+    something, those next to it are asked, as far as misjudged noise could have put them behind.
+    """
+    kept, aside = answer_set(hypotheses)
+    best = max(one.fit.log_likelihood for one in hypotheses)
+    behind = sorted((one for one in hypotheses if one not in kept), key=lambda one: -one.fit.log_likelihood)
+    next_to_it = [
+        one
+        for one in behind
+        if "+".join(one.names) not in aside and 2 * (best - one.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
+    ]
+    for group in (kept, next_to_it):
+        mending: list[Evidence] = []
+        after: Questions | None = None
+        for one in group:
+            asked = search.after(one.fit) if one.credible else None
+            if asked is None or asked.something:
+                aside["+".join(one.names)] = one.reason if asked is None else "something is left once it is added"
+            elif not mending or one in answer_set([*mending, one])[0]:
+                mending.append(one)
+                after = after or asked
+        if mending:
+            return mending, aside, after
+    return [], aside, None
 
 
 def verdict_of(kept: Sequence[Evidence]) -> str:
@@ -123,11 +149,8 @@ def _together(
     nothing = [Finding(UNEXPLAINED, questions, tried=(*ranked, *both), search=search, aside=_why_not(ranked, both))]
     if not both:
         return nothing
-    kept, aside = answer_set(both)
-    best = kept[0]
-    after = question(best.fit, effects, LATER_LEVEL)
-    gain = 2 * (best.fit.log_likelihood - ranked[0].fit.log_likelihood)
-    if after.something or not best.credible or gain < after.threshold**2:
+    kept, aside, after = _mending(both, search)
+    if after is None or 2 * (kept[0].fit.log_likelihood - ranked[0].fit.log_likelihood) < after.threshold**2:
         return nothing
     common = set.intersection(*(set(one.names) for one in kept))
     by_name = {one.names[0]: one for one in ranked if len(one.names) == 1}

@@ -25,7 +25,9 @@ WORSE = -1.0
 WITHIN_REACH = 16.0
 ALIKE = 0.95
 SHARE_WORTH_A_CLIMB = 0.2
-FEWEST_CLIMBED = 5
+FEWEST_CLIMBED, LOUDEST = 5, 4
+"""The most promising and those with the largest scores: what is left of a fit far off may show in either way alone."""
+
 REACH_OF_CLIMBS, SHARE_OF_REACH = 40.0, 0.1
 MOST_FITTED = 7
 STARTS_EACH = 3
@@ -43,6 +45,7 @@ class Search:
     climbs: dict[str, Climb] = field(default_factory=dict)
     fitted: dict[str, Evidence] = field(default_factory=dict)
     silent: set[str] = field(default_factory=set)
+    asked: dict[int, Questions] = field(default_factory=dict)
     most_fitted: int = MOST_FITTED
 
     def __post_init__(self) -> None:
@@ -60,6 +63,12 @@ class Search:
         """Effects that may be missing, the most promising first."""
         names = dict.fromkeys(self.questions.answers.effects)
         return sorted(names, key=lambda name: -self.questions.promise(name))
+
+    def after(self, fit: Fit) -> Questions:
+        """What one of its fits leaves, asked once."""
+        if id(fit) not in self.asked:
+            self.asked[id(fit)] = question(fit, self.questions.effects, LATER_LEVEL)
+        return self.asked[id(fit)]
 
     def singles(self, *, all_of_them: bool = False) -> list[Evidence]:
         """Fit the hypotheses that may be the best or near it, each effect alone."""
@@ -104,13 +113,18 @@ class Search:
 
     def _worth_a_climb(self) -> list[str]:
         top = self.questions.promise(self.names[0]) if self.names else 0.0
+        loudest = self._loudest()
         return [
             name
             for k, name in enumerate(self.names)
             if k < FEWEST_CLIMBED
+            or name in loudest
             or self.questions.promise(name) > SHARE_WORTH_A_CLIMB * top
             or self.questions.cosine(name, self.names[0]) > ALIKE
         ]
+
+    def _loudest(self) -> list[str]:
+        return sorted(self.names, key=lambda name: -self.questions.best_z(name)[0])[:LOUDEST]
 
     def _climb_all(self, names: Iterable[str]) -> None:
         for name in names:
@@ -131,10 +145,10 @@ class Search:
         names = self.names
         if not names:
             return []
-        top = self.questions.promise(names[0])
+        top, loudest = self.questions.promise(names[0]), self._loudest()[:1]
         for name in names:
-            near = self.questions.promise(name) > max(top - WITHIN_REACH, 0.25 * top)
-            alike = self.questions.cosine(name, names[0]) > ALIKE
+            near = self.questions.promise(name) > max(min(top - WITHIN_REACH, 0.6 * top), 0.25 * top)
+            alike = self.questions.cosine(name, names[0]) > ALIKE or name in loudest
             if (near or alike or all_of_them) and name not in self.fitted and name not in self.silent:
                 self.report(f"fitting {name}")
                 self._fit_from_prediction(name)
