@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from explorer_campaign import DEMO, make_experiment, make_results
+from explorer_campaign import DEMO, SMALL, make_experiment, make_results
 
 from vinetrack.effects import Parameter
 from vinetrack.explorer.campaign import Campaign, Seen, condition_labels
@@ -26,7 +26,7 @@ from vinetrack.laboratory.tracks import grow
 from vinetrack.records import Trial
 from vinetrack.stages.results import ResultsError
 
-GAMMA = "reservoir_depletion.gamma"
+GAMMA, EXPONENT = "reservoir_depletion.gamma", "eversion_damping.n"
 
 
 def test_untouched_the_errors_are_those_of_the_comparison(campaign: Campaign) -> None:
@@ -35,6 +35,32 @@ def test_untouched_the_errors_are_those_of_the_comparison(campaign: Campaign) ->
     for condition, error in errors.items():
         assert error == pytest.approx(table.loc[condition, "rms_position_m"], rel=2e-3)
         assert campaign.floors_m[condition] == pytest.approx(table.loc[condition, "replicate_floor_m"])
+
+
+def test_a_rest_behind_a_door_is_where_the_comparison_has_it(tmp_path: Path) -> None:
+    """Of a rest that is seen only vaguely no point is fitted, and still it tells where the vine began."""
+    experiment = make_experiment(tmp_path / "vines", SMALL[:4])
+    for path in (experiment / "tracks").iterdir():
+        table = pd.read_csv(path)
+        table.assign(sigma_m=np.where(table["time_s"] < 0.015, 2e-3, 1e-4)).to_csv(path, index=False)
+    door = open_campaign(make_results(experiment, tmp_path / "results"))
+    table = pd.read_csv(door.folder / "comparison.csv").set_index("condition")
+    curves = follow(door, sized(door, first_choice(door)))
+    for seen, motion in zip(door.trials, curves, strict=True):
+        assert seen.item.vague_rest is not None
+        assert motion.origin_m == seen.origin_m
+    for condition, error in errors_m(door, curves).items():
+        assert error == pytest.approx(table.loc[condition, "rms_position_m"], rel=2e-3)
+
+
+def test_where_no_rest_was_filmed_release_and_origin_stay_near_the_track(campaign: Campaign) -> None:
+    """At constant speed the two are one: neither runs away, of vines of 0.2 m."""
+    blind = replace(campaign, trials=tuple(replace(seen, origin_known=False) for seen in campaign.trials))
+    start = first_choice(blind)
+    for n in (0.2, 0.37, 0.7):
+        for seen, motion in zip(blind.trials, follow(blind, sized(blind, start.with_size(EXPONENT, n))), strict=True):
+            assert motion.rms_m < 0.1
+            assert abs(motion.origin_m - seen.origin_m) < 0.1
 
 
 def test_the_missing_effect_at_its_size_lowers_every_error_to_the_replicates(campaign: Campaign) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from vinetrack.diagnosis.hypotheses import host_for
 from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.model.fit_data import FitTrial, prepare
-from vinetrack.model.left_out import FEWEST_AT_REST
+from vinetrack.model.left_out import rest_is_seen
 from vinetrack.model.model import Model
 from vinetrack.model.rig import check_needs
 from vinetrack.model.starts import first_own
@@ -200,7 +200,7 @@ def _floors(results: Results) -> dict[str, float]:
 
 def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[Seen]:
     """Trials with the release and origin that the comparison found, or else what the track alone shows."""
-    own = first_own(data)
+    own, at_rest = first_own(data), rest_is_seen(data)
     found = []
     for i, item in enumerate(data):
         release_s, origin_m = float(own[i, 0]), float(own[i, 1])
@@ -209,10 +209,10 @@ def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
         if rows is not None and len(rows) == item.time_s.size:
             release_s = float(item.time_s[0] - rows["time_s"].iloc[0])
             origin_m = float(item.lead_position_m[0] - rows["lead_position_m"].iloc[0])
-        at_rest = item.n_rest >= FEWEST_AT_REST
-        if at_rest:
-            origin_m = float(np.mean(item.lead_position_m[: item.n_rest]))
-        found.append(Seen(item, release_s, origin_m, at_rest))
+        if at_rest[i]:
+            vague = item.vague_rest
+            origin_m = float(np.mean(item.lead_position_m[: item.n_rest])) if vague is None else vague.origin_m
+        found.append(Seen(item, release_s, origin_m, bool(at_rest[i])))
     return found
 
 

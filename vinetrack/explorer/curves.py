@@ -16,6 +16,7 @@ import numpy as np
 
 from vinetrack.explorer.campaign import Campaign, Seen
 from vinetrack.model.free import YIELD_PRESSURE
+from vinetrack.model.left_out import TOLD_APART
 from vinetrack.model.model import Model
 from vinetrack.model.simulate import Trace, Trajectory, simulate_many
 from vinetrack.records import Floats, Trial
@@ -149,8 +150,10 @@ def _step(slope: Floats, left: Floats, *, free_origin: bool) -> tuple[float, flo
     if not free_origin:
         square = float(slope @ slope)
         return (float(slope @ left) / square if square > 0 else 0.0), 0.0
+    # At constant speed a later release and a higher origin are one: of what is hardly told apart nothing is moved.
     design = np.column_stack([slope, np.ones(slope.size)])
-    later, higher = np.linalg.lstsq(design, left, rcond=1e-9)[0]
+    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    later, higher = np.linalg.lstsq(design / length, left, rcond=math.sqrt(TOLD_APART))[0] / length
     return float(later), float(higher)
 
 
