@@ -37,7 +37,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = ("tutorial", "own_effect", "verdicts")
 WIDTH = 116
-LARGEST_BYTES = 150_000
+LARGEST_BYTES, LARGEST_WITH_A_RECORDING_BYTES = 150_000, 200_000
 EXPLORER_PX = (1400, 1330)
 CAPTION = (
     "*The demonstration. The base model is off by {before} where replicates differ by {floor}; with reservoir "
@@ -126,7 +126,7 @@ def wrapped(line: str) -> list[str]:
     return textwrap.wrap(line, WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
-def save_picture(png: bytes, name: str, width_px: int = 1200) -> None:
+def save_picture(png: bytes, name: str, width_px: int = 1200, largest_bytes: int = LARGEST_BYTES) -> None:
     """A picture for the docs: no wider than a page, few colours, small enough to be stored."""
     from PIL import Image
 
@@ -135,7 +135,7 @@ def save_picture(png: bytes, name: str, width_px: int = 1200) -> None:
     for colours in (256, 128, 64):
         out = BytesIO()
         image.quantize(colours, dither=Image.Dither.NONE).save(out, "PNG", optimize=True)
-        if out.tell() <= LARGEST_BYTES:
+        if out.tell() <= largest_bytes:
             break
     (DOCS / f"{name}.png").write_bytes(out.getvalue())
 
@@ -170,7 +170,7 @@ def save_explorer(results: Path, scratch: Path) -> None:
         browser.run("scrollTo(0, 0)")
         time.sleep(1)
         browser.picture(scratch / "explorer.png")
-    save_picture((scratch / "explorer.png").read_bytes(), "explorer", 1120)
+    save_picture((scratch / "explorer.png").read_bytes(), "explorer", 1120, LARGEST_WITH_A_RECORDING_BYTES)
     page_file = DOCS / "explorer.md"
     caption = "\n".join(textwrap.wrap(CAPTION.format(before=before, floor=floor, after=after), 120))
     text = page_file.read_text(encoding="utf-8")
@@ -200,8 +200,9 @@ def main() -> None:
             stage_own_effect(scratch / "my_experiment")
         if not asked.no_pictures:
             save_pictures(results, scratch)
-            save_explorer(scratch / "results" / "demo", scratch)
         os.chdir(scratch)
+        if not asked.no_pictures:
+            save_explorer(Path("results/demo"), scratch)
         run = Runner(scratch)
         # The tutorial saves an effect to the model: what others print comes first.
         for name in sorted(asked.pages, key=lambda page: page == "tutorial"):
