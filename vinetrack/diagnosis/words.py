@@ -59,7 +59,8 @@ def explain(finding: Finding) -> str:
     """One round in sentences."""
     questions = finding.questions
     model = " + ".join(questions.found.model.names)
-    trials = f"{len(questions.found.trials)} trials"
+    count = len(questions.found.trials)
+    trials = f"{count} trial{'s' if count != 1 else ''}"
     if finding.verdict == ADEQUATE:
         return _adequate(finding, model, trials)
     kept = finding.kept
