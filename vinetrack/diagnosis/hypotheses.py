@@ -27,6 +27,9 @@ NARROW, ROOM_BELOW = 2.0, 3.0
 AMPLITUDES = (0.03, 0.2, 0.7)
 """Fractions of the plausible range at which an effect is tried whose small sizes do nothing."""
 
+LADDER = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
+"""The same for a threshold: its answer jumps, and a start too far below or above leads nowhere."""
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -119,7 +122,8 @@ def whole_shapes(effect: Effect, rests: Sequence[tuple[float, ...]] = ((),)) -> 
     low, high = plausible_range(effect.parameters[0])
     largest = high if abs(high) >= abs(low) else low
     zero = effect.parameters[0].zero
-    return [Shape(effect, rest, part * (largest - zero), whole=True) for rest in rests for part in AMPLITUDES]
+    parts = LADDER if "rest_force" in effect.functions else AMPLITUDES
+    return [Shape(effect, rest, part * (largest - zero), whole=True) for rest in rests for part in parts]
 
 
 def first_step(size: Parameter) -> float:
