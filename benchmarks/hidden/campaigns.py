@@ -61,8 +61,10 @@ class Hidden:
     truth: Truth
 
 
-def make(kind: str, seed: int) -> Hidden:
+def make(kind: str, seed: int, *, filmed: bool = False) -> Hidden:
     """The campaign of this kind and seed; the same ones give the same numbers.
+
+    One to be `filmed` has the positions as they were: noise, lost frames and late starts are the camera's business.
 
     Raises
     ------
@@ -73,7 +75,7 @@ def make(kind: str, seed: int) -> Hidden:
         raise KeyError(kind)
     for attempt in range(50):
         draw = np.random.default_rng([zlib.crc32(kind.encode()), seed, attempt])
-        found = _attempt(kind, seed, draw)
+        found = _attempt(kind, seed, draw, filmed=filmed)
         if found is not None:
             return found
     raise RuntimeError(f"No campaign of kind {kind} moves with seed {seed}.")
@@ -114,11 +116,13 @@ def _nuisances(kind: str, regime_name: str, draw: np.random.Generator) -> Nuisan
     return how
 
 
-def _attempt(kind: str, seed: int, draw: np.random.Generator) -> Hidden | None:
+def _attempt(kind: str, seed: int, draw: np.random.Generator, *, filmed: bool) -> Hidden | None:
     """One campaign, or None where too few of its trials move."""
     names, outsider, regime_name = _parts(kind)
     settings = design(draw, _wants(names, outsider, kind))
     how = _nuisances(kind, regime_name, draw)
+    if filmed:
+        how = replace(how, noise="white", noise_m=0.0, dropped=0.0, without_rest=0.0, trace_sigma_kPa=math.nan)
     if all(ALL[name][1].quiet for name in names) and names and draw.uniform() < 0.6:
         # What is weak beside the scatter of a laboratory shows in a careful one.
         how = replace(how, damping_scatter=0.2 * how.damping_scatter, pressure_scatter=0.2 * how.pressure_scatter)

@@ -18,6 +18,9 @@ from vinetrack.effects import Effect
 from vinetrack.model.fit_result import Fit
 
 MOST_AGAIN = 2
+LOUD = 1.0
+"""Standard deviations above the threshold from which a score is no chance, even if no refit bears it out."""
+
 NO_BETTER = 1.0
 """Difference in ln L that counts as a better minimum."""
 
@@ -67,9 +70,12 @@ def inquire(found: Fit, effects: Sequence[Effect], report: Report, *, again: int
     alone = _alone(questions, search, tried)
     if alone is not None:
         return alone
-    if not tried or best_of(tried).sigma < questions.threshold:
-        mends = questions.structure.p < 0.1 * FIRST_LEVEL or questions.off
-        verdict = UNEXPLAINED if mends else ADEQUATE
+    believed = [one for one in tried if one.credible]
+    if not believed or best_of(believed).sigma < questions.threshold:
+        # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
+        loud = questions.possible.max(initial=0.0) > questions.threshold + LOUD
+        fails = questions.shaped or questions.off or loud
+        verdict = UNEXPLAINED if fails else ADEQUATE
         return [Finding(verdict, questions, tried=tuple(tried), search=search)]
     report("two effects together")
     return _together(questions, search, tried, effects, report)
@@ -122,7 +128,8 @@ def _mending(hypotheses: Sequence[Evidence], search: Search) -> tuple[list[Evide
         after: Questions | None = None
         for one in group:
             asked = search.after(one.fit) if one.credible else None
-            if asked is None or asked.something:
+            # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
+            if asked is None or asked.something or (len(one.effects) > 1 and asked.whispers):
                 aside["+".join(one.names)] = one.reason if asked is None else "something is left once it is added"
             elif not mending or one in answer_set([*mending, one])[0]:
                 mending.append(one)

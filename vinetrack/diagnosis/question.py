@@ -31,6 +31,9 @@ FIRST_LEVEL, LATER_LEVEL = 3e-3, 1e-4
 """Chance at which nothing missing may be taken for something by the best of all candidates; once an effect was added
 the gate is stricter, for a pair of effects can imitate what no catalogue holds."""
 
+LOUD_PROBE = 3e-4
+"""Chance at which the loudest probe of a fit with nothing missing may stand out."""
+
 FAR_OFF = 4.0
 """χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
 
@@ -86,11 +89,18 @@ class Questions:
     @property
     def something(self) -> bool:
         """Whether anything is missing, known or not."""
-        return bool(
-            self.off
-            or self.structure.p < 0.1 * self.level
-            or (self.possible.size and self.possible.max() > self.threshold)
-        )
+        return bool(self.off or self.shaped or (self.possible.size and self.possible.max() > self.threshold))
+
+    @cached_property
+    def whispers(self) -> bool:
+        """Whether any candidate stands out as far as would say of a first model that something is missing."""
+        first = family_threshold(self.scores.cosines, self.signs, FIRST_LEVEL)
+        return bool(self.possible.max(initial=0.0) > first)
+
+    @property
+    def shaped(self) -> bool:
+        """Whether what is left has a shape that some smooth force would give it."""
+        return self.structure.p < 0.1 * self.level or self.structure.loudest < min(LOUD_PROBE, self.level)
 
     @property
     def far_off(self) -> bool:

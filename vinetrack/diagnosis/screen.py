@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.diagnosis.answers import Answers, answers_of
+from vinetrack.diagnosis.doubts import doubts_of
 from vinetrack.diagnosis.hypotheses import Shape, probe
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.mixed import State, own_prior
@@ -37,11 +38,15 @@ SHARE_LEFT = 1e-4
 
 @dataclass(frozen=True)
 class Products:
-    """Sums of products of all columns of a fit and of answers: own numbers, keys, residual, shapes; see `whitened`."""
+    """Sums of products of a fit's columns and of answers, see `whitened`.
+
+    In order: own numbers, keys, residual, shapes, doubts.
+    """
 
     grams: Floats
     n_keys: int
     n_shapes: int
+    n_doubts: int = 0
 
 
 @dataclass(frozen=True)
@@ -97,14 +102,14 @@ class Scores:
 
 def products_of(found: Fit, answers: Answers) -> Products:
     """All sums of products that the tests need."""
-    columns = found.solution.columns
+    columns, doubts = found.solution.columns, doubts_of(found)
     grams = np.stack(
         [
-            products(np.column_stack([own, more]), item.first)
-            for own, more, item in zip(columns, answers.columns, found.predictor.data, strict=True)
+            products(np.column_stack([own, more, doubt]), item.first)
+            for own, more, doubt, item in zip(columns, answers.columns, doubts, found.predictor.data, strict=True)
         ]
     )
-    return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes))
+    return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes), doubts[0].shape[1])
 
 
 def scores_of(found: Fit, sums: Products, state: State | None = None) -> Scores:
@@ -114,14 +119,15 @@ def scores_of(found: Fit, sums: Products, state: State | None = None) -> Scores:
     blocks = eliminated(sums, found, state)
     p, size = sums.n_keys, frame.prior_mean.size
     index = frame.index
-    X, r, C = slice(0, p), p, slice(p + 1, p + 1 + sums.n_shapes)
+    asked = sums.n_shapes + sums.n_doubts
+    X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
     square = np.zeros((size + 1, size + 1))
     np.add.at(square, (index[:, :, None], index[:, None, :]), blocks[:, X, X])
     square = square[:size, :size] + np.diag(frame.prior_precision)
     slope = np.zeros(size + 1)
     np.add.at(slope, index, blocks[:, X, r])
     slope = slope[:size] - frame.prior_precision * (state.theta - frame.prior_mean)
-    cross = np.zeros((size + 1, sums.n_shapes))
+    cross = np.zeros((size + 1, asked))
     np.add.at(cross, index, blocks[:, X, C])
     cross = cross[:size]
     moving = np.flatnonzero(frame.free & (np.diag(square) > 0) & ~_pressed(found))
@@ -135,7 +141,7 @@ def scores_of(found: Fit, sums: Products, state: State | None = None) -> Scores:
     # What rounding leaves of a shape that the free numbers imitate exactly is nothing.
     gone = np.diag(information) < 1e-9 * np.maximum(np.diag(total), 1e-300)
     information[gone, :] = information[:, gone] = 0.0
-    levers = np.vstack([lever, np.zeros((1, sums.n_shapes))])[index]
+    levers = np.vstack([lever, np.zeros((1, asked))])[index]
     steps = np.append(step, 0.0)[index]
     left = blocks[:, :, r] - np.einsum("nqk,nk->nq", blocks[:, :, X], steps)
     single = left[:, C] - np.einsum("nkj,nk->nj", levers, left[:, X])
@@ -146,7 +152,23 @@ def scores_of(found: Fit, sums: Products, state: State | None = None) -> Scores:
     score = blocks[:, C, r].sum(axis=0) - cross.T @ step
     score[gone] = 0.0
     degrees = max(len(single) - moving.size, 1)
-    return Scores(score, information, single, alone, float(degrees))
+    return _doubts_aside(Scores(score, information, single, alone, float(degrees)), sums.n_shapes)
+
+
+def _doubts_aside(scores: Scores, n_shapes: int) -> Scores:
+    """What is left of the shapes once all that is in doubt, each of standard deviation 1, is integrated out."""
+    asked = scores.score.size
+    turn = np.zeros((asked, n_shapes))
+    turn[:n_shapes] = np.eye(n_shapes)
+    if asked > n_shapes:
+        inner = scores.information[n_shapes:, n_shapes:] + np.eye(asked - n_shapes)
+        turn[n_shapes:] = -np.linalg.solve(inner, scores.information[n_shapes:, :n_shapes])
+    score, information = turn.T @ scores.score, scores.information[:n_shapes] @ turn
+    gone = np.diag(information) < 1e-9 * np.maximum(np.diag(scores.information)[:n_shapes], 1e-300)
+    information[gone, :] = information[:, gone] = 0.0
+    score[gone] = 0.0
+    informations = turn.T @ scores.informations[:, :, :n_shapes]
+    return Scores(score, information, scores.scores @ turn, informations, scores.degrees)
 
 
 def scatter_of(single: Floats, degrees: float) -> Floats:
@@ -244,12 +266,17 @@ def probe_shapes(found: Fit) -> list[Shape]:
 
 @dataclass(frozen=True)
 class Structure:
-    """What probes find: χ² of their scores for `degrees` of freedom, its upper tail `p`, and that as a `z`."""
+    """What probes find: χ² of their scores for `degrees` of freedom, its upper tail `p`, and that as a `z`.
+
+    `loudest` is the chance at which the loudest of as many probes stands out alone: something narrow shows in one of
+    them, and drowns in the sum over all.
+    """
 
     chi2: float
     degrees: int
     p: float
     z: float
+    loudest: float = 1.0
 
 
 def structure_of(found: Fit) -> Structure:
@@ -258,7 +285,7 @@ def structure_of(found: Fit) -> Structure:
     All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
     """
     from scipy.stats import f as fisher
-    from scipy.stats import norm
+    from scipy.stats import norm, t
 
     answers = answers_of(found, probe_shapes(found))
     if not answers.shapes:
@@ -278,7 +305,12 @@ def structure_of(found: Fit) -> Structure:
     chi2 = float(np.sum(along**2 / np.maximum(1.0, robust)))
     degrees = int(np.count_nonzero(keep))
     p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0
-    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))))
+    # A probe that few trials feel has as few degrees of freedom, however many there are in all.
+    each = np.einsum("njj->nj", scores.informations)[:, live]
+    felt = each.sum(axis=0) ** 2 / np.maximum(np.sum(each**2, axis=0), 1e-300)
+    chances = 2 * t.sf(np.abs(scores.z[live]), np.clip(felt - 1, 1.0, max(scores.degrees, 3.0)))
+    loudest = min(degrees * float(np.min(chances, initial=1.0)), 1.0)
+    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), loudest)
 
 
 def family_threshold(cosines: Floats, signs: Sequence[int], level: float, draws: int = 40_000) -> float:

@@ -18,7 +18,7 @@ from vinetrack.laboratory.scene import Scene, Tube, preset
 from vinetrack.laboratory.targets import Target, render_target
 from vinetrack.laboratory.tracks import VirtualTrial
 from vinetrack.model.simulate import simulate
-from vinetrack.records import Floats
+from vinetrack.records import Floats, Trial
 from vinetrack.tables import replacing
 
 FINE_STEPS = 8
@@ -48,16 +48,16 @@ def make_filming(content: dict[str, Any]) -> Filming:
     )
 
 
-def scene_of(trial: VirtualTrial, filming: Filming) -> Scene:
-    """The scene with the trial's own tube before the camera."""
+def scene_of(stated: Trial, filming: Filming) -> Scene:
+    """The scene with the trial's own tube before the camera, of the size that the sheet states."""
     base = preset(filming.scene)
     subject = base.subject
     if isinstance(subject, Tube):
         subject = replace(
             subject,
-            diameter_m=trial.stated.diameter_m,
-            length_m=trial.stated.length_m,
-            payload_diameter_m=0.6 * trial.stated.diameter_m if trial.stated.payload_kg > 0 else 0.0,
+            diameter_m=stated.diameter_m,
+            length_m=stated.length_m,
+            payload_diameter_m=0.6 * stated.diameter_m if stated.payload_kg > 0 else 0.0,
         )
     return replace(base, subject=subject, camera=filming.camera, exposure_fraction=filming.exposure_fraction)
 
@@ -67,7 +67,7 @@ def film(trial: VirtualTrial, filming: Filming, out_path: Path, seed: int = 0) -
     capture_fps = trial.stated.capture_fps
     n_frames = int(trial.track.time_s.size)
     return render_recording(
-        scene_of(trial, filming),
+        scene_of(trial.stated, filming),
         _motion(trial, n_frames / capture_fps, FINE_STEPS * n_frames),
         n_frames=n_frames,
         capture_fps=capture_fps,

@@ -38,6 +38,7 @@ from vinetrack.model.solve import (
     make_frame,
     solve,
     track_correlation,
+    trial_costs,
 )
 from vinetrack.model.starts import align, candidates, first_own
 from vinetrack.records import Floats, Track
@@ -316,6 +317,11 @@ def _led_back(predictor: Predictor, frame: Frame, state: State, held: Held) -> S
     """
     if held.noise is not None or cost(predictor, frame, state) < BAD_START * float(np.sum(frame.points)):
         return state
+    # What was taken for a late release may be what the new effect holds back: every trial begins where it fits best.
+    aligned, _ = align(predictor.data, predictor, state.theta, state.own)
+    ways = [state, replace(state, own=aligned)]
+    best = np.argmin([trial_costs(predictor, frame, way) for way in ways], axis=0)
+    state = replace(state, own=np.array([ways[way].own[i] for i, way in enumerate(best)]))
     noise = Held(held.spread or state.spread, (state.rho, state.variance))
     return solve(predictor, frame, state, noise, warm=True, most_iterations=GUIDED_ITERATIONS).state
 

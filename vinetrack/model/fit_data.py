@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.model.gauge_noise import without_noise
 from vinetrack.records import Floats, Track, Trial
 from vinetrack.video.position_noise import position_noise, rest_points, rough_noise
 
@@ -70,6 +71,7 @@ class FitTrial:
     correlation: float
     trace: tuple[Floats, Floats] | None = None
     vague_rest: VagueRest | None = None
+    stated_sigma_m: float = math.nan  #: median error of a position that the track states itself
 
     @cached_property
     def frame_s(self) -> float:
@@ -130,8 +132,10 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     if track.pressure_Pa is not None:
         known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
         if np.count_nonzero(known) >= 2:
-            trace = (track.time_s[known].astype(float), track.pressure_Pa[known].astype(float))
+            clock_s = track.time_s[known].astype(float)
+            trace = (clock_s, without_noise(track.pressure_Pa[known].astype(float)))
     n_rest = rest_points(position_m)
+    stated_m = track.lead_position_sigma_m[usable]
     return FitTrial(
         trial=trial,
         time_s=time_s,
@@ -142,6 +146,7 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         correlation=correlation,
         trace=trace,
         vague_rest=vague_rest,
+        stated_sigma_m=float(np.nanmedian(stated_m)) if np.isfinite(stated_m).any() else math.nan,
     )
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vinetrack.effects import Rig
 from vinetrack.model.fit_data import FitTrial
 from vinetrack.model.free import DAMPING, YIELD_PRESSURE, Layout
 from vinetrack.model.model import Model
@@ -30,18 +31,20 @@ error, and small enough for the curvature not to count."""
 
 SMALLEST_STEP, LARGEST_STEP = 1e-5, 0.1
 RELEASE_STEP_FRAMES = 0.1
+PAYLOAD_COLUMN = Rig._fields.index("payload_mass")
 DAMPING_STEP = 1e-3
 
 
 @dataclass(frozen=True)
 class Job:
-    """One trajectory to simulate: which trial, its parameters, pressures and release."""
+    """One trajectory to simulate: which trial, its parameters, pressures and release, and how wrong its payload is."""
 
     trial: int
     row: Floats
     yield_pressure_Pa: float
     pressure_deviation: float
     release_s: float
+    payload_factor: float = 1.0
 
 
 class Predictor:
@@ -85,6 +88,7 @@ class Predictor:
             self.rigs[places, 0] * (1 + np.array([job.pressure_deviation for job in jobs])),
             np.array([job.yield_pressure_Pa for job in jobs]),
         )
+        rigs[:, PAYLOAD_COLUMN] *= [job.payload_factor for job in jobs]
         data = [self.data[job.trial] for job in jobs]
         batch = lay_out(
             model,

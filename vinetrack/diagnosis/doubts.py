@@ -1,0 +1,63 @@
+"""What is never known exactly and shared by many trials: the mass of a payload, the place a camera gives an edge.
+
+Errors of that kind do not average out over trials, so that the scatter of trials does not tell of them; left out, they
+pass for a small effect as soon as pressures and B scatter little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from vinetrack.model.fit_result import Fit
+from vinetrack.model.simulate import SimulationError
+from vinetrack.records import Floats
+
+PAYLOAD_ERROR = 0.005
+"""Standard deviation of a payload's mass beside what the sheet states, as part of it: a gram in two hundred."""
+
+PAYLOAD_STEP = 1e-2
+WAVES = 6
+"""Half waves along the growth, at most, in which a tracker may be off by its stated error in all trials alike."""
+
+
+def doubts_of(found: Fit) -> list[Floats]:
+    """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions."""
+    return [np.column_stack(both) for both in zip(_payloads(found), _tracker(found), strict=True)]
+
+
+def _payloads(found: Fit) -> list[Floats]:
+    """The relative error of each payload of the campaign. Trials with the same payload had the same body."""
+    loaded = [i for i, trial in enumerate(found.trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
+    payloads = dict.fromkeys(round(found.trials[i].trial.payload_kg, 9) for i in loaded)
+    places = {payload: k for k, payload in enumerate(payloads)}
+    columns = [np.zeros((trial.time_s.size, len(places))) for trial in found.trials]
+    if not loaded:
+        return columns
+    state, predictor = found.solution.state, found.predictor
+    jobs = predictor.jobs(state.theta, state.own)
+    try:
+        heavier = predictor.run([replace(jobs[i], payload_factor=1 + PAYLOAD_STEP) for i in loaded])
+    except SimulationError:
+        return [column[:, :0] for column in columns]
+    for i, other in zip(loaded, heavier, strict=True):
+        trial = found.trials[i]
+        change = other.observed_position_m - (trial.predicted_position_m - trial.origin_m)
+        if other.status == "ended":
+            over = other.time_s > other.end_time_s
+            change[over] = change[-1]
+        columns[i][:, places[round(trial.trial.payload_kg, 9)]] = PAYLOAD_ERROR / PAYLOAD_STEP * change
+    return columns
+
+
+def _tracker(found: Fit) -> list[Floats]:
+    """Slow errors along the picture, of the size of the error that tracks state of their positions, if they do."""
+    stated = np.array([item.stated_sigma_m for item in found.predictor.data])
+    if not np.isfinite(stated).any():
+        return [np.zeros((trial.time_s.size, 0)) for trial in found.trials]
+    sigma_m = float(np.nanmedian(stated))
+    grown = [trial.predicted_position_m - trial.origin_m for trial in found.trials]
+    reach = max(float(np.max(one)) for one in grown)
+    waves = np.pi * np.arange(1, WAVES + 1)
+    return [sigma_m * np.cos(one[:, None] / reach * waves) for one in grown]
