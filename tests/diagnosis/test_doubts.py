@@ -1,0 +1,92 @@
+"""What is never known exactly and shared by many trials does not pass for a missing effect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hidden_truth import Pairs, sheet
+
+import vinetrack as vt
+from vinetrack.diagnosis import hypotheses, screen
+from vinetrack.diagnosis.question import FIRST_LEVEL, Questions, question
+from vinetrack.laboratory.campaign import damping_values
+from vinetrack.laboratory.nature import BASE, Nature
+from vinetrack.laboratory.tracks import grow
+from vinetrack.model.fit import fit
+
+
+def careful(payload_g: float, seed: int) -> Pairs:
+    """Twenty-four trials of two vines that scatter by a tenth of a per cent, half of them with a payload."""
+    loads = [(f"{trial.name}_{load:g}g", load, trial) for load in (0.0, payload_g) for trial in sheet()]
+    trials = [replace(trial, name=name, payload_kg=1e-3 * load) for name, load, trial in loads]
+    nature = Nature(
+        effects=BASE,
+        values=damping_values(trials),
+        damping_scatter=1e-3,
+        pressure_scatter=1e-3,
+        yield_error_kPa=0.05,
+        noise_m=2e-5,
+        noise_correlation=0.0,
+        seed=seed,
+    )
+    return [(one.stated, one.track) for one in grow(trials, nature)]
+
+
+def asked(pairs: Pairs) -> Questions:
+    model = vt.base_model()
+    candidates = hypotheses.candidates_of(model, None, None)
+    found = fit(model, pairs, host=hypotheses.host_for(model, candidates), profile=False)
+    return question(found, hypotheses.testable(candidates, found.predictor.data)[0], FIRST_LEVEL)
+
+
+@pytest.fixture
+def without_doubts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(screen, "doubts_of", lambda found: [np.zeros((trial.time_s.size, 0)) for trial in found.trials])
+    return
+
+
+def misweighed() -> Pairs:
+    """Payloads of 60 g of which the sheet says one per cent less."""
+    return [(replace(trial, payload_kg=trial.payload_kg / 1.01), track) for trial, track in careful(60.0, 8)]
+
+
+def seen_crookedly() -> Pairs:
+    """Tracks that say of themselves that they err by 20 µm, and do, slowly and all alike."""
+
+    def bent(position_m: np.ndarray) -> np.ndarray:
+        grown_m = position_m - position_m[0]
+        return position_m + 2e-5 * np.cos(2 * np.pi * grown_m / 0.28)
+
+    return [
+        (
+            trial,
+            replace(
+                track,
+                lead_position_m=bent(track.lead_position_m),
+                lead_position_sigma_m=np.full(track.time_s.size, 2e-5),
+            ),
+        )
+        for trial, track in careful(0.0, 9)
+    ]
+
+
+@pytest.mark.parametrize("make", [misweighed, seen_crookedly])
+def test_a_doubt_shared_by_trials_is_no_missing_effect(make):
+    assert not asked(make()).something
+
+
+@pytest.mark.parametrize("make", [misweighed, seen_crookedly])
+@pytest.mark.usefixtures("without_doubts")
+def test_unless_it_is_left_out(make):
+    assert asked(make()).something
+
+
+def test_an_error_that_tracks_do_not_own_up_to_counts():
+    silent = [
+        (trial, replace(track, lead_position_sigma_m=np.full(track.time_s.size, np.nan)))
+        for trial, track in seen_crookedly()
+    ]
+    assert asked(silent).something
