@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Sequence, Sized
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,11 +174,12 @@ class Batch:
         if threads == 1:
             self._part(0, count, relative_tolerance, out, ends)
         else:
-            with ThreadPoolExecutor(threads) as pool:
-                rest = relative_tolerance, out, ends
-                shares = [pool.submit(self._part, a, b, *rest) for a, b in itertools.pairwise(edges)]
-                for share in shares:
-                    share.result()
+            rest = relative_tolerance, out, ends
+            (begin, end), *others = itertools.pairwise(edges)
+            shares = [_pool(os.getpid(), threads).submit(self._part, a, b, *rest) for a, b in others]
+            self._part(begin, end, *rest)
+            for share in shares:
+                share.result()
         return out, ends
 
     def _part(self, a: int, b: int, relative_tolerance: float, out: Floats, ends: Floats) -> None:
@@ -199,6 +201,12 @@ class Batch:
             out,
             ends[a:b],
         )
+
+
+@lru_cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
+    """Threads that wait for work; a process that was forked off has its own."""
+    return ThreadPoolExecutor(threads)
 
 
 def prepare(
