@@ -4,7 +4,7 @@
 
 The campaigns are those of `benchmarks/hidden/` (see `hidden_effects.py`), which shares no code with the package's
 model; the virtual laboratory films them with distortion, blur, photon noise and compression, beside a calibration
-board. What is analysed is a folder of recordings and a sheet, by the workflow, as anybody's.
+board. What is analysed is a folder of recordings and a sheet, as anybody's.
 
 SD: of tracked minus true position, px, after the mean is taken out, the median of the trials. An offset of all frames
 is no error, any analysis has an origin of its own.
@@ -15,18 +15,21 @@ Seeds 950–974 are kept for this and were chosen by the length of their recordi
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from hidden import make
 from hidden.campaigns import Hidden
 from hidden.filmed import film_campaign, filming_of
+
+import vinetrack as vt
+from vinetrack.records import Track, Trial
+from vinetrack.settings import ExperimentSettings
+from vinetrack.video.measure import measure_recording
 
 ONE_EACH = (
     "null:anything@953",
@@ -38,49 +41,46 @@ ONE_EACH = (
     "length_scale@962",
     "outsider:rough_patch@962",
 )
-ROOT = Path(__file__).parents[1]
-
-
-def tracked_sd_px(campaign: Hidden, results: Path) -> float:
-    """Median over the trials of the SD of tracked minus true position."""
-    m_per_px = filming_of(campaign).camera.m_per_px
-    errors = []
-    for trial, track in campaign.pairs:
-        path = results / "tracks" / f"{trial.name}.csv"
-        if not path.is_file():
-            continue
-        seen = pd.read_csv(path, comment="#")
-        seen = seen[seen["flag"].isna()]
-        true = np.interp(seen["time_s"], track.time_s, track.lead_position_m)
-        error = seen["lead_position_m"] - true
-        errors.append(float(np.nanstd(error - error.mean())) / m_per_px)
-    return float(np.median(errors)) if errors else float("nan")
 
 
 def ask(kind: str, seed: int, folder: Path, cores: int) -> None:
-    """Film, analyse and print one row."""
+    """Film, track, diagnose and print one row."""
     campaign = make(kind, seed, filmed=True)
     begun = time.perf_counter()
     experiment = film_campaign(campaign, folder, cores)
     filmed_s = time.perf_counter() - begun
     begun = time.perf_counter()
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), "--directory", str(folder)]
-    command += ["--cores", str(cores), "--config", f"experiment={experiment.folder}"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    results = folder / "results" / experiment.folder.name
+    track = partial(measured, settings=experiment.settings, folder=experiment.folder)
+    with ProcessPoolExecutor(cores) as pool:
+        tracks = dict(zip((t.name for t in experiment.trials), pool.map(track, experiment.trials), strict=True))
+    tracked_s = time.perf_counter() - begun
+    begun = time.perf_counter()
+    said = vt.diagnose(experiment, tracks=tracks, ladder=False, advice=False)
     hidden = "+".join(campaign.truth.effects) or campaign.truth.outsider or "nothing"
-    if not (results / "diagnosis.json").is_file():
-        print(f"{hidden}: no diagnosis\n{done.stderr[-2000:]}", flush=True)
-        return
-    said = json.loads((results / "diagnosis.json").read_text(encoding="utf-8"))
-    answer = ", ".join(said.get("answer_set", [])) or "-"
     print(
-        f"{hidden:20s} {seed} {len(campaign.pairs):3d} trials  {said['verdict']:12s}{answer:36s}"
-        f"filmed {filmed_s:4.0f} s, analysed {time.perf_counter() - begun:4.0f} s, "
-        f"SD {tracked_sd_px(campaign, results):.3f} px",
+        f"{hidden:20s} {seed} {len(tracks):3d} trials  {said.verdict:12s}{', '.join(said.answer_set) or '-':36s}"
+        f"then {said.final_verdict:12s} SD {tracked_sd_px(campaign, tracks):.3f} px; seconds: filmed {filmed_s:.0f}, "
+        f"tracked {tracked_s:.0f}, diagnosed {time.perf_counter() - begun:.0f}",
         flush=True,
     )
-    print("    " + said["explanation"][:500], flush=True)
+    print("    " + said.explanation[:500], flush=True)
+
+
+def measured(trial: Trial, settings: ExperimentSettings, folder: Path) -> Track:
+    """The track of one recording."""
+    return measure_recording(trial, settings, folder).tracking.track
+
+
+def tracked_sd_px(campaign: Hidden, tracks: dict[str, Track]) -> float:
+    """Median over the trials of the SD of tracked minus true position, where no frame is doubtful."""
+    m_per_px = filming_of(campaign).camera.m_per_px
+    errors = []
+    for trial, true in campaign.pairs:
+        seen = tracks[trial.name]
+        sure = seen.usable & (seen.flag == "")
+        error = seen.lead_position_m[sure] - np.interp(seen.time_s[sure], true.time_s, true.lead_position_m)
+        errors.append(float(np.std(error)) / m_per_px)
+    return float(np.median(errors))
 
 
 def main() -> None:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from vinetrack.diagnosis.evidence import Evidence, weigh
 from vinetrack.diagnosis.question import LATER_LEVEL, Questions, question
-from vinetrack.diagnosis.search import MORE_ITERATIONS, Climb, Slope, best_climb, full_fit, start_of, starts_of
+from vinetrack.diagnosis.search import Climb, Slope, best_climb, full_fit, start_of, starts_of
 from vinetrack.effects import Effect
+from vinetrack.model.fit import FitError, refit
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.model import Value
+from vinetrack.model.simulate import SimulationError
 
 Report = Callable[[str], None]
 """Told in a few words what is being done."""
@@ -31,6 +36,9 @@ FEWEST_CLIMBED, LOUDEST = 5, 4
 REACH_OF_CLIMBS, SHARE_OF_REACH = 40.0, 0.1
 MOST_FITTED = 7
 STARTS_EACH = 3
+SURELY = 6.0
+"""Standard deviations from nothing beyond which a number is there."""
+
 FIRSTS, PARTNERS, SHARE_OF_BEST = 3, 4, 0.3
 """Pairs are built on the three best effects alone, if they explain this part of what the best explains, with the four
 that promise most beside each."""
@@ -91,25 +99,12 @@ class Search:
 
     def _fit_what_is_contained(self) -> None:
         """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
+        found = self.questions.found
         for one in list(self.fitted.values()):
-            for name in one.effects[-1].replaces:
-                simpler = [effect for effect in self.questions.effects if effect.name == name]
-                if not simpler:
-                    continue
-                values = {key: value for key, value in one.fit.model.values.items() if "." in key}
-                sizes = {key.split(".")[1]: value for key, value in values.items() if key.split(".")[0] in one.names}
-                kept = {key: value for key, value in values.items() if key.split(".")[0] in self.questions.found.model}
-                own = {f"{name}.{p.name}": sizes[p.name] for p in simpler[0].parameters if p.name in sizes}
-                if self._in_reach(simpler[0], {**kept, **own}):
-                    self._fit(Climb((simpler[0],), math.nan, {**kept, **own}))
-
-    def _in_reach(self, effect: Effect, values: Mapping[str, Value]) -> bool:
-        """Whether a few steps from these values come near the best climb; where none was made, it may."""
-        if not self.climbs:
-            return True
-        there = self.slope.climb((effect,), values, iterations=MORE_ITERATIONS)
-        best = min(one.deviance for one in self.climbs.values())
-        return there is not None and there.deviance - best < self.reach
+            for both, fit in simpler_forms(found, one, self.questions.effects):
+                name, simpler = "+".join(effect.name for effect in both), weigh(found, both, fit)
+                if name not in self.fitted or simpler.delta_chi2 > max(self.fitted[name].delta_chi2, WORSE):
+                    self.fitted[name] = simpler
 
     def _worth_a_climb(self) -> list[str]:
         top = self.questions.promise(self.names[0]) if self.names else 0.0
@@ -213,4 +208,35 @@ def pairs(before: Fit, firsts: Sequence[Evidence], effects: Sequence[Effect], re
             both = weigh(before, (*first.effects, *second.effects), second.fit)
             if names not in found or both.fit.log_likelihood > found[names].fit.log_likelihood:
                 found[names] = both
+    for one in sorted(found.values(), key=lambda one: -one.fit.log_likelihood)[:PARTNERS]:
+        for effects_both, fit in simpler_forms(before, one, effects):
+            names = frozenset(effect.name for effect in effects_both)
+            if names not in found or fit.log_likelihood > found[names].fit.log_likelihood:
+                found[names] = weigh(before, effects_both, fit)
     return sorted(found.values(), key=lambda one: -one.fit.log_likelihood)
+
+
+def simpler_forms(before: Fit, one: Evidence, effects: Sequence[Effect]) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
+    """A hypothesis with one of its effects in the simpler form that it contains, fitted from where it ended."""
+    for held in one.effects:
+        for simpler in effects:
+            if simpler.name not in held.replaces or simpler.name in one.names or _needs_more(one.fit, held, simpler):
+                continue
+            both = tuple(simpler if effect is held else effect for effect in one.effects)
+            model = before.model
+            for effect in both:
+                model = model + effect
+            values = one.fit.model.values
+            sizes = {f"{simpler.name}.{p.name}": values.get(f"{held.name}.{p.name}") for p in simpler.parameters}
+            start = {key: size for key, size in sizes.items() if size is not None}
+            with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
+                yield both, refit(one.fit, model, start=start, thorough=False)
+
+
+def _needs_more(fit: Fit, held: Effect, simpler: Effect) -> bool:
+    """Whether a number that only the larger form has is known so well that it cannot lie where the two are one."""
+    extra = {p.name for p in held.parameters} - {p.name for p in simpler.parameters}
+    numbers = [n for n in fit.numbers if n.key.split(".")[0] == held.name and n.key.split(".")[1] in extra]
+    return any(
+        math.isfinite(n.sigma) and not math.isfinite(n.bound) and abs(n.value) > SURELY * n.sigma for n in numbers
+    )
