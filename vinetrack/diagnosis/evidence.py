@@ -83,8 +83,10 @@ def belief(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple
             for number in after.numbers:
                 if number.key != f"{effect.name}.{parameter.name}" or not math.isfinite(number.sigma):
                     continue
-                if not is_plausible(parameter, number.value, number.sigma, widened=widened):
-                    low, high = parameter.plausible or (math.nan, math.nan)
+                low, high = parameter.plausible or (math.nan, math.nan)
+                # At its bound, beyond what is plausible, it wants more than any rig has, whatever its error says.
+                pressed = math.isfinite(number.bound) and (number.bound < low or number.bound > high)
+                if pressed or not is_plausible(parameter, number.value, number.sigma, widened=widened):
                     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
                     needs = f"it would need {number.symbol} = {number.value:.3g}{unit}"
                     return False, f"{needs}, and {low:.3g} to {high:.3g} is plausible"
