@@ -37,6 +37,7 @@ ONE_EACH = (
     "reservoir_depletion@973",
     "tail_friction@950",
     "air_drag@956",
+    "inlet_loss@962",
     "perspective@959",
     "length_scale@962",
     "outsider:rough_patch@962",
