@@ -29,6 +29,7 @@ from hidden.filmed import film_campaign, filming_of
 import vinetrack as vt
 from vinetrack.records import Track, Trial
 from vinetrack.settings import ExperimentSettings
+from vinetrack.video.frames import RecordingError
 from vinetrack.video.measure import measure_recording
 
 ONE_EACH = (
@@ -53,7 +54,8 @@ def ask(kind: str, seed: int, folder: Path, cores: int) -> None:
     begun = time.perf_counter()
     track = partial(measured, settings=experiment.settings, folder=experiment.folder)
     with ProcessPoolExecutor(cores) as pool:
-        tracks = dict(zip((t.name for t in experiment.trials), pool.map(track, experiment.trials), strict=True))
+        seen = zip(experiment.trials, pool.map(track, experiment.trials), strict=True)
+        tracks = {trial.name: one for trial, one in seen if one is not None}
     tracked_s = time.perf_counter() - begun
     begun = time.perf_counter()
     said = vt.diagnose(experiment, tracks=tracks, ladder=False, advice=False)
@@ -67,9 +69,13 @@ def ask(kind: str, seed: int, folder: Path, cores: int) -> None:
     print("    " + said.explanation[:500], flush=True)
 
 
-def measured(trial: Trial, settings: ExperimentSettings, folder: Path) -> Track:
-    """The track of one recording."""
-    return measure_recording(trial, settings, folder).tracking.track
+def measured(trial: Trial, settings: ExperimentSettings, folder: Path) -> Track | None:
+    """The track of one recording; None where it is refused, as the workflow leaves out such a trial alone."""
+    try:
+        return measure_recording(trial, settings, folder).tracking.track
+    except RecordingError as error:
+        print(f"    left out: {error}")
+        return None
 
 
 def tracked_sd_px(campaign: Hidden, tracks: dict[str, Track]) -> float:
@@ -77,6 +83,8 @@ def tracked_sd_px(campaign: Hidden, tracks: dict[str, Track]) -> float:
     m_per_px = filming_of(campaign).camera.m_per_px
     errors = []
     for trial, true in campaign.pairs:
+        if trial.name not in tracks:
+            continue
         seen = tracks[trial.name]
         sure = seen.usable & (seen.flag == "")
         error = seen.lead_position_m[sure] - np.interp(seen.time_s[sure], true.time_s, true.lead_position_m)

@@ -37,8 +37,9 @@ LOUD_PROBE = 3e-4
 FAR_OFF = 4.0
 """χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
 
-OFF = 6e-4
-"""Part of its growth by which the median trial is missed beyond any tracker's slow errors: 0.1 mm of 170 mm."""
+OFF, OFF_OTHERWISE = 6e-4, 1.5e-4
+"""Part of its growth by which the median trial is missed beyond any tracker's slow errors: 0.1 mm of 170 mm. Positions
+without a stated error, and pressures that were set, have no such errors that anybody knows of."""
 
 TESTABLE_SIGMAS = 3.0
 """An effect whose largest plausible size would show by less than this cannot be tested here."""
@@ -110,7 +111,14 @@ class Questions:
     @property
     def off(self) -> bool:
         """Whether it misses more than noise, and more of the growth than a tracker's slow errors amount to."""
-        return self.far_off and missed_part(self.found.predictor, self.found.solution) > OFF
+        return self.far_off and missed_part(self.found.predictor, self.found.solution) > self._allowed
+
+    @property
+    def _allowed(self) -> float:
+        """The part that may be missed: less where neither the tracks nor a gauge have slow errors to own up to."""
+        data = self.found.predictor.data
+        slow = any(math.isfinite(item.stated_sigma_m) or item.trace is not None for item in data)
+        return OFF if slow else OFF_OTHERWISE
 
     @property
     def lost(self) -> bool:
