@@ -1,4 +1,4 @@
-"""What is never known exactly and shared by many trials: the mass of a payload, the place a camera gives an edge.
+"""What is never known exactly and shared by trials: a payload's mass, a set pressure, the place a camera gives an edge.
 
 Errors of that kind do not average out over trials, so that the scatter of trials does not tell of them; left out, they
 pass for a small effect as soon as pressures and B scatter little.
@@ -11,11 +11,15 @@ from dataclasses import replace
 import numpy as np
 
 from vinetrack.model.fit_result import Fit
+from vinetrack.model.sensitivity import PRESSURE
 from vinetrack.model.simulate import SimulationError
 from vinetrack.records import Floats
 
 PAYLOAD_ERROR = 0.005
 """Standard deviation of a payload's mass beside what the sheet states, as part of it: a gram in two hundred."""
+
+PRESSURE_ERROR_PA = 30.0
+"""Standard deviation of a set pressure beside what the sheet states: read to a tenth of a kilopascal."""
 
 PAYLOAD_STEP = 1e-2
 WAVES = 6
@@ -24,7 +28,8 @@ WAVES = 6
 
 def doubts_of(found: Fit) -> list[Floats]:
     """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions."""
-    return [np.column_stack(both) for both in zip(_payloads(found), _tracker(found), strict=True)]
+    parts = zip(_payloads(found), _set_pressures(found), _tracker(found), strict=True)
+    return [np.column_stack(one) for one in parts]
 
 
 def _payloads(found: Fit) -> list[Floats]:
@@ -48,6 +53,19 @@ def _payloads(found: Fit) -> list[Floats]:
             over = other.time_s > other.end_time_s
             change[over] = change[-1]
         columns[i][:, places[round(trial.trial.payload_kg, 9)]] = PAYLOAD_ERROR / PAYLOAD_STEP * change
+    return columns
+
+
+def _set_pressures(found: Fit) -> list[Floats]:
+    """The error of the pressure that was set for a condition; its replicates have it together."""
+    feels = found.predictor.feels_pressure
+    conditions = dict.fromkeys(one.trial.condition for one, felt in zip(found.trials, feels, strict=True) if felt)
+    places = {condition: k for k, condition in enumerate(conditions)}
+    columns = [np.zeros((trial.time_s.size, len(places))) for trial in found.trials]
+    for column, trial, own, felt in zip(columns, found.trials, found.solution.columns, feels, strict=True):
+        if felt:
+            relative = PRESSURE_ERROR_PA / trial.trial.pressure_Pa
+            column[:, places[trial.trial.condition]] = relative * own[:, PRESSURE]
     return columns
 
 
