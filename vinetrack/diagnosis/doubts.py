@@ -25,6 +25,10 @@ PAYLOAD_STEP = 1e-2
 WAVES = 6
 """Half waves along the growth, at most, in which a tracker may be off by its stated error in all trials alike."""
 
+BEGIN, END, COVERED = 0.015, 0.03, 4.0
+"""Parts of the growth at its begin and end in which it may be off by so many times that: a door hides half of the tip
+there, the last fold pulls it out of shape."""
+
 
 def doubts_of(found: Fit) -> list[Floats]:
     """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions."""
@@ -78,4 +82,17 @@ def _tracker(found: Fit) -> list[Floats]:
     grown = [trial.predicted_position_m - trial.origin_m for trial in found.trials]
     reach = max(float(np.max(one)) for one in grown)
     waves = np.pi * np.arange(1, WAVES + 1)
-    return [sigma_m * np.cos(one[:, None] / reach * waves) for one in grown]
+    slow = [sigma_m * np.cos(one[:, None] / reach * waves) for one in grown]
+    return [
+        np.column_stack([first, *_ends(one / reach, COVERED * sigma_m)]) for first, one in zip(slow, grown, strict=True)
+    ]
+
+
+def _ends(part: Floats, sigma_m: float) -> list[Floats]:
+    """Errors where the tip leaves what holds it, and where the film runs out and the tip changes its shape."""
+    last = float(np.max(part))
+    return [
+        sigma_m * np.exp(-part / BEGIN),
+        sigma_m * np.exp(-part / (3 * BEGIN)),
+        sigma_m * np.exp((part - last) / END),
+    ]
