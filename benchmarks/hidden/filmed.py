@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -58,7 +57,7 @@ def _film(pair: tuple[Trial, Track], filming: Filming, folder: Path) -> None:
     fine_s = np.linspace(0.0, count / trial.capture_fps, FINE_STEPS * count + 1)
     # Between frames the motion is smooth, and at rest it stays at rest.
     motion = fine_s, PchipInterpolator(track.time_s, grown)(np.minimum(fine_s, track.time_s[-1]))
-    scene = scene_of(replace(trial), filming)
+    scene = scene_of(trial, filming)
     path = folder / "videos" / f"{trial.name}.mp4"
     render_recording(
         scene, motion, n_frames=count, capture_fps=trial.capture_fps, out_path=path, seed=int(trial.name[1:])

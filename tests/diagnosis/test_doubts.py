@@ -10,12 +10,15 @@ import pytest
 from hidden_truth import Pairs, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis import hypotheses, screen
+from vinetrack.diagnosis import hypotheses
+from vinetrack.diagnosis import question as questions
 from vinetrack.diagnosis.question import FIRST_LEVEL, Questions, question
 from vinetrack.laboratory.campaign import damping_values
 from vinetrack.laboratory.nature import BASE, Nature
 from vinetrack.laboratory.tracks import grow
 from vinetrack.model.fit import fit
+from vinetrack.model.fit_result import Fit
+from vinetrack.records import Floats
 
 
 def careful(payload_g: float, seed: int) -> Pairs:
@@ -44,7 +47,10 @@ def asked(pairs: Pairs) -> Questions:
 
 @pytest.fixture
 def without_doubts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(screen, "doubts_of", lambda found: [np.zeros((trial.time_s.size, 0)) for trial in found.trials])
+    def none(found: Fit) -> list[Floats]:
+        return [np.zeros((trial.time_s.size, 0)) for trial in found.trials]
+
+    monkeypatch.setattr(questions, "doubts_of", none)
     return
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from vinetrack.diagnosis.hypotheses import Shape, whole_shapes
 from vinetrack.model.fit_result import Fit
-from vinetrack.model.simulate import SimulationError
+from vinetrack.model.simulate import SimulationError, Trajectory
 from vinetrack.records import Floats
 
 AIMED_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
@@ -112,12 +112,13 @@ def _change(found: Fit, shape: Shape, plain: Sequence[Floats]) -> list[Floats]:
     rows = np.array([[*job.row, *shape.values] for job in jobs]).reshape(len(jobs), -1)
     model = found.predictor.layout.model + shape.effect
     moved = predictor.run_as(model, jobs, rows)
-    change = []
-    for before, trajectory in zip(plain, moved, strict=True):
-        one = trajectory.observed_position_m - before
-        if trajectory.status == "ended":
-            # Behind the end of growth the film stands still: what delays the end moves nothing there.
-            over = trajectory.time_s > trajectory.end_time_s
-            one[over] = one[-1]
-        change.append(one)
-    return change
+    return [moved_by(before, trajectory) for before, trajectory in zip(plain, moved, strict=True)]
+
+
+def moved_by(before: Floats, after: Trajectory) -> Floats:
+    """How far the observed positions of a trial moved, m, shape (n_points,)."""
+    change = after.observed_position_m - before
+    if after.status == "ended":
+        # Behind the end of growth the film stands still: what delays the end moves nothing there.
+        change[after.time_s > after.end_time_s] = change[-1]
+    return np.asarray(change)

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vinetrack.diagnosis.answers import moved_by
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.sensitivity import PRESSURE
 from vinetrack.model.simulate import SimulationError
@@ -52,10 +53,7 @@ def _payloads(found: Fit) -> list[Floats]:
         return [column[:, :0] for column in columns]
     for i, other in zip(loaded, heavier, strict=True):
         trial = found.trials[i]
-        change = other.observed_position_m - (trial.predicted_position_m - trial.origin_m)
-        if other.status == "ended":
-            over = other.time_s > other.end_time_s
-            change[over] = change[-1]
+        change = moved_by(trial.predicted_position_m - trial.origin_m, other)
         columns[i][:, places[round(trial.trial.payload_kg, 9)]] = PAYLOAD_ERROR / PAYLOAD_STEP * change
     return columns
 

@@ -18,6 +18,8 @@ ANSWER_SET = 9.0
 """Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
 
 MOST_INFLATION = 6.0
+"""How many times the variance of the noise model trials may be seen to scatter: beyond, few trials say too little."""
+
 CREDIBLE = 3.0
 """How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag."""
 
@@ -48,6 +50,11 @@ class Evidence:
     def names(self) -> tuple[str, ...]:
         """Names of the effects it adds."""
         return tuple(effect.name for effect in self.effects)
+
+    @property
+    def label(self) -> str:
+        """Names joined, by which it is kept."""
+        return "+".join(self.names)
 
     @property
     def numbers(self) -> tuple[Number, ...]:
@@ -167,12 +174,12 @@ def answer_set(hypotheses: Sequence[Evidence]) -> tuple[list[Evidence], dict[str
             and (_contains(one, other) or distance(other.fit, one.fit) < LIMIT_DISTANCE)
         ]
         if simpler:
-            aside["+".join(one.names)] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
+            aside[one.label] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
         else:
             kept.append(one)
     believed = [one for one in kept if one.credible]
     if believed and len(believed) < len(kept):
-        aside |= {"+".join(one.names): one.reason for one in kept if not one.credible}
+        aside |= {one.label: one.reason for one in kept if not one.credible}
         kept = believed
     return kept, aside
 

@@ -18,6 +18,8 @@ from vinetrack.effects import Effect
 from vinetrack.model.fit_result import Fit
 
 MOST_AGAIN = 2
+"""Times that all is asked again of a better minimum."""
+
 LOUD = 1.0
 """Standard deviations above the threshold from which a score is no chance, even if no refit bears it out."""
 
@@ -121,7 +123,7 @@ def _mending(hypotheses: Sequence[Evidence], search: Search) -> tuple[list[Evide
     next_to_it = [
         one
         for one in behind
-        if "+".join(one.names) not in aside and 2 * (best - one.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
+        if one.label not in aside and 2 * (best - one.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
     ]
     for group in (kept, next_to_it):
         mending: list[Evidence] = []
@@ -130,7 +132,7 @@ def _mending(hypotheses: Sequence[Evidence], search: Search) -> tuple[list[Evide
             asked = search.after(one.fit) if one.credible else None
             # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
             if asked is None or asked.something or (len(one.effects) > 1 and asked.whispers):
-                aside["+".join(one.names)] = one.reason if asked is None else "something is left once it is added"
+                aside[one.label] = one.reason if asked is None else "something is left once it is added"
             elif not mending or one in answer_set([*mending, one])[0]:
                 mending.append(one)
                 after = after or asked
@@ -218,6 +220,6 @@ def _turned(one: Evidence, first: str) -> Evidence:
 
 def _why_not(ranked: Sequence[Evidence], both: Sequence[Evidence]) -> tuple[tuple[str, str], ...]:
     return tuple(
-        ("+".join(one.names), one.reason if not one.credible else "something is left once it is added")
+        (one.label, one.reason if not one.credible else "something is left once it is added")
         for one in (*ranked[:1], *both[:1])
     )

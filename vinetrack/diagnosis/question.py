@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from vinetrack.diagnosis.answers import Answers, answers_of
+from vinetrack.diagnosis.doubts import doubts_of
 from vinetrack.diagnosis.hypotheses import Shape, plausible_range, shapes_of
 from vinetrack.diagnosis.screen import (
     Products,
@@ -184,5 +185,6 @@ def question(found: Fit, effects: Sequence[Effect], level: float) -> Questions:
     effects = tuple(effect for effect in effects if effect.name not in found.model)
     shapes: list[Shape] = [shape for effect in effects for shape in shapes_of(effect)]
     answers = answers_of(found, shapes)
-    sums = products_of(found, answers)
-    return Questions(found, effects, answers, sums, scores_of(found, sums), structure_of(found), level)
+    doubts = doubts_of(found)
+    sums = products_of(found, answers, doubts)
+    return Questions(found, effects, answers, sums, scores_of(found, sums), structure_of(found, doubts), level)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.model.fit_result import TrialFit
-from vinetrack.model.left_out import FEWEST_AT_REST
+from vinetrack.model.left_out import FEWEST_AT_REST, told_apart
 from vinetrack.records import Floats
 from vinetrack.video.position_noise import rest_points
 
@@ -149,10 +149,7 @@ def _about_their_mean(trials: Sequence[TrialFit], reference: TrialFit, time_s: F
             if np.count_nonzero(use) > 2:
                 free = 0.0 if at_rest[i] else 1.0
                 design = np.column_stack([-speed_m_s[use], np.full(np.count_nonzero(use), free)])
-                # At constant speed later and higher are one: what only their difference could explain is left alone.
-                scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-                found = np.linalg.lstsq(design / scale, deviation_m[i, use], rcond=TELLS_APART)[0]
-                later_s, higher_m = found / scale
+                later_s, higher_m = told_apart(design, deviation_m[i, use], TELLS_APART)
                 release_s[i] += np.clip(later_s, -2 * frames_s[i], 2 * frames_s[i])
                 origin_m[i] += higher_m
     return deviation_m

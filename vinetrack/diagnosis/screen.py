@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.diagnosis.answers import Answers, answers_of
-from vinetrack.diagnosis.doubts import doubts_of
 from vinetrack.diagnosis.hypotheses import Shape, probe
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.mixed import State, own_prior
@@ -100,9 +99,9 @@ class Scores:
         return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
 
 
-def products_of(found: Fit, answers: Answers) -> Products:
-    """All sums of products that the tests need."""
-    columns, doubts = found.solution.columns, doubts_of(found)
+def products_of(found: Fit, answers: Answers, doubts: Sequence[Floats]) -> Products:
+    """All sums of products that the tests need; `doubts` are those of `doubts_of`."""
+    columns = found.solution.columns
     grams = np.stack(
         [
             products(np.column_stack([own, more, doubt]), item.first)
@@ -279,7 +278,7 @@ class Structure:
     loudest: float = 1.0
 
 
-def structure_of(found: Fit) -> Structure:
+def structure_of(found: Fit, doubts: Sequence[Floats]) -> Structure:
     """Whether anything that a smooth force could explain is left beside a fit.
 
     All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
@@ -290,7 +289,7 @@ def structure_of(found: Fit) -> Structure:
     answers = answers_of(found, probe_shapes(found))
     if not answers.shapes:
         return Structure(0.0, 0, 1.0, 0.0)
-    scores = scores_of(found, products_of(found, answers))
+    scores = scores_of(found, products_of(found, answers, doubts))
     root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
     live = np.diag(scores.information) > 0
     information = (scores.information / root[:, None] / root)[np.ix_(live, live)]

@@ -93,6 +93,11 @@ class Slope:
         level = deviance(part, solution.frame, solution.state, CLIMB_SPREADS, restricted=False)
         return Climb(tuple(effects), level, _values(layout, solution.state.theta)) if math.isfinite(level) else None
 
+    def here(self) -> float:
+        """−2 ln L where a few steps from the fit itself end; infinite where it cannot be followed."""
+        climb = self.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
+        return math.inf if climb is None else climb.deviance
+
     def _fixed(self, names: Iterable[str]) -> tuple[str, ...]:
         held = self.found.options["fixed"]
         return tuple(name for name in held if name in names or any(name == full.split(".")[1] for full in names))
@@ -190,7 +195,8 @@ def from_other_starts(found: Fit) -> Fit:
         return found
     slope = Slope(found)
     points = sum(item.time_s.size for item in slope.data)
-    return _from(slope, [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)], LOWER_PER_POINT * points)
+    starts: list[Start] = [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
+    return _from(slope, starts, slope.here(), LOWER_PER_POINT * points)
 
 
 def without(found: Fit, other: Fit) -> Fit:
@@ -200,18 +206,16 @@ def without(found: Fit, other: Fit) -> Fit:
     """
     slope, names = Slope(found), set(found.model.parameter_names)
     added = [effect for effect in other.model if effect.name not in found.model]
-    here = slope.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
-    there = slope.climb(added, other.model.values, iterations=1)
-    lower = math.inf if here is None or there is None else max(LOWER, 0.5 * (here.deviance - there.deviance))
-    return _from(slope, [((), {key: value for key, value in other.model.values.items() if key in names})], lower)
+    here, there = slope.here(), slope.climb(added, other.model.values, iterations=1)
+    lower = math.inf if there is None else max(LOWER, 0.5 * (here - there.deviance))
+    return _from(slope, [((), {key: value for key, value in other.model.values.items() if key in names})], here, lower)
 
 
-def _from(slope: Slope, starts: Sequence[Start], lower: float) -> Fit:
-    """The model of a fit begun elsewhere, where a climb from there ends lower by this than one from where it stands."""
+def _from(slope: Slope, starts: Sequence[Start], here: float, lower: float) -> Fit:
+    """The model of a fit begun elsewhere, where a climb from there ends lower than `here` by this."""
     found = slope.found
-    here = slope.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
-    climb = best_climb(slope, starts, math.inf if here is None else here.deviance)
-    if climb is None or (here is not None and climb.deviance > here.deviance - lower):
+    climb = best_climb(slope, starts, here)
+    if climb is None or climb.deviance > here - lower:
         return found
     other = full_fit(found, climb, found.log_likelihood)
     return other if other is not None and other.log_likelihood > found.log_likelihood else found

@@ -59,7 +59,6 @@ class Search:
     def __post_init__(self) -> None:
         self.slope = Slope(self.questions.found)
         self.goal = math.inf
-        self.reach = REACH_OF_CLIMBS
 
     @property
     def weak(self) -> bool:
@@ -89,9 +88,9 @@ class Search:
         best = leaders[0]
         base = self.slope.climb((), {}, iterations=4)
         gain = max((base.deviance if base else best.deviance) - best.deviance, 0.0)
-        self.reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
+        reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
         alike = [c for c in leaders if self.questions.cosine(c.names[0], best.names[0]) > ALIKE]
-        chosen = [one for one in leaders if one.deviance - best.deviance < self.reach or one in alike]
+        chosen = [one for one in leaders if one.deviance - best.deviance < reach or one in alike]
         for climb in chosen[: self.most_fitted + 3 * all_of_them]:
             self._fit(climb)
         self._fit_what_is_contained()
@@ -102,9 +101,10 @@ class Search:
         found = self.questions.found
         for one in list(self.fitted.values()):
             for both, fit in simpler_forms(found, one, self.questions.effects):
-                name, simpler = "+".join(effect.name for effect in both), weigh(found, both, fit)
-                if name not in self.fitted or simpler.delta_chi2 > max(self.fitted[name].delta_chi2, WORSE):
-                    self.fitted[name] = simpler
+                simpler = weigh(found, both, fit)
+                known = self.fitted.get(simpler.label)
+                if known is None or simpler.delta_chi2 > max(known.delta_chi2, WORSE):
+                    self.fitted[simpler.label] = simpler
 
     def _worth_a_climb(self) -> list[str]:
         top = self.questions.promise(self.names[0]) if self.names else 0.0

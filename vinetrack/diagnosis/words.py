@@ -116,7 +116,7 @@ def _adequate(finding: Finding, model: str, trials: str) -> str:
 
 def _runner_up(finding: Finding) -> str:
     others = [one for one in finding.tried if len(one.names) == 1 and one.names not in {k.names for k in finding.kept}]
-    others = [one for one in others if "+".join(one.names) not in dict(finding.aside)]
+    others = [one for one in others if one.label not in dict(finding.aside)]
     text = ""
     if others:
         best = max(others, key=lambda one: one.fit.log_likelihood)

@@ -210,8 +210,7 @@ def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
             release_s = float(item.time_s[0] - rows["time_s"].iloc[0])
             origin_m = float(item.lead_position_m[0] - rows["lead_position_m"].iloc[0])
         if at_rest[i]:
-            vague = item.vague_rest
-            origin_m = float(np.mean(item.lead_position_m[: item.n_rest])) if vague is None else vague.origin_m
+            origin_m = item.rest_origin_m
         found.append(Seen(item, release_s, origin_m, bool(at_rest[i])))
     return found
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from vinetrack.explorer.campaign import Campaign, Seen
 from vinetrack.model.free import YIELD_PRESSURE
-from vinetrack.model.left_out import TOLD_APART
+from vinetrack.model.left_out import TOLD_APART, told_apart
 from vinetrack.model.model import Model
 from vinetrack.model.simulate import Trace, Trajectory, simulate_many
 from vinetrack.records import Floats, Trial
@@ -150,10 +150,8 @@ def _step(slope: Floats, left: Floats, *, free_origin: bool) -> tuple[float, flo
     if not free_origin:
         square = float(slope @ slope)
         return (float(slope @ left) / square if square > 0 else 0.0), 0.0
-    # At constant speed a later release and a higher origin are one: of what is hardly told apart nothing is moved.
     design = np.column_stack([slope, np.ones(slope.size)])
-    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    later, higher = np.linalg.lstsq(design / length, left, rcond=math.sqrt(TOLD_APART))[0] / length
+    later, higher = told_apart(design, left, math.sqrt(TOLD_APART))
     return float(later), float(higher)
 
 

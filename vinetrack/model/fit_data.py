@@ -78,6 +78,18 @@ class FitTrial:
         """Spacing of the points, s."""
         return float(np.median(np.diff(self.time_s)))
 
+    @property
+    def shows_rest(self) -> bool:
+        """Whether anything is seen of the rest before the motion, be it only vaguely."""
+        return self.n_rest > 0 or self.vague_rest is not None
+
+    @property
+    def rest_origin_m(self) -> float:
+        """Where the edge rests before the motion, m; the mean of its points where they are in the fit."""
+        if self.vague_rest is not None:
+            return self.vague_rest.origin_m
+        return float(np.mean(self.lead_position_m[: self.n_rest]))
+
     @cached_property
     def let_in(self) -> bool:
         """Whether the pressure was let in while it was recorded: then the trace says what started the growth, and when.

@@ -97,6 +97,15 @@ def laid_on(found: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[P
     return predictor, own, square
 
 
+def told_apart(design: Floats, left: Floats, least: float) -> Floats:
+    """Least squares of columns brought to one length, shape (n_columns,); what is hardly told apart is left alone.
+
+    At constant speed a later release and a higher origin are one. `least` is the least singular value that counts.
+    """
+    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    return np.asarray(np.linalg.lstsq(design / length, left, rcond=least)[0] / length)
+
+
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
     """Trials filmed long enough at rest to say where they began, shape (n_trials,)."""
     return np.array([item.n_rest >= FEWEST_AT_REST or item.vague_rest is not None for item in data], dtype=bool)
@@ -139,8 +148,7 @@ def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> t
     own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
     let_in = np.array([item.let_in for item in data], dtype=bool)
     for i in np.flatnonzero(held).tolist():
-        vague = data[i].vague_rest
-        own[i, ORIGIN] = np.mean(data[i].lead_position_m[: data[i].n_rest]) if vague is None else vague.origin_m
+        own[i, ORIGIN] = data[i].rest_origin_m
     moving = np.arange(len(data))
     for _ in range(MOST_STEPS):
         sums = _sums(predictor, own, moving, rho)

@@ -104,7 +104,7 @@ def make_frame(predictor: Predictor, own: Floats) -> Frame:
     durations = np.array([item.time_s[-1] - item.time_s[0] for item in data])
     spans = np.array([np.ptp(item.lead_position_m) for item in data])
     frames = np.array([item.frame_s for item in data])
-    rests = np.array([item.n_rest > 0 or item.vague_rest is not None for item in data])
+    rests = np.array([item.shows_rest for item in data])
     known = rests | np.array([item.let_in for item in data])
     vague = np.array([0.0 if item.vague_rest is None else item.vague_rest.sigma_m for item in data])
     release_sd = np.where(rests, RELEASE_ROOM_FRAMES * frames, 3 * durations)
@@ -188,8 +188,7 @@ def solve(
         state = replace(state, rho=held.correlation)
     damping, converged, iteration, promised = (0.0 if warm else 1e-3), False, 0, math.inf
     early = not warm
-    columns = predictor.linearise(state.theta, state.own)
-    grams = _products(predictor, columns)
+    columns, grams = _about(predictor, state)
     looks, looked = MOST_LOOKS, 0
     for iteration in range(1, most_iterations + 1):
         near = promised < FAR_OFF or iteration > MOST_EARLY
@@ -205,7 +204,7 @@ def solve(
             looked = iteration
             jumped = release_again(predictor, frame, state)
             if jumped is not None:
-                state, columns, grams = _from_there(predictor, jumped)
+                state, (columns, grams) = jumped, _about(predictor, jumped)
                 looks -= 1
                 continue
             looks = min(looks, 1) if promised > SETTLED_DECREASE else 0
@@ -220,17 +219,18 @@ def solve(
                 break
             continue
         try:
-            columns = predictor.linearise(taken.theta, taken.own)
+            columns, grams = _about(predictor, taken)
         except SimulationError:
             # A neighbour of the new place cannot be followed: what was reached before is worth more than nothing.
             break
-        state, grams = taken, _products(predictor, columns)
+        state = taken
     return Solution(state, frame, grams, tuple(columns), can, converged, iteration)
 
 
-def _from_there(predictor: Predictor, state: State) -> tuple[State, list[Floats], Floats]:
+def _about(predictor: Predictor, state: State) -> tuple[list[Floats], Floats]:
+    """Sensitivities at a state, and their sums of products."""
     columns = predictor.linearise(state.theta, state.own)
-    return state, columns, _products(predictor, columns)
+    return columns, _products(predictor, columns)
 
 
 def _step_report(predictor: Predictor, state: State, iteration: int, promised: float) -> Step:

@@ -156,7 +156,7 @@ def align(data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Fl
     for i, (item, (time_s, y)) in enumerate(zip(data, thin, strict=True)):
         if item.let_in:
             shifts = np.zeros(1)
-        elif item.n_rest > 0 or item.vague_rest is not None:
+        elif item.shows_rest:
             shifts = item.frame_s * np.arange(-6, 3.01, 0.5)
         else:
             shifts = -np.geomspace(0.25 * item.frame_s, durations[i], 30)

@@ -37,11 +37,7 @@ DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
 
 def unseen(predictor: Predictor) -> list[int]:
     """Places of the trials that show nothing of their release, and whose pressure is a single number."""
-    return [
-        i
-        for i, item in enumerate(predictor.data)
-        if item.n_rest == 0 and item.vague_rest is None and item.trace is None
-    ]
+    return [i for i, item in enumerate(predictor.data) if not item.shows_rest and item.trace is None]
 
 
 def release_again(predictor: Predictor, frame: Frame, state: State) -> State | None:

@@ -202,11 +202,12 @@ def _poster(path: Path) -> bytes:
 
     try:
         with av.open(str(path)) as container:
-            pictures = [frame.to_image() for frame in container.decode(video=0)]
+            frames = list(container.decode(video=0))
+            picture = frames[2 * len(frames) // 3].to_image()
     except av.error.FFmpegError:
         return b""
     file = io.BytesIO()
-    pictures[2 * len(pictures) // 3].save(file, "WEBP", quality=60)
+    picture.save(file, "WEBP", quality=60)
     return file.getvalue()
 
 
