@@ -87,7 +87,7 @@ def test_speed_and_speed_over_diameter_stand_side_by_side() -> None:
     assert points(figure)[0][:, 0].tolist() == [6.0, 12.0, 18.0, 24.0]
     assert points(figure, 1)[0][3, 1] == pytest.approx(1e3 * 0.3 * 24**-0.3)
     assert "N = 4 vines of 3–4 trials" in words(figure)
-    assert "power 0.70 (0.1 to 1.3), p = 0.040; line: R² 0.935, p = 0.033" in words(figure)
+    assert "power (dashed) 0.70 (0.1 to 1.3), p = 0.040\nline (full): R² 0.935, p = 0.033" in words(figure)
 
 
 def test_line_and_power_law_are_drawn_as_fitted() -> None:
@@ -103,13 +103,35 @@ def test_two_vines_have_no_line_and_further_pressures_are_said() -> None:
     assert "2 more pressures in scaling.json" in words(figure)
 
 
+def test_two_points_of_nearly_one_value_stand_inside_the_axes() -> None:
+    """128.5 and 127.4: a margin of a twentieth of what they differ by would cut the marker of the higher in half."""
+    family = {**speed_family([14.0, 20.0]), "x_ss_over_diameter_1_s": [128.5, 127.4], "n_steady": [1, 1]}
+    figure = draw_speed_scaling({"steady_speed": [family]})
+    left, right = figure.axes
+    assert right.get_ylim()[1] > 1.05 * 131.5  # the second has an error of 3
+    assert left.get_xlim()[1] > 1.05 * 20
+    assert "N = 2 vines of 1 trial\n" in words(figure)
+    assert "no trend: 2 sizes; at least 3" in words(figure)
+    assert "without what replicates would differ by" in words(figure).replace("\n", " ")
+
+
+def test_single_trials_have_no_standard_error() -> None:
+    family = {**efficiency_family(), "n_efficiency": [1] * 6}
+    refused = {"refused": "6 conditions; a power of wall with an error takes 7", "n": 6}
+    family["trend"] = dict.fromkeys(family["trend"], refused)
+    said = words(draw_efficiency({"efficiency": [family]})).replace("\n", " ")
+    assert "N = 1 trial a point" in said
+    assert "standard error" not in said
+    assert "no trend: 6 conditions" in said
+
+
 def test_three_ways_to_count_efficiency() -> None:
     figure = draw_efficiency({"efficiency": [efficiency_family(), efficiency_family()]})
     assert len(figure.axes) == 6
     assert points(figure, 0)[0][:, 1] == pytest.approx([100 * 0.5 * (t / 100) ** -0.6 for t in (50, 100, 200)])
     assert points(figure, 2)[0][1, 1] == pytest.approx(40.0)
     assert "34 kPa with 35.6 g, after 150 mm of growth; N = 4 trials a point" in words(figure)
-    assert "1 more families" in words(figure)
+    assert "1 more family in" in words(figure)
     assert "power of the diameter 0.10" in words(figure)
 
 

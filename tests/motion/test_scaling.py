@@ -46,4 +46,9 @@ def test_two_vines_are_shown_but_carry_no_line() -> None:
 def test_vines_that_share_nothing_are_no_family() -> None:
     found = fit_scaling(damping({"a": law(1.0, 6.0, 50.0), "b": law(3.0, 12.0, 50.0)}))
     assert found["isometric"] == found["thickness"] == []
-    assert "2 vines" in found["reason"]
+    assert "of 2 vines" in found["reason"]
+
+
+def test_one_vine_or_none_is_said_so() -> None:
+    assert fit_scaling(damping({}))["reason"] == "no vine has a damping coefficient"
+    assert "one vine alone" in fit_scaling(damping({"a": law(1.0, 6.0, 50.0)}))["reason"]

@@ -118,7 +118,13 @@ def test_scaled_copies_have_no_power_of_their_own() -> None:
 def test_too_few_conditions_for_a_trend_are_refused() -> None:
     rows = [loaded(12.0, 50.0, 0.5), loaded(12.0, 100.0, 0.4)]
     (family,) = fit_trends(conditions(rows))["efficiency"]
-    assert "2 conditions are too few" in family["trend"]["efficiency"]["refused"]
+    assert family["trend"]["efficiency"]["refused"] == "2 conditions; a power of wall with an error takes 3"
+
+
+def test_a_payload_that_was_not_there_has_no_trend() -> None:
+    """Without a payload its own part of the efficiency is 0 of all: nothing that a logarithm could be taken of."""
+    sizes = {"thickness_um": np.array([50.0, 100.0, 200.0]), "diameter_mm": np.full(3, 12.0)}
+    assert planes(sizes, np.zeros(3))["refused"] == "no condition has such a value above 0"
 
 
 def test_efficiencies_at_other_lengths_are_not_mixed() -> None:

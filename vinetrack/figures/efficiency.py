@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vinetrack.figures.numbers import interval, number
-from vinetrack.figures.style import MUTED, VINE_COLOURS, VINE_MARKERS, blank, look, note_below
+from vinetrack.figures.style import MUTED, VINE_COLOURS, VINE_MARKERS, blank, counted, look, note_below
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,10 +45,10 @@ def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure:
         for row, x in enumerate(along):
             for ax, key in zip(axes[row], shown, strict=True):
                 _draw_panel(ax, family, key, x)
-                ax.set(xlabel=_AXES[x][0], ylim=(0, None))
+                ax.set_xlabel(_AXES[x][0])
                 if row == 0:
                     ax.set_title(VARIANTS[key], fontsize=10.5)
-            axes[row][0].set_ylabel("energy efficiency (%)")
+            axes[row][0].set(ylabel="energy efficiency (%)", ylim=(0, 1.08 * max(ax.dataLim.y1 for ax in axes[row])))
             axes[row][-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0.0, fontsize=9)
         fig.suptitle(_title(family, len(families)), fontsize=11, x=0.01, ha="left")
         note_below(fig, note)
@@ -77,7 +78,9 @@ def _draw_panel(ax: Axes, family: dict[str, Any], key: str, x: str) -> None:
 
 
 def _words(trend: dict[str, Any], x: str) -> str:
-    if trend.get("refused") or x not in trend:
+    if trend.get("refused"):
+        return f"no trend: {textwrap.fill(str(trend['refused']), 30)}"
+    if x not in trend:
         return ""
     power = trend[x]
     spread, p = interval(power["power_95"]), number(power["p"], 2)
@@ -86,10 +89,11 @@ def _words(trend: dict[str, Any], x: str) -> str:
 
 def _title(family: dict[str, Any], n_families: int) -> str:
     counts = [int(count) for count in family["n_efficiency"]]
-    times = str(min(counts)) if min(counts) == max(counts) else f"{min(counts)}–{max(counts)}"
+    error = ", ± standard error" if max(counts) > 1 else ""
     load = f" with {family['payload_g']:.4g} g" if family["payload_g"] else " without payload"
-    more = f"; {n_families - 1} more families in scaling.json" if n_families > 1 else ""
+    left = n_families - 1
+    more = f"; {left} more {'family' if left == 1 else 'families'} in scaling.json" if left else ""
     return (
         f"{family['pressure_kPa']:.4g} kPa{load}, after {family['efficiency_at_mm']:.4g} mm of growth; "
-        f"N = {times} trials a point, ± standard error{more}"
+        f"N = {counted(min(counts), max(counts), 'trial')} a point{error}{more}"
     )

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.figures.style import VINE_COLOURS, VINE_MARKERS, blank, legend_above, look, note_below, rows
+from vinetrack.figures.style import (
+    VINE_COLOURS,
+    VINE_MARKERS,
+    blank,
+    counted,
+    legend_above,
+    look,
+    note_below,
+    rows,
+    up_from_zero,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,9 +78,11 @@ def _draw_vine(ax: Axes, measured: pd.DataFrame, model: pd.DataFrame, line: str)
             _draw_curve(ax, curve, colour, line if i == 0 else "")
     first = next(rows(measured))
     counts = measured["n_final"].astype(int)
-    times = str(counts.min()) if counts.min() == counts.max() else f"{counts.min()}–{counts.max()}"
-    ax.set(xlabel="payload (g)", ylabel="speed of the leading edge (m/s)", ylim=(0, None))
-    title = f"{first.vine}, after {first.final_at_mm:.4g} mm\nN = {times} trials a point, ± standard error"
+    times = counted(int(counts.min()), int(counts.max()), "trial")
+    ax.set(xlabel="payload (g)", ylabel="speed of the leading edge (m/s)")
+    up_from_zero(ax)
+    error = ", ± standard error" if counts.max() > 1 else ""
+    title = f"{first.vine}, after {first.final_at_mm:.4g} mm\nN = {times} a point{error}"
     legend_above(ax, n_columns=2, title=title, alignment="left", fontsize=9)
 
 

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.figures.numbers import interval, number
-from vinetrack.figures.style import MUTED, VINE_COLOURS, VINE_MARKERS, blank, legend_above, look, plain_log_ticks
+from vinetrack.figures.style import (
+    MUTED,
+    VINE_COLOURS,
+    VINE_MARKERS,
+    blank,
+    legend_above,
+    look,
+    note_below,
+    plain_log_ticks,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,13 +31,14 @@ _TITLES = {"isometric": "Scaled copies (one t/D)", "thickness": "One diameter"}
 MAX_FAMILIES = 4
 
 
-def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = None) -> Figure:
+def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = None, note: str = "") -> Figure:
     """Draw B against size, one panel for vines that are scaled copies and one for vines of one diameter.
 
     Parameters
     ----------
     scaling : as in `scaling.json`.
     published : `{"B": {vine: …}, "source": …}` to set beside it; None where there is nothing to set.
+    note : a sentence to set below.
     """
     from matplotlib.figure import Figure
 
@@ -47,6 +57,7 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
             left_out = len(scaling[kind]) - len(families)
             title = _TITLES[kind] + (f", {left_out} more families in scaling.json" if left_out else "")
             legend_above(ax, n_columns=1, title=title, alignment="left")
+        note_below(fig, note)
     return fig
 
 
@@ -55,7 +66,8 @@ def _draw_family(ax: Axes, family: dict[str, Any], index: int) -> None:
     sizes, B = np.array(family["sizes"], dtype=float), np.array(family["B"], dtype=float)
     low, high = np.array(family["B_95"], dtype=float).T
     errors = np.nan_to_num(np.vstack([B - low, high - B])).clip(min=0)
-    label = f"B with 95 % interval, N = {B.size} vines"
+    refused = f"\nno line: {family['refused']}" if family.get("refused") else ""
+    label = f"B with 95 % interval, N = {B.size} vines{refused}"
     ax.errorbar(sizes, B, yerr=errors, fmt=marker, color=colour, ms=6, capsize=3, elinewidth=1.3, label=label, zorder=3)
     span = np.geomspace(sizes.min() / 1.15, sizes.max() * 1.15, 100)
     if power := family["power"]:

@@ -1,6 +1,6 @@
 """Steady speed against the size of scaled copies, one family a pressure; beside it the same divided by the diameter.
 
-Straight lines are full, power laws dashed; bars are standard errors.
+Straight lines are full, power laws dashed; bars are standard errors, those of a single trial its own reading's alone.
 """
 
 from __future__ import annotations
@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.figures.numbers import interval, number
-from vinetrack.figures.style import VINE_COLOURS, VINE_MARKERS, blank, legend_above, look, note_below
+from vinetrack.figures.style import (
+    VINE_COLOURS,
+    VINE_MARKERS,
+    blank,
+    counted,
+    legend_above,
+    look,
+    note_below,
+    up_from_zero,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,16 +46,17 @@ def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure:
     if not families:
         return blank("No two vines that are scaled copies of each other have a steady speed at one pressure.")
     with look():
-        fig = Figure(figsize=(11.0, 5.6 if len(families) < 3 else 6.4), layout="constrained")
+        fig = Figure(figsize=(11.0, 5.2 + 0.45 * min(len(families), MAX_FAMILIES)), layout="constrained")
         for ax, (key, sigma, label, title) in zip(fig.subplots(1, 2), _PANELS, strict=True):
             for i, family in enumerate(families[:MAX_FAMILIES]):
                 lines = family if key == "x_ss_m_s" else family["over_diameter"]
                 _draw_family(ax, family, key, sigma, lines, i)
-            ax.set(xlabel="diameter (mm)", ylabel=label, xlim=(0, None), ylim=(0, None))
+            ax.set(xlabel="diameter (mm)", ylabel=label)
+            up_from_zero(ax, x=True)
             left_out = len(families) - MAX_FAMILIES
             more = f", {left_out} more pressures in scaling.json" if left_out > 0 else ""
             legend_above(ax, n_columns=1, title=title + more, alignment="left", fontsize=9)
-        note_below(fig, note)
+        note_below(fig, " ".join(filter(None, [note, _alone(families[:MAX_FAMILIES])])))
     return fig
 
 
@@ -54,7 +64,9 @@ def _draw_family(ax: Axes, family: dict[str, Any], key: str, sigma: str, lines: 
     colour, marker = VINE_COLOURS[index % len(VINE_COLOURS)], VINE_MARKERS[index % len(VINE_MARKERS)]
     sizes, values = (np.array(family[name], dtype=float) for name in ("sizes", key))
     errors = np.nan_to_num(np.array(family[sigma], dtype=float))
-    label = f"{family['pressure_kPa']:.4g} kPa, N = {sizes.size} vines of {_range(family['n_steady'])} trials"
+    counts = [int(count) for count in family["n_steady"]]
+    trials = counted(min(counts), max(counts), "trial")
+    label = f"{family['pressure_kPa']:.4g} kPa, N = {counted(sizes.size, sizes.size, 'vine')} of {trials}"
     ax.errorbar(
         sizes,
         values,
@@ -76,12 +88,13 @@ def _draw_family(ax: Axes, family: dict[str, Any], key: str, sigma: str, lines: 
 
 def _statistics(lines: dict[str, Any]) -> str:
     if lines["refused"]:
-        return ""
+        return f"\nno trend: {lines['refused']}"
     line, power = lines["line"], lines["power"]
     slope = f"{number(power['slope'], 2)} ({interval(power['slope_95'])}), p = {number(power['p'], 2)}"
-    return f"\npower {slope}; line: R² {number(line['R2'])}, p = {number(line['p'], 2)}"
+    return f"\npower (dashed) {slope}\nline (full): R² {number(line['R2'])}, p = {number(line['p'], 2)}"
 
 
-def _range(counts: list[float]) -> str:
-    low, high = int(min(counts)), int(max(counts))
-    return str(low) if low == high else f"{low}–{high}"
+def _alone(families: list[dict[str, Any]]) -> str:
+    if not any(count == 1 for family in families for count in family["n_steady"]):
+        return ""
+    return "The bar of a single trial is the error of its reading, without what replicates would differ by."

@@ -151,6 +151,25 @@ def note_below(fig: Figure, note: str) -> None:
         fig.supxlabel(textwrap.fill(note, int(fig.get_figwidth() * 12.5)), fontsize=10)
 
 
+def up_from_zero(ax: Axes, *, x: bool = False) -> None:
+    """Let the axes begin at zero and end a little above all that is drawn, however near to each other the values are.
+
+    A margin that goes with the range of the data would be none where two points of nearly one value are all there is.
+    """
+    ax.set_ylim(0, 1.08 * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
+    if x:
+        ax.set_xlim(0, 1.08 * ax.dataLim.x1 if ax.dataLim.x1 > 0 else None)
+
+
+def counted(low: int, high: int, what: str) -> str:
+    """So many of something, from the fewest to the most.
+
+    >>> counted(1, 1, "trial"), counted(2, 3, "trial")
+    ('1 trial', '2–3 trials')
+    """
+    return f"{low}–{high} {what}s" if low != high else f"{low} {what}" + ("" if low == 1 else "s")
+
+
 def plain_log_ticks(ax: Axes, which: str = "both") -> None:
     """Ticks at 1, 2, 5 written as plain numbers, so that less than a decade still has readable values."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator

@@ -44,8 +44,16 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]], method: str = "both_ax
     thickness = _families(vines, "thickness_um", lambda v: v["diameter_mm"], SAME_WITHIN)
     reason = None
     if not isometric and not thickness:
-        reason = f"{len(vines)} vines with a damping coefficient, none scaled copies of each other or of one diameter"
+        reason = _nothing(len(vines))
     return {"method": method, "isometric": isometric, "thickness": thickness, "reason": reason}
+
+
+def _nothing(count: int) -> str:
+    if count == 0:
+        return "no vine has a damping coefficient"
+    if count == 1:
+        return "one vine alone has a damping coefficient, and growth with size takes two"
+    return f"of {count} vines with a damping coefficient no two are scaled copies of each other or of one diameter"
 
 
 def _families(vines: Mapping[str, Any], along: str, alike: Any, within: float) -> list[dict[str, Any]]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 SAME_SETTING_WITHIN = 0.01
 """Pressures and payloads that agree within this fraction count as the same: gauges are read to a per cent."""
 
+SIZES = {"thickness_um": "wall", "diameter_mm": "diameter"}
 EFFICIENCIES = ("efficiency", "efficiency_payload", "efficiency_with_weight")
 
 
@@ -95,7 +96,7 @@ def _speed_family(group: pd.DataFrame) -> dict[str, Any]:
 def _lines(sizes: Floats, values: Floats) -> dict[str, Any]:
     """A power law and a straight line, or why neither."""
     if np.unique(sizes).size < FEWEST_VINES:
-        return {"power": None, "line": None, "refused": f"{np.unique(sizes).size} sizes; at least {FEWEST_VINES}"}
+        return {"power": None, "line": None, "refused": f"{np.unique(sizes).size} sizes; it takes {FEWEST_VINES}"}
     return {"power": regress(np.log(sizes), np.log(values)), "line": regress(sizes, values), "refused": None}
 
 
@@ -148,10 +149,14 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
     varying = {name: np.log(size[known]) for name, size in sizes.items() if np.unique(size[known]).size > 1}
     n, dof = int(known.sum()), int(known.sum()) - len(varying) - 1
     if not varying or dof < 1:
-        return {"refused": f"{n} conditions are too few for {len(varying)} powers", "n": n, "R2": None}
+        return {"refused": _too_few(n, list(varying)), "n": n, "R2": None}
     matrix = np.column_stack([np.ones(n), *varying.values()])
     if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
-        return {"refused": f"{' and '.join(varying)} vary together: neither power stands alone", "n": n, "R2": None}
+        return {
+            "refused": f"{' and '.join(SIZES[name] for name in varying)} vary together: neither power stands alone",
+            "n": n,
+            "R2": None,
+        }
     y = np.log(values[known])
     found = np.linalg.lstsq(matrix, y, rcond=None)[0]
     left = y - matrix @ found
@@ -164,6 +169,15 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
         "n": n,
         "refused": None,
     }
+
+
+def _too_few(n: int, varying: Sequence[str]) -> str:
+    if n == 0:
+        return "no condition has such a value above 0"
+    if not varying:
+        return "all vines are of one size"
+    powers = "a power of " + " and one of ".join(SIZES[name] for name in varying)
+    return f"{n} conditions; {powers} with an error take{'s' if len(varying) == 1 else ''} {len(varying) + 2}"
 
 
 def _power(value: float, error: float, reach: float, dof: int) -> dict[str, float | Sequence[float]]:
