@@ -281,8 +281,6 @@ if plan.published:
             plan.result("damping.json"),
             plan.result("scaling.json"),
             plan.result("fit.json"),
-            plan.result("comparison.csv"),
-            plan.result("comparison"),
         output:
             plan.paper_tables,
             [

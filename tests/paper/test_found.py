@@ -91,7 +91,7 @@ FIT = {
 
 
 def found(mark: str = SIMULATED, **changes: object) -> Found:
-    positions = pd.DataFrame([("c", 7.0, 4, 0.0031, 0.0042, 0.0045)], columns=list(POSITION_COLUMNS))
+    positions = pd.DataFrame([("c", 7.0, 4, 0.0031, 0.0042)], columns=list(POSITION_COLUMNS))
     speeds = pd.DataFrame(
         [("a", "v", 14.0, 10.0, 4, 120.0, 1.1, 0.1, 1.0), ("b", "v", 14.0, 20.0, 4, 120.0, 1.3, 0.1, 1.6)],
         columns=list(SPEED_COLUMNS),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -13,9 +14,9 @@ from vinetrack import published
 from vinetrack.motion.conditions import mean_with_error
 from vinetrack.motion.efficiency import lead_velocity_at
 from vinetrack.paper.departures import NONE, WITHIN, follow
-from vinetrack.records import Trial
+from vinetrack.records import Floats, Trial
 
-POSITION_COLUMNS = ("condition", "pressure_kPa", "n_trials", "rms_mean_m", "rms_single_m", "floor_m")
+POSITION_COLUMNS = ("condition", "pressure_kPa", "n_trials", "rms_mean_m", "rms_single_m")
 SPEED_COLUMNS = (
     "condition",
     "vine",
@@ -28,6 +29,13 @@ SPEED_COLUMNS = (
     "eq2_lead_velocity_m_s",
 )
 MEAN_COLUMNS = ("pressure_kPa", "time_s", "lead_position_m", "lead_position_sigma_m", "n_trials")
+
+
+class Rest(NamedTuple):
+    """When a trial was let go, on its track's clock, and where its edge was until then."""
+
+    release_s: float
+    origin_m: float
 
 
 def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
@@ -61,71 +69,74 @@ def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float
     return all(math.isclose(ours, printed, rel_tol=0.02) for ours, printed in pairs)
 
 
-def mean_motions(conditions: Mapping[float, list[Trial]], moved: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """The mean of the trials of each pressure since release, until the first ends, columns `MEAN_COLUMNS`.
+def mean_motions(
+    conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
+) -> pd.DataFrame:
+    """The mean of the trials of each pressure since release, columns `MEAN_COLUMNS`.
+
+    Until the first of them has grown to 95 %. The release is that of the trial itself, from a fit in which its pressure
+    and B are its own: laid where one B for all fits best, a trial's release would take up what its speed is off.
 
     Parameters
     ----------
     conditions : as `position_conditions` finds them.
-    moved : by condition, its trials as `comparison/CONDITION.csv` holds them.
+    kinematics : by trial, as `kinematics/TRIAL.csv` holds them.
+    rests : by trial.
     """
     parts = []
     for pressure_kPa, trials in conditions.items():
-        table = moved.get(trials[0].condition)
-        if table is None or not len(table):
+        time_s, laid_m = _since_release(trials, kinematics, rests)
+        if not len(laid_m):
             continue
-        ends_s = table.groupby("trial")["time_s"].max()
-        one = table[(table["trial"] == ends_s.idxmax()) & table["time_s"].between(0, ends_s.min())]
-        parts.append(
-            pd.DataFrame(
-                {
-                    "pressure_kPa": pressure_kPa,
-                    "time_s": one["time_s"],
-                    "lead_position_m": one["replicates_mean_m"],
-                    "lead_position_sigma_m": one["replicates_sigma_m"],
-                    "n_trials": table["trial"].nunique(),
-                }
-            )
-        )
+        sigma_m = np.std(laid_m, axis=0, ddof=1) if len(laid_m) > 1 else np.full(time_s.size, math.nan)
+        columns = (pressure_kPa, time_s, laid_m.mean(axis=0), sigma_m, len(laid_m))
+        parts.append(pd.DataFrame(dict(zip(MEAN_COLUMNS, columns, strict=True))))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(MEAN_COLUMNS), dtype=float)
 
 
-def position_errors(
-    conditions: Mapping[float, list[Trial]], means: pd.DataFrame, comparison: pd.DataFrame
-) -> pd.DataFrame:
-    """How far the mean of the trials lies from Eq. (2) with the printed B and n, columns `POSITION_COLUMNS`.
+def _since_release(
+    trials: Sequence[Trial], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
+) -> tuple[Floats, Floats]:
+    """Common times since release, shape (n,), and positions from rest, shape (n_trials, n), of those that are known."""
+    motions = []
+    for trial in trials:
+        if trial.name in kinematics and trial.name in rests:
+            rest, own = rests[trial.name], kinematics[trial.name]
+            grown_m = own["lead_position_m"].to_numpy(float) - rest.origin_m
+            time_s, known = own["time_s"].to_numpy(float) - rest.release_s, np.isfinite(grown_m)
+            beyond = np.flatnonzero(known & (grown_m >= WITHIN * trial.length_m))
+            stop = int(beyond[0]) + 1 if beyond.size else grown_m.size
+            motions.append((time_s[:stop][known[:stop]], grown_m[:stop][known[:stop]]))
+    if not motions:
+        return np.empty(0), np.empty((0, 0))
+    end_s = min(float(time_s[-1]) for time_s, _ in motions)
+    common_s = np.arange(0, end_s, 1 / published.CAPTURE_FPS)
+    return common_s, np.array([np.interp(common_s, *motion) for motion in motions])
 
-    Until Eq. (2) has grown to 95 % of the length, or the first trial ends, both since release. `rms_single_m` and
-    `floor_m` are what `comparison.csv` says of single trials and the model that was fitted to them.
+
+def position_errors(
+    conditions: Mapping[float, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
+) -> pd.DataFrame:
+    """How far trials lie from Eq. (2) with the printed B and n, their mean and each alone, columns `POSITION_COLUMNS`.
+
+    Since release, until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
     """
     rows = []
     for pressure_kPa, trials in conditions.items():
-        own = means[means["pressure_kPa"] == pressure_kPa]
-        stated = comparison[comparison["condition"] == trials[0].condition]
-        if not len(own) or not len(stated):
+        time_s, laid_m = _since_release(trials, kinematics, rests)
+        if not len(laid_m):
             continue
         plain = follow(trials[0], NONE, published.DAMPING_B[4])
         stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trials[0].length_m))
-        end_s = plain.time_s[min(stop, plain.time_s.size - 1)]
-        own = own[own["time_s"] <= end_s]
-        said_m = np.interp(own["time_s"], plain.time_s, plain.lead_position_m)
-        rms_m = math.sqrt(float(np.mean((own["lead_position_m"] - said_m) ** 2)))
-        single = stated.iloc[0]
-        rows.append(
-            (
-                trials[0].condition,
-                pressure_kPa,
-                int(own["n_trials"].iloc[0]),
-                rms_m,
-                float(single["rms_position_m"]),
-                float(single["replicate_floor_m"]),
-            )
-        )
+        counts = time_s <= plain.time_s[min(stop, plain.time_s.size - 1)]
+        off_m = (laid_m - np.interp(time_s, plain.time_s, plain.lead_position_m))[:, counts]
+        mean_m, single_m = (math.sqrt(float(np.mean(np.square(one)))) for one in (off_m.mean(axis=0), off_m))
+        rows.append((trials[0].condition, pressure_kPa, len(laid_m), mean_m, single_m))
     return pd.DataFrame(rows, columns=list(POSITION_COLUMNS))
 
 
 def final_speeds(
-    conditions: Mapping[str, list[Trial]], kinematics: Mapping[str, pd.DataFrame], origins_m: Mapping[str, float]
+    conditions: Mapping[str, list[Trial]], kinematics: Mapping[str, pd.DataFrame], rests: Mapping[str, Rest]
 ) -> pd.DataFrame:
     """Speed of the leading edge at the paper's 12 cm, means of trials, beside Eq. (2), columns `SPEED_COLUMNS`.
 
@@ -133,19 +144,19 @@ def final_speeds(
     ----------
     conditions : as `speed_conditions` finds them.
     kinematics : by trial, as `kinematics/TRIAL.csv` holds them.
-    origins_m : by trial, where it was at rest.
+    rests : by trial.
     """
     rows = []
     at_m = published.FINAL_SPEED_AT_MM / 1e3
     for condition, trials in conditions.items():
         speeds = [
             lead_velocity_at(
-                kinematics[trial.name]["lead_position_m"].to_numpy(float) - origins_m[trial.name],
+                kinematics[trial.name]["lead_position_m"].to_numpy(float) - rests[trial.name].origin_m,
                 kinematics[trial.name]["lead_velocity_m_s"].to_numpy(float),
                 at_m,
             )
             for trial in trials
-            if trial.name in kinematics and trial.name in origins_m
+            if trial.name in kinematics and trial.name in rests
         ]
         mean, sigma, count = mean_with_error(np.array(speeds, dtype=float))
         if count:

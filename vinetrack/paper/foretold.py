@@ -45,7 +45,7 @@ def _fast_rows() -> Iterator[PaperRow]:
             published=published.FAST_VINE_PREDICTED_M_S,
             ours=speed,
             mark=NOT_CHECKABLE,
-            how=f"its B is not printed; with a guess, B = {B:.2f}",
+            how=f"its B is not printed; with a guess, B = {B:.2f}; fold and gas are the least that moves",
             beside="in Eq. (2) the speed of a bare vine has no limit at its end: the place where it is taken decides",
         )
 

@@ -23,7 +23,7 @@ class Found:
     """What an experiment found: tables and files of its results folder, by the names they have there.
 
     `mark` is `SIMULATED` or `MEASURED`. `positions` has a row a pressure of the paper's Fig. 4 (`pressure_kPa,
-    n_trials, rms_mean_m, rms_single_m, floor_m`), `speeds` one a condition of Fig. 5 (`pressure_kPa, payload_g,
+    n_trials, rms_mean_m, rms_single_m`), `speeds` one a condition of Fig. 5 (`pressure_kPa, payload_g,
     final_lead_velocity_m_s, eq2_lead_velocity_m_s`); `departures` is `departures.departure_table`.
     """
 
@@ -112,7 +112,7 @@ def _position_rows(found: Found) -> Iterator[PaperRow]:
     for pressure_kPa, printed_cm in published.POSITION_RMS_CM.items():
         own = found.positions[np.isclose(found.positions["pressure_kPa"].to_numpy(float), pressure_kPa)]
         n_trials, mean_m, single_m = (float(own[name].iloc[0]) for name in names) if len(own) else (0.0, nan, nan)
-        alone = f"; single trials {100 * single_m:.2f} cm from the model fitted to them" if len(own) else ""
+        alone = f"; {100 * single_m:.2f} cm over single trials" if len(own) else ""
         yield PaperRow(
             row=f"position_rms_{pressure_kPa:g}kPa",
             where="Fig. 4, Table II",
