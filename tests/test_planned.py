@@ -108,6 +108,31 @@ def test_a_sheet_without_rows_is_refused(tmp_path: Path, text: str) -> None:
         planned_sheet(tmp_path)
 
 
+def test_a_file_that_is_no_sheet_gets_one_sentence_and_not_one_a_row(tmp_path: Path) -> None:
+    (tmp_path / "track.csv").write_text("time_s,position_m\n" + "0.1,0.2\n" * 100, encoding="utf-8")
+    with pytest.raises(ExperimentError) as caught:
+        planned_sheet(tmp_path / "track.csv")
+    (line,) = (str(problem) for problem in caught.value.problems)
+    assert line.startswith("error: track.csv: has no column diameter_mm, thickness_um, length_mm, pressure_kPa")
+    assert "give a trial sheet" in line
+
+
+def test_a_column_that_no_sheet_has_is_named_and_not_passed_over(tmp_path: Path) -> None:
+    """A payload under a wrong name would else be taken for none."""
+    text = "diameter_mm,thickness_um,length_mm,pressure_kPa,payload_gr\n24,200,280,28,35.6\n"
+    (tmp_path / "ideas.csv").write_text(text.replace("d", "trial,d", 1).replace("\n24", "\na,24"), encoding="utf-8")
+    planned = planned_sheet(tmp_path / "ideas.csv")
+    (line,) = (str(problem) for problem in planned.problems)
+    assert "payload_gr" in line
+    assert "did you mean payload_g?" in line
+
+
+def test_a_column_may_stand_in_the_settings_instead(tmp_path: Path) -> None:
+    (tmp_path / "experiment.yaml").write_text("pressure_kPa: 28\n", encoding="utf-8")
+    (tmp_path / "trials.csv").write_text("trial,diameter_mm,thickness_um,length_mm\na,24,200,280\n", encoding="utf-8")
+    assert planned_sheet(tmp_path).trials[0].pressure_Pa == 28e3
+
+
 def test_a_sheet_that_is_not_there_suggests_the_nearest(tmp_path: Path) -> None:
     (tmp_path / "ideas.csv").write_text("trial\n")
     with pytest.raises(ExperimentError, match=r"did you mean ideas\.csv"):

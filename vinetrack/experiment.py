@@ -20,7 +20,7 @@ from vinetrack.naming import with_names
 from vinetrack.problems import ExperimentError, Problem, format_problems
 from vinetrack.records import Trial
 from vinetrack.settings import ExperimentSettings, read_experiment_settings
-from vinetrack.sheet import SHEET, Row, find_missing, judge_pressures, judge_row, make_trial, read_row
+from vinetrack.sheet import SHEET, Row, find_missing, judge_pressures, judge_row, make_trial, read_row, unknown_columns
 from vinetrack.tables import Table, TableError, read_table, safe_join
 from vinetrack.video.importers import TrackError, load_track, read_pressure_trace, read_track
 
@@ -177,14 +177,7 @@ def _missing_sheet_remedy(folder: Path) -> str:
 
 def _judge_columns(table: Table) -> list[Problem]:
     """Problems of the header, and a sheet without rows."""
-    problems = []
-    for name in table.columns:
-        if name not in COLUMNS:
-            nearest = difflib.get_close_matches(name, [c for c in COLUMNS if c not in table.columns], 1, 0.6)
-            remedy = f"did you mean {nearest[0]}?" if nearest else ""
-            message = "is no column of a trial sheet and is ignored"
-            place: dict[str, Any] = {"file": SHEET, "line": 1, "column": name}
-            problems.append(Problem(message=message, severity="warning", remedy=remedy, **place))
+    problems = unknown_columns(table, SHEET)
     if table.nameless:
         problems.append(Problem(message="has a column without a name, ignored", file=SHEET, severity="warning"))
     if "trial" not in table.columns:

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vinetrack.columns import COLUMNS
+from vinetrack.columns import COLUMNS, SHARED
 from vinetrack.naming import with_names
 from vinetrack.problems import ExperimentError, Problem
 from vinetrack.records import Trial
 from vinetrack.settings import ExperimentSettings, read_experiment_settings
-from vinetrack.sheet import SHEET, Row, judge_pressures, judge_wall, make_trial, read_row
+from vinetrack.sheet import SHEET, Row, judge_pressures, judge_wall, make_trial, read_row, unknown_columns
 from vinetrack.tables import Table, TableError, read_table
 
 NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
@@ -91,7 +91,30 @@ def planned_sheet(path: Path) -> Planned:
     settings = read_experiment_settings(file.parent / "experiment.yaml")
     if not table.rows:
         raise ExperimentError([Problem(message="has no rows", file=file.name, remedy="write one row a trial")])
-    return _assembled(table, settings, file.parent, NEEDED, lambda problem: replace(problem, file=file.name))
+    header = _judge_header(table, settings, file.name)
+    return _assembled(table, settings, file.parent, NEEDED, lambda problem: replace(problem, file=file.name), header)
+
+
+def _judge_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
+    """Warnings about columns that no sheet has.
+
+    Raises
+    ------
+    ExperimentError
+        If what must be known of every vine is nowhere: said once, not of every row.
+    """
+    unknown = unknown_columns(table, file)
+    absent = [
+        name
+        for name in NEEDED
+        if name not in table.columns and not (name in SHARED and getattr(settings, name) is not None)
+    ]
+    if absent:
+        message = f"has no column {', '.join(absent)}"
+        if len(absent) == len(NEEDED):
+            raise ExperimentError([Problem(message=message, file=file, remedy="give a trial sheet, one row a trial")])
+        raise ExperimentError([Problem(message=message, file=file, remedy="add what is missing"), *unknown])
+    return unknown
 
 
 def _nearest(file: Path) -> str:
@@ -104,13 +127,19 @@ def _nearest(file: Path) -> str:
 
 
 def _assembled(
-    table: Table, settings: ExperimentSettings, folder: Path | None, needed: Sequence[str], shown: Shown
+    table: Table,
+    settings: ExperimentSettings,
+    folder: Path | None,
+    needed: Sequence[str],
+    shown: Shown,
+    header: Sequence[Problem] = (),
 ) -> Planned:
     """Read, judge and name the rows; refuse them all if one has a fault."""
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
     for row in rows:
         _judge(row, needed)
-    problems = [shown(problem) for row in rows for problem in row.problems if problem.column not in _RECORDED]
+    of_rows = (shown(problem) for row in rows for problem in row.problems if problem.column not in _RECORDED)
+    problems = [*header, *of_rows]
     if any(problem.severity == "error" for problem in problems) or not rows:
         nothing = [] if rows else [shown(Problem(message="has no trial in use", remedy="take `use: no` off one"))]
         raise ExperimentError([*problems, *nothing])

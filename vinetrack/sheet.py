@@ -5,6 +5,7 @@ Nothing here opens a recording; `vinetrack.experiment` joins rows, settings and 
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 from dataclasses import dataclass, field, replace
@@ -81,6 +82,19 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
     if not row.in_use:
         row.problems = [replace(problem, severity="warning") for problem in row.problems]
     return row
+
+
+def unknown_columns(table: Table, file: str) -> list[Problem]:
+    """A warning for every column that no trial sheet has, with the nearest that it may have meant."""
+    problems = []
+    for name in table.columns:
+        if name not in COLUMNS:
+            nearest = difflib.get_close_matches(name, [c for c in COLUMNS if c not in table.columns], 1, 0.6)
+            remedy = f"did you mean {nearest[0]}?" if nearest else ""
+            message = "is no column of a trial sheet and is ignored"
+            place: dict[str, Any] = {"file": file, "line": 1, "column": name}
+            problems.append(Problem(message=message, severity="warning", remedy=remedy, **place))
+    return problems
 
 
 def _judge_name(row: Row) -> None:
