@@ -84,7 +84,7 @@ def test_a_campaign_is_planned_rehearsed_and_written_as_a_sheet(tmp_path: Path) 
 
 def test_a_campaign_out_of_reach_says_what_would_help() -> None:
     output = run("campaign", *TWO, "--n-within", 1e-5, "--most-trials", 30, "--check", 0).output
-    assert "! no campaign of 30 trials or fewer leaves as little as that" in output
+    assert "! no campaign of 30 trials or fewer, with the pressures and replicates allowed, leaves so little" in output
     assert "widen the pressures" in output
 
 
@@ -93,6 +93,14 @@ def test_a_campaign_out_of_reach_says_what_would_help() -> None:
     [
         (("vine",), "--pressure-kPa is missing"),
         (("vine", "--pressure-kPa", 62000), "62000 Pa is 62 kPa"),
+        (
+            ("vine", "--pressure-kPa", 2, "--yield-pressure-kPa", 3),
+            "to its end, against a yield pressure of 3 kPa: raise",
+        ),
+        (
+            ("vine", "--pressure-kPa", 62, "--of-burst", 0.05, "--diameter-mm", 25, "--yield-pressure-kPa", 30),
+            "their walls are trusted with 6.24 kPa at most: raise --of-burst",  # 0.05 × 2 × 200 µm × 7.8 MPa/25 mm
+        ),
         (("vine", "--pressure-kPa", 62, "--diameter-mm", "25:5"), "write the lower value first"),
         (("vine", "--pressure-kPa", 62, "--diameter-mm", "5:15:25"), "write low:high"),
         (("vine", "--pressure-kPa", 62, "--diameter-mm", "5000"), "5000 µm is 5 mm"),

@@ -37,8 +37,8 @@ REPLICATES = 4
 STEADY_FEWEST_POINTS, STEADY_CV = 3, 0.03
 """A steady window: points in a row, and the coefficient of variation of their velocities."""
 
-YIELD_PRESSURE_KPA = 3.0
-"""Of the 24 mm × 200 µm vine; no other is printed."""
+YIELD_PRESSURE_KPA, YIELD_PRESSURE_SCALE = 3.0, 4
+"""Of the 24 mm × 200 µm vine, R = 4; no other is printed."""
 
 CAPTURE_FPS = 1069.0
 CHAMBER_L = 3.7

@@ -80,6 +80,22 @@ def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a
     assert np.quantile(draws, (0.05, 0.5, 0.95)) == pytest.approx([1e3, 3e3, 9e3], rel=0.03)
 
 
+def test_the_printed_yield_pressure_is_believed_of_the_vine_that_it_was_printed_for() -> None:
+    """Printed as about 3 kPa: evenly between 2.5 and 3.5 has a standard deviation of 1/√12 kPa."""
+    belief = believe(trial(diameter_mm=24, thickness_um=200, length_mm=280, pressure_kPa=28))
+    assert belief.origins[YIELD].startswith("printed")
+    draws = belief.draw(20_000, 1, only=["printed P_y"])[YIELD]
+    assert np.mean(draws) == pytest.approx(3e3, rel=0.01)
+    assert np.std(draws) == pytest.approx(1e3 / math.sqrt(12), rel=0.03)
+    assert believe(trial(diameter_mm=12, thickness_um=100)).origins[YIELD].startswith("guess")
+
+
+def test_a_size_beyond_what_is_plausible_is_said() -> None:
+    said = Said(effects=("air_drag",), sizes={"air_drag.C_D": Size(99.0, 99.0)})
+    assert believe(trial(), said).notes == ("C_D of air_drag is beyond what is plausible, 0 to 3",)
+    assert believe(trial(), Said(effects=("air_drag",), sizes={"air_drag.C_D": Size(0.5, 1.5)})).notes == ()
+
+
 def test_a_yield_pressure_that_is_given_has_its_stated_error() -> None:
     draws = believe(trial(yield_pressure_kPa=5, yield_pressure_sigma_kPa=0.3)).draw(40_000, seed=1)[YIELD]
     assert (np.mean(draws), np.std(draws)) == pytest.approx((5e3, 300.0), rel=0.02)

@@ -56,6 +56,15 @@ def test_a_tail_that_would_have_to_push() -> None:
     assert any("would have to push in every draw" in one for one in found)
 
 
+def test_a_tail_that_seldom_pushes_is_told_how_low_its_tension_comes() -> None:
+    """A median above 0 alone would deny what the sentence says."""
+    vine = {"diameter_mm": 24, "thickness_um": 200, "payload_g": 35.6, "pressure_kPa": 28, "growth_angle_deg": 60}
+    found = sight(Said(B=6.44, B_error=0.1), **vine)
+    assert 0.05 < found.slack < 0.5
+    (sentence,) = (one for one in hazards(found) if "would have to push" in one)
+    assert "in one draw of twenty below -" in sentence
+
+
 def test_a_tail_that_may_go_slack_does() -> None:
     loose = sight(
         tail_slack="free", diameter_mm=24, thickness_um=200, payload_g=35.6, pressure_kPa=14, growth_angle_deg=0

@@ -214,6 +214,10 @@ def _yield_pressure(making: _Making, anchor: tuple[str, bool]) -> None:
         if sigma > 0:
             words = f"stated to {sigma / 1e3:.2g} kPa"
             making.doubt("stated P_y", words, f"P_y stated|{trial.vine}", shifted(YIELD, sigma))
+    elif _printed_scale(trial) == published.YIELD_PRESSURE_SCALE:
+        making.know(YIELD, guess.YIELD_PRESSURE_PA, f"printed, {published.SOURCE}")
+        words = f"printed to a whole number: ±{guess.PRINTED_YIELD_SIGMA_PA / 1e3:.2g} kPa"
+        making.doubt("printed P_y", words, "P_y printed", shifted(YIELD, guess.PRINTED_YIELD_SIGMA_PA))
     else:
         making.know(YIELD, guess.YIELD_PRESSURE_PA, "guess: the one that is printed, for another vine")
         words = (
@@ -241,6 +245,12 @@ def _further(making: _Making, said: Said, model: Model, anchor: tuple[str, bool]
             place = making.fit.place(name, anchor[0]) if making.fit else None
             if size is not None:
                 making.know(name, size.middle, "given")
+                low, high = parameter.plausible or parameter.bounds
+                if size.low < low or size.high > high:
+                    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+                    making.notes.append(
+                        f"{parameter.symbol} of {effect.name} is beyond what is plausible, {low:g} to {high:g}{unit}"
+                    )
                 if size.high > size.low:
                     words = f"{parameter.symbol} of {effect.name} evenly between {size.low:g} and {size.high:g}"
                     making.doubt(f"{parameter.symbol} ({effect.name})", words, name, even(name, size))

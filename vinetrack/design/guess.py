@@ -28,6 +28,9 @@ PRINTED_ERROR = 0.05
 some ten of them, make 3 to 6 %."""
 
 YIELD_PRESSURE_PA = 1000 * published.YIELD_PRESSURE_KPA
+PRINTED_YIELD_SIGMA_PA = 1000 / math.sqrt(12)
+"""Of the printed yield pressure, for the vine that it was printed for: "about 3 kPa", so to a whole number."""
+
 YIELD_FACTOR = 3.0
 """One yield pressure is printed, for one vine: nine of ten others are taken to lie within this factor of it."""
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.design.beliefs import BAND, YIELD, Belief
-from vinetrack.design.foresee import EJECTION, Foresight, told_by_payload
+from vinetrack.design.foresee import EJECTION, LEAST_TENSION, Foresight, told_by_payload
 from vinetrack.design.guess import BURST_STRESS_PA, burst_pressure_Pa, hoop_stress_Pa
 from vinetrack.design.runs import LONGEST_S, POINTS, follow
 from vinetrack.effects import Effect, EffectError, catalogue
@@ -21,7 +21,6 @@ from vinetrack.records import Floats, Trial
 CERTAIN = 0.95
 WORTH_A_WORD = 0.05
 """Share of the draws above which a hazard is named."""
-
 
 FILM_MODULUS_PA = 25e6
 """Young's modulus of the film, 10 to 50 MPa."""
@@ -103,8 +102,16 @@ def _slack(sight: Foresight) -> Iterator[str]:
         return
     payload = f" and the {EJECTION} is at least what is stated" if trial.payload_kg > 0 else ""
     yield (
-        f"the tail would have to push {often} (least tension {sight['least tension of the tail'].median:.2g} N), which "
+        f"the tail would have to push {often} (least tension {_least_tension(sight)}), which "
         f"it cannot: the payload runs ahead of the film{payload}; `--tail-slack free` lets it"
+    )
+
+
+def _least_tension(sight: Foresight) -> str:
+    """The median where that is below 0 itself, else how low it comes in one draw of twenty."""
+    one = sight[LEAST_TENSION]
+    return (
+        f"{one.median:.2g} N" if one.median < 0 else f"{one.median:.2g} N, in one draw of twenty below {one.low:.2g} N"
     )
 
 

@@ -95,12 +95,12 @@ def _compared(found: Planned, beliefs: Sequence[Belief], camera: Camera) -> Iter
 
 def _out_of_reach(found: Planned, most_trials: int) -> Iterator[str]:
     near, end = found.nearest, found.endless
-    yield f"! no campaign of {most_trials} trials or fewer leaves as little as that"
+    yield f"! no campaign of {most_trials} trials or fewer, with the pressures and replicates allowed, leaves so little"
     yield (
         f"the nearest, {near.n_trials} trials at {near.pressures} pressures, leaves n {near.n_error:.4f} and B "
         f"{100 * near.B_error:.2f} %; endlessly many would leave n {end.n_error:.4f} and B {100 * end.B_error:.2f} %"
     )
-    yield "widen the pressures, allow more trials (--most-trials), add vines, or want less"
+    yield "widen the pressures, allow more (--most-trials, --replicates, --pressures), add vines, or want less"
 
 
 def rehearsal_lines(found: Planned, rehearsal: Rehearsal) -> list[str]:

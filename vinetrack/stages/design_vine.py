@@ -110,6 +110,7 @@ def design_vine(
         raise as_option(error) from None
     except (SimulationError, FitError) as error:
         raise ResultsError(str(error)) from None
+    _refuse_standstill(room, found)
     lines = list(_lines(room, found))
     if figure is not None:
         write_figure(_picture(found), figure)
@@ -125,6 +126,20 @@ def _check(room: Room, films: str, diameter: str) -> None:
     if max(room.films_m) > room.diameter_m[0] / 4:
         words = f"begins below four times the thickest film, {1e6 * max(room.films_m):g} µm"
         raise _refusal("diameter_mm", diameter, words, f"begin at {4e3 * max(room.films_m):g} mm or more")
+
+
+def _refuse_standstill(room: Room, found: Sequence[Choice]) -> None:
+    """There is no fastest of vines that do not move, at the medians of what is believed."""
+    if found[0].sight.final.median > 0:
+        return
+    highest_Pa = max(choice.sight.belief.trial.pressure_Pa for choice in found)
+    yield_kPa = found[0].sight.belief.trial.yield_pressure_Pa / 1e3
+    message = f"moves none of these vines to its end, against a yield pressure of {yield_kPa:.3g} kPa"
+    remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
+    if highest_Pa < 0.995 * room.pressure_Pa:
+        message += f": their walls are trusted with {highest_Pa / 1e3:.3g} kPa at most"
+        remedy = "raise --of-burst, or allow thicker films or smaller diameters"
+    raise _refusal("pressure_kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
 
 def _lines(room: Room, found: Sequence[Choice]) -> Iterator[str]:

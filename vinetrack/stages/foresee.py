@@ -141,7 +141,8 @@ def _quantity_row(one: Quantity) -> tuple[str, str, str, str, str]:
         texts, unit = [number(1e3 * value) for value in values], "mN"
     else:
         texts, unit = [shown(value, unit) for value in values], unit_of(unit)
-    return one.name, place, texts[1], "–" if one.low == one.high else f"{texts[0]} to {texts[2]}", unit
+    no_band = one.low == one.high or math.isnan(one.median)
+    return one.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
 
 
 def _share_row(name: str, low: float, high: float, words: str) -> tuple[str, str, str]:
