@@ -79,6 +79,8 @@ def test_what_was_grown_is_answered_and_what_was_not_is_blank(beside: tuple[Path
     assert 0 < rows.loc["final_speed_rms_41kPa", "ours"] < 0.5
     assert math.isnan(rows.loc["position_rms_7kPa", "ours"])
     assert math.isnan(rows.loc["fast_vine_measured", "ours"])
+    assert rows.loc["position_rms_7kPa", "how"] == "the trials of this experiment do not tell"
+    assert "9.52" in rows.loc["position_rms_7kPa", "beside"]  # what departures would cause needs no trial
     assert math.isnan(rows.loc["efficiency_power_of_wall", "ours"])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import pandas as pd
@@ -15,6 +15,8 @@ COMPUTED = "computed"
 SIMULATED = "simulated from printed parameters"
 MEASURED = "measured"
 NOT_CHECKABLE = "not checkable"
+
+UNANSWERED = "the trials of this experiment do not tell"
 
 MARKS = {
     COMPUTED: f"follows by arithmetic, or by Eq. (2), from other numbers of {SOURCE}; ours is the corrected value "
@@ -81,7 +83,7 @@ def as_table(rows: Iterable[PaperRow]) -> pd.DataFrame:
         If a row's name stands twice, or its mark is none.
     """
     entries = []
-    for row in rows:
+    for row in map(_as_answered, rows):
         entry = asdict(row)
         entry["ours_low_95"], entry["ours_high_95"] = entry.pop("low"), entry.pop("high")
         entry["as_printed"] = row.as_printed or (f"{row.published:g}" if math.isfinite(row.published) else "")
@@ -93,6 +95,13 @@ def as_table(rows: Iterable[PaperRow]) -> pd.DataFrame:
     if twice:
         raise ValueError(f"rows stand twice: {', '.join(twice)}")
     return table
+
+
+def _as_answered(row: PaperRow) -> PaperRow:
+    """A row that trials should answer and do not says that, in place of how they would have."""
+    if row.mark not in (SIMULATED, MEASURED) or math.isfinite(row.ours):
+        return row
+    return replace(row, how=UNANSWERED)
 
 
 def number(value: Any) -> float:
