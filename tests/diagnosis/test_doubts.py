@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from vinetrack.laboratory.campaign import damping_values
 from vinetrack.laboratory.nature import BASE, Nature
 from vinetrack.laboratory.tracks import grow
 from vinetrack.model.fit import fit
-from vinetrack.model.fit_result import Fit
 from vinetrack.records import Floats
 
 
@@ -47,8 +47,8 @@ def asked(pairs: Pairs) -> Questions:
 
 @pytest.fixture
 def without_doubts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    def none(found: Fit) -> list[Floats]:
-        return [np.zeros((trial.time_s.size, 0)) for trial in found.trials]
+    def none(*about: Any) -> list[Floats]:
+        return [np.zeros((trial.time_s.size, 0)) for trial in about[-1]]
 
     monkeypatch.setattr(questions, "doubts_of", none)
     return

@@ -15,7 +15,8 @@ import numpy as np
 
 from vinetrack.diagnosis.hypotheses import Shape, whole_shapes
 from vinetrack.model.fit_result import Fit
-from vinetrack.model.simulate import SimulationError, Trajectory
+from vinetrack.model.sensitivity import moved_by
+from vinetrack.model.simulate import SimulationError
 from vinetrack.records import Floats
 
 AIMED_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
@@ -113,12 +114,3 @@ def _change(found: Fit, shape: Shape, plain: Sequence[Floats]) -> list[Floats]:
     model = found.predictor.layout.model + shape.effect
     moved = predictor.run_as(model, jobs, rows)
     return [moved_by(before, trajectory) for before, trajectory in zip(plain, moved, strict=True)]
-
-
-def moved_by(before: Floats, after: Trajectory) -> Floats:
-    """How far the observed positions of a trial moved, m, shape (n_points,)."""
-    change = after.observed_position_m - before
-    if after.status == "ended":
-        # Behind the end of growth the film stands still: what delays the end moves nothing there.
-        change[after.time_s > after.end_time_s] = change[-1]
-    return np.asarray(change)

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.diagnosis.hypotheses import is_plausible
-from vinetrack.diagnosis.screen import FEWEST_CLUSTERS, Products, eliminated
 from vinetrack.effects import Effect
 from vinetrack.model.fit_result import Fit, Number
-from vinetrack.records import Floats
+from vinetrack.model.full_errors import FEWEST_CLUSTERS, robust_covariance
 
 ANSWER_SET = 9.0
 """Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
@@ -100,40 +99,12 @@ def belief(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple
     return True, ""
 
 
-def robust_covariance(found: Fit) -> tuple[Floats, Floats]:
-    """Covariance of the free numbers as the fit holds them, from the noise model and from the scatter of trials."""
-    solution = found.solution
-    frame, state = solution.frame, solution.state
-    sums = Products(solution.grams, solution.columns[0].shape[1] - 5, 0)
-    blocks = eliminated(sums, found, state)
-    p, size = sums.n_keys, frame.prior_mean.size
-    square = np.zeros((size + 1, size + 1))
-    np.add.at(square, (frame.index[:, :, None], frame.index[:, None, :]), blocks[:, :p, :p])
-    square = square[:size, :size] + np.diag(frame.prior_precision)
-    live = np.flatnonzero((np.diag(square) > 0) & np.array([not math.isfinite(n.bound) for n in found.numbers]))
-    scale = 1 / np.sqrt(np.diag(square)[live])
-    inverse = np.zeros_like(square)
-    inverse[np.ix_(live, live)] = (
-        np.linalg.pinv(square[np.ix_(live, live)] * scale[:, None] * scale, rcond=1e-11, hermitian=True)
-        * scale[:, None]
-        * scale
-    )
-    single = np.zeros((len(blocks), size + 1))
-    for i, row in enumerate(blocks[:, :p, p]):
-        np.add.at(single[i], frame.index[i], row)
-    single = single[:, :size] - single[:, :size].mean(axis=0)
-    trials = len(blocks)
-    meat = single.T @ single * trials / max(trials - live.size, 1)
-    # The prior's information does not scatter from trial to trial, yet it is uncertain all the same.
-    meat += np.diag(frame.prior_precision)
-    return inverse, inverse @ meat @ inverse
-
-
 def _robust_ratio(after: Fit, names: Sequence[str]) -> float:
     """How much larger the error of an effect's size is by the scatter of trials than by the noise model; at least 1."""
     if len(after.trials) < FEWEST_CLUSTERS:
         return 1.0
-    plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in robust_covariance(after))
+    matrices = robust_covariance(after.predictor, after.solution)
+    plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in matrices)
     mine = [k for k, number in enumerate(after.numbers) if number.key.split(".")[0] in names and plain[k] > 0]
     return max([1.0, *(float(robust[k] / plain[k]) for k in mine)])
 

@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 
 from vinetrack.diagnosis.answers import Answers, answers_of
-from vinetrack.diagnosis.doubts import doubts_of
 from vinetrack.diagnosis.hypotheses import Shape, plausible_range, shapes_of
 from vinetrack.diagnosis.screen import (
     Products,
@@ -23,6 +22,7 @@ from vinetrack.diagnosis.screen import (
     structure_of,
 )
 from vinetrack.effects import Effect
+from vinetrack.model.doubts import doubts_of
 from vinetrack.model.fit import lost, missed_part
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.solve import track_correlation
@@ -185,6 +185,6 @@ def question(found: Fit, effects: Sequence[Effect], level: float) -> Questions:
     effects = tuple(effect for effect in effects if effect.name not in found.model)
     shapes: list[Shape] = [shape for effect in effects for shape in shapes_of(effect)]
     answers = answers_of(found, shapes)
-    doubts = doubts_of(found)
+    doubts = doubts_of(found.predictor, found.solution, found.trials)
     sums = products_of(found, answers, doubts)
     return Questions(found, effects, answers, sums, scores_of(found, sums), structure_of(found, doubts), level)

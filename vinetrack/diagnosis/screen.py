@@ -22,13 +22,11 @@ from numpy.typing import NDArray
 from vinetrack.diagnosis.answers import Answers, answers_of
 from vinetrack.diagnosis.hypotheses import Shape, probe
 from vinetrack.model.fit_result import Fit
-from vinetrack.model.mixed import State, own_prior
+from vinetrack.model.full_errors import scatter_of
+from vinetrack.model.mixed import State, eliminated
 from vinetrack.model.sensitivity import OWN
-from vinetrack.model.whitened import at_correlation, products
+from vinetrack.model.whitened import products
 from vinetrack.records import Floats
-
-FEWEST_CLUSTERS = 8
-"""Trials from which their scatter says more than the model of the noise."""
 
 BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
 SHARE_LEFT = 1e-4
@@ -115,7 +113,7 @@ def scores_of(found: Fit, sums: Products, state: State | None = None) -> Scores:
     """Scores at a fit, or with the noise and spreads of another `state`."""
     solution = found.solution
     frame, state = solution.frame, state or solution.state
-    blocks = eliminated(sums, found, state)
+    blocks = eliminated(sums.grams, sums.n_keys, solution.frame, state)
     p, size = sums.n_keys, frame.prior_mean.size
     index = frame.index
     asked = sums.n_shapes + sums.n_doubts
@@ -170,37 +168,9 @@ def _doubts_aside(scores: Scores, n_shapes: int) -> Scores:
     return Scores(score, information, scores.scores @ turn, informations, scores.degrees)
 
 
-def scatter_of(single: Floats, degrees: float) -> Floats:
-    """Variance of sums over trials from how single trials, shape (n_trials, n), scatter; 0 where they are too few.
-
-    Priors' parts belong to no trial: the mean is taken out.
-    """
-    trials = len(single)
-    if trials < FEWEST_CLUSTERS:
-        return np.zeros(single.shape[1])
-    return np.asarray(np.sum((single - single.mean(axis=0)) ** 2, axis=0) * trials / degrees)
-
-
 def _pressed(found: Fit) -> NDArray[np.bool_]:
     """Numbers at a bound, which cannot give way."""
     return np.array([math.isfinite(number.bound) for number in found.numbers], dtype=bool)
-
-
-def eliminated(sums: Products, found: Fit, state: State) -> Floats:
-    """Products of keys, residual and shapes in units of the noise, each trial's own numbers integrated out."""
-    frame = found.solution.frame
-    white = at_correlation(sums.grams, state.rho) / state.variance[:, None, None]
-    put_back = np.broadcast_to(np.eye(white.shape[1]), white.shape).copy()
-    residual = OWN + sums.n_keys
-    for column in (2, 3):
-        put_back[:, column, residual] = state.own[:, column]
-    white = np.swapaxes(put_back, 1, 2) @ white @ put_back
-    precision = own_prior(frame, state)[1]
-    own = white[:, :OWN, :OWN] + precision[:, :, None] * np.eye(OWN)
-    scale = 1 / np.sqrt(np.einsum("nkk->nk", own))
-    even = own * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(OWN)
-    side = scale[:, :, None] * white[:, :OWN, OWN:]
-    return np.asarray(white[:, OWN:, OWN:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(even, side))
 
 
 def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
@@ -227,7 +197,7 @@ def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats
 def _rest(found: Fit, sums: Products, state: State) -> float:
     """Sum of squares that the fit's own numbers leave, with the priors' part."""
     frame = found.solution.frame
-    blocks = eliminated(sums, found, state)
+    blocks = eliminated(sums.grams, sums.n_keys, frame, state)
     p, size = sums.n_keys, frame.prior_mean.size
     square = np.zeros((size + 1, size + 1))
     np.add.at(square, (frame.index[:, :, None], frame.index[:, None, :]), blocks[:, :p, :p])

@@ -12,7 +12,8 @@ import numpy as np
 from vinetrack.model.fit_data import FitTrial
 from vinetrack.model.fit_result import Fit, Number, Spread, TrialFit
 from vinetrack.model.free import YIELD_PRESSURE, Free, Layout
-from vinetrack.model.intervals import Precision, degrees_of_freedom, near_bound, precision, profile_interval, student
+from vinetrack.model.full_errors import full_errors
+from vinetrack.model.intervals import Precision, near_bound, precision, profile_interval, student
 from vinetrack.model.mixed import deviance, estimate_spreads, marginal, own_prior
 from vinetrack.model.model import Model, Value
 from vinetrack.model.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
@@ -36,8 +37,10 @@ def assemble(
 ) -> Fit:
     """Everything that is said about a fit."""
     layout, state = predictor.layout, solution.state
-    known = precision(solution)
-    numbers = _numbers(predictor, solution, known, profile=profile)
+    by_noise = precision(solution)
+    trials = _trial_fits(predictor, solution, by_noise)
+    known = full_errors(predictor, solution, trials, by_noise)
+    numbers = _numbers(predictor, solution, by_noise, known, profile=profile)
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([item.time_s.size for item in predictor.data], dtype=float)
     variance = float(np.average(state.variance, weights=weights)) / (1 - state.rho**2)
@@ -53,7 +56,7 @@ def assemble(
         noise_correlation=state.rho,
         chi2_per_dof=chi2,
         log_likelihood=log_likelihood(solution),
-        trials=_trial_fits(predictor, solution, known),
+        trials=trials,
         messages=tuple(_messages(layout, solution, numbers, known, chi2)),
         left_out=dict(left_out),
         converged=solution.converged,
@@ -86,10 +89,12 @@ def fitted_model(layout: Layout, numbers: Sequence[Number]) -> Model:
     return layout.model.with_values(values)
 
 
-def _numbers(predictor: Predictor, solution: Solution, known: Precision, *, profile: bool) -> tuple[Number, ...]:
+def _numbers(
+    predictor: Predictor, solution: Solution, by_noise: Precision, known: Precision, *, profile: bool
+) -> tuple[Number, ...]:
     layout, frame, theta = predictor.layout, solution.frame, solution.state.theta
     sigma = np.sqrt(np.diag(known.covariance))
-    dof = degrees_of_freedom(solution)
+    dof = known.degrees
     reach = student(dof)
     doubtful = near_bound(solution, sigma)
     numbers = []
@@ -98,7 +103,9 @@ def _numbers(predictor: Predictor, solution: Solution, known: Precision, *, prof
         if not math.isfinite(sigma[k]):
             low, high, method = frame.lower[k], frame.upper[k], "none"
         elif doubtful[k] and profile:
-            low, high = profile_interval(predictor, solution, k, float(sigma[k]), float(reach[k]))
+            # The likelihood knows of the noise alone: it is followed as much further as the error is wider.
+            narrow = math.sqrt(by_noise.covariance[k, k])
+            low, high = profile_interval(predictor, solution, k, narrow, float(reach[k] * sigma[k] / narrow))
             method = "profile"
         low, high = max(low, frame.lower[k]), min(high, frame.upper[k])
         at = [b for b in (frame.lower[k], frame.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]

@@ -25,6 +25,7 @@ from vinetrack.model.free import make_layout
 from vinetrack.model.left_out import predict_trials
 from vinetrack.model.mixed import Frame, State, deviance, marginal
 from vinetrack.model.model import Model, Value
+from vinetrack.model.own_numbers import trial_costs
 from vinetrack.model.sensitivity import Predictor
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.solve import (
@@ -38,7 +39,6 @@ from vinetrack.model.solve import (
     make_frame,
     solve,
     track_correlation,
-    trial_costs,
 )
 from vinetrack.model.starts import align, candidates, first_own
 from vinetrack.records import Floats, Track
@@ -59,7 +59,7 @@ ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 40
 BAD_START = 1.5
 """χ² per point from which a start misses by more than the noise of the fit it came from."""
 
-GUIDING_SPREADS = (5e-4, 1e-3)
+GUIDING_SPREADS, STRICT_SPREADS = (5e-4, 1e-3), (0.01, 0.03)
 
 
 def fit(
@@ -211,6 +211,24 @@ def _guided(
         return None
 
 
+def _strictly(predictor: Predictor, theta: Floats, own: Floats, held: Held, watch: Watch | None) -> Solution | None:
+    """A solution led by the noise of the tracks, which nothing missed can enlarge, from numbers that are nearly right.
+
+    Trials whose own pressure or B is far from what was set would else be taken for noise altogether.
+    """
+    if held.noise is not None:
+        return None
+    state, frame = first_state(predictor.data, theta, own), make_frame(predictor, own)
+    noise = Held(spread=held.spread or STRICT_SPREADS, noise=(state.rho, state.variance))
+    try:
+        first = solve(predictor, frame, state, noise, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+        if chi2_per_dof(predictor, first) > POOR_FIT:
+            return None
+        return solve(predictor, frame, first.state, held, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+    except SimulationError:
+        return None
+
+
 def _solve_from(
     predictor: Predictor,
     theta: Floats,
@@ -236,6 +254,9 @@ def _found_again(
         own, _ = align(predictor.data, predictor, theta, first_own(predictor.data))
     except SimulationError:
         return solution
+    strict = _strictly(predictor, theta, own, held, watch)
+    if strict is not None and not lost(predictor, strict):
+        return strict
     guided = _guided(predictor, theta, own, held, watch, freed=thorough)
     return solution if guided is None else _sane(predictor, solution, [guided])
 

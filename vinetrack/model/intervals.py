@@ -34,21 +34,27 @@ LOG_STEP = 0.1
 class Precision:
     """Covariance of the free numbers as the fit holds them, shape (n_free, n_free), infinite where nothing is known.
 
-    `silent` marks numbers that move no trajectory, `tied` those that only a sum or product with others fixes.
+    `degrees`, shape (n_free,), are those of freedom of the errors. `silent` marks numbers that move no trajectory,
+    `tied` those that only a sum or product with others fixes.
     """
 
     covariance: Floats
+    degrees: Floats
     silent: np.ndarray
     tied: np.ndarray
 
 
 def precision(solution: Solution) -> Precision:
-    """Covariance at the end of a fit."""
+    """Covariance at the end of a fit, by the model of the noise and the scatter."""
     part = marginal(solution.grams, solution.frame, solution.state)
-    return _precision(part, solution.frame, solution.state, solution.state.spread)
+    covariance, silent, tied = _covariance(part, solution.frame, solution.state, solution.state.spread)
+    return Precision(covariance, degrees_of_freedom(solution), silent, tied)
 
 
-def _precision(part: Marginal, frame: Frame, state: State, spread: tuple[float, float]) -> Precision:
+def _covariance(
+    part: Marginal, frame: Frame, state: State, spread: tuple[float, float]
+) -> tuple[Floats, np.ndarray, np.ndarray]:
+    """Covariance of the free numbers, which of them are silent, and which are tied."""
     information = normal_equations(part, frame, state, spread)[0]
     diagonal = np.diag(information)
     silent = frame.free & ~(diagonal > SILENT)
@@ -65,7 +71,7 @@ def _precision(part: Marginal, frame: Frame, state: State, spread: tuple[float, 
         covariance[np.ix_(k, k)] = inverse * scale[:, None] * scale
     unknown = np.flatnonzero(silent | tied)
     covariance[unknown, unknown] = math.inf
-    return Precision(covariance, silent, tied)
+    return covariance, silent, tied
 
 
 def degrees_of_freedom(solution: Solution) -> Floats:
@@ -101,7 +107,7 @@ def degrees_of_freedom(solution: Solution) -> Floats:
 
 
 def _variances(part: Marginal, frame: Frame, state: State, spread: tuple[float, float]) -> Floats:
-    return np.nan_to_num(np.diag(_precision(part, frame, state, spread).covariance), posinf=0.0)
+    return np.nan_to_num(np.diag(_covariance(part, frame, state, spread)[0]), posinf=0.0)
 
 
 def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
@@ -172,7 +178,7 @@ def _rise(predictor: Predictor, solution: Solution, held: Held, place: int, valu
     theta = solution.state.theta.copy()
     step = value - theta[place]
     part = marginal(solution.grams, solution.frame, solution.state)
-    covariance = _precision(part, solution.frame, solution.state, solution.state.spread).covariance
+    covariance = _covariance(part, solution.frame, solution.state, solution.state.spread)[0]
     if math.isfinite(covariance[place, place]) and covariance[place, place] > 0:
         along = np.nan_to_num(covariance[:, place] / covariance[place, place], posinf=0.0)
         theta = np.clip(theta + along * step, solution.frame.lower, solution.frame.upper)

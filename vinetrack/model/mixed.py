@@ -177,6 +177,21 @@ def solve_each(square: Floats, right: Floats) -> Floats:
     return np.asarray(scale[:, :, None] * np.linalg.solve(even, scale[:, :, None] * right))
 
 
+def eliminated(grams: Floats, n_keys: int, frame: Frame, state: State) -> Floats:
+    """Products of keys, residual and what follows in units of the noise, each trial's own numbers integrated out.
+
+    `grams` are those of [own numbers, keys, residual, more].
+    """
+    white = at_correlation(grams, state.rho) / state.variance[:, None, None]
+    put_back = np.broadcast_to(np.eye(white.shape[1]), white.shape).copy()
+    for column in SPREAD_COLUMNS:
+        put_back[:, column, OWN + n_keys] = state.own[:, column]
+    white = np.swapaxes(put_back, 1, 2) @ white @ put_back
+    own = white[:, :OWN, :OWN] + own_prior(frame, state)[1][:, :, None] * np.eye(OWN)
+    side = white[:, :OWN, OWN:]
+    return np.asarray(white[:, OWN:, OWN:] - np.swapaxes(side, 1, 2) @ solve_each(own, side))
+
+
 @dataclass(frozen=True)
 class Marginal:
     """The trials with release and origin eliminated, shape (n_trials, 2 + n_keys + 1) squared: deviations, keys, rest.

@@ -73,13 +73,13 @@ class Predictor:
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
 
-    def run(self, jobs: Sequence[Job], times_s: Floats | None = None) -> list[Trajectory]:
-        """Simulate at the instants of each job's trial, or at `times_s`."""
+    def run(self, jobs: Sequence[Job], times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
+        """Simulate at the instants of each job's trial, or at those of `times_s`, one array a job."""
         rows = np.array([job.row for job in jobs]).reshape(len(jobs), -1)
         return self.run_as(self.layout.model, jobs, rows, times_s)
 
     def run_as(
-        self, model: Model, jobs: Sequence[Job], rows: Floats, times_s: Floats | None = None
+        self, model: Model, jobs: Sequence[Job], rows: Floats, times_s: Sequence[Floats] | None = None
     ) -> list[Trajectory]:
         """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials."""
         places = np.array([job.trial for job in jobs], dtype=int)
@@ -95,8 +95,8 @@ class Predictor:
             rigs,
             [self.bends[job.trial] for job in jobs],
             [
-                (item.time_s if times_s is None else times_s) - job.release_s
-                for item, job in zip(data, jobs, strict=True)
+                time_s - job.release_s
+                for time_s, job in zip(times_s or [item.time_s for item in data], jobs, strict=True)
             ],
             traces=[
                 None if item.trace is None else (item.trace[0] - job.release_s, item.trace[1])
@@ -208,6 +208,15 @@ def _change(plain: Trajectory, other: Trajectory) -> Floats:
         over = plain.time_s > plain.end_time_s
         change[over] = change[-1] if other.status == "ended" else 0.0
     return change
+
+
+def moved_by(before: Floats, after: Trajectory) -> Floats:
+    """How far the observed positions of a trial moved from those `before`, m, shape (n_points,)."""
+    change = after.observed_position_m - before
+    if after.status == "ended":
+        # Behind the end of growth the film stands still: what delays the end moves nothing there.
+        change[after.time_s > after.end_time_s] = change[-1]
+    return np.asarray(change)
 
 
 def _step(answer: float, before: float) -> float:

@@ -16,15 +16,14 @@ from vinetrack.model.mixed import (
     estimate_spreads,
     marginal,
     newton_step,
-    own_penalty,
-    own_step,
     shared_penalty,
 )
-from vinetrack.model.sensitivity import DAMPING_DEVIATION, PRESSURE, RELEASE, Predictor
+from vinetrack.model.own_numbers import follow, limited, trial_costs
+from vinetrack.model.releases import release_again
+from vinetrack.model.sensitivity import Predictor
 from vinetrack.model.simulate import SimulationError
 from vinetrack.model.starts import first_own
-from vinetrack.model.unseen_release import release_again
-from vinetrack.model.whitened import all_products, at_correlation, whiten
+from vinetrack.model.whitened import all_products, at_correlation
 from vinetrack.records import Floats
 
 MOST_ITERATIONS = 60
@@ -44,15 +43,15 @@ FIRST_SPREADS = (0.01, 0.03)
 EXACT_PART = 2e-6
 """Least noise, as part of a trial's travel: the integrator is no better."""
 
-LARGEST_DEVIATION_STEP = 0.3
-LARGEST_DEVIATION = 0.9
-LARGEST_RELEASE_STEP_FRAMES = 2.0
 RELEASE_ROOM_FRAMES, ORIGIN_ROOM_SIGMAS = 10.0, 10.0
 """Where the rest is seen it says of release and origin what it says through its points, a hundred times less a second
 time: that only counts where a wrong model would drag both along."""
 
 KNOWN_RELEASE_S = 1e-6
 """The release of a vine whose pressure was let in while it was recorded: nothing to find."""
+
+SHORTER, MOST_DAMPED = (1.0, 0.4, 0.15), 11
+"""Parts of a step that are tried, and how often it is damped further if none of them helps."""
 
 FEWEST_TO_SPARE = 3
 """A spread is estimated where this many more trials feel it than there are numbers without a prior."""
@@ -189,7 +188,7 @@ def solve(
     damping, converged, iteration, promised = (0.0 if warm else 1e-3), False, 0, math.inf
     early = not warm
     columns, grams = _about(predictor, state)
-    looks, looked = MOST_LOOKS, 0
+    looks, looked, in_vain = MOST_LOOKS, 0, False
     for iteration in range(1, most_iterations + 1):
         near = promised < FAR_OFF or iteration > MOST_EARLY
         search = early and iteration > EARLY_ITERATIONS and near
@@ -200,15 +199,16 @@ def solve(
         step, own_change, promised = newton_step(grams, frame, state, damping)
         if watch is not None:
             watch(_step_report(predictor, state, iteration, promised))
-        if looks and (promised < NEARLY_SETTLED or iteration >= looked + PATIENCE):
-            looked = iteration
+        settled = promised < SETTLED_DECREASE
+        if looks and (settled or (promised < NEARLY_SETTLED and not in_vain) or iteration >= looked + PATIENCE):
+            looked, in_vain = iteration, True
             jumped = release_again(predictor, frame, state)
             if jumped is not None:
                 state, (columns, grams) = jumped, _about(predictor, jumped)
-                looks -= 1
+                looks, in_vain = looks - 1, False
                 continue
-            looks = min(looks, 1) if promised > SETTLED_DECREASE else 0
-        if promised < SETTLED_DECREASE and moved < SETTLED_SPREAD and not early:
+            looks = 0 if settled else looks
+        if settled and moved < SETTLED_SPREAD and not early:
             converged = True
             break
         taken, damping = _take_step(predictor, frame, grams, state, step, own_change, damping)
@@ -286,62 +286,35 @@ def _variances_moved(before: State, after: State) -> float:
 def _take_step(
     predictor: Predictor, frame: Frame, grams: Floats, state: State, step: Floats, own_change: Floats, damping: float
 ) -> tuple[State | None, float]:
-    """The first of ever more damped steps that lowers the sum of squares, and the damping to go on with."""
+    """The first of ever shorter, then ever more damped steps that lowers the sum of squares, and the damping to go on.
+
+    A step too long for a curved valley is right in its direction, which damping would turn across the valley.
+    """
     now = cost(predictor, frame, state)
-    for _ in range(12):
-        theta = np.clip(state.theta + step, frame.lower, frame.upper)
-        try:
-            tried = replace(state, theta=theta, own=_limited(predictor, state.own, own_change))
-            tried, reached = _follow(predictor, frame, tried)
-            better = reached < now
-        except SimulationError:
-            better = False
-        if better:
+    for part in SHORTER:
+        tried = _tried(predictor, frame, state, part * step, part * own_change, now)
+        if tried is not None:
             return tried, damping * 0.1 if damping > 1e-6 else 0.0
+    for _ in range(MOST_DAMPED):
         damping = max(10 * damping, 1e-4)
         step, own_change, _ = newton_step(grams, frame, state, damping)
+        tried = _tried(predictor, frame, state, step, own_change, now)
+        if tried is not None:
+            return tried, damping * 0.1
     return None, 0.0
 
 
-def _follow(predictor: Predictor, frame: Frame, state: State) -> tuple[State, float]:
-    """The trials' own numbers brought to their best for the others, and the cost there.
-
-    They are known so well that a step of the shared numbers leaves the valley by its curvature alone. Every trial
-    takes what serves it best: where a release meets a frame, the cost has a corner at which no full step helps.
-    """
-    grams = _products(predictor, predictor.linearise(state.theta, state.own, own_only=True))
-    ways = [
-        state,
-        *(
-            replace(state, own=_limited(predictor, state.own, own_step(grams, frame, state, pinned=pinned)))
-            for pinned in (False, True)
-        ),
-    ]
-    costs = np.array([trial_costs(predictor, frame, way) for way in ways])
-    best = np.argmin(costs, axis=0)
-    own = np.array([ways[way].own[i] for i, way in enumerate(best)])
-    return replace(state, own=own), float(np.sum(np.min(costs, axis=0))) + shared_penalty(frame, state)
-
-
-def _limited(predictor: Predictor, own: Floats, step: Floats) -> Floats:
-    """Own numbers after a step: the release moves by two frames at most, a deviation by 0.3."""
-    reach = LARGEST_RELEASE_STEP_FRAMES * np.array([item.frame_s for item in predictor.data])
-    moved = own + step
-    moved[:, RELEASE] = own[:, RELEASE] + np.clip(step[:, RELEASE], -reach, reach)
-    deviations = [PRESSURE, DAMPING_DEVIATION]
-    stride = np.clip(step[:, deviations], -LARGEST_DEVIATION_STEP, LARGEST_DEVIATION_STEP)
-    moved[:, deviations] = np.clip(own[:, deviations] + stride, -LARGEST_DEVIATION, LARGEST_DEVIATION)
-    return moved
-
-
-def trial_costs(predictor: Predictor, frame: Frame, state: State) -> Floats:
-    """Whitened sum of squares of every trial with what the priors of its own numbers add, shape (n_trials,)."""
-    residuals = predictor.residuals(state.theta, state.own)
-    squares = [
-        float(np.sum(whiten(residual, item.first, state.rho) ** 2)) / variance
-        for item, residual, variance in zip(predictor.data, residuals, state.variance, strict=True)
-    ]
-    return np.array(squares) + own_penalty(frame, state)
+def _tried(
+    predictor: Predictor, frame: Frame, state: State, step: Floats, own_change: Floats, now: float
+) -> State | None:
+    """The state after a step, if that lowers the sum of squares."""
+    theta = np.clip(state.theta + step, frame.lower, frame.upper)
+    try:
+        there = replace(state, theta=theta, own=limited(predictor, state.own, own_change))
+        there, costs = follow(predictor, frame, there)
+    except SimulationError:
+        return None
+    return there if float(np.sum(costs)) + shared_penalty(frame, there) < now else None
 
 
 def cost(predictor: Predictor, frame: Frame, state: State) -> float:

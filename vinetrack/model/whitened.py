@@ -38,9 +38,13 @@ def at_correlation(grams: Floats, rho: float) -> Floats:
 
 
 def whiten(residual: Floats, first: NDArray[np.bool_], rho: float) -> Floats:
-    """Residuals freed of their correlation, same variance at the first point of a stretch as at the others."""
+    """Residuals freed of their correlation, same variance at the first point of a stretch as at the others.
+
+    They have shape (n_points,), (n_points, k) or (m, n_points, k), `first` (n_points,).
+    """
     white = residual.copy()
+    along, before = (np.swapaxes(one, 0, 1) if one.ndim == 3 else one for one in (white, residual))
     follows = np.flatnonzero(~first)
-    white[follows] -= rho * residual[follows - 1]
-    white[first] *= np.sqrt(1 - rho**2)
+    along[follows] -= rho * before[follows - 1]
+    along[first] *= np.sqrt(1 - rho**2)
     return white

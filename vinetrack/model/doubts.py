@@ -6,14 +6,15 @@ pass for a small effect as soon as pressures and B scatter little.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from vinetrack.diagnosis.answers import moved_by
-from vinetrack.model.fit_result import Fit
-from vinetrack.model.sensitivity import PRESSURE
+from vinetrack.model.fit_result import TrialFit
+from vinetrack.model.sensitivity import PRESSURE, Predictor, moved_by
 from vinetrack.model.simulate import SimulationError
+from vinetrack.model.solve import Solution
 from vinetrack.records import Floats
 
 PAYLOAD_ERROR = 0.005
@@ -31,53 +32,52 @@ BEGIN, END, COVERED = 0.015, 0.03, 4.0
 there, the last fold pulls it out of shape."""
 
 
-def doubts_of(found: Fit) -> list[Floats]:
+def doubts_of(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> list[Floats]:
     """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions."""
-    parts = zip(_payloads(found), _set_pressures(found), _tracker(found), strict=True)
+    ways = _payloads(predictor, solution, trials), _set_pressures(predictor, solution), _tracker(predictor, trials)
+    parts = zip(*ways, strict=True)
     return [np.column_stack(one) for one in parts]
 
 
-def _payloads(found: Fit) -> list[Floats]:
+def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> list[Floats]:
     """The relative error of each payload of the campaign. Trials with the same payload had the same body."""
-    loaded = [i for i, trial in enumerate(found.trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
-    payloads = dict.fromkeys(round(found.trials[i].trial.payload_kg, 9) for i in loaded)
+    loaded = [i for i, trial in enumerate(trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
+    payloads = dict.fromkeys(round(trials[i].trial.payload_kg, 9) for i in loaded)
     places = {payload: k for k, payload in enumerate(payloads)}
-    columns = [np.zeros((trial.time_s.size, len(places))) for trial in found.trials]
+    columns = [np.zeros((trial.time_s.size, len(places))) for trial in trials]
     if not loaded:
         return columns
-    state, predictor = found.solution.state, found.predictor
-    jobs = predictor.jobs(state.theta, state.own)
+    jobs = predictor.jobs(solution.state.theta, solution.state.own)
     try:
         heavier = predictor.run([replace(jobs[i], payload_factor=1 + PAYLOAD_STEP) for i in loaded])
     except SimulationError:
         return [column[:, :0] for column in columns]
     for i, other in zip(loaded, heavier, strict=True):
-        trial = found.trials[i]
+        trial = trials[i]
         change = moved_by(trial.predicted_position_m - trial.origin_m, other)
         columns[i][:, places[round(trial.trial.payload_kg, 9)]] = PAYLOAD_ERROR / PAYLOAD_STEP * change
     return columns
 
 
-def _set_pressures(found: Fit) -> list[Floats]:
+def _set_pressures(predictor: Predictor, solution: Solution) -> list[Floats]:
     """The error of the pressure that was set for a condition; its replicates have it together."""
-    feels = found.predictor.feels_pressure
-    conditions = dict.fromkeys(one.trial.condition for one, felt in zip(found.trials, feels, strict=True) if felt)
+    data, feels = [item.trial for item in predictor.data], predictor.feels_pressure
+    conditions = dict.fromkeys(trial.condition for trial, felt in zip(data, feels, strict=True) if felt)
     places = {condition: k for k, condition in enumerate(conditions)}
-    columns = [np.zeros((trial.time_s.size, len(places))) for trial in found.trials]
-    for column, trial, own, felt in zip(columns, found.trials, found.solution.columns, feels, strict=True):
+    columns = [np.zeros((len(own), len(places))) for own in solution.columns]
+    for column, trial, own, felt in zip(columns, data, solution.columns, feels, strict=True):
         if felt:
-            relative = PRESSURE_ERROR_PA / trial.trial.pressure_Pa
-            column[:, places[trial.trial.condition]] = relative * own[:, PRESSURE]
+            column[:, places[trial.condition]] = PRESSURE_ERROR_PA / trial.pressure_Pa * own[:, PRESSURE]
     return columns
 
 
-def _tracker(found: Fit) -> list[Floats]:
+def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
     """Slow errors along the picture, of the size of the error that tracks state of their positions, if they do."""
-    stated = np.array([item.stated_sigma_m for item in found.predictor.data])
+    stated = np.array([item.stated_sigma_m for item in predictor.data])
     if not np.isfinite(stated).any():
-        return [np.zeros((trial.time_s.size, 0)) for trial in found.trials]
+        return [np.zeros((trial.time_s.size, 0)) for trial in trials]
     sigma_m = float(np.nanmedian(stated))
-    grown = [trial.predicted_position_m - trial.origin_m for trial in found.trials]
+    grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
     reach = max(float(np.max(one)) for one in grown)
     waves = np.pi * np.arange(1, WAVES + 1)
     slow = [sigma_m * np.cos(one[:, None] / reach * waves) for one in grown]
