@@ -36,6 +36,7 @@ def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> Fram
     return Frame(
         index=np.tile(np.arange(keys), (n_trials, 1)),
         feels=np.tile([False, True], (n_trials, 1)),
+        gauge_error=np.zeros(n_trials),
         own_centre=np.zeros((n_trials, 2)),
         own_precision=np.full((n_trials, 2), flat_sd**-2),
         prior_mean=np.zeros(keys),

@@ -61,7 +61,8 @@ def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFi
 
 def _set_pressures(predictor: Predictor, solution: Solution) -> list[Floats]:
     """The error of the pressure that was set for a condition; its replicates have it together."""
-    data, feels = [item.trial for item in predictor.data], predictor.feels_pressure
+    data = [item.trial for item in predictor.data]
+    feels = predictor.feels_pressure & np.array([item.trace is None for item in predictor.data])
     conditions = dict.fromkeys(trial.condition for trial, felt in zip(data, feels, strict=True) if felt)
     places = {condition: k for k, condition in enumerate(conditions)}
     columns = [np.zeros((len(own), len(places))) for own in solution.columns]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.model.gauge_noise import without_noise
+from vinetrack.model.gauge_noise import noise_of, without_noise
 from vinetrack.records import Floats, Track, Trial
 from vinetrack.video.position_noise import position_noise, rest_points, rough_noise
 
@@ -59,7 +59,7 @@ class FitTrial:
     `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0
     where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
     `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
-    pressure, Pa.
+    pressure, Pa; `gauge_error` is by what part of it the noise of the gauge leaves it wrong along the whole motion.
     """
 
     trial: Trial
@@ -70,6 +70,7 @@ class FitTrial:
     noise_m: float
     correlation: float
     trace: tuple[Floats, Floats] | None = None
+    gauge_error: float = 0.0
     vague_rest: VagueRest | None = None
     stated_sigma_m: float = math.nan  #: median error of a position that the track states itself
 
@@ -140,13 +141,8 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
     if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
         raise FitError("its leading edge never moves forward beyond its noise")
-    trace = None
-    if track.pressure_Pa is not None:
-        known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
-        if np.count_nonzero(known) >= 2:
-            clock_s = track.time_s[known].astype(float)
-            trace = (clock_s, without_noise(track.pressure_Pa[known].astype(float)))
     n_rest = rest_points(position_m)
+    trace, gauge_error = _trace(track, time_s[max(n_rest - 1, 0) :])
     stated_m = track.lead_position_sigma_m[usable]
     return FitTrial(
         trial=trial,
@@ -157,9 +153,26 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         noise_m=noise_m,
         correlation=correlation,
         trace=trace,
+        gauge_error=gauge_error,
         vague_rest=vague_rest,
         stated_sigma_m=float(np.nanmedian(stated_m)) if np.isfinite(stated_m).any() else math.nan,
     )
+
+
+def _trace(track: Track, moving_s: Floats) -> tuple[tuple[Floats, Floats] | None, float]:
+    """Times and pressures of a trace freed of noise, and by what part of the pressure it is wrong all the same."""
+    if track.pressure_Pa is None:
+        return None, 0.0
+    known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
+    if np.count_nonzero(known) < 2:
+        return None, 0.0
+    clock_s, pressure_Pa = (one[known].astype(float) for one in (track.time_s, track.pressure_Pa))
+    told = (clock_s >= moving_s[0]) & (clock_s <= moving_s[-1])
+    typical_Pa = abs(float(np.median(pressure_Pa[told]))) if told.any() else math.nan
+    smooth_Pa = without_noise(pressure_Pa)
+    if not typical_Pa > 0 or smooth_Pa is pressure_Pa:
+        return (clock_s, smooth_Pa), 0.0
+    return (clock_s, smooth_Pa), noise_of(pressure_Pa) / math.sqrt(np.count_nonzero(told)) / typical_Pa
 
 
 def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], VagueRest | None]:

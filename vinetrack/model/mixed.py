@@ -57,13 +57,15 @@ class Frame:
     """What does not change during a fit.
 
     `index`, shape (n_trials, n_keys), places each trial's columns among the free numbers; `feels`, shape (n_trials, 2),
-    tells which trials have a deviation of pressure and of B; `own_centre` and `own_precision`, shape (n_trials, 2),
+    tells which trials have a deviation of pressure and of B; `gauge_error`, shape (n_trials,), the relative error of a
+    pressure that was measured, 0 of one that was set; `own_centre` and `own_precision`, shape (n_trials, 2),
     belong to release and origin: so wide a prior that it only matters where a track leaves them open.
     `free` marks the numbers that may move; `points` and `stretches` count those of each trial.
     """
 
     index: NDArray[np.int_]
     feels: NDArray[np.bool_]
+    gauge_error: Floats
     own_centre: Floats
     own_precision: Floats
     prior_mean: Floats
@@ -80,9 +82,15 @@ def own_prior(frame: Frame, state: State) -> tuple[Floats, Floats]:
     n = frame.index.shape[0]
     centre, precision = np.zeros((n, OWN)), np.ones((n, OWN))
     centre[:, :2], precision[:, :2] = frame.own_centre, frame.own_precision
-    for k, column in enumerate(SPREAD_COLUMNS):
-        precision[:, column] = 1 / max(state.spread[k], LEAST_SPREAD) ** 2
+    precision[:, SPREAD_COLUMNS] = 1 / np.maximum(spreads(frame, state.spread), LEAST_SPREAD) ** 2
     return centre, precision
+
+
+def spreads(frame: Frame, spread: tuple[float, float]) -> Floats:
+    """Standard deviations of each trial's pressure and B, shape (n_trials, 2): a measured pressure has its own."""
+    each = np.tile(spread, (frame.gauge_error.size, 1))
+    each[:, 0] = np.where(frame.gauge_error > 0, frame.gauge_error, each[:, 0])
+    return each
 
 
 def shared_penalty(frame: Frame, state: State) -> float:
@@ -223,7 +231,7 @@ def left_to_keys(part: Marginal, frame: Frame, spread: tuple[float, float]) -> t
 
     Shapes (n_trials, n_keys + 1, n_keys + 1), the last row and column the rest, and (n_trials, 2, 2).
     """
-    root = np.array(spread) * frame.feels
+    root = spreads(frame, spread) * frame.feels
     inner = np.eye(2) + root[:, :, None] * part.blocks[:, :2, :2] * root[:, None, :]
     side = root[:, :, None] * part.blocks[:, :2, 2:]
     return part.blocks[:, 2:, 2:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(inner, side), inner

@@ -51,7 +51,7 @@ class Predictor:
     """Simulates the trials of a fit.
 
     `feels_pressure` and `feels_damping`, shape (n_trials,), tell which trials have a pressure that may deviate (it was
-    set, not measured) and a B. `host` is a larger model whose compiled form serves this one.
+    set, or measured by a gauge with noise) and a B. `host` is a larger model whose compiled form serves this one.
     """
 
     def __init__(self, layout: Layout, data: Sequence[FitTrial], host: Model | None = None) -> None:
@@ -60,7 +60,8 @@ class Predictor:
         self.damping_column = model.parameter_names.index(DAMPING) if DAMPING in model.parameter_names else -1
         driven = "pressure_drive" in model
         self.feels_pressure = np.array(
-            [driven and item.trace is None and item.trial.pressure_Pa > 0 for item in data], dtype=bool
+            [driven and (item.trial.pressure_Pa > 0 if item.trace is None else item.gauge_error > 0) for item in data],
+            dtype=bool,
         )
         self.feels_damping = np.array(
             [self.damping_column >= 0 and item.trial.travel_ratio != 1 for item in data], dtype=bool
@@ -99,7 +100,9 @@ class Predictor:
                 for time_s, job in zip(times_s or [item.time_s for item in data], jobs, strict=True)
             ],
             traces=[
-                None if item.trace is None else (item.trace[0] - job.release_s, item.trace[1])
+                None
+                if item.trace is None
+                else (item.trace[0] - job.release_s, item.trace[1] * (1 + job.pressure_deviation))
                 for item, job in zip(data, jobs, strict=True)
             ],
             parameters=rows,

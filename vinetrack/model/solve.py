@@ -114,6 +114,7 @@ def make_frame(predictor: Predictor, own: Floats) -> Frame:
     return Frame(
         index=layout.index,
         feels=np.column_stack([predictor.feels_pressure, predictor.feels_damping]),
+        gauge_error=np.array([item.gauge_error for item in data]),
         own_centre=np.where(known[:, None], first_own(data)[:, :2], own[:, :2]),
         own_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
         prior_mean=layout.start,
@@ -156,7 +157,8 @@ def floor(data: Sequence[FitTrial]) -> Floats:
 def estimable(frame: Frame) -> tuple[bool, bool]:
     """Whether there are trials enough to estimate the spread of pressure, and that of B."""
     needed = np.count_nonzero(frame.prior_precision == 0) + FEWEST_TO_SPARE
-    pressure, damping = (bool(np.count_nonzero(frame.feels[:, k]) >= needed) for k in range(2))
+    varied = frame.feels & np.column_stack([frame.gauge_error == 0, np.ones(frame.gauge_error.size, dtype=bool)])
+    pressure, damping = (bool(np.count_nonzero(varied[:, k]) >= needed) for k in range(2))
     return pressure, damping
 
 

@@ -132,6 +132,7 @@ def subset_frame(frame: Frame, layout: Layout, rows: Indices, places: Indices) -
         frame,
         index=layout.index,
         feels=frame.feels[rows],
+        gauge_error=frame.gauge_error[rows],
         own_centre=frame.own_centre[rows],
         own_precision=frame.own_precision[rows],
         prior_mean=numbers(frame.prior_mean),
