@@ -10,7 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vinetrack.diagnosis.evidence import ANSWER_SET, MOST_INFLATION, Evidence, answer_set
-from vinetrack.diagnosis.question import FAR_OFF, FIRST_LEVEL, LATER_LEVEL, Questions, question
+from vinetrack.diagnosis.question import (
+    FAR_OFF,
+    FIRST_LEVEL,
+    LATER_LEVEL,
+    SUSPECT_SIGMAS,
+    Questions,
+    question,
+)
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, UNEXPLAINED
 from vinetrack.diagnosis.search import from_other_starts, without
 from vinetrack.diagnosis.singles import Report, Search, pairs
@@ -57,10 +64,12 @@ def inquire(found: Fit, effects: Sequence[Effect], report: Report, *, again: int
         found = from_other_starts(found)
     report("questioning the model")
     questions = question(found, effects, FIRST_LEVEL)
-    if not questions.something:
+    if not questions.something and not questions.suspect:
         return [Finding(ADEQUATE, questions)]
     search = Search(questions, report)
     tried = search.singles()
+    if not questions.something and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
+        return [Finding(ADEQUATE, questions, tried=tuple(tried), search=search)]
     if tried and again < MOST_AGAIN:
         rival = without(found, best_of(tried).fit)
         if rival.log_likelihood > found.log_likelihood + NO_BETTER:
@@ -76,7 +85,7 @@ def inquire(found: Fit, effects: Sequence[Effect], report: Report, *, again: int
     if not believed or best_of(believed).sigma < questions.threshold:
         # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
         loud = questions.possible.max(initial=0.0) > questions.threshold + LOUD
-        fails = questions.shaped or questions.off or loud
+        fails = questions.fails or questions.off or loud
         verdict = UNEXPLAINED if fails else ADEQUATE
         return [Finding(verdict, questions, tried=tuple(tried), search=search)]
     report("two effects together")

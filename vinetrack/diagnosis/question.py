@@ -11,6 +11,7 @@ import numpy as np
 
 from vinetrack.diagnosis.answers import Answers, answers_of
 from vinetrack.diagnosis.hypotheses import Shape, plausible_range, shapes_of
+from vinetrack.diagnosis.own_deviations import conditions_apart, noisier_in_motion
 from vinetrack.diagnosis.screen import (
     Products,
     Scores,
@@ -41,6 +42,10 @@ FAR_OFF = 4.0
 OFF, OFF_OTHERWISE = 6e-4, 1.5e-4
 """Part of its growth by which the median trial is missed beyond any tracker's slow errors: 0.1 mm of 170 mm. Positions
 without a stated error, and pressures that were set, have no such errors that anybody knows of."""
+
+SUSPECT, SUSPECT_CHANCE, SUSPECT_SIGMAS = 1.5, 1e-2, 6.0
+"""χ² per degree of freedom, and chance of what trials bend, from which effects are fitted although no score is high,
+and what one must then be worth in standard deviations. Heavy tails alone reach 1.5."""
 
 TESTABLE_SIGMAS = 3.0
 """An effect whose largest plausible size would show by less than this cannot be tested here."""
@@ -91,7 +96,22 @@ class Questions:
     @property
     def something(self) -> bool:
         """Whether anything is missing, known or not."""
-        return bool(self.off or self.shaped or (self.possible.size and self.possible.max() > self.threshold))
+        return bool(self.off or self.fails or (self.possible.size and self.possible.max() > self.threshold))
+
+    @property
+    def fails(self) -> bool:
+        """Whether what is left has a shape, is alike in replicates, or is louder in motion than at rest."""
+        return self.shaped or self.hidden < 0.1 * self.level
+
+    @cached_property
+    def hidden(self) -> float:
+        """Chance of what trials take upon themselves, or lets pass for noise."""
+        return min(conditions_apart(self.found), noisier_in_motion(self.found))
+
+    @property
+    def suspect(self) -> bool:
+        """Whether a fit that passes is worth a search all the same: it may have bent everything until it fits."""
+        return self.found.chi2_per_dof > SUSPECT or self.hidden < SUSPECT_CHANCE
 
     @cached_property
     def whispers(self) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vinetrack.diagnosis.hypotheses import Shape
+from vinetrack.diagnosis.hypotheses import Shape, is_plausible
 from vinetrack.effects import Effect
 from vinetrack.model.fit import lost, refit
 from vinetrack.model.fit_data import FitError, FitTrial
@@ -36,8 +36,12 @@ MOST_CLIMBED = 14
 """Trials of a climb: one of every condition, no more than this."""
 
 FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
+SLOW_NOISE = 0.99
 LOWER, LOWER_PER_POINT = 1.0, 0.02
 """By how much −2 ln L of a climb must end lower for its start to be worth a fit."""
+
+FAR_BEYOND = 6.0
+"""Times its plausible range."""
 
 HOPELESS = 0.5
 """A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far."""
@@ -55,6 +59,16 @@ class Climb:
     def names(self) -> tuple[str, ...]:
         """Names of the effects that were added."""
         return tuple(effect.name for effect in self.effects)
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether it ended at sizes so far beyond belief that a full fit will not bring it back."""
+        return any(
+            not is_plausible(parameter, value, 0.0, widened=FAR_BEYOND)
+            for effect in self.effects
+            for parameter in effect.parameters
+            if isinstance(value := self.values.get(f"{effect.name}.{parameter.name}"), float)
+        )
 
 
 class Slope:
@@ -182,6 +196,9 @@ def full_fit(found: Fit, climb: Climb, best: float = -math.inf) -> Fit | None:
         model = model + effect
     try:
         fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False)
+        if fit.noise_correlation > SLOW_NOISE and lost(fit.predictor, fit.solution):
+            # Noise that wanders as it likes makes anything likely.
+            return None
         if fit.converged or fit.log_likelihood < best - FAR_BEHIND or lost(fit.predictor, fit.solution):
             return fit
         return refit(fit, most_iterations=MORE_OF_FIT, thorough=False)

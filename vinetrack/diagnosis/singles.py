@@ -33,7 +33,10 @@ SHARE_WORTH_A_CLIMB = 0.2
 FEWEST_CLIMBED, LOUDEST = 5, 4
 """The most promising and those with the largest scores: what is left of a fit far off may show in either way alone."""
 
-REACH_OF_CLIMBS, SHARE_OF_REACH = 40.0, 0.1
+REACH_OF_CLIMBS, SHARE_OF_REACH, ALIKE_REACH = 40.0, 0.1, 5.0
+"""How far behind the best in −2 ln L a climb may end to be worth a fit: this, or this part of what the best gains, and
+so many times further where the two look alike."""
+
 MOST_FITTED = 7
 STARTS_EACH = 3
 SURELY = 6.0
@@ -53,6 +56,7 @@ class Search:
     climbs: dict[str, Climb] = field(default_factory=dict)
     fitted: dict[str, Evidence] = field(default_factory=dict)
     silent: set[str] = field(default_factory=set)
+    simplified: set[int] = field(default_factory=set)
     asked: dict[int, Questions] = field(default_factory=dict)
     most_fitted: int = MOST_FITTED
 
@@ -63,7 +67,8 @@ class Search:
     @property
     def weak(self) -> bool:
         """Whether predictions from sensitivities are good enough to choose by."""
-        return not self.questions.far_off and max(map(self.questions.promise, self.names), default=0.0) < WEAK
+        settled = not self.questions.far_off and not self.questions.suspect
+        return settled and max(map(self.questions.promise, self.names), default=0.0) < WEAK
 
     @property
     def names(self) -> list[str]:
@@ -82,7 +87,7 @@ class Search:
         if self.weak:
             return self._fit_weak(all_of_them=all_of_them)
         self._climb_all(self.names if all_of_them else self._worth_a_climb())
-        leaders = sorted(self.climbs.values(), key=lambda one: one.deviance)
+        leaders = sorted(self.climbs.values(), key=lambda one: (one.hopeless, one.deviance))
         if not leaders:
             return []
         best = leaders[0]
@@ -90,7 +95,10 @@ class Search:
         gain = max((base.deviance if base else best.deviance) - best.deviance, 0.0)
         reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
         alike = [c for c in leaders if self.questions.cosine(c.names[0], best.names[0]) > ALIKE]
-        chosen = [one for one in leaders if one.deviance - best.deviance < reach or one in alike]
+        near = [
+            one for one in leaders if one.deviance - best.deviance < (ALIKE_REACH * reach if one in alike else reach)
+        ]
+        chosen = [one for one in near if not one.hopeless] or near
         for climb in chosen[: self.most_fitted + 3 * all_of_them]:
             self._fit(climb)
         self._fit_what_is_contained()
@@ -100,6 +108,9 @@ class Search:
         """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
         found = self.questions.found
         for one in list(self.fitted.values()):
+            if id(one.fit) in self.simplified:
+                continue
+            self.simplified.add(id(one.fit))
             for both, fit in simpler_forms(found, one, self.questions.effects):
                 simpler = weigh(found, both, fit)
                 known = self.fitted.get(simpler.label)

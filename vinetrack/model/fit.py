@@ -59,6 +59,9 @@ ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 40
 BAD_START = 1.5
 """χ² per point from which a start misses by more than the noise of the fit it came from."""
 
+STRICT_ITERATIONS, HOPELESS = 8, 30.0
+"""After so many steps led by the noise of the tracks alone, χ² per degree of freedom above which none will help."""
+
 GUIDING_SPREADS, STRICT_SPREADS = (5e-4, 1e-3), (0.01, 0.03)
 
 
@@ -221,7 +224,13 @@ def _strictly(predictor: Predictor, theta: Floats, own: Floats, held: Held, watc
     state, frame = first_state(predictor.data, theta, own), make_frame(predictor, own)
     noise = Held(spread=held.spread or STRICT_SPREADS, noise=(state.rho, state.variance))
     try:
-        first = solve(predictor, frame, state, noise, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+        first = solve(predictor, frame, state, noise, warm=True, most_iterations=STRICT_ITERATIONS, watch=watch)
+        if chi2_per_dof(predictor, first) > HOPELESS:
+            return None
+        if not first.converged:
+            first = solve(
+                predictor, frame, first.state, noise, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch
+            )
         if chi2_per_dof(predictor, first) > POOR_FIT:
             return None
         return solve(predictor, frame, first.state, held, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)

@@ -29,12 +29,16 @@ from vinetrack.model.whitened import all_products, at_correlation, whiten
 from vinetrack.records import Floats
 
 RELEASES = 60
-NEAR_FRAMES = np.arange(-14.0, 15.0)
-"""Where else the release of a trial may be that was seen at rest, from where it is held to be."""
+NEAR_FRAMES = np.concatenate([np.arange(-14.0, 15.0), [-0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6]])
+"""Where else the release of a trial may be that was seen at rest, from where it is held to be. Close by, it may lie on
+the other side of a frame at which the edge jumps."""
 
 GRID_POINTS = 600
 WORTH_MOVING = 0.5
 """Fall of a trial's −2 ln L for which its release jumps to another minimum."""
+
+HARDLY_MISSED = 30.0
+"""Times the variance of its noise by which a trial may be missed for its release to be looked for."""
 
 IMPROVED = 3
 """Steps in which a trial settles at another release before it is held against where it was."""
@@ -46,8 +50,17 @@ DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
 
 
 def release_again(predictor: Predictor, frame: Frame, state: State) -> State | None:
-    """The state with likelier releases; None if none is. Trials whose pressure was recorded are left alone."""
-    places = [i for i, item in enumerate(predictor.data) if item.trace is None]
+    """The state with likelier releases; None if none is.
+
+    Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than noise:
+    another release would make up for something else.
+    """
+    missed = trial_costs(predictor, frame, state) * state.variance / (1 - state.rho**2) / frame.points
+    places = [
+        i
+        for i, item in enumerate(predictor.data)
+        if item.trace is None and (not item.shows_rest or missed[i] < HARDLY_MISSED * item.noise_m**2)
+    ]
     if not places:
         return None
     plain = predictor.jobs(state.theta, state.own)

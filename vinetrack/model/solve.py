@@ -31,7 +31,7 @@ SETTLED_DECREASE = 1e-2
 """A step that promises less than this of −2 ln L moves every number by under a twentieth of its error."""
 
 SETTLED_SPREAD = 0.02
-NEARLY_SETTLED, PATIENCE, MOST_LOOKS = 3.0, 4, 5
+NEARLY_SETTLED, PATIENCE, MOST_LOOKS = 3.0, 4, 8
 """Where a step promises less, or after so many steps, releases that no frame at rest shows are looked for elsewhere: a
 step only creeps along such a valley. So often at most."""
 
