@@ -111,6 +111,8 @@ def ask_vinetrack(kind: str, seed: int) -> Row:
     numbers = [number for c in said.rounds[0].ranking if c.status == "refitted" for number in c.numbers]
     if len(campaign.truth.effects) > 1:
         numbers = list(said.fits[-1].numbers)
+        # Beside a fault of the measurement the other size is the one stated along with it.
+        numbers = next(([*c.numbers, *c.along] for c in said.rounds[-1].ranking if c.along), numbers)
     row["sizes"] = json.dumps(_sizes(numbers, campaign.truth.values))
     return row
 

@@ -251,6 +251,7 @@ def _ranking(finding: Finding, blind: Mapping[str, str]) -> list[Candidate]:
                     effect.name in finding.answer,
                     aside.get(effect.name, one.reason),
                     largest,
+                    one.others if effect.name in finding.answer else (),
                 )
             )
         elif finding.verdict == ADEQUATE and not shows and z < questions.threshold:

@@ -64,6 +64,11 @@ class Evidence:
             if number.key.split(".")[0] in self.names and math.isfinite(number.sigma)
         )
 
+    @property
+    def others(self) -> tuple[Number, ...]:
+        """All other numbers of its fit."""
+        return tuple(number for number in self.fit.numbers if number.key.split(".")[0] not in self.names)
+
 
 def weigh(before: Fit, effects: Sequence[Effect], after: Fit) -> Evidence:
     """Hold a refit against the fit without the effects."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vinetrack.diagnosis.evidence import ANSWER_SET, MOST_INFLATION, Evidence, answer_set
+from vinetrack.diagnosis.evidence import ANSWER_SET, MOST_INFLATION, Evidence, answer_set, weigh
 from vinetrack.diagnosis.question import (
     FAR_OFF,
     FIRST_LEVEL,
@@ -209,9 +209,10 @@ def _in_order(
         return [first]
     base = by_name.get(first_name)
     later = question(base.fit if base else turned[0].fit, questions.effects, LATER_LEVEL)
-    seconds = tuple(one.names[-1] for one in turned)
-    second_verdict = verdict_of(turned)
-    second = Finding(second_verdict, later, tuple(turned), tuple(turned), answer=seconds)
+    seconds = tuple(weigh(later.found, one.effects[1:], one.fit) for one in turned)
+    second_verdict = verdict_of(seconds)
+    names = tuple(one.names[0] for one in seconds)
+    second = Finding(second_verdict, later, seconds, seconds, answer=names)
     return [first, second, Finding(ADEQUATE, after)] if second_verdict == MISSING else [first, second]
 
 

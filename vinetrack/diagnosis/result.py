@@ -39,7 +39,8 @@ class Candidate:
 
     `delta_chi2` is by how much −2 ln L falls when it is added (predicted from sensitivities where only `screened`), and
     `sigma` what that is worth in standard deviations for the numbers it brings. `numbers` are its sizes with errors
-    and 95 % intervals. `largest` maps each parameter to the largest size that could still hide, one-sided 95 %.
+    and 95 % intervals, `along` those of all else that is fitted with it, where it is in the answer set. `largest` maps
+    each parameter to the largest size that could still hide, one-sided 95 %.
     `reason` says in words why it is not testable, or not plausible, or another's limit.
     """
 
@@ -53,6 +54,7 @@ class Candidate:
     in_answer_set: bool = False
     reason: str = ""
     largest: Mapping[str, float] = field(default_factory=dict)
+    along: tuple[Number, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
@@ -67,6 +69,7 @@ class Candidate:
             "in_answer_set": self.in_answer_set,
             "reason": self.reason,
             "largest": dict(self.largest),
+            "along": [number_entry(number) for number in self.along],
         }
 
 

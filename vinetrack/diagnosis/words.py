@@ -17,6 +17,7 @@ from vinetrack.diagnosis.result import (
     Round,
 )
 from vinetrack.model.fit_result import SHOWN_AS, Number, decimals
+from vinetrack.model.model import base_model
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -85,7 +86,7 @@ def explain(finding: Finding) -> str:
         return (
             f"The measurement is at fault rather than the physics: {which} mends what {model} misses "
             f"({'; '.join(_one(one.names, one.numbers) for one in kept)}). It is not added to the model: "
-            "find the fault and measure again, or correct the sheet."
+            f"find the fault and measure again, or correct the sheet.{_with_the_fault(finding)}"
         )
     text = (
         f"{model} fails beyond the noise of {trials}, and no effect of the catalogue nor any two of those that help "
@@ -94,6 +95,18 @@ def explain(finding: Finding) -> str:
     for name, why in finding.aside:
         text += f" Nearest comes {name.replace('+', ' with ')}: {why}."
     return text
+
+
+def _with_the_fault(finding: Finding) -> str:
+    """What effects found before amount to once the fault is fitted along: without it they make up for it."""
+    found, best = finding.questions.found, finding.kept[0]
+    mine = [number for number in best.others if number.key.split(".")[0] not in base_model()]
+    before = {number.name: number for number in found.numbers}
+    moved = [number for number in mine if number.name in before and math.isfinite(number.sigma)]
+    if not moved:
+        return ""
+    instead = sizes_in_words([before[number.name] for number in moved])
+    return f" Fitted along with {best.names[-1]}, {sizes_in_words(moved)} instead of {instead}."
 
 
 def _one(names: Sequence[str], numbers: Sequence[Number]) -> str:
