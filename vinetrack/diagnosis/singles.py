@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vinetrack.diagnosis.evidence import Evidence, weigh
+from vinetrack.diagnosis.evidence import ANSWER_SET, MOST_INFLATION, Evidence, weigh
 from vinetrack.diagnosis.question import LATER_LEVEL, Questions, question
 from vinetrack.diagnosis.search import Climb, Slope, best_climb, full_fit, start_of, starts_of
 from vinetrack.effects import Effect
@@ -107,8 +107,11 @@ class Search:
     def _fit_what_is_contained(self) -> None:
         """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
         found = self.questions.found
+        best = max((one.fit.log_likelihood for one in self.fitted.values()), default=0.0)
         for one in list(self.fitted.values()):
-            if id(one.fit) in self.simplified:
+            # The simpler is in the larger one, and can be no better.
+            behind = 2 * (best - one.fit.log_likelihood) > ANSWER_SET * MOST_INFLATION
+            if behind or id(one.fit) in self.simplified:
                 continue
             self.simplified.add(id(one.fit))
             for both, fit in simpler_forms(found, one, self.questions.effects):
