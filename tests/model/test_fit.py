@@ -382,3 +382,9 @@ def test_whoever_watches_is_told_of_every_step_and_may_end_the_fit() -> None:
 
     with pytest.raises(TimeoutError):
         vt.refit(found, watch=enough)
+
+
+def test_a_refit_begun_afresh_ends_where_the_fit_was(campaign: Campaign) -> None:
+    found = campaign[0]
+    again = vt.refit(found, afresh=True)
+    assert again.log_likelihood == pytest.approx(found.log_likelihood, abs=0.3)

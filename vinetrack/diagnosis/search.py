@@ -186,16 +186,17 @@ def best_climb(slope: Slope, starts: Sequence[Start], goal: float) -> Climb | No
     return best
 
 
-def full_fit(found: Fit, climb: Climb, best: float = -math.inf) -> Fit | None:
+def full_fit(found: Fit, climb: Climb, best: float = -math.inf, *, afresh: bool = False) -> Fit | None:
     """The hypothesis fitted to all trials from where its climb ended; None where it cannot be followed.
 
-    One whose ln L is still far below the `best` after the first iterations is left unsettled.
+    `afresh` begins with nothing of what the fit had bent to do without it. One whose ln L is still far below the `best`
+    after the first iterations is left unsettled.
     """
     model = found.model
     for effect in climb.effects:
         model = model + effect
     try:
-        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False)
+        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False, afresh=afresh)
         if fit.noise_correlation > SLOW_NOISE and lost(fit.predictor, fit.solution):
             # Noise that wanders as it likes makes anything likely.
             return None

@@ -24,6 +24,9 @@ Report = Callable[[str], None]
 WEAK = 100.0
 """Δχ² up to which what the sensitivities predict is good to a per cent: hypotheses are then fitted without a climb."""
 
+PART_KEPT = 0.1
+"""Part of what a climb gained that a fit to all trials must gain, or it is begun again."""
+
 WORSE = -1.0
 """An effect added can do no harm: Δχ² below this is a fit that has lost its way."""
 
@@ -63,6 +66,7 @@ class Search:
     def __post_init__(self) -> None:
         self.slope = Slope(self.questions.found)
         self.goal = math.inf
+        self.base = -math.inf
 
     @property
     def weak(self) -> bool:
@@ -92,7 +96,8 @@ class Search:
             return []
         best = leaders[0]
         base = self.slope.climb((), {}, iterations=4)
-        gain = max((base.deviance if base else best.deviance) - best.deviance, 0.0)
+        self.base = base.deviance if base else best.deviance
+        gain = max(self.base - best.deviance, 0.0)
         reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
         alike = [c for c in leaders if self.questions.cosine(c.names[0], best.names[0]) > ALIKE]
         near = [
@@ -189,19 +194,21 @@ class Search:
             return
         self.report(f"fitting {name}")
         best = max((one.fit.log_likelihood for one in self.fitted.values()), default=-math.inf)
-        fit = full_fit(self.questions.found, climb, best)
-        if fit is None:
-            self.silent.add(name)
-            return
-        found = weigh(self.questions.found, climb.effects, fit)
-        if found.delta_chi2 < WORSE:
-            # The smaller model is in this one: it was led astray by its start, and begins again where the other ended.
-            fit = full_fit(self.questions.found, Climb(climb.effects, math.nan, self._smallest(climb.effects)), best)
-            found = max((found, *([weigh(self.questions.found, climb.effects, fit)] if fit else [])), key=_gain)
-        if found.delta_chi2 < WORSE:
+        found = self._from_climb(climb, best)
+        promised = self.base - climb.deviance if math.isfinite(climb.deviance) else 0.0
+        if found is not None and found.delta_chi2 < max(WORSE, PART_KEPT * promised):
+            # The smaller model is in this one, and part of the trials gained more: it was led astray by its start.
+            smallest = Climb(climb.effects, math.nan, self._smallest(climb.effects))
+            others = (self._from_climb(climb, best, afresh=True), self._from_climb(smallest, best))
+            found = max((one for one in (found, *others) if one is not None), key=_gain)
+        if found is None or found.delta_chi2 < WORSE:
             self.silent.add(name)
         elif name not in self.fitted or found.delta_chi2 > self.fitted[name].delta_chi2:
             self.fitted[name] = found
+
+    def _from_climb(self, climb: Climb, best: float, *, afresh: bool = False) -> Evidence | None:
+        fit = full_fit(self.questions.found, climb, best, afresh=afresh)
+        return None if fit is None else weigh(self.questions.found, climb.effects, fit)
 
 
 def _gain(one: Evidence) -> float:

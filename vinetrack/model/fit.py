@@ -287,6 +287,7 @@ def refit(
     profile: bool = False,
     most_iterations: int = MOST_ITERATIONS,
     thorough: bool = True,
+    afresh: bool = False,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
@@ -304,6 +305,8 @@ def refit(
     thorough
         Whether a fit far off that takes what it misses for slow noise is led on by what it misses until nothing moves;
         else it is only led so far that it can be held against others.
+    afresh
+        Whether releases, deviations and noise begin as the tracks show them, and not as the fit left them.
     watch
         Told of every step of the iterations; what it raises ends the fit.
     """
@@ -327,7 +330,7 @@ def refit(
             theta[k] = number.inside(float(np.clip(values[number.name], number.lower, number.upper)))
     held = Held(old.spread if hold_spreads else None, (old.rho, old.variance) if hold_noise else None)
     try:
-        if before.chi2_per_dof > POOR_FIT:
+        if afresh or before.chi2_per_dof > POOR_FIT:
             own, _ = align(data, predictor, theta, first_own(data))
             solution = _solve_from(predictor, theta, own, held, most_iterations=most_iterations, watch=watch)
         else:
