@@ -66,7 +66,7 @@ def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
 def noisier_in_motion(found: Fit) -> float:
     """Chance at which positions in motion are so much noisier, over stretches, than at rest; 1 where nobody can tell.
 
-    Positions with stated errors come from recordings, whose slow errors in motion are known to be larger.
+    Positions read from recordings are not asked: a tracker's slow errors in motion are larger than those at rest.
     """
     from scipy.stats import f
 
@@ -74,7 +74,7 @@ def noisier_in_motion(found: Fit) -> float:
     motion: list[Floats] = []
     freedom = 0.0
     for trial, item in zip(found.trials, found.predictor.data, strict=True):
-        if math.isfinite(item.stated_sigma_m):
+        if math.isfinite(item.tracker_sigma_m):
             continue
         here = _sums(trial.whitened[: item.n_rest])
         if here.size < 2:

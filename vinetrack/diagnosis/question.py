@@ -41,7 +41,7 @@ FAR_OFF = 4.0
 
 OFF, OFF_OTHERWISE = 6e-4, 1.5e-4
 """Part of its growth by which the median trial is missed beyond any tracker's slow errors: 0.1 mm of 170 mm. Positions
-without a stated error, and pressures that were set, have no such errors that anybody knows of."""
+that somebody else measured, and pressures that were set, have no such errors that anybody knows of."""
 
 SUSPECT, SUSPECT_CHANCE, SUSPECT_SIGMAS = 1.5, 1e-2, 6.0
 """χ² per degree of freedom, and chance of what trials bend, from which effects are fitted although no score is high,
@@ -138,7 +138,7 @@ class Questions:
     def _allowed(self) -> float:
         """The part that may be missed: less where neither the tracks nor a gauge have slow errors to own up to."""
         data = self.found.predictor.data
-        slow = any(math.isfinite(item.stated_sigma_m) or item.trace is not None for item in data)
+        slow = any(math.isfinite(item.tracker_sigma_m) or item.trace is not None for item in data)
         return OFF if slow else OFF_OTHERWISE
 
     @property

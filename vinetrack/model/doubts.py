@@ -73,8 +73,8 @@ def _set_pressures(predictor: Predictor, solution: Solution) -> list[Floats]:
 
 
 def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
-    """Slow errors along the picture, of the size of the error that tracks state of their positions, if they do."""
-    stated = np.array([item.stated_sigma_m for item in predictor.data])
+    """Slow errors along the picture, of the size of the error that is stated of positions read from recordings."""
+    stated = np.array([item.tracker_sigma_m for item in predictor.data])
     if not np.isfinite(stated).any():
         return [np.zeros((trial.time_s.size, 0)) for trial in trials]
     sigma_m = float(np.nanmedian(stated))

@@ -72,7 +72,7 @@ class FitTrial:
     trace: tuple[Floats, Floats] | None = None
     gauge_error: float = 0.0
     vague_rest: VagueRest | None = None
-    stated_sigma_m: float = math.nan  #: median error of a position that the track states itself
+    tracker_sigma_m: float = math.nan  #: median error of a position that was read from a recording
 
     @cached_property
     def frame_s(self) -> float:
@@ -144,6 +144,8 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     n_rest = rest_points(position_m)
     trace, gauge_error = _trace(track, time_s[max(n_rest - 1, 0) :])
     stated_m = track.lead_position_sigma_m[usable]
+    # Of positions that somebody else measured, an error is that of the point alone; a tracker errs slowly besides.
+    filmed = trial.video is not None
     return FitTrial(
         trial=trial,
         time_s=time_s,
@@ -155,7 +157,7 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         trace=trace,
         gauge_error=gauge_error,
         vague_rest=vague_rest,
-        stated_sigma_m=float(np.nanmedian(stated_m)) if np.isfinite(stated_m).any() else math.nan,
+        tracker_sigma_m=float(np.nanmedian(stated_m)) if filmed and np.isfinite(stated_m).any() else math.nan,
     )
 
 
