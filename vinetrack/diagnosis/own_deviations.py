@@ -66,7 +66,8 @@ def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
 def noisier_in_motion(found: Fit) -> float:
     """Chance at which positions in motion are so much noisier, over stretches, than at rest; 1 where nobody can tell.
 
-    Positions read from recordings are not asked: a tracker's slow errors in motion are larger than those at rest.
+    Positions read from recordings are not asked, for a tracker's slow errors in motion are larger than those at rest,
+    and none under a recorded pressure, for a gauge's noise moves what the model predicts.
     """
     from scipy.stats import f
 
@@ -74,7 +75,7 @@ def noisier_in_motion(found: Fit) -> float:
     motion: list[Floats] = []
     freedom = 0.0
     for trial, item in zip(found.trials, found.predictor.data, strict=True):
-        if math.isfinite(item.tracker_sigma_m):
+        if math.isfinite(item.tracker_sigma_m) or item.gauge_error > 0:
             continue
         here = _sums(trial.whitened[: item.n_rest])
         if here.size < 2:
