@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -100,7 +101,9 @@ def report(rows: list[Row]) -> None:
     print(f"\n{len(table)} answers about {len(table.drop_duplicates(['kind', 'seed']))} campaigns\n")
     answers = table[table["method"] != "left_out"]
     print(tables.headline(answers).to_string(), "\n")
-    print(f"answer sets above 8 σ hold {tables.surplus(table):+.2f} names more than exhaustive refits leave tied")
+    surplus = tables.surplus(table)
+    if math.isfinite(surplus):
+        print(f"answer sets above 8 σ hold {surplus:+.2f} names more than exhaustive refits leave tied")
     if "left_out" in set(table["method"]):
         show("errors on left-out conditions, in those of the true model", tables.left_out(table))
     for method, group in answers.groupby("method", sort=False):

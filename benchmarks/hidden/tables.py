@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pandas as pd
 
-from hidden.kinds import EFFECTS, MEASUREMENT
+from hidden.kinds import EFFECTS, INTERRUPTED, MEASUREMENT
 
 FAULTS = {*MEASUREMENT, "dropped_frames"}
 SIGMA_BINS = (0, 3, 5, 8, 15, 40, math.inf)
@@ -58,7 +58,7 @@ def visible(rows: pd.DataFrame) -> pd.DataFrame:
 def tied_sizes(rows: pd.DataFrame) -> pd.Series:
     """How many hypotheses the data leave tied, from exhaustive refits (the rows of `bic`), by kind and seed."""
     known = rows[(rows["method"] == "bic") & (rows["tied"].notna() & (rows["tied"] != ""))]
-    return known.set_index(["kind", "seed"])["tied"].str.split("|").str.len()
+    return known.set_index(["kind", "seed"])["tied"].astype(str).str.split("|").str.len()
 
 
 def surplus(rows: pd.DataFrame) -> float:
@@ -101,7 +101,7 @@ def false_alarms(rows: pd.DataFrame) -> pd.DataFrame:
 
 def singles(rows: pd.DataFrame) -> pd.DataFrame:
     """One hidden effect of the catalogue."""
-    return rows[rows["hidden"].isin(set(EFFECTS) | {"dropped_frames"})]
+    return rows[rows["hidden"].isin({*EFFECTS, *INTERRUPTED, "dropped_frames"})]
 
 
 def by_effect(rows: pd.DataFrame) -> pd.DataFrame:
