@@ -27,6 +27,9 @@ CENTRINGS = 3
 """Times the strip may be cut anew: what lay outside the first shows only in the second."""
 APART_PX = 1.0
 """Bands of the edge that disagree by more cannot all be its own."""
+MOSTLY_LOST = 0.5
+"""Part of the frames without an edge from which a recording is not one where nothing moves."""
+
 STEADIED_PX = 0.1
 """Error of a camera's shake taken off by what stands still: measured 0.1-0.15 px, mostly of its slow part."""
 OFF_CENTRE_PX = 0.8
@@ -133,6 +136,11 @@ def track_frames(
     )  # fmt: skip
     sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
     if verdict.last_moving < 0:
+        if np.mean(~(sigma < LOST_SIGMA_PX)) > MOSTLY_LOST:
+            raise RecordingError(
+                f"{name}: something moves, but its edge is too vague to be followed: film it nearer, with more light or"
+                " contrast, or at more frames a second"
+            )
         raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
     scale = trial.m_per_px if m_per_px is None else m_per_px
     notes = [*frames.notes, *verdict.notes]
