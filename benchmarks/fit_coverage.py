@@ -23,10 +23,11 @@ import pandas as pd
 from tqdm import tqdm
 
 import vinetrack as vt
-from vinetrack.laboratory.campaign import PAPER_CHAMBER_M3, campaign, damping_values, isometric_vine
+from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
 from vinetrack.laboratory.nature import BASE, Nature
 from vinetrack.laboratory.tracks import VirtualTrial, grow
 from vinetrack.naming import with_names
+from vinetrack.published import CHAMBER_L
 from vinetrack.records import Floats, Track, Trial
 
 NOISE_M = 1e-4
@@ -37,7 +38,7 @@ def sheet() -> list[Trial]:
     """Two vines, four pressures each, three trials a pressure."""
     trials = campaign(isometric_vine(4), (14, 18, 23, 28), 3, prefix="a")
     trials += campaign(isometric_vine(3), (14, 20, 28, 40), 3, prefix="b")
-    return [replace(trial, chamber_m3=PAPER_CHAMBER_M3) for trial in with_names(trials)]
+    return [replace(trial, chamber_m3=CHAMBER_L / 1e3) for trial in with_names(trials)]
 
 
 def draw_nature(seed: int) -> tuple[Nature, float, bool]:

@@ -16,9 +16,10 @@ from dataclasses import replace
 import numpy as np
 
 import vinetrack as vt
-from vinetrack.laboratory.campaign import PAPER_CHAMBER_M3, damping_values, paper_damping
+from vinetrack.laboratory.campaign import damping_values, paper_damping
 from vinetrack.laboratory.nature import BASE, Nature
 from vinetrack.laboratory.tracks import grow
+from vinetrack.published import CHAMBER_L
 from vinetrack.records import Track, Trial
 
 SIZES = (12, 24, 48, 100, 200)
@@ -27,7 +28,7 @@ EFFECT = "reservoir_depletion"
 
 def measured(count: int, seed: int) -> list[tuple[Trial, Track]]:
     """`count` trials of the protocol, spread over vines and pressures."""
-    trials = [replace(trial, chamber_m3=PAPER_CHAMBER_M3) for trial in paper_damping(replicates=5)]
+    trials = [replace(trial, chamber_m3=CHAMBER_L / 1e3) for trial in paper_damping(replicates=5)]
     take = np.linspace(0, len(trials) - 1, count).astype(int)
     nature = Nature(
         effects=(*BASE, EFFECT),

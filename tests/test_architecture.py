@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -133,3 +134,13 @@ def test_no_two_test_files_share_a_name() -> None:
     """Pytest imports test files by their name alone: the second of two would not be run. It knows each conftest.py."""
     names = [path.name for path in (ROOT / "tests").rglob("*.py") if path.name != "conftest.py"]
     assert sorted(names) == sorted(set(names))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_a_benchmark_finds_what_it_imports(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "vinetrack":
+            room = importlib.import_module(str(node.module))
+            for alias in node.names:
+                if not hasattr(room, alias.name):
+                    importlib.import_module(f"{node.module}.{alias.name}")
