@@ -23,7 +23,7 @@ from vinetrack.diagnosis.answers import Answers, answers_of
 from vinetrack.diagnosis.hypotheses import Shape, probe
 from vinetrack.model.fit_result import Fit
 from vinetrack.model.full_errors import scatter_of
-from vinetrack.model.mixed import State, eliminated
+from vinetrack.model.mixed import State, eliminated, gather, gather_vector, inverse_among
 from vinetrack.model.sensitivity import OWN
 from vinetrack.model.whitened import products
 from vinetrack.records import Floats
@@ -118,20 +118,13 @@ def scores_of(found: Fit, sums: Products, state: State | None = None) -> Scores:
     index = frame.index
     asked = sums.n_shapes + sums.n_doubts
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
-    square = np.zeros((size + 1, size + 1))
-    np.add.at(square, (index[:, :, None], index[:, None, :]), blocks[:, X, X])
-    square = square[:size, :size] + np.diag(frame.prior_precision)
-    slope = np.zeros(size + 1)
-    np.add.at(slope, index, blocks[:, X, r])
-    slope = slope[:size] - frame.prior_precision * (state.theta - frame.prior_mean)
+    square = gather(blocks[:, X, X], frame) + np.diag(frame.prior_precision)
+    slope = gather_vector(blocks[:, X, r], frame) - frame.prior_precision * (state.theta - frame.prior_mean)
     cross = np.zeros((size + 1, asked))
     np.add.at(cross, index, blocks[:, X, C])
     cross = cross[:size]
     moving = np.flatnonzero(frame.free & (np.diag(square) > 0) & ~_pressed(found))
-    inverse = np.zeros_like(square)
-    scale = 1 / np.sqrt(np.diag(square)[moving])
-    even = square[np.ix_(moving, moving)] * scale[:, None] * scale
-    inverse[np.ix_(moving, moving)] = np.linalg.pinv(even, rcond=1e-11, hermitian=True) * scale[:, None] * scale
+    inverse = inverse_among(square, moving)
     lever, step = inverse @ cross, inverse @ slope
     total = blocks[:, C, C].sum(axis=0)
     information = total - cross.T @ lever
@@ -198,14 +191,10 @@ def _rest(found: Fit, sums: Products, state: State) -> float:
     """Sum of squares that the fit's own numbers leave, with the priors' part."""
     frame = found.solution.frame
     blocks = eliminated(sums.grams, sums.n_keys, frame, state)
-    p, size = sums.n_keys, frame.prior_mean.size
-    square = np.zeros((size + 1, size + 1))
-    np.add.at(square, (frame.index[:, :, None], frame.index[:, None, :]), blocks[:, :p, :p])
-    square = square[:size, :size] + np.diag(frame.prior_precision)
-    slope = np.zeros(size + 1)
-    np.add.at(slope, frame.index, blocks[:, :p, p])
+    p = sums.n_keys
+    square = gather(blocks[:, :p, :p], frame) + np.diag(frame.prior_precision)
     away = state.theta - frame.prior_mean
-    slope = slope[:size] - frame.prior_precision * away
+    slope = gather_vector(blocks[:, :p, p], frame) - frame.prior_precision * away
     step = np.linalg.lstsq(square, slope, rcond=1e-11)[0]
     whole = blocks[:, p, p].sum() + float(np.sum(frame.prior_precision * away**2))
     return max(float(whole - step @ slope), 1e-9 * float(whole))

@@ -15,7 +15,7 @@ import numpy as np
 from vinetrack.model.doubts import doubts_of
 from vinetrack.model.fit_result import TrialFit
 from vinetrack.model.intervals import Precision
-from vinetrack.model.mixed import eliminated
+from vinetrack.model.mixed import eliminated, gather, inverse_among
 from vinetrack.model.sensitivity import OWN, Predictor
 from vinetrack.model.solve import Solution
 from vinetrack.model.whitened import products
@@ -76,15 +76,10 @@ def _sandwich(predictor: Predictor, solution: Solution, doubts: Sequence[Floats]
         both = zip(solution.columns, doubts, predictor.data, strict=True)
         grams = np.stack([products(np.column_stack([own, doubt]), item.first) for own, doubt, item in both])
     blocks = eliminated(grams, p, frame, state)
-    square = np.zeros((size + 1, size + 1))
-    np.add.at(square, (frame.index[:, :, None], frame.index[:, None, :]), blocks[:, :p, :p])
-    square = square[:size, :size] + np.diag(frame.prior_precision)
+    square = gather(blocks[:, :p, :p], frame) + np.diag(frame.prior_precision)
     inside = (state.theta > frame.lower) & (state.theta < frame.upper)
     live = np.flatnonzero(frame.free & inside & (np.diag(square) > 0))
-    scale = 1 / np.sqrt(np.diag(square)[live])
-    even = square[np.ix_(live, live)] * scale[:, None] * scale
-    plain = np.zeros_like(square)
-    plain[np.ix_(live, live)] = np.linalg.pinv(even, rcond=1e-11, hermitian=True) * scale[:, None] * scale
+    plain = inverse_among(square, live)
     single = np.zeros((len(blocks), size + 1))
     for i, row in enumerate(blocks[:, :p, p]):
         np.add.at(single[i], frame.index[i], row)

@@ -178,6 +178,15 @@ def solve_scaled(square: Floats, slope: Floats) -> Floats:
     return np.asarray(scale * np.linalg.lstsq(even, scale * slope, rcond=1e-12)[0])
 
 
+def inverse_among(square: Floats, places: NDArray[np.int_]) -> Floats:
+    """Inverse of a symmetric matrix among these places, 0 elsewhere; directions that nothing fixes are left out."""
+    scale = 1 / np.sqrt(np.diag(square)[places])
+    even = square[np.ix_(places, places)] * scale[:, None] * scale
+    inverse = np.zeros_like(square)
+    inverse[np.ix_(places, places)] = np.linalg.pinv(even, rcond=1e-11, hermitian=True) * scale[:, None] * scale
+    return inverse
+
+
 def solve_each(square: Floats, right: Floats) -> Floats:
     """Solve the small system of every trial, shape (n_trials, k, k), brought to unit diagonals."""
     scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
@@ -191,13 +200,18 @@ def eliminated(grams: Floats, n_keys: int, frame: Frame, state: State) -> Floats
     `grams` are those of [own numbers, keys, residual, more].
     """
     white = at_correlation(grams, state.rho) / state.variance[:, None, None]
-    put_back = np.broadcast_to(np.eye(white.shape[1]), white.shape).copy()
-    for column in SPREAD_COLUMNS:
-        put_back[:, column, OWN + n_keys] = state.own[:, column]
-    white = np.swapaxes(put_back, 1, 2) @ white @ put_back
+    white = _put_back(white, state, OWN + n_keys)
     own = white[:, :OWN, :OWN] + own_prior(frame, state)[1][:, :, None] * np.eye(OWN)
     side = white[:, :OWN, OWN:]
     return np.asarray(white[:, OWN:, OWN:] - np.swapaxes(side, 1, 2) @ solve_each(own, side))
+
+
+def _put_back(white: Floats, state: State, residual: int) -> Floats:
+    """The products with what the deviations explain so far put back into the column of the residual."""
+    turn = np.broadcast_to(np.eye(white.shape[1]), white.shape).copy()
+    for column in SPREAD_COLUMNS:
+        turn[:, column, residual] = state.own[:, column]
+    return np.asarray(np.swapaxes(turn, 1, 2) @ white @ turn)
 
 
 @dataclass(frozen=True)
@@ -215,10 +229,7 @@ class Marginal:
 def marginal(grams: Floats, frame: Frame, state: State) -> Marginal:
     """Eliminate release and origin, and put back what the deviations explain so far."""
     white = at_correlation(grams, state.rho) / state.variance[:, None, None]
-    put_back = np.broadcast_to(np.eye(white.shape[1]), white.shape).copy()
-    for column in SPREAD_COLUMNS:
-        put_back[:, column, -1] = state.own[:, column]
-    white = np.swapaxes(put_back, 1, 2) @ white @ put_back
+    white = _put_back(white, state, -1)
     flat = white[:, :2, :2] + frame.own_precision[:, :, None] * np.eye(2)
     rest = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_each(flat, white[:, :2, 2:])
     log_noise = np.sum(frame.points * np.log(state.variance)) - np.sum(frame.stretches) * math.log(1 - state.rho**2)
