@@ -1,11 +1,11 @@
-# From an experiment folder to its report. Rules only: what they need to know is in vinetrack/workflow.py.
+# From an experiment folder to its report. Rules only: what they need to know is in vinetrack/pipeline/workflow.py.
 #
 #   snakemake --cores 2                               the shipped demonstration
 #   snakemake --cores 2 --config experiment=PATH      a folder of one's own
 
 from pathlib import Path
 
-from vinetrack.workflow import (
+from vinetrack.pipeline.workflow import (
     CAMPAIGN_FIGURES,
     DIAGNOSIS_FIGURES,
     PAPER_FIGURES,

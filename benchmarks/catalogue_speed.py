@@ -14,10 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.model import Model, base_model, make_model
+from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import catalogue
-from vinetrack.model.model import Model, base_model, make_model
-from vinetrack.model.simulate import simulate_many
-from vinetrack.records import Trial
 
 RUNS, COPIES = 40, 10
 LIMIT = 1.6

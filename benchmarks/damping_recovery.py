@@ -27,13 +27,13 @@ import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
+from vinetrack.dynamics.model import Model, base_model, make_model
+from vinetrack.experiment.settings import RunSettings
+from vinetrack.kinematics.damping import fit_laws, mark_half_steady
+from vinetrack.kinematics.summary import summarise_trial
 from vinetrack.laboratory.campaign import PAPER_B, PAPER_N, damping_values, paper_damping
-from vinetrack.laboratory.nature import BASE, Nature
+from vinetrack.laboratory.ground_truth import BASE, Nature
 from vinetrack.laboratory.tracks import VirtualTrial, grow
-from vinetrack.model.model import Model, base_model, make_model
-from vinetrack.motion.damping import fit_laws, mark_half_steady
-from vinetrack.motion.summary import summarise_trial
-from vinetrack.settings import RunSettings
 
 NATURES = {
     "plain": {},

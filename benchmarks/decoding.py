@@ -19,8 +19,8 @@ import av
 import cv2
 from tracking_accuracy import CAPTURE_FPS, film
 
+from vinetrack.core.records import Trial
 from vinetrack.laboratory.scene import preset
-from vinetrack.records import Trial
 from vinetrack.video.frames import DECODER_THREADS, read_frames
 from vinetrack.video.track import track_frames, track_recording
 

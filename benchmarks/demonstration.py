@@ -25,13 +25,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from vinetrack.experiment import Experiment, read_experiment
+from vinetrack.core.tables import write_text
+from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.__main__ import DEMO
 from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
-from vinetrack.laboratory.nature import read_nature
+from vinetrack.laboratory.ground_truth import read_nature
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.tracks import VirtualTrial, grow
-from vinetrack.tables import write_text
 from vinetrack.video.measure import Measurement, measure_recording
 
 SHIPPED = Path(__file__).parents[1] / "data" / "demo"

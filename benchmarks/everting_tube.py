@@ -33,7 +33,7 @@ from tube.picture import draw
 from tube.recordings import Recording, balance, read_recordings, thresholds
 
 import vinetrack as vt
-from vinetrack.experiment import Experiment
+from vinetrack.experiment.folder import Experiment
 
 AMBIENT_KPA = 101.325
 AUTHORS_START_KPA, AUTHORS_STOP_KPA = 113.1, 108.0

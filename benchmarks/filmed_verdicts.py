@@ -27,8 +27,8 @@ from hidden.campaigns import Hidden
 from hidden.filmed import film_campaign, filming_of
 
 import vinetrack as vt
-from vinetrack.records import Track, Trial
-from vinetrack.settings import ExperimentSettings
+from vinetrack.core.records import Track, Trial
+from vinetrack.experiment.settings import ExperimentSettings
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.measure import measure_recording
 

@@ -23,12 +23,12 @@ import pandas as pd
 from tqdm import tqdm
 
 import vinetrack as vt
+from vinetrack.core.published import CHAMBER_L
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.experiment.naming import with_names
 from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
-from vinetrack.laboratory.nature import BASE, Nature
+from vinetrack.laboratory.ground_truth import BASE, Nature
 from vinetrack.laboratory.tracks import VirtualTrial, grow
-from vinetrack.naming import with_names
-from vinetrack.published import CHAMBER_L
-from vinetrack.records import Floats, Track, Trial
 
 NOISE_M = 1e-4
 EFFECT = "reservoir_depletion"

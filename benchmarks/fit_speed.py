@@ -16,11 +16,11 @@ from dataclasses import replace
 import numpy as np
 
 import vinetrack as vt
+from vinetrack.core.published import CHAMBER_L
+from vinetrack.core.records import Track, Trial
 from vinetrack.laboratory.campaign import damping_values, paper_damping
-from vinetrack.laboratory.nature import BASE, Nature
+from vinetrack.laboratory.ground_truth import BASE, Nature
 from vinetrack.laboratory.tracks import grow
-from vinetrack.published import CHAMBER_L
-from vinetrack.records import Track, Trial
 
 SIZES = (12, 24, 48, 100, 200)
 EFFECT = "reservoir_depletion"

@@ -24,15 +24,15 @@ import pandas as pd
 from tqdm import tqdm
 
 import vinetrack as vt
-from vinetrack.design.believe import believe
-from vinetrack.design.from_fit import numbers_of
-from vinetrack.design.runs import run
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.simulate import simulate
+from vinetrack.experiment.naming import with_names
 from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
-from vinetrack.laboratory.nature import Nature
+from vinetrack.laboratory.ground_truth import Nature
 from vinetrack.laboratory.tracks import grow
-from vinetrack.model.simulate import simulate
-from vinetrack.naming import with_names
-from vinetrack.records import Trial
+from vinetrack.planning.fit_inputs import numbers_of
+from vinetrack.planning.input_sources import predictive_inputs
+from vinetrack.planning.prediction_runs import run
 
 DAMPING_SCATTER, PRESSURE_SCATTER = 0.03, 0.01
 SAMPLES = 400
@@ -78,7 +78,9 @@ def measure(seed: int) -> list[dict[str, object]]:
     numbers = numbers_of(vt.fit(vt.base_model(), [(one.stated, one.track) for one in grown], profile=False))
     rows = []
     for k, (name, trial) in enumerate(unseen().items()):
-        belief = believe(replace(trial, yield_pressure_Pa=np.nan, yield_pressure_sigma_Pa=np.nan), None, numbers)
+        belief = predictive_inputs(
+            replace(trial, yield_pressure_Pa=np.nan, yield_pressure_sigma_Pa=np.nan), None, numbers
+        )
         runs = run(belief, np.array([0.95 * trial.length_m]), SAMPLES, seed, with_tension=False)
         speeds = 2 * runs.end_lead_velocity_m_s if trial.payload_kg > 0 else runs.lead_velocity_m_s[:, 0]
         low, median, high = np.quantile(speeds, (0.05, 0.5, 0.95))

@@ -23,15 +23,15 @@ import time
 from io import BytesIO
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "diagnosis"))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "explorer"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 
 import pandas as pd
 from doc_commands import Shown, printed, rewritten
 from grown import grown, sheet
 
-from vinetrack.tables import write_csv, write_json
+from vinetrack.core.tables import write_csv, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

@@ -31,14 +31,14 @@ import numpy as np
 from numba import njit
 from scipy.integrate import solve_ivp
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "model"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 
 from vine_reference import G, masses, reference
 
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.model import base_model
+from vinetrack.dynamics.simulate import prepare, simulate, simulate_many
 from vinetrack.laboratory.campaign import CAPTURE_FPS, PAPER_B, PAPER_N, Vine, paper_damping, paper_payload
-from vinetrack.model.model import base_model
-from vinetrack.model.simulate import prepare, simulate, simulate_many
-from vinetrack.records import Trial
 
 FAST_B = 3.3
 RELATIVE = 10.0 ** np.arange(-4, -11.5, -0.5)

@@ -29,15 +29,15 @@ import numpy as np
 from tqdm import tqdm
 
 import vinetrack as vt
-from vinetrack.design.guess import guess_damping
-from vinetrack.diagnosis.next_trial import Limits, NextExperiment, next_experiment
+from vinetrack.core.records import Track, Trial
+from vinetrack.core.terminal import table
+from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
+from vinetrack.experiment.naming import with_names
+from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.campaign import Vine, campaign
-from vinetrack.laboratory.nature import BASE, Nature
+from vinetrack.laboratory.ground_truth import BASE, Nature
 from vinetrack.laboratory.tracks import grow
-from vinetrack.model.fit_result import Fit
-from vinetrack.naming import with_names
-from vinetrack.records import Track, Trial
-from vinetrack.terminal import table
+from vinetrack.planning.scaling_priors import damping_prior
 
 TUBE, DAMPING, EXPONENT, GUESSED_WRONG = Vine(24.0, 200.0, 280.0), 6.44, 0.37, 1.15
 
@@ -80,7 +80,7 @@ def grown(trials: Sequence[Trial], tie: Tie, seed: int) -> list[tuple[Trial, Tra
     damping = {
         t.vine: DAMPING
         if (round(t.diameter_m * 1e3), round(t.thickness_m * 1e6)) == (24, 200)
-        else GUESSED_WRONG * guess_damping(t.diameter_m, t.thickness_m)
+        else GUESSED_WRONG * damping_prior(t.diameter_m, t.thickness_m)
         for t in trials
     }
     nature = Nature(

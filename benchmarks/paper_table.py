@@ -13,7 +13,7 @@ from pathlib import Path
 from vinetrack.figures.style import rows
 from vinetrack.report.paper import every_row, table_one, table_two
 from vinetrack.report.section import ReportTable
-from vinetrack.stages.results import read_result
+from vinetrack.results.folder_layout import read_result
 
 
 def main(folder: Path) -> None:

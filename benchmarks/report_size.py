@@ -17,13 +17,13 @@ from pathlib import Path
 
 import pandas as pd
 
-from vinetrack.experiment import read_experiment
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.experiment.settings import RunSettings
+from vinetrack.pipeline.report_stage import report_content
 from vinetrack.report.build import ReportContent, build_report
-from vinetrack.settings import RunSettings
-from vinetrack.stages.report import report_content
-from vinetrack.stages.results import read_json
+from vinetrack.results.folder_layout import read_json
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "explorer"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
 RUNS = 5
 

@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "motion"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 
 from vine_truth import CAPTURE_FPS, G, Recording, Vine, ar1, make_track, record
 
-from vinetrack.motion.steady import gated_window, paper_window
-from vinetrack.motion.velocity import estimate_kinematics
-from vinetrack.records import Window
+from vinetrack.core.records import Window
+from vinetrack.kinematics.steady import gated_window, paper_window
+from vinetrack.kinematics.velocity import estimate_kinematics
 
 FIRST_SEED = 1000
 NOISES = ((3e-5, 0.0), (1e-4, 0.0), (1e-4, 0.6), (3e-4, 0.3))

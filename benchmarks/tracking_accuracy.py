@@ -23,9 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
+from vinetrack.core.records import Trial
 from vinetrack.laboratory.render import Truth, render_recording
 from vinetrack.laboratory.scene import Scene, Tube, preset
-from vinetrack.records import Trial
 from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
 from vinetrack.video.track import Tracking, track_frames
 
@@ -181,7 +181,7 @@ def hard_rows(seeds: list[int], folder: Path, names: tuple[str, ...] = HARD + BO
 
 def plain_rows(seeds: list[int], folder: Path) -> list[Row]:
     """Recordings drawn by other code, H.264 at a camera's rate."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "video"))
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
     from plain_scene import HARDER, Plan, plain_scene, write_video
 
     rows = []

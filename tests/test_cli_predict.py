@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from click.testing import Result
+from lsoda_vine import N_TRUE, small_campaign
 from typer.testing import CliRunner
 
 import vinetrack as vt
-from vinetrack.cli import app
-from vinetrack.design.foresee import CURVE_COLUMNS
-from vinetrack.stages.beliefs import Asked, beliefs_of, read_ground
-from vinetrack.stages.model import fit_entry
-from vinetrack.tables import write_json
-
-sys.path.insert(0, str(Path(__file__).parent / "model"))
-from lsoda_vine import N_TRUE, small_campaign
+from vinetrack.cli.main import app
+from vinetrack.core.tables import write_json
+from vinetrack.pipeline.model_stage import fit_entry
+from vinetrack.pipeline.prediction_inputs import Asked, beliefs_of, read_ground
+from vinetrack.planning.prediction import CURVE_COLUMNS
 
 FAST = ("--diameter-mm", 25, "--thickness-um", 100, "--length-mm", 400, "--pressure-kPa", 62)
 SHEET = "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,payload_g\n"
@@ -175,7 +172,7 @@ def test_a_vine_that_never_gets_there_says_never() -> None:
 
 def test_python_foretells_what_the_command_does() -> None:
     trial = vt.planned_trial({"diameter_mm": "25", "thickness_um": "100", "length_mm": "400", "pressure_kPa": "62"})
-    sight = vt.foresee(vt.believe(trial.trials[0]), samples=60)
+    sight = vt.predict_vine(vt.predictive_inputs(trial.trials[0]), samples=60)
     shown = row(run("predict", *FAST, *FEW).output, "speed of the leading edge")[2]
     assert float(shown) == pytest.approx(sight.final.median, rel=0.01)
     assert math.isnan(sight["hoop stress PD/2t"].y_over_L)

@@ -41,7 +41,7 @@ def test_the_python_on_the_page_runs() -> None:
     code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     assert code is not None
     known: dict[str, object] = {}
-    exec(code[1].replace("vt.believe(trial))  ", "vt.believe(trial), samples=50)  "), known)
+    exec(code[1].replace("vt.predictive_inputs(trial))  ", "vt.predictive_inputs(trial), samples=50)  "), known)
     assert known["sight"].table["unit"].tolist()[0] == "m/s"  # type: ignore[attr-defined]
 
 

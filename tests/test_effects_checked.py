@@ -8,8 +8,8 @@ import pytest
 from hand_sheet import two_vines
 from typer.testing import CliRunner
 
-from vinetrack.cli import app
-from vinetrack.stages.effects import model_problems
+from vinetrack.cli.main import app
+from vinetrack.pipeline.effects_stage import model_problems
 
 BASE = "pressure_drive, gravity, eversion_damping, yield_pressure"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from hand_sheet import GOOD, HEADER, TRACK, two_vines, write
 
-from vinetrack.experiment import Experiment, Problem, check_experiment, format_problems, read_experiment
-from vinetrack.records import Trial
+from vinetrack.core.records import Trial
+from vinetrack.experiment.folder import Experiment, Problem, check_experiment, format_problems, read_experiment
 
 
 @pytest.fixture

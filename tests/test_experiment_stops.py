@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hand_sheet import GOOD, HEADER, stopped, two_vines, write
 
-from vinetrack.experiment import read_experiment
+from vinetrack.experiment.folder import read_experiment
 
 
 @pytest.fixture

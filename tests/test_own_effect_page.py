@@ -10,11 +10,11 @@ import pytest
 from doc_commands import Shown, pieces
 from typer.testing import CliRunner
 
-from vinetrack.cli import app
+from vinetrack.cli.main import app
 from vinetrack.effects import EffectError
 from vinetrack.effects._own import own_effects
-from vinetrack.experiment import read_experiment
-from vinetrack.stages.tracks import model_of
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.pipeline.tracks_stage import model_of
 
 PAGE = Path(__file__).parents[1] / "docs" / "own_effect.md"
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\na,a.csv,12,100,300,20,3\n"

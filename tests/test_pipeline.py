@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from vinetrack.cli import app
+from vinetrack.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 N = 0.4

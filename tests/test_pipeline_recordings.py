@@ -19,11 +19,11 @@ import pytest
 from test_pipeline import read_rows, snakemake
 from typer.testing import CliRunner
 
-from vinetrack.cli import app
-from vinetrack.experiment import read_experiment
+from vinetrack.cli.main import app
+from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film, picture_target
-from vinetrack.laboratory.nature import Nature
+from vinetrack.laboratory.ground_truth import Nature
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.targets import Target
 from vinetrack.laboratory.tracks import grow

@@ -10,7 +10,7 @@ import pytest
 import typer.main
 from doc_commands import Shown, pieces
 
-from vinetrack.cli import app
+from vinetrack.cli.main import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -13,28 +13,32 @@ Whatever is named here is loaded when it is first used.
 
 from __future__ import annotations
 
+import warnings
 from importlib import import_module
 from typing import Any
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "FitError": "vinetrack.model.fit",
-    "Model": "vinetrack.model.model",
-    "Said": "vinetrack.design.believe",
-    "base_model": "vinetrack.model.model",
-    "believe": "vinetrack.design.believe",
+    "FitError": "vinetrack.inference.fit",
+    "Model": "vinetrack.dynamics.model",
+    "StatedValues": "vinetrack.planning.input_sources",
+    "base_model": "vinetrack.dynamics.model",
     "compare": "vinetrack.diagnosis.compare",
     "diagnose": "vinetrack.diagnosis.diagnose",
-    "fit": "vinetrack.model.fit",
-    "foresee": "vinetrack.design.foresee",
-    "make_model": "vinetrack.model.model",
-    "planned_trial": "vinetrack.planned",
-    "predict": "vinetrack.model.fit",
-    "read_experiment": "vinetrack.experiment",
-    "refit": "vinetrack.model.fit",
-    "simulate": "vinetrack.model.simulate",
+    "fit": "vinetrack.inference.fit",
+    "make_model": "vinetrack.dynamics.model",
+    "planned_trial": "vinetrack.experiment.planned",
+    "predict": "vinetrack.inference.fit",
+    "predict_vine": "vinetrack.planning.prediction",
+    "predictive_inputs": "vinetrack.planning.input_sources",
+    "read_experiment": "vinetrack.experiment.folder",
+    "refit": "vinetrack.inference.fit",
+    "simulate": "vinetrack.dynamics.simulate",
 }
+
+_RENAMED = {"Said": "StatedValues", "believe": "predictive_inputs", "foresee": "predict_vine"}
+"""Names of version 0.1 that are still read, with a warning, until the next release."""
 
 __all__ = ["__version__", "effects", *_HOMES]
 
@@ -42,6 +46,9 @@ __all__ = ["__version__", "effects", *_HOMES]
 def __getattr__(name: str) -> Any:
     if name == "effects":
         return import_module("vinetrack.effects")
+    if name in _RENAMED:
+        warnings.warn(f"vinetrack.{name} is now vinetrack.{_RENAMED[name]}", DeprecationWarning, stacklevel=2)
+        name = _RENAMED[name]
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'vinetrack' has no attribute {name!r}")

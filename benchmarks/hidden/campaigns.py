@@ -15,8 +15,8 @@ from hidden.kinds import EFFECTS, INTERRUPTED, OUTSIDERS, Scene
 from hidden.kinds import Hidden as Change
 from hidden.motion import Floats, Physics, Tube, follow
 from hidden.nuisances import Nuisances, draw_nuisances, noise, regime, scatter
-from vinetrack.naming import with_names
-from vinetrack.records import Bend, Track, Trial
+from vinetrack.core.records import Bend, Track, Trial
+from vinetrack.experiment.naming import with_names
 
 ALL = {**EFFECTS, **INTERRUPTED}
 MOST_FRAMES = 1500

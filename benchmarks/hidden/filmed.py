@@ -11,13 +11,13 @@ from scipy.interpolate import PchipInterpolator
 
 from hidden.campaigns import Hidden
 from hidden.folder import write_folder
-from vinetrack.experiment import Experiment, read_experiment
+from vinetrack.core.records import Track, Trial
+from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import FINE_STEPS, Filming, picture_target, scene_of
 from vinetrack.laboratory.refilm import before_the_camera
 from vinetrack.laboratory.render import render_recording
 from vinetrack.laboratory.targets import Target
-from vinetrack.records import Track, Trial
 
 WIDTH_PX, HEIGHT_PX, MARGIN = 960, 320, 1.35
 """Of the picture, and how many times the longest vine it is wide."""

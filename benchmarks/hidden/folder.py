@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 from hidden.campaigns import Hidden
-from vinetrack.records import Track, Trial
+from vinetrack.core.records import Track, Trial
 
 COLUMNS = (
     "trial",

@@ -14,8 +14,8 @@ import vinetrack as vt
 from hidden.campaigns import Hidden, Truth, make
 from hidden.kinds import MEASUREMENT
 from vinetrack.effects import Effect, EffectError, catalogue, load_effect
-from vinetrack.model.fit import FitError
-from vinetrack.model.fit_result import Fit, Number
+from vinetrack.inference.fit import FitError
+from vinetrack.inference.fit_result import Fit, Number
 
 Row = dict[str, object]
 TIED = 9.0
@@ -189,7 +189,7 @@ def _rest_noise_m(campaign: Hidden) -> float:
     """What somebody in a hurry would take for the noise: the median of the tracks' own."""
     from statistics import median
 
-    from vinetrack.video.position_noise import position_noise
+    from vinetrack.tracks.position_noise import position_noise
 
     return median(position_noise(track.time_s, track.lead_position_m)[0] for _, track in campaign.pairs)
 

@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import vinetrack as vt
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.model.model import Model
-from vinetrack.model.terms import evaluate
-from vinetrack.motion.velocity import estimate_kinematics
-from vinetrack.records import Floats, Track, Trial
+from vinetrack.kinematics.velocity import estimate_kinematics
 
 FOLDS = 5
 GAINS = ("length_scale", "time_base", "pressure_gain", "area_scale")

@@ -10,7 +10,7 @@ import pandas as pd
 
 import vinetrack as vt
 from hidden.motion import Floats, Physics, Tube, follow
-from vinetrack.records import Bend, Trial
+from vinetrack.core.records import Bend, Trial
 
 SIZES: dict[str, tuple[Mapping[str, float], Mapping[str, float]]] = {
     "": ({}, {}),

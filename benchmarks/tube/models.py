@@ -11,14 +11,14 @@ import numpy as np
 import vinetrack as vt
 from tube.folder import REEL
 from tube.recordings import AREA_M2, Recording
+from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.ladder import in_sample, left_out
 from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.dynamics.model import Model, Value
 from vinetrack.effects import load_effect
-from vinetrack.experiment import Experiment
-from vinetrack.model.fit_data import pairs_of
-from vinetrack.model.fit_result import Fit, TrialFit
-from vinetrack.model.model import Model, Value
-from vinetrack.records import Track, Trial
+from vinetrack.experiment.folder import Experiment
+from vinetrack.inference.fit_data import pairs_of
+from vinetrack.inference.fit_result import Fit, TrialFit
 
 PER_TUBE = {"static_yield.P_s": "vine"}
 """A pressure to start belongs to a tube as its yield pressure does."""

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy.signal import savgol_filter
 
-from vinetrack.records import Floats
+from vinetrack.core.records import Floats
 
 PA_PER_PSI = 6894.757
 DIAMETER_M, THICKNESS_M = 25.4e-3, 50.8e-6

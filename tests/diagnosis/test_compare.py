@@ -5,21 +5,11 @@ Seeds 11 and 12 score; no number here was tuned on them.
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-import vinetrack as vt
-from vinetrack.diagnosis.compare import COMPARISON_COLUMNS, Comparison, compare, position_errors, trajectory_table
-from vinetrack.diagnosis.replicates import replicates_of
-from vinetrack.model.fit_result import TrialFit
-from vinetrack.records import Track, Trial
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
 from lsoda_vine import (
     B_TRUE,
     FPS,
@@ -30,6 +20,12 @@ from lsoda_vine import (
     small_campaign,
     vine_trial,
 )
+
+import vinetrack as vt
+from vinetrack.core.records import Track, Trial
+from vinetrack.diagnosis.compare import COMPARISON_COLUMNS, Comparison, compare, position_errors, trajectory_table
+from vinetrack.diagnosis.replicates import replicates_of
+from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
 SPEED_M_S = 2.0

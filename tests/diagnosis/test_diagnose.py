@@ -12,10 +12,10 @@ import pytest
 from hidden_truth import Pairs, grown, sheet
 
 import vinetrack as vt
+from vinetrack.core.records import Track
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
 from vinetrack.effects import EffectError, own_effects
 from vinetrack.laboratory.campaign import damping_values
-from vinetrack.records import Track
 
 OWN_EFFECT = '''"""Ratchet: a force that grows with the square root of the growth.
 
@@ -108,7 +108,7 @@ def test_n_and_B_come_home(depleted: Diagnosis) -> None:
 
 
 def test_the_answer_can_be_written_as_json(depleted: Diagnosis, tmp_path: Path) -> None:
-    from vinetrack.tables import write_json
+    from vinetrack.core.tables import write_json
 
     write_json(tmp_path / "diagnosis.json", depleted.to_json())
     read = json.loads((tmp_path / "diagnosis.json").read_text())

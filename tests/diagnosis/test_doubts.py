@@ -12,14 +12,14 @@ import pytest
 from hidden_truth import Pairs, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis import hypotheses
-from vinetrack.diagnosis import question as questions
-from vinetrack.diagnosis.question import FIRST_LEVEL, Questions, question
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis import candidates as hypotheses
+from vinetrack.diagnosis import misfit_tests as questions
+from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
+from vinetrack.inference.fit import fit
 from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.nature import BASE, Nature
+from vinetrack.laboratory.ground_truth import BASE, Nature
 from vinetrack.laboratory.tracks import grow
-from vinetrack.model.fit import fit
-from vinetrack.records import Floats
 
 
 def careful(payload_g: float, seed: int) -> Pairs:
@@ -39,11 +39,11 @@ def careful(payload_g: float, seed: int) -> Pairs:
     return [(one.stated, one.track) for one in grow(trials, nature)]
 
 
-def asked(pairs: Pairs) -> Questions:
+def asked(pairs: Pairs) -> MisfitTests:
     model = vt.base_model()
     candidates = hypotheses.candidates_of(model, None, None)
     found = fit(model, pairs, host=hypotheses.host_for(model, candidates), profile=False)
-    return question(found, hypotheses.testable(candidates, found.predictor.data)[0], FIRST_LEVEL)
+    return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], FIRST_LEVEL)
 
 
 @pytest.fixture

@@ -14,9 +14,9 @@ from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis.drift import DRIFT_COLUMNS, GROUP_COLUMNS, Drift, drift
-from vinetrack.diagnosis.own_values import lay, own_values
-from vinetrack.model.fit_result import Fit
-from vinetrack.model.model import Model
+from vinetrack.diagnosis.per_trial_estimates import lay, per_trial_estimates
+from vinetrack.dynamics.model import Model
+from vinetrack.inference.fit_result import Fit
 
 B = "eversion_damping.B"
 
@@ -99,7 +99,7 @@ def test_a_friction_on_the_payload_makes_b_know_the_payload() -> None:
 def test_every_trial_finds_the_b_it_was_grown_with() -> None:
     virtual = grown(sheet(replicates=2), 56, pressure_scatter=0.0)
     found = fitted(pairs_of(virtual))
-    values = own_values(found, B, lay(found))
+    values = per_trial_estimates(found, B, lay(found))
     true = np.array([one.damping for one in virtual])
     # What the common law errs by stays in all trials of a vine; what is left is the noise of a track.
     away = np.log(values.value / true)
@@ -149,13 +149,9 @@ def test_without_replicates_the_line_itself_says_how_values_scatter() -> None:
 
 
 def test_a_body_that_falls_has_nothing_to_drift() -> None:
-    import sys
-    from pathlib import Path
-
-    sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
     from lsoda_vine import as_track
 
-    from vinetrack.records import Trial
+    from vinetrack.core.records import Trial
 
     draw = np.random.default_rng(60)
     time_s = np.arange(120) / 240

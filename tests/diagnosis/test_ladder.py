@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import vinetrack as vt
+from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.compare import compare
 from vinetrack.diagnosis.ladder import (
     LADDER_COLUMNS,
@@ -22,12 +23,11 @@ from vinetrack.diagnosis.ladder import (
     left_out,
     moved,
 )
+from vinetrack.experiment.naming import with_names
+from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
-from vinetrack.laboratory.nature import BASE, Nature
+from vinetrack.laboratory.ground_truth import BASE, Nature
 from vinetrack.laboratory.tracks import grow
-from vinetrack.model.fit_result import Fit
-from vinetrack.naming import with_names
-from vinetrack.records import Track, Trial
 
 Pairs = list[tuple[Trial, Track]]
 DEPLETION = "reservoir_depletion"

@@ -12,12 +12,12 @@ import pytest
 from grown import effect_file, grown, pairs_of, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis.force_answers import answers_to_forces, motions_of
+from vinetrack.diagnosis.force_sensitivities import force_sensitivities, motions_of
 from vinetrack.diagnosis.missing_force import FORCE_COLUMNS, LAW_COLUMNS, MissingForce, missing_force
-from vinetrack.diagnosis.own_values import lay
+from vinetrack.diagnosis.per_trial_estimates import lay
+from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects._own import own_effects
-from vinetrack.model.fit_result import Fit
-from vinetrack.model.simulate import simulate_many
+from vinetrack.inference.fit_result import Fit
 
 FORCES = {
     "patch": "0.5 * (np.tanh((s.lead_position - 0.12) / 0.003) - np.tanh((s.lead_position - 0.15) / 0.003))",
@@ -121,7 +121,7 @@ def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(path: Path) 
         "bump": lambda m: np.exp(-0.5 * ((m.lead_position_m - 0.08) / 0.01) ** 2),
         "slow": lambda m: 1 / (0.3 + m.tail_velocity_m_s),
     }
-    answers = answers_to_forces(found, own, motions, lambda m: np.column_stack([f(m) for f in shapes.values()]))
+    answers = force_sensitivities(found, own, motions, lambda m: np.column_stack([f(m) for f in shapes.values()]))
     jobs = found.predictor.jobs(found.solution.state.theta, own)
     times = [item.time_s - job.release_s for item, job in zip(found.predictor.data, jobs, strict=True)]
     with_force = model + own_effects([path])["hidden"]

@@ -14,11 +14,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from vinetrack.core.records import Trial
 from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, PAYLOADS, payload_curves, speeds_with_error
-from vinetrack.model.fit_result import Number
-from vinetrack.model.model import base_model
-from vinetrack.naming import with_names
-from vinetrack.records import Trial
+from vinetrack.dynamics.model import base_model
+from vinetrack.experiment.naming import with_names
+from vinetrack.inference.fit_result import Number
 
 P, P_Y, B, AREA, G, LENGTH = 28e3, 3e3, 2.0, math.pi * 0.012**2, 9.81, 0.2
 GAS = 0.25 * (P + 101_325) / (287 * 293) * AREA * LENGTH

@@ -16,7 +16,7 @@ from tube.recordings import Recording, balance, read_recordings, thresholds
 
 import vinetrack as vt
 from vinetrack.diagnosis.result import ADEQUATE
-from vinetrack.experiment import Experiment
+from vinetrack.experiment.folder import Experiment
 
 FOLDER = os.environ.get("VINETRACK_REAL_DATA", "")
 pytestmark = [

@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 
 import vinetrack as vt
-from vinetrack.diagnosis.hypotheses import whole_shapes
+from vinetrack.core.records import Track, Trial
+from vinetrack.diagnosis.candidates import whole_shapes
+from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import find_effect
-from vinetrack.model.simulate import simulate
-from vinetrack.records import Track, Trial
 
 P_S_TRUE, P_Y, B_TRUE, N_TRUE, NOISE_M = 11e3, 6e3, 6.0, 0.4, 1e-4
 TIMES_S = np.linspace(-0.05, 0.9, 191)

@@ -10,10 +10,20 @@ import numpy as np
 import pytest
 
 import vinetrack.effects as effects
-from vinetrack.effects import BASE_EFFECTS, HOOKS, Effect, EffectError, Rig, State, catalogue, find_effect, load_effect
-from vinetrack.model.model import base_model, make_model
-from vinetrack.model.simulate import simulate
-from vinetrack.records import Trial
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.model import base_model, make_model
+from vinetrack.dynamics.simulate import simulate
+from vinetrack.effects import (
+    BASE_EFFECTS,
+    HOOKS,
+    Effect,
+    EffectError,
+    State,
+    TrialInputs,
+    catalogue,
+    find_effect,
+    load_effect,
+)
 
 FOLDER = Path(effects.__file__).parent
 FILES = sorted(path for path in FOLDER.glob("*.py") if not path.stem.startswith("_"))
@@ -42,9 +52,9 @@ STATE = State(
     tail_tension=1.3,
     observed=0.108,
 )
-RIG = Rig(
+RIG = TrialInputs(
     **{
-        **dict.fromkeys(Rig._fields, 0.0),
+        **dict.fromkeys(TrialInputs._fields, 0.0),
         "set_pressure": 28e3,
         "yield_pressure": 3e3,
         "diameter": 0.024,
@@ -138,7 +148,7 @@ def test_what_it_is_taken_for_is_an_effect_or_a_quantity_named_in_the_text(effec
 def test_worked_numbers_agree(effect: Effect, worked) -> None:
     """What the example does not name is NaN, so that an effect cannot use what the hand-worked number left out."""
     state = State(**{**dict.fromkeys(State._fields, math.nan), **worked.state})
-    rig = Rig(**{**dict.fromkeys(Rig._fields, math.nan), **worked.rig})
+    rig = TrialInputs(**{**dict.fromkeys(TrialInputs._fields, math.nan), **worked.rig})
     assert set(worked.parameters) == {parameter.name for parameter in effect.parameters}
     assert worked.how
     got = effect.functions[worked.hook](state, rig, *(worked.parameters[p.name] for p in effect.parameters))

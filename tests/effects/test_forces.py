@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from by_hand import ATM, BARE, LEVEL, LOADED, RT_AIR, G, Vine, assert_same_motion, simulated
 
-from vinetrack.records import Bend
+from vinetrack.core.records import Bend
 
 BOTH = pytest.mark.parametrize("vine", [BARE, LOADED], ids=["bare", "loaded"])
 

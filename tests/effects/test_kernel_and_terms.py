@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from by_hand import BARE, LOADED, Vine, simulated, whole_catalogue
 
+from vinetrack.core.records import Bend, Trial
+from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.kernel import kernel
+from vinetrack.dynamics.model import Model, base_model, effects_on
+from vinetrack.dynamics.simulate import simulate, trial_inputs
 from vinetrack.effects import catalogue
-from vinetrack.model.kernel import kernel
-from vinetrack.model.model import Model, base_model, effects_on
-from vinetrack.model.simulate import rig_of, simulate
-from vinetrack.model.terms import evaluate
-from vinetrack.records import Bend, Trial
 
 BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
 
@@ -28,7 +28,7 @@ def accelerations(
     """Of the tail, by the compiled rates, at these pressures of the chamber (none: as at release)."""
     compiled = kernel(model.effects)
     theta = model.parameters_for(trial.vine)
-    on, rig = effects_on(model, theta[None])[0], np.array(rig_of(trial))
+    on, rig = effects_on(model, theta[None])[0], np.array(trial_inputs(trial))
     bends = np.array([(b.start_m, b.arc_m, b.radius_m) for b in trial.bends]).reshape(-1, 3)
     pressures = np.full(time.size, compiled.first_chamber(on, rig, theta)) if chamber is None else chamber
     common = (on, rig, theta, np.empty(0), np.empty(0), bends)

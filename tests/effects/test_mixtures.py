@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from by_hand import N, Vine, whole_catalogue
 
+from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import catalogue
-from vinetrack.model.simulate import simulate
 
 TIMES = np.linspace(0.0, 0.3, 200)
 

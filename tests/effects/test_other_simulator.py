@@ -18,9 +18,9 @@ from hidden.questions import outsider_values, true_effects
 from hidden.verify import FRAME_S, SIZES, ours, trials
 
 import vinetrack as vt
+from vinetrack.dynamics.model import Model, make_model
 from vinetrack.effects import catalogue
-from vinetrack.model.fit_data import pairs_of
-from vinetrack.model.model import Model, make_model
+from vinetrack.inference.fit_data import pairs_of
 
 B, N = 6.44, 0.37
 TIMES = FRAME_S * np.arange(-3, 1200)

@@ -10,11 +10,11 @@ from by_hand import LOADED, followed
 from click.testing import Result
 from typer.testing import CliRunner
 
-from vinetrack.cli import app
+from vinetrack.cli.main import app
+from vinetrack.dynamics.model import base_model, make_model
+from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import EffectError, catalogue, load_effect
 from vinetrack.effects._own import UNCHANGED, behaviour_faults, own_effects
-from vinetrack.model.model import base_model, make_model
-from vinetrack.model.simulate import simulate
 
 BRUSH = '''"""Brush: bristles at the mouth hold the tail back, the more the further it has run.
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from by_hand import ATM, BARE, LOADED, RT_AIR, N, Vine, assert_same_motion, simulated, whole_catalogue
 
+from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.model import base_model, make_model
+from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import EffectError, catalogue
-from vinetrack.model.model import base_model, make_model
-from vinetrack.model.simulate import simulate
-from vinetrack.model.terms import evaluate
 
 V0 = 3.7e-3
 A_IN = math.pi * 6e-3**2 / 4

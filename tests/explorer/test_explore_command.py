@@ -16,9 +16,9 @@ from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 from typer.testing import CliRunner
 
-from vinetrack.cli import app
+from vinetrack.cli.main import app
+from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.settings import read_experiment_settings
 
 
 def refused(*arguments: object) -> str:

@@ -15,7 +15,7 @@ from chrome import Chrome, find_chrome, until
 from explorer_campaign import SETTINGS, film_of, make_experiment, make_results
 from served import Served, Visitor
 
-from vinetrack.settings import read_experiment_settings
+from vinetrack.experiment.settings import read_experiment_settings
 
 pytestmark = pytest.mark.skipif(find_chrome() is None, reason="needs a browser: apt install chromium")
 

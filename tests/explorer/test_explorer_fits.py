@@ -15,9 +15,9 @@ from vinetrack.explorer.curves import overall_m
 from vinetrack.explorer.fitting import FAULT, Fitted, Job, first_fit, fit_choice, gained_words, tied_words
 from vinetrack.explorer.ground import Ground
 from vinetrack.explorer.waiting import Waiting
-from vinetrack.model.fit_data import FitError
-from vinetrack.model.fit_result import Fit
-from vinetrack.model.solve import Step, Watch
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.optimiser import Step, Watch
 
 GAMMA = "reservoir_depletion.gamma"
 

@@ -13,11 +13,11 @@ import pytest
 from bokeh.document import Document
 from explorer_campaign import SETTINGS, write_diagnosis
 
+from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.ground import Ground
 from vinetrack.explorer.page import Page
-from vinetrack.settings import read_experiment_settings
 
 GAMMA = "size_reservoir_depletion.gamma"
 
@@ -236,7 +236,7 @@ def test_a_diagnosis_appears_by_itself(campaign: Campaign, ground: Ground, tmp_p
 def test_a_model_that_cannot_be_followed_is_said_and_the_curves_stay(
     browser: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from vinetrack.model.simulate import SimulationError
+    from vinetrack.dynamics.simulate import SimulationError
 
     def refuse(*_: object) -> None:
         raise SimulationError("Trial a: too hard.")

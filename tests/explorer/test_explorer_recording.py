@@ -12,7 +12,7 @@ from explorer_campaign import write_bars
 
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.recording import Film, View, view_of
-from vinetrack.stages.results import Results
+from vinetrack.results.folder_layout import Results
 
 
 def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) -> Path:

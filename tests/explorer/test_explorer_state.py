@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from explorer_campaign import DEMO, SMALL, make_experiment, make_results
 
+from vinetrack.core.records import Trial
 from vinetrack.effects import Parameter
 from vinetrack.explorer.campaign import Campaign, Seen, condition_labels
 from vinetrack.explorer.choice import ChoiceError, changed, chosen, first_choice, sized, slider_range
@@ -21,10 +22,9 @@ from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.curves import errors_m, follow, overall_m
 from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, exported, model_words
 from vinetrack.explorer.series import bands, error_bars, measured, modelled, residuals, symmetric, thinned, vine_colours
-from vinetrack.laboratory.nature import read_nature
+from vinetrack.laboratory.ground_truth import read_nature
 from vinetrack.laboratory.tracks import grow
-from vinetrack.records import Trial
-from vinetrack.stages.results import ResultsError
+from vinetrack.results.folder_layout import ResultsError
 
 GAMMA, EXPONENT = "reservoir_depletion.gamma", "eversion_damping.n"
 

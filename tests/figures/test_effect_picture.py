@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from vinetrack.dynamics.effect_motion import effect_motion, reference_words, size_words
 from vinetrack.effects import catalogue
 from vinetrack.figures.effect_picture import draw_effect
 from vinetrack.figures.style import BLUE, render
-from vinetrack.model.effect_motion import effect_motion, reference_words, size_words
 
 FASTER = {"fold_inertia", "wall_stretch", "gravity"}
 

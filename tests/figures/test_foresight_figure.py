@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.design.foresee import CURVE_COLUMNS
-from vinetrack.figures.foresight import MOST_CURVES, Picture, draw_foresight
+from vinetrack.figures.prediction import MOST_CURVES, Picture, draw_foresight
 from vinetrack.figures.style import render
+from vinetrack.planning.prediction import CURVE_COLUMNS
 
 
 def picture(until_s: float = 0.02, arrives: bool = True, least_N: float = 1.0) -> Picture:

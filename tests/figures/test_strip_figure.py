@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vinetrack.core.records import Track
 from vinetrack.figures.strip import LARGEST_PX, draw_strip, flagged, shrunk
 from vinetrack.figures.style import render
-from vinetrack.records import Track
 from vinetrack.report.compact import compact_svg
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking

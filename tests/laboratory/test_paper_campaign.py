@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from vinetrack.experiment import read_experiment
+from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory import __main__ as command
 from vinetrack.laboratory.campaign import paper_campaign, paper_values
 from vinetrack.laboratory.filming import make_filming
-from vinetrack.laboratory.nature import read_nature
+from vinetrack.laboratory.ground_truth import read_nature
 from vinetrack.laboratory.refilm import before_the_camera
 
 ROOT = Path(__file__).parents[2]

@@ -14,8 +14,8 @@ import pytest
 
 from vinetrack.laboratory.render import FrameRenderer, frame_order
 from vinetrack.laboratory.scene import PRESETS, Ball, Camera, Door, Faults, Light, Scene, Sensor, Tube, preset
-from vinetrack.laboratory.staging import motion_function
-from vinetrack.laboratory.subjects import tip_profiles
+from vinetrack.laboratory.scene_motion import motion_function
+from vinetrack.laboratory.scene_objects import tip_profiles
 
 FPS = 1000.0
 CLEAN = preset("clean")

@@ -12,7 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vinetrack.experiment import check_experiment, read_experiment
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.simulate import simulate
+from vinetrack.experiment.folder import check_experiment, read_experiment
+from vinetrack.experiment.naming import with_names
 from vinetrack.laboratory import __main__ as command
 from vinetrack.laboratory.campaign import (
     PAPER_B,
@@ -23,12 +26,9 @@ from vinetrack.laboratory.campaign import (
     paper_damping,
     paper_payload,
 )
-from vinetrack.laboratory.nature import Nature, read_nature
+from vinetrack.laboratory.ground_truth import Nature, read_nature
 from vinetrack.laboratory.tracks import VirtualTrial, grow, write_experiment, write_tracks, write_truth
-from vinetrack.model.simulate import simulate
-from vinetrack.naming import with_names
-from vinetrack.records import Trial
-from vinetrack.video.importers import load_track
+from vinetrack.tracks.importers import load_track
 
 ROOT = Path(__file__).parents[2]
 
@@ -317,7 +317,7 @@ sys.addaudithook(watch)
 experiment, results, truth = sys.argv[1:]
 
 from typer.testing import CliRunner
-from vinetrack.cli import app
+from vinetrack.cli.main import app
 
 def run(*arguments):
     done = CliRunner().invoke(app, list(arguments))
@@ -332,11 +332,11 @@ run("damping", results)
 run("model", experiment, results)
 run("figures", experiment, results, "--of", "campaign")
 
-from vinetrack.experiment import read_experiment
-from vinetrack.model.model import base_model
-from vinetrack.motion.summary import summarise_trial
-from vinetrack.settings import RunSettings
-from vinetrack.video.importers import load_track
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.dynamics.model import base_model
+from vinetrack.kinematics.summary import summarise_trial
+from vinetrack.experiment.settings import RunSettings
+from vinetrack.tracks.importers import load_track
 
 trial = read_experiment(experiment).trials[0]
 summarise_trial(trial, load_track(trial), RunSettings(), base_model())
@@ -345,7 +345,7 @@ def told():
     return {"seen": list(seen), "modules": [name for name in sys.modules if "laboratory" in name]}
 
 blind = told()
-import vinetrack.laboratory.nature
+import vinetrack.laboratory.ground_truth
 open(truth).close()
 print(json.dumps([blind, told()]))
 """
@@ -386,4 +386,4 @@ def test_the_analysis_never_opens_the_truth_nor_loads_the_laboratory(watched: tu
 def test_the_watch_would_see_a_peek(watched: tuple[Path, list[dict]]) -> None:
     root, (_, peeked) = watched
     assert root / "truth.json" in truths(peeked["seen"])
-    assert "vinetrack.laboratory.nature" in peeked["modules"]
+    assert "vinetrack.laboratory.ground_truth" in peeked["modules"]

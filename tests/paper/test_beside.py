@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
-from vinetrack.naming import with_names
+from vinetrack.core.records import Trial
+from vinetrack.experiment.naming import with_names
 from vinetrack.paper.beside import (
     Rest,
     eq2_speed_m_s,
@@ -21,7 +22,6 @@ from vinetrack.paper.beside import (
     speed_curves,
 )
 from vinetrack.paper.departures import NONE, follow
-from vinetrack.records import Trial
 
 
 def trial(name: str, pressure_kPa: float, payload_g: float, thickness_um: float = 200.0) -> Trial:

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 from scipy.integrate import solve_ivp
 
+from vinetrack.core.records import Trial
 from vinetrack.paper.departures import (
     DEPARTURE_COLUMNS,
     DEPARTURES,
@@ -25,7 +26,6 @@ from vinetrack.paper.departures import (
 from vinetrack.paper.expected import drag_shares, fast_vine_speeds, rule_on_noise_free
 from vinetrack.paper.foretold import departures_in_words, foretold_rows
 from vinetrack.paper.rows import as_table
-from vinetrack.records import Trial
 
 A, L, PAY, B, N, P_Y, G, AMBIENT, V0 = math.pi * 0.012**2, 0.28, 35.6e-3, 6.44, 0.37, 3e3, 9.81, 101_325.0, 3.7e-3
 FILM = 1200 * math.pi * 0.024 * 200e-6

@@ -7,7 +7,8 @@ import math
 import pandas as pd
 import pytest
 
-from vinetrack.motion.conditions import CONDITION_COLUMNS
+from vinetrack.core.records import Trial
+from vinetrack.kinematics.conditions import CONDITION_COLUMNS
 from vinetrack.paper.arithmetic import computed_rows
 from vinetrack.paper.beside import POSITION_COLUMNS, SPEED_COLUMNS
 from vinetrack.paper.departures import DEPARTURE_COLUMNS, DEPARTURES
@@ -25,7 +26,6 @@ from vinetrack.paper.rows import (
     bounds,
     number,
 )
-from vinetrack.records import Trial
 
 nan = math.nan
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import base64
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -22,7 +20,6 @@ from vinetrack.report.recordings import Recording
 from vinetrack.video.write import write_clip
 
 pytest.importorskip("tornado", reason="the browser is driven through bokeh's server, which is not installed")
-sys.path.insert(0, str(Path(__file__).parents[1] / "explorer"))
 from chrome import Chrome, find_chrome
 
 pytestmark = pytest.mark.skipif(find_chrome() is None, reason="there is no Chromium on this machine")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vinetrack.records import Trial
+from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
 from vinetrack.video.body import track_body
 from vinetrack.video.frames import Frames, Recording, RecordingError, Region

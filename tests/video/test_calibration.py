@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
+from vinetrack.experiment.settings import Charuco, Checkerboard, MmPerPx, TwoPoints
 from vinetrack.laboratory.render import render_recording
 from vinetrack.laboratory.scene import Camera, Encoding, Light, Sensor, Tube, preset
 from vinetrack.laboratory.targets import Target, render_calibration_clip, render_target
-from vinetrack.settings import Charuco, Checkerboard, MmPerPx, TwoPoints
 from vinetrack.video.calibration import CalibrationError, calibrate, calibrate_pictures
 from vinetrack.video.plane_map import PlaneMap, fit_planes
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from plain_scene import Plan, plain_scene, write_video
 
-from vinetrack.records import FLAGS, Trial
+from vinetrack.core.records import FLAGS, Trial
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import Frames, Recording, RecordingError, Region
-from vinetrack.video.judge import FLOOR_PX, calibrated_sigma, judge, moving_range
+from vinetrack.video.point_quality import FLOOR_PX, calibrated_sigma, judge, moving_range
 from vinetrack.video.track import track_frames, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}

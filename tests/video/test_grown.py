@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinetrack.video.judge import Judgement
+from vinetrack.video.point_quality import Judgement
 from vinetrack.video.track import _is_grown
 
 EDGE_PX = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vinetrack.records import Trial
+from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import read_frames
 from vinetrack.video.track import track_recording

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from plain_scene import Plan, plain_scene
 
-from vinetrack.records import Trial
+from vinetrack.core.records import Trial
 from vinetrack.video.frames import Frames, Recording, Region
 from vinetrack.video.track import Tracking, track_frames
 

@@ -11,8 +11,8 @@ import av
 import numpy as np
 import pytest
 
-from vinetrack.experiment import check_experiment, format_problems
-from vinetrack.problems import Problem
+from vinetrack.core.problems import Problem
+from vinetrack.experiment.folder import check_experiment, format_problems
 from vinetrack.video.survey import survey
 
 HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa"

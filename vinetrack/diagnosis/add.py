@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from vinetrack.diagnosis.hypotheses import host_for, shapes_of
-from vinetrack.diagnosis.search import Slope, best_climb, full_fit, start_of
+from vinetrack.core.records import Track
+from vinetrack.diagnosis.candidates import host_for, shapes_of
+from vinetrack.diagnosis.multi_start import SubsetFitter, best_subset_fit, full_fit, start_of
+from vinetrack.dynamics.model import make_model
+from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import EffectError, find_effect
-from vinetrack.model.fit import fit as fit_model
-from vinetrack.model.fit import refit
-from vinetrack.model.fit_data import FitError
-from vinetrack.model.fit_result import Fit
-from vinetrack.model.model import make_model
-from vinetrack.model.rig import check_needs
-from vinetrack.records import Track
+from vinetrack.inference.fit import fit as fit_model
+from vinetrack.inference.fit import refit
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.experiment import Experiment
+    from vinetrack.experiment.folder import Experiment
 
 
 def add(
@@ -46,9 +46,9 @@ def add(
     report("fitting the model as it is")
     before = fit_model(model, experiment, tracks=tracks, host=host_for(model, (effect,)), profile=False)
     report(f"fitting it with {effect.name}")
-    slope = Slope(before)
+    slope = SubsetFitter(before)
     starts = [((effect,), start_of(shape, shape.step * 10)) for shape in shapes_of(effect)]
-    climb = best_climb(slope, starts, float("inf"))
+    climb = best_subset_fit(slope, starts, float("inf"))
     after = full_fit(before, climb) if climb is not None else None
     if after is None:
         raise FitError(f"The model with {effect.name} cannot be followed from any start.")

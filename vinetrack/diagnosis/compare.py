@@ -21,19 +21,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.diagnosis.replicates import Replicates, first_that_counts, replicates_of
-from vinetrack.model.fit_data import Pairs, pairs_of
-from vinetrack.model.fit_result import Fit, TrialFit
-from vinetrack.model.left_out import predict_trials
-from vinetrack.model.simulate import simulate_many
-from vinetrack.motion.efficiency import lead_velocity_at
-from vinetrack.motion.velocity import estimate_kinematics
-from vinetrack.records import Floats, Kinematics, Track
+from vinetrack.dynamics.simulate import simulate_many
+from vinetrack.inference.fit_data import Pairs, pairs_of
+from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.left_out import predict_trials
+from vinetrack.kinematics.efficiency import lead_velocity_at
+from vinetrack.kinematics.velocity import estimate_kinematics
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.experiment import Experiment
+    from vinetrack.experiment.folder import Experiment
 
 COMPARISON_COLUMNS = (
     "model",

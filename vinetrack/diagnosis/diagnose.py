@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.diagnosis.hypotheses import candidates_of, host_for, testable
-from vinetrack.diagnosis.inquiry import Finding, inquire
-from vinetrack.diagnosis.question import Questions
+from vinetrack.core.records import Track, Trial
+from vinetrack.diagnosis.candidates import candidates_of, host_for, testable
+from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -31,19 +31,19 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.words import dropped_in_words, explain, listed
+from vinetrack.diagnosis.selection import SelectionStep, select_effects
+from vinetrack.dynamics.model import Model, base_model, make_model
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
-from vinetrack.model.fit import fit as fit_model
-from vinetrack.model.fit_data import FitError, Pairs, pairs_of
-from vinetrack.model.fit_result import Fit, Number
-from vinetrack.model.model import Model, base_model, make_model
-from vinetrack.model.sensitivity import Predictor
-from vinetrack.model.simulate import SimulationError
-from vinetrack.records import Track, Trial
+from vinetrack.inference.fit import fit as fit_model
+from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
+from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.sensitivity import Predictor
+from vinetrack.narrative.verdict_text import dropped_in_words, explain, listed
 
 if TYPE_CHECKING:
-    from vinetrack.experiment import Experiment
-    from vinetrack.settings import Limits
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import Limits
 
 log = logging.getLogger(__name__)
 
@@ -117,7 +117,7 @@ def diagnose(
         found = fit_model(model, pairs, host=host_for(model, questioned), profile=False, thorough=False)
         found = replace(found, left_out={**left_out, **found.left_out})
     effects, blind = testable(questioned, found.predictor.data)
-    findings = inquire(found, effects, report)
+    findings = select_effects(found, effects, report)
     result = _conclude(found, findings, blind)
     if dropped:
         result = _artefact_first(result, dropped)
@@ -133,7 +133,7 @@ def _settings(
 ) -> tuple[Experiment, Model, tuple[str, ...] | None, dict[str, Effect], Limits] | None:
     """An experiment with what it says of model, candidates, own effects and limits; None for bare pairs."""
     from vinetrack.effects import own_effects
-    from vinetrack.experiment import Experiment, read_experiment
+    from vinetrack.experiment.folder import Experiment, read_experiment
 
     if isinstance(source, (str, Path)):
         source = read_experiment(source)
@@ -154,7 +154,7 @@ def _with_host(found: Fit, questioned: Sequence[Effect]) -> Fit:
 
 def _frames_put_right(pairs: Iterable[tuple[Trial, Track]]) -> tuple[list[tuple[Trial, Track]], list[str]]:
     """Tracks with dropped and repeated frames put right, and the trials from which frames are missing."""
-    from vinetrack.video.corrections import correct_frames
+    from vinetrack.tracks.frame_timing import correct_frames
 
     right, dropped = [], []
     for trial, track in pairs:
@@ -168,7 +168,7 @@ def _frames_put_right(pairs: Iterable[tuple[Trial, Track]]) -> tuple[list[tuple[
 
 def _dropped_in_fit(found: Fit) -> list[str]:
     """Trials of a fit from which frames are missing that nobody has put right."""
-    from vinetrack.video.corrections import correct_frames
+    from vinetrack.tracks.frame_timing import correct_frames
 
     dropped = []
     for item in found.predictor.data:
@@ -185,7 +185,7 @@ def _dropped_in_fit(found: Fit) -> list[str]:
     return dropped
 
 
-def _conclude(found: Fit, findings: Sequence[Finding], blind: Mapping[str, str]) -> Diagnosis:
+def _conclude(found: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, str]) -> Diagnosis:
     """Findings in words and tables."""
     rounds = tuple(_round(finding, blind) for finding in findings)
     added: list[str] = []
@@ -202,7 +202,7 @@ def _conclude(found: Fit, findings: Sequence[Finding], blind: Mapping[str, str])
     return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits))
 
 
-def _round(finding: Finding, blind: Mapping[str, str]) -> Round:
+def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
     questions = finding.questions
     names, cosines = _cosines(questions)
     return Round(
@@ -218,7 +218,7 @@ def _round(finding: Finding, blind: Mapping[str, str]) -> Round:
     )
 
 
-def _cosines(questions: Questions) -> tuple[tuple[str, ...], list[list[float]]]:
+def _cosines(questions: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]]:
     """Cosines between effects, each in the shape that promises most."""
     names = tuple(dict.fromkeys(questions.answers.effects))
     places = [questions.of(name)[0] for name in names]
@@ -226,7 +226,7 @@ def _cosines(questions: Questions) -> tuple[tuple[str, ...], list[list[float]]]:
     return names, matrix.tolist()
 
 
-def _ranking(finding: Finding, blind: Mapping[str, str]) -> list[Candidate]:
+def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate]:
     questions = finding.questions
     aside = dict(finding.aside)
     singles = {one.names[0]: one for one in finding.tried if len(one.names) == 1}
@@ -279,20 +279,20 @@ def _ranking(finding: Finding, blind: Mapping[str, str]) -> list[Candidate]:
     return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_known(row.delta_chi2)))
 
 
-def _promised(finding: Finding, name: str, z: float) -> float:
+def _promised(finding: SelectionStep, name: str, z: float) -> float:
     """Fall of −2 ln L that the sensitivities promise; of an adequate model, what the score says."""
     if finding.verdict == ADEQUATE:
         return z**2
     return math.nan if finding.questions.lost else finding.questions.promise(name)
 
 
-def _holds(effect: Effect, finding: Finding) -> str:
+def _holds(effect: Effect, finding: SelectionStep) -> str:
     """That an effect contains one that was found, where it does: it can be no worse, and need not be tried."""
     held = [name for name in effect.replaces if name in finding.answer]
     return f"it holds {held[0]} as a limit" if held else ""
 
 
-def _behind(finding: Finding, name: str) -> str:
+def _behind(finding: SelectionStep, name: str) -> str:
     """How far a candidate stayed behind the best where only one trial of every condition was fitted."""
     climbs = finding.search.climbs if finding.search else {}
     if name not in climbs:
@@ -305,7 +305,7 @@ def _known(value: float) -> float:
     return value if math.isfinite(value) else -math.inf
 
 
-def _predicted(questions: Questions, effect: Effect, place: int) -> tuple[Number, ...]:
+def _predicted(questions: MisfitTests, effect: Effect, place: int) -> tuple[Number, ...]:
     """The size that the sensitivities predict, with its error; nothing where the model is too far off for that."""
     if place < 0 or not effect.parameters or questions.lost:
         return ()
@@ -368,7 +368,7 @@ def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Di
         tied.insert(0, last.fit)
     if last.verdict not in (AMBIGUOUS, ARTEFACT) or len(tied) < 2:
         return result
-    from vinetrack.diagnosis.next_trial import next_experiment
+    from vinetrack.diagnosis.next_experiment import next_experiment
 
     report("looking for the next experiment")
     try:

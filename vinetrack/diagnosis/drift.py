@@ -21,17 +21,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.constancy_tests import CONDITIONS, Against, ConstancyTest, Sums, as_deviate, constancy, sums_of
 from vinetrack.diagnosis.drift_along import against_the_sheet, along_growth
-from vinetrack.diagnosis.drift_tests import CONDITIONS, Against, Sums, Tested, as_deviate, constancy, sums_of
-from vinetrack.diagnosis.own_values import OwnValues, lay, own_values
-from vinetrack.diagnosis.scatter import LEAST_SPREAD, Scatter
+from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates, lay, per_trial_estimates
+from vinetrack.diagnosis.replicate_scatter import LEAST_SPREAD, Scatter
 from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
-from vinetrack.model.fit_data import FitError
-from vinetrack.model.fit_result import SHOWN_AS, Fit, Number, decimals
-from vinetrack.model.free import DAMPING, EXPONENT, YIELD_PRESSURE
-from vinetrack.model.simulate import SimulationError
-from vinetrack.model.subset import fit_subset
-from vinetrack.records import Floats
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import SHOWN_AS, Fit, Number, decimals
+from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE
+from vinetrack.inference.subset import fit_subset
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -126,12 +126,12 @@ def drift(found: Fit, scatter: Scatter | None = None) -> Drift:
     )
 
 
-def _tests(found: Fit, scatter: Scatter, notes: list[str]) -> Iterator[Tested]:
+def _tests(found: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTest]:
     keys = [key for key in found.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
     laid, damping = lay(found), None
     for key in keys:
         try:
-            own = own_values(found, key, laid)
+            own = per_trial_estimates(found, key, laid)
         except SimulationError:
             notes.append(f"{key} could not be found for single trials: the model cannot be followed there.")
             continue
@@ -147,7 +147,7 @@ def _tests(found: Fit, scatter: Scatter, notes: list[str]) -> Iterator[Tested]:
             notes.append("B could not be followed along the growth: the model cannot be followed there.")
 
 
-def _against(own: OwnValues, against: Against) -> Iterator[Tested]:
+def _against(own: PerTrialEstimates, against: Against) -> Iterator[ConstancyTest]:
     """Rows of one parameter against one condition: each vine alone where it has values of its own, and all."""
     levels = np.array([against.level(trial) for trial in own.trials])
     usable = np.isfinite(levels) & np.isfinite(own.deviation)
@@ -171,8 +171,8 @@ def _against(own: OwnValues, against: Against) -> Iterator[Tested]:
 
 
 def _slope(
-    own: OwnValues, against: Against, levels: Floats, sums: Sums, vine: str, groups: list[dict[str, object]]
-) -> Tested:
+    own: PerTrialEstimates, against: Against, levels: Floats, sums: Sums, vine: str, groups: list[dict[str, object]]
+) -> ConstancyTest:
     from scipy.stats import t as student
 
     square = float(np.sum(sums.weight * sums.x**2))
@@ -203,10 +203,10 @@ def _slope(
         "n_trials": int(sums.x.size),
     }
     row["sentence"] = _said(own, against, row, steadily=p <= p_groups)
-    return Tested(row, min(1.0, 2 * min(p, p_groups)), groups)
+    return ConstancyTest(row, min(1.0, 2 * min(p, p_groups)), groups)
 
 
-def _said(own: OwnValues, against: Against, row: Mapping[str, Any], *, steadily: bool) -> str:
+def _said(own: PerTrialEstimates, against: Against, row: Mapping[str, Any], *, steadily: bool) -> str:
     """A row in words; `steadily` where a straight line says more than that groups differ."""
     who = f"{own.symbol} of {row['vine']}" if row["vine"] else own.symbol
     start, stop = against.shown(row["from_level"]), against.shown(row["to_level"])
@@ -222,7 +222,7 @@ def _said(own: OwnValues, against: Against, row: Mapping[str, Any], *, steadily:
     )
 
 
-def _amount(own: OwnValues, change: float, error: float) -> str:
+def _amount(own: PerTrialEstimates, change: float, error: float) -> str:
     """A change with its error, in per cent or in the unit it reads best in."""
     unit, factor = ("%", 100.0) if own.logarithmic else SHOWN_AS.get(own.unit, (own.unit, 1.0))
     digits = max(decimals(error * factor) - 1, 0)
@@ -230,7 +230,7 @@ def _amount(own: OwnValues, change: float, error: float) -> str:
 
 
 def _groups(
-    own: OwnValues, against: Against | None, levels: Floats, chosen: NDArray[np.bool_], sums: Sums, vine: str
+    own: PerTrialEstimates, against: Against | None, levels: Floats, chosen: NDArray[np.bool_], sums: Sums, vine: str
 ) -> list[dict[str, object]]:
     """Mean value of every group; error from the scatter of replicates."""
     rows = []
@@ -244,7 +244,13 @@ def _groups(
 
 
 def _group_row(
-    own: OwnValues, against: Against | None, level: float, vine: str, mean: float, sigma: float, k: NDArray[np.int_]
+    own: PerTrialEstimates,
+    against: Against | None,
+    level: float,
+    vine: str,
+    mean: float,
+    sigma: float,
+    k: NDArray[np.int_],
 ) -> dict[str, object]:
     base = float(np.mean(own.base[k])) if np.ptp(own.base[k]) <= 1e-9 * abs(own.base[k][0]) else math.nan
     if own.logarithmic:
@@ -299,7 +305,7 @@ def _vine_row(
     }
 
 
-def _between_vines(found: Fit, scatter: Scatter) -> Iterator[Tested]:
+def _between_vines(found: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
     """Whether a number that all trials share suits every vine: each is fitted alone, with all its numbers free."""
     shared = [n.key for n in found.numbers if not n.vine and n.key != YIELD_PRESSURE]
     parts = list(_alone(found, scatter)) if shared else []
@@ -329,7 +335,7 @@ def _alone(found: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
             continue
 
 
-def _apart(common: Number, own: Sequence[tuple[str, Number, int]]) -> Tested:
+def _apart(common: Number, own: Sequence[tuple[str, Number, int]]) -> ConstancyTest:
     """The values of single vines against one for all."""
     from scipy.stats import chi2 as chi_square
 
@@ -339,7 +345,7 @@ def _apart(common: Number, own: Sequence[tuple[str, Number, int]]) -> Tested:
     groups = [_alone_group(*one, common.value) for one in own]
     count = sum(one[2] for one in own)
     row = _vine_row(common.key, common.symbol, common.unit, groups, as_deviate(p), math.inf, count)
-    return Tested(row, p, groups)
+    return ConstancyTest(row, p, groups)
 
 
 def _alone_group(vine: str, number: Number, count: int, common: float) -> dict[str, object]:

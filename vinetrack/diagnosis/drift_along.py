@@ -13,15 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vinetrack.diagnosis.drift_tests import FEWEST_DEGREES, Tested, as_deviate
-from vinetrack.diagnosis.force_answers import Motion, answers_to_pushes, motions_of
-from vinetrack.diagnosis.own_values import Laid, OwnValues
-from vinetrack.model.fit_result import Fit, decimals
-from vinetrack.model.free import DAMPING, YIELD_PRESSURE
-from vinetrack.model.left_out import rest_is_seen
-from vinetrack.model.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
-from vinetrack.model.terms import evaluate
-from vinetrack.records import Floats, Trial
+from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.constancy_tests import FEWEST_DEGREES, ConstancyTest, as_deviate
+from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of, push_sensitivities
+from vinetrack.diagnosis.per_trial_estimates import AlignedTrial, PerTrialEstimates
+from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.inference.fit_result import Fit, decimals
+from vinetrack.inference.left_out import rest_is_seen
+from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
 
 STEP = 1e-3
 LEAST_SCATTER = 2e-3
@@ -39,7 +39,7 @@ class _Halves:
     deviation: Floats
 
 
-def along_growth(found: Fit, laid: Laid, values: OwnValues) -> Iterator[Tested]:
+def along_growth(found: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> Iterator[ConstancyTest]:
     """Rows of B against the growth, for every vine and for all; `values` are those of B.
 
     Raises
@@ -60,7 +60,7 @@ def along_growth(found: Fit, laid: Laid, values: OwnValues) -> Iterator[Tested]:
             yield tested
 
 
-def _halves(found: Fit, laid: Laid, own: Floats) -> _Halves:
+def _halves(found: Fit, laid: AlignedTrial, own: Floats) -> _Halves:
     """About each trial's own B: about the common one, its scatter would count in the second order."""
     motions = motions_of(found, own)
     data = laid.predictor.data
@@ -72,14 +72,14 @@ def _halves(found: Fit, laid: Laid, own: Floats) -> _Halves:
     ]
     pushes = [_pushes(*one) for one in zip(motions, middles, strict=True)]
     deviation = np.full((len(data), 2), math.nan)
-    for i, answers in enumerate(answers_to_pushes(found, own, motions, pushes)):
+    for i, answers in enumerate(push_sensitivities(found, own, motions, pushes)):
         others = columns[i][:, [RELEASE]] if held[i] else columns[i][:, [RELEASE, ORIGIN]]
         if laid.predictor.feels_damping[i] and np.all(np.ptp(answers, axis=0) > 0):
             deviation[i] = np.linalg.lstsq(np.column_stack([answers, others]), columns[i][:, -1], rcond=1e-9)[0][:2]
     return _Halves(tuple(item.trial for item in data), deviation + own[:, [DAMPING_DEVIATION]])
 
 
-def _pushes(motion: Motion, middle_m: float) -> Floats:
+def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
     """What a unit of ln B does to the tail's acceleration in each half of the growth, m/s², shape (n_times, 2)."""
     value = motion.model.values[DAMPING]
     assert isinstance(value, float)
@@ -90,7 +90,7 @@ def _pushes(motion: Motion, middle_m: float) -> Floats:
     return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
 
 
-def _tested(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> Tested | None:
+def _tested(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> ConstancyTest | None:
     """The mean difference of the halves against how replicates differ in it."""
     from scipy.stats import t as student
 
@@ -128,7 +128,7 @@ def _tested(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> Teste
             " the way."
         ),
     }
-    return Tested(row, p, _groups(found, halves, vine, chosen) if vine else [])
+    return ConstancyTest(row, p, _groups(found, halves, vine, chosen) if vine else [])
 
 
 def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
@@ -170,7 +170,7 @@ def _groups(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[
     return rows
 
 
-def against_the_sheet(found: Fit) -> Iterator[Tested]:
+def against_the_sheet(found: Fit) -> Iterator[ConstancyTest]:
     """Rows of yield pressures that the fit moved, beside the error that the sheet gives them."""
     for number, free in zip(found.numbers, found.predictor.layout.free, strict=True):
         if number.key != YIELD_PRESSURE or not math.isfinite(free.prior_sd):
@@ -198,4 +198,4 @@ def against_the_sheet(found: Fit) -> Iterator[Tested]:
                 f" {free.prior_sd / 1e3:.2f} kPa of the sheet to {number.value / 1e3:.2f} kPa ({z:.1f} σ)."
             ),
         }
-        yield Tested(row, p, [])
+        yield ConstancyTest(row, p, [])

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.diagnosis.replicates import first_that_counts, replicates_of
-from vinetrack.model.fit_data import FitError
-from vinetrack.model.fit_result import Fit, TrialFit
-from vinetrack.model.left_out import predict_prepared
-from vinetrack.model.subset import fit_subset
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.left_out import predict_prepared
+from vinetrack.inference.subset import fit_subset
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -3,7 +3,7 @@
 By condition; along time, position and speed; and by which parameter drifts with a condition it should not know
 (`vinetrack.diagnosis.drift`). A prediction has a release and an origin of its own and nothing else, as in
 `vinetrack.diagnosis.compare`. Errors are those of the mean of the trials there, from how replicates scatter
-(`vinetrack.diagnosis.scatter`): a thousand frames of one trial are one trial.
+(`vinetrack.diagnosis.replicate_scatter`): a thousand frames of one trial are one trial.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.records import Floats
 from vinetrack.diagnosis.compare import position_errors
 from vinetrack.diagnosis.drift import Drift, drift
 from vinetrack.diagnosis.ladder import excess
+from vinetrack.diagnosis.replicate_scatter import Scatter, Stretches, stretch_covariance, unlikely
 from vinetrack.diagnosis.replicates import replicates_of
-from vinetrack.diagnosis.scatter import Scatter, Stretches, stretch_covariance, unlikely
 from vinetrack.diagnosis.stretches import (
     STRETCHES,
     Course,
@@ -31,8 +32,7 @@ from vinetrack.diagnosis.stretches import (
     stretches_of,
     variances_of,
 )
-from vinetrack.model.fit_result import Fit, TrialFit, decimals
-from vinetrack.records import Floats
+from vinetrack.inference.fit_result import Fit, TrialFit, decimals
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,8 +1,8 @@
 """The force that a model lacks: drawn against growth, speed, time and pressure, and held against simple laws.
 
-Nothing is differentiated. What a force would do to the positions is known (`vinetrack.diagnosis.force_answers`); the
-positions then say which force, by least squares with the noise of the tracks, release and origin of every trial free,
-its pressure and B free within what replicates scatter by, and B, n and all other numbers of the model free beside it.
+Nothing is differentiated. What a force would do to the positions is known (`vinetrack.diagnosis.force_sensitivities`);
+the positions then say which force, by least squares with the noise of the tracks, release and origin of every trial
+free, its pressure and B free within what replicates scatter by, and B, n and all other numbers of the model free beside it.
 
 Part of any force can be taken over by B and n: between them and a force that is drawn freely the data do not decide.
 Where a simple law explains most of what is missing, B and n are put as this law has them; else where the fit left them.
@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.diagnosis.force_answers import Motion, answers_to_forces, motions_of
-from vinetrack.diagnosis.force_fit import ForceFit, Gain
-from vinetrack.diagnosis.force_refine import refine
-from vinetrack.diagnosis.own_values import lay
-from vinetrack.diagnosis.simple_laws import Law, coarse_laws, finer_laws
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.force_inversion import ForceFit, Gain
+from vinetrack.diagnosis.force_laws import Law, coarse_laws, finer_laws
+from vinetrack.diagnosis.force_refinement import refine
+from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities, motions_of
+from vinetrack.diagnosis.per_trial_estimates import lay
 from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
-from vinetrack.model.fit_data import FitError
-from vinetrack.model.fit_result import Fit
-from vinetrack.model.simulate import SimulationError
-from vinetrack.records import Floats
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -114,7 +114,7 @@ def missing_force(found: Fit) -> MissingForce:
     fit, motions, everything = look.fit, look.motions, look.everything
 
     def answers(laws: Sequence[Law]) -> list[Floats]:
-        return answers_to_forces(found, fit.own, motions, lambda m: np.column_stack([one.along(m) for one in laws]))
+        return force_sensitivities(found, fit.own, motions, lambda m: np.column_stack([one.along(m) for one in laws]))
 
     ranked = _in_full(found, fit, motions, _ranked(fit, answers, motions, everything))
     families = _families(found, fit, motions)
@@ -137,7 +137,7 @@ class _Look:
     """The trials laid out about one place: motions, what smooth pieces of force do, and what all of them explain."""
 
     fit: ForceFit
-    motions: list[Motion]
+    motions: list[FittedMotion]
     longest: dict[str, float]
     pieces: list[Floats]
     everything: Gain
@@ -148,7 +148,7 @@ def _look(found: Fit, fit: ForceFit) -> _Look:
     longest = {motion.trial.condition: 0.0 for motion in motions}
     for motion in motions:
         longest[motion.trial.condition] = max(longest[motion.trial.condition], float(motion.lead_position_m.max()))
-    pieces = answers_to_forces(
+    pieces = force_sensitivities(
         found, fit.own, motions, lambda m: pieces_of(m.lead_position_m / longest[m.trial.condition])
     )
     return _Look(fit, motions, longest, pieces, fit.by_condition(pieces))
@@ -186,7 +186,7 @@ def _splines(at: Floats, knots: Floats) -> Floats:
     return np.asarray(BSpline.design_matrix(np.clip(at, 0.0, 1.0), ends, 3).toarray())
 
 
-def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[Motion], everything: Gain) -> list[_Judged]:
+def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[FittedMotion], everything: Gain) -> list[_Judged]:
     """The best law of each kind, best first."""
 
     def gains(laws: Sequence[Law]) -> list[tuple[Law, Gain]]:
@@ -201,7 +201,7 @@ def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[Motion], everythi
     return sorted(_best_of_kinds(_judged(fit, found, most)), key=lambda one: (not one.seen, one.bic))
 
 
-def _in_full(found: Fit, fit: ForceFit, motions: Sequence[Motion], laws: list[_Judged]) -> list[_Judged]:
+def _in_full(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion], laws: list[_Judged]) -> list[_Judged]:
     """The laws, the best fitted in full where that leaves hardly more than their linear fit promised.
 
     Where the linear fit of the best leaves but noise, its rivals' will do.
@@ -233,7 +233,7 @@ def _best_of_kinds(found: Sequence[_Judged]) -> list[_Judged]:
     return list(best.values())
 
 
-def _families(found: Fit, fit: ForceFit, motions: Sequence[Motion]) -> dict[str, float]:
+def _families(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion]) -> dict[str, float]:
     """By how much χ² falls with a smooth force that hangs on one thing alone; or one constant a condition."""
     along = {
         "growth": lambda m: m.lead_position_m,
@@ -243,20 +243,20 @@ def _families(found: Fit, fit: ForceFit, motions: Sequence[Motion]) -> dict[str,
     explained = {}
     for name, count in FAMILIES.items():
         top = max(float(along[name](motion).max()) for motion in motions)
-        answers = answers_to_forces(
+        answers = force_sensitivities(
             found,
             fit.own,
             motions,
             lambda m, a=along[name], t=top, n=count: curves(a(m) / t, n),  # type: ignore[misc]
         )
         explained[name] = fit.together(answers).beyond
-    constant = answers_to_forces(found, fit.own, motions, lambda m: np.ones((m.time_s.size, 1)))
+    constant = force_sensitivities(found, fit.own, motions, lambda m: np.ones((m.time_s.size, 1)))
     explained["condition"] = fit.by_condition(constant).beyond
     return explained
 
 
 def _table(
-    motions: Sequence[Motion], longest: Mapping[str, float], drawn: Mapping[str, tuple[Floats, Floats]]
+    motions: Sequence[FittedMotion], longest: Mapping[str, float], drawn: Mapping[str, tuple[Floats, Floats]]
 ) -> pd.DataFrame:
     """Force of every condition along its first trial's motion, and the mean over all."""
     import pandas as pd

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.model.fit_result import Fit, Number
-from vinetrack.model.free import YIELD_PRESSURE
-from vinetrack.model.simulate import Trajectory, simulate_many
-from vinetrack.motion.efficiency import lead_velocity_at
-from vinetrack.records import Floats, Trial
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.simulate import Trajectory, simulate_many
+from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.parameters import YIELD_PRESSURE
+from vinetrack.kinematics.efficiency import lead_velocity_at
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vinetrack.model.fit_result import TrialFit
-from vinetrack.model.left_out import FEWEST_AT_REST, told_apart
-from vinetrack.records import Floats
-from vinetrack.video.position_noise import rest_points
+from vinetrack.core.records import Floats
+from vinetrack.inference.fit_result import TrialFit
+from vinetrack.inference.left_out import FEWEST_AT_REST, told_apart
+from vinetrack.tracks.position_noise import rest_points
 
 TELLS_APART = 0.05
 """Of a shift in time and one in position, the least singular value by which both are found."""
@@ -70,7 +70,7 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
     Parameters
     ----------
     trials
-        Trials of one condition as a model predicts them, see `vinetrack.model.fit.predict`.
+        Trials of one condition as a model predicts them, see `vinetrack.inference.fit.predict`.
     """
     longest = max(trials, key=lambda trial: trial.time_s[-1] - trial.release_s)
     frame_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.model.fit_result import Fit, Number
+from vinetrack.inference.fit_result import Fit, Number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -165,9 +165,9 @@ class Diagnosis:
         }
 
     def __str__(self) -> str:
-        from vinetrack.diagnosis.words import printed
+        from vinetrack.narrative.verdict_text import diagnosis_text
 
-        return printed(self)
+        return diagnosis_text(self)
 
 
 def number_entry(number: Number) -> dict[str, Any]:

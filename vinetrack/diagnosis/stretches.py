@@ -1,4 +1,4 @@
-"""Trials cut into stretches, and how much replicates scatter in them; see `vinetrack.diagnosis.scatter`."""
+"""Trials cut into stretches, and how much replicates scatter in them; see `vinetrack.diagnosis.replicate_scatter`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.ladder import in_sample
-from vinetrack.diagnosis.own_values import lay
+from vinetrack.diagnosis.per_trial_estimates import lay
+from vinetrack.diagnosis.replicate_scatter import (
+    Scatter,
+    Stretches,
+    find_scatter,
+    scatter_sensitivities,
+    stretch_covariance,
+)
 from vinetrack.diagnosis.replicates import first_that_counts
-from vinetrack.diagnosis.scatter import Scatter, Stretches, answers_to_scatter, find_scatter, stretch_covariance
-from vinetrack.model.fit_data import FitTrial
-from vinetrack.model.fit_result import Fit, TrialFit
-from vinetrack.records import Floats, Trial
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.fit_result import Fit, TrialFit
 
 STRETCHES = 8
 """Parts of the growth that a mean is taken over."""
@@ -50,7 +56,7 @@ def courses_of(found: Fit) -> tuple[list[Course], tuple[TrialFit, ...]]:
         If the model cannot be followed.
     """
     predicted = in_sample(found).trials
-    answers = answers_to_scatter(lay(found))
+    answers = scatter_sensitivities(lay(found))
     return [_course(*one) for one in zip(predicted, answers, found.predictor.data, strict=True)], predicted
 
 

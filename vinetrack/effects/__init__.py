@@ -6,7 +6,7 @@ a user's own, `own_effects(paths)` all of them, tried out.
 
 from __future__ import annotations
 
-from vinetrack.effects._base import HOOKS, Effect, Parameter, Rig, State, Worked
+from vinetrack.effects._base import HOOKS, Effect, Parameter, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import BASE_EFFECTS, EffectError, catalogue, find_effect, load_effect
 from vinetrack.effects._own import own_effects
 
@@ -16,8 +16,8 @@ __all__ = [
     "Effect",
     "EffectError",
     "Parameter",
-    "Rig",
     "State",
+    "TrialInputs",
     "Worked",
     "catalogue",
     "find_effect",

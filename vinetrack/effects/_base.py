@@ -56,7 +56,7 @@ class State(NamedTuple):
     observed: float  #: position that the camera would report, m, as changed by the effects asked before
 
 
-class Rig(NamedTuple):
+class TrialInputs(NamedTuple):
     """What stays the same during one trial (SI; NaN where the sheet is blank)."""
 
     set_pressure: float
@@ -163,7 +163,7 @@ class Effect:
     in_trace: bool = False  #: a pressure measured during growth already holds it
     replaces: tuple[str, ...] = ()  #: effects that it contains and that rest while it is in the model
     order: int = 3  #: place among the effects of one hook
-    corners: Callable[[Rig], Sequence[float]] | None = None  #: lead positions where its force has a corner, m
+    corners: Callable[[TrialInputs], Sequence[float]] | None = None  #: lead positions where its force has a corner, m
 
     @property
     def formula(self) -> str:

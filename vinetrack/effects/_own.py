@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from vinetrack.effects._base import Effect, Rig, State, Worked
+from vinetrack.effects._base import Effect, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import EffectError, load_effect
 
 _STATE = State(
@@ -27,7 +27,7 @@ _STATE = State(
     tail_tension=2.0,
     observed=0.101,
 )
-_RIG = Rig(
+_RIG = TrialInputs(
     set_pressure=28e3,
     yield_pressure=3e3,
     diameter=24e-3,
@@ -115,7 +115,7 @@ def worked_value(effect: Effect, worked: Worked) -> float:
         If the worked number names no function of the effect, or lacks one of its parameters.
     """
     state = State(*(math.nan,) * len(State._fields))._replace(**worked.state)
-    rig = Rig(*(math.nan,) * len(Rig._fields))._replace(**worked.rig)
+    rig = TrialInputs(*(math.nan,) * len(TrialInputs._fields))._replace(**worked.rig)
     arguments = [worked.parameters[parameter.name] for parameter in effect.parameters]
     return float(effect.functions[worked.hook](state, rig, *arguments))
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from vinetrack.core.terminal import table
 from vinetrack.effects._base import KINDS, Effect, Parameter
-from vinetrack.terminal import table
 
 _HEAD = ("name", "kind", "parameters")
 

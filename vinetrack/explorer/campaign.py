@@ -14,21 +14,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.diagnosis.hypotheses import host_for
+from vinetrack.core.records import Floats, Kinematics, Track, Trial
+from vinetrack.diagnosis.candidates import host_for
+from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.model.fit_data import FitTrial, prepare
-from vinetrack.model.left_out import rest_is_seen
-from vinetrack.model.model import Model
-from vinetrack.model.rig import check_needs
-from vinetrack.model.starts import first_own
-from vinetrack.records import Floats, Kinematics, Track, Trial
-from vinetrack.stages.model import measured
-from vinetrack.stages.results import Results, ResultsError, read_json, read_result
+from vinetrack.inference.fit_data import FitTrial, prepare
+from vinetrack.inference.left_out import rest_is_seen
+from vinetrack.inference.starts import initial_trial_effects
+from vinetrack.pipeline.model_stage import measured
+from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.experiment import Experiment
+    from vinetrack.experiment.folder import Experiment
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def read_campaign(folder: Path, experiment: Experiment, own: Mapping[str, Effect
     Parameters
     ----------
     own
-        The user's own effects, see `vinetrack.stages.effects.effects_of`.
+        The user's own effects, see `vinetrack.pipeline.effects_stage.effects_of`.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def _floors(results: Results) -> dict[str, float]:
 
 def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[Seen]:
     """Trials with the release and origin that the comparison found, or else what the track alone shows."""
-    own, at_rest = first_own(data), rest_is_seen(data)
+    own, at_rest = initial_trial_effects(data), rest_is_seen(data)
     found = []
     for i, item in enumerate(data):
         release_s, origin_m = float(own[i, 0]), float(own[i, 1])

@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from vinetrack.dynamics.model import Model, Value
 from vinetrack.effects import BASE_EFFECTS, Effect, Parameter
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.curves import Sized, yields_of
-from vinetrack.model.free import DAMPING
-from vinetrack.model.model import Model, Value
+from vinetrack.inference.parameters import DAMPING
 
 SHOWN_UNITS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/MPa", 1e6), "m": ("mm", 1e3), "m²": ("cm²", 1e4), "1": ("", 1.0)}
 """Units that read better another way: name and factor."""

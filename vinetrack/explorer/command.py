@@ -47,8 +47,8 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
         If the experiment cannot be read.
     """
     from vinetrack.explorer.campaign import read_campaign
-    from vinetrack.stages.behind import experiment_behind
-    from vinetrack.stages.effects import effects_of
+    from vinetrack.pipeline.effects_stage import effects_of
+    from vinetrack.pipeline.source_experiment import experiment_behind
 
     read = experiment_behind(folder, experiment)
     return read_campaign(folder, read, effects_of(read.folder))
@@ -62,8 +62,8 @@ def explore(folder: Path, experiment: Path | None, wanted: Wanted, say: Callable
     ResultsError, ExperimentError, ChoiceError, PageError, FitError, EffectError, SimulationError
         In one sentence each.
     """
+    from vinetrack.core.terminal import waiting
     from vinetrack.explorer.choice import chosen, first_choice
-    from vinetrack.terminal import waiting
 
     with waiting(f"opening {folder}"):
         campaign = open_campaign(folder, experiment)
@@ -83,12 +83,12 @@ def explore(folder: Path, experiment: Path | None, wanted: Wanted, say: Callable
 def _without_a_page(
     campaign: Campaign, start: Choice, choice: Choice, wanted: Wanted, say: Callable[[str], None]
 ) -> None:
+    from vinetrack.core.terminal import waiting
     from vinetrack.explorer.choice import sized
     from vinetrack.explorer.curves import errors_m, follow
     from vinetrack.explorer.export import model_words, write_export
     from vinetrack.explorer.fitting import first_fit, fit_choice, gained_words
-    from vinetrack.stages.save_model import save_model
-    from vinetrack.terminal import waiting
+    from vinetrack.pipeline.save_model import save_model
 
     with waiting("simulating the trials"):
         before = errors_m(campaign, follow(campaign, sized(campaign, start)))
@@ -112,9 +112,9 @@ def _without_a_page(
 
 def error_lines(campaign: Campaign, choice: Choice, now: dict[str, float], before: dict[str, float]) -> list[str]:
     """The error of every condition before and now beside what replicates differ by, aligned, with units."""
+    from vinetrack.core.terminal import table
     from vinetrack.explorer.curves import overall_m
     from vinetrack.explorer.export import model_words
-    from vinetrack.terminal import table
 
     def cells(values: dict[str, float]) -> list[str]:
         return [f"{1e3 * values[key]:.3f}" if values[key] == values[key] else "–" for key in ("was", "now", "floor")]

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.simulate import Trace, Trajectory, simulate_many
 from vinetrack.explorer.campaign import Campaign, Seen
-from vinetrack.model.free import YIELD_PRESSURE
-from vinetrack.model.left_out import TOLD_APART, told_apart
-from vinetrack.model.model import Model
-from vinetrack.model.simulate import Trace, Trajectory, simulate_many
-from vinetrack.records import Floats, Trial
+from vinetrack.inference.left_out import TOLD_APART, told_apart
+from vinetrack.inference.parameters import YIELD_PRESSURE
 
 GRID_POINTS = 500
 """Points of the grid a trial is simulated on: linear between them it is good to a part in 10⁵ of its length."""
@@ -41,7 +41,7 @@ class Sized:
 
 
 @dataclass(frozen=True)
-class Motion:
+class ModelCurves:
     """What the model says of one trial; arrays have shape (n_points,), at the trial's own frames.
 
     `release_s` and `origin_m` are on the track's clock and ruler. `growth_m` is the position the camera would report,
@@ -68,7 +68,7 @@ class Motion:
         return self.origin_m + np.interp(since, self.path_s, self.path_m, right=math.nan)
 
 
-Curves = tuple[Motion, ...]
+Curves = tuple[ModelCurves, ...]
 """A motion for every trial of a campaign, in its order."""
 
 
@@ -120,7 +120,7 @@ def _since(seen: Seen) -> Trace | None:
     return None if trace is None else (trace[0] - seen.release_s, trace[1])
 
 
-def _laid(seen: Seen, grid: Floats, moved: Trajectory, start_s: float) -> Motion:
+def _laid(seen: Seen, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
     """Newton's steps in release, and in the origin where the vine was not seen at rest."""
     item, position = seen.item, moved.observed_position_m
     speed = np.gradient(position, grid)
@@ -142,7 +142,7 @@ def _laid(seen: Seen, grid: Floats, moved: Trajectory, start_s: float) -> Motion
     residual = item.lead_position_m - origin_m - growth
     counted = residual[seen.counts_from(release_s) :]
     above = origin_m - seen.origin_m
-    return Motion(release_s, origin_m, growth + above, residual, float(np.mean(counted**2)), grid, position)
+    return ModelCurves(release_s, origin_m, growth + above, residual, float(np.mean(counted**2)), grid, position)
 
 
 def _step(slope: Floats, left: Floats, *, free_origin: bool) -> tuple[float, float]:

@@ -99,7 +99,7 @@ def write_export(campaign: Campaign, choice: Choice, curves: Curves, path: Path)
     ChoiceError
         If the ending is none of `FORMATS`.
     """
-    from vinetrack.tables import write_bytes
+    from vinetrack.core.tables import write_bytes
 
     form = path.suffix.lower().removeprefix(".")
     write_bytes(path, exported(campaign, choice, curves, range(len(campaign.trials)), form))

@@ -17,7 +17,7 @@ from vinetrack.explorer.campaign import Campaign, Seen
 from vinetrack.explorer.curves import Curves
 from vinetrack.explorer.look import EARLIER_EDGE, MEASURED_EDGE, MODEL_EDGE, escaped, progress_bar, sheet, words
 from vinetrack.explorer.recording import Film, View, view_of
-from vinetrack.stages.results import Results
+from vinetrack.results.folder_layout import Results
 
 PLAY_MS = 70
 NARROW = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"

@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from vinetrack.diagnosis.compare import compare
+from vinetrack.dynamics.model import Value
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.choice import Choice, sized
 from vinetrack.explorer.curves import Curves, errors_m, follow
-from vinetrack.model.fit import fit, refit
-from vinetrack.model.fit_data import FitError
-from vinetrack.model.fit_result import Fit, Number
-from vinetrack.model.model import Value
-from vinetrack.model.simulate import SimulationError
-from vinetrack.model.solve import Step, Watch
+from vinetrack.inference.fit import fit, refit
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.optimiser import Step, Watch
 
 log = logging.getLogger(__name__)
 

@@ -6,14 +6,14 @@ import logging
 import threading
 from collections.abc import Callable
 
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.choice import Choice, first_choice, sized
 from vinetrack.explorer.curves import Curves, errors_m, follow
 from vinetrack.explorer.fitting import FAULT, Fitted, first_fit
-from vinetrack.model.fit_data import FitError
-from vinetrack.model.simulate import SimulationError
-from vinetrack.model.solve import Step
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.optimiser import Step
 
 log = logging.getLogger(__name__)
 

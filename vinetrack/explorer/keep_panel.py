@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from bokeh.models import Button, Column, ColumnDataSource, CustomJS, Row
 
+from vinetrack.core.problems import ExperimentError, format_problems
+from vinetrack.core.tables import TableError
 from vinetrack.explorer.export import commands, exported, model_words
 from vinetrack.explorer.look import command_block, escaped, sheet, words
-from vinetrack.problems import ExperimentError, format_problems
-from vinetrack.stages.save_model import save_model
-from vinetrack.tables import TableError
+from vinetrack.pipeline.save_model import save_model
 
 if TYPE_CHECKING:
     from vinetrack.explorer.page import Page

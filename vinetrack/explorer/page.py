@@ -10,6 +10,7 @@ from typing import Any
 from bokeh.document import Document
 from bokeh.models import Button, Column, CustomJS, Row
 
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.explorer.choice import Choice, changed, sized
 from vinetrack.explorer.chooser import Chooser
 from vinetrack.explorer.curves import Curves, errors_m, follow
@@ -25,8 +26,7 @@ from vinetrack.explorer.sides import Rung, headline, next_panel, numbers_words, 
 from vinetrack.explorer.story import DIAGNOSIS, Story, read_story
 from vinetrack.explorer.waiting import Waiting
 from vinetrack.figures.page_tokens import follows_screen
-from vinetrack.model.simulate import SimulationError
-from vinetrack.model.solve import Step
+from vinetrack.inference.optimiser import Step
 
 COALESCE_MS = 4
 """A redraw waits this long, so that all moves of a slider that have come in by then are drawn as one."""

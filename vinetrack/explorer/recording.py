@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.records import Floats, Trial
-from vinetrack.stages.overlays import shake_along
-from vinetrack.stages.results import Results, ResultsError, read_json, read_result
+from vinetrack.core.records import Floats, Trial
+from vinetrack.pipeline.overlays_stage import shake_along
+from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from vinetrack.core.records import Floats
 from vinetrack.explorer.campaign import Campaign, Seen, condition_labels
 from vinetrack.explorer.curves import Curves
 from vinetrack.figures.style import vine_styles
-from vinetrack.records import Floats
 
 MOST_POINTS = 250
 """Points of a line on the page: more cannot be seen, and would take longer to send than to compute."""

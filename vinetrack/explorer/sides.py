@@ -15,7 +15,7 @@ from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
 from vinetrack.explorer.look import command_block, escaped, table
 from vinetrack.explorer.series import vine_colours
 from vinetrack.explorer.story import Story
-from vinetrack.model.fit_result import Number, decimals
+from vinetrack.inference.fit_result import Number, decimals
 
 AT_THE_FLOOR = 1.15
 MOST_PAIRS = 6

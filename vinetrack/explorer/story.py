@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vinetrack.stages.results import ResultsError, read_json
+from vinetrack.results.folder_layout import ResultsError, read_json
 
 DIAGNOSIS = "diagnosis.json"
 

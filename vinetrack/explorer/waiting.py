@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from vinetrack.model.solve import SETTLED_DECREASE, Step
+from vinetrack.inference.optimiser import SETTLED_DECREASE, Step
 
 LEAST_SHARE = 0.04
 

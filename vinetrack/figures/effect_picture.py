@@ -24,7 +24,7 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     name : of the effect.
     size : its parameters in words, such as `C_D = 1`; blank where it has none.
     vine : the vine and the trial in words.
-    table : columns as of `vinetrack.model.effect_motion.effect_motion`.
+    table : columns as of `vinetrack.dynamics.effect_motion.effect_motion`.
     """
     from matplotlib.figure import Figure
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from vinetrack import published
+from vinetrack.core import published
 from vinetrack.figures.style import INK, MUTED, VINE_COLOURS, look
 
 if TYPE_CHECKING:

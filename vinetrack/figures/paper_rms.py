@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack import published
+from vinetrack.core import published
 from vinetrack.figures.style import BLUE, GREEN, INK, ORANGE, PURPLE, look, plain_log_ticks
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.records import UNUSABLE_FLAGS
 from vinetrack.figures.style import INK, MUTED, ORANGE, SKY, VERMILLION, legend_above, look
-from vinetrack.records import UNUSABLE_FLAGS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

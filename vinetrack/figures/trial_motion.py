@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.records import UNUSABLE_FLAGS
 from vinetrack.figures.numbers import with_error
 from vinetrack.figures.style import (
     GRID,
@@ -24,7 +25,6 @@ from vinetrack.figures.style import (
     look,
     rows,
 )
-from vinetrack.records import UNUSABLE_FLAGS
 
 if TYPE_CHECKING:
     import pandas as pd

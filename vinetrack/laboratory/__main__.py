@@ -21,9 +21,9 @@ from pathlib import Path
 
 import yaml
 
-from vinetrack.experiment import Experiment, read_experiment
+from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
-from vinetrack.laboratory.nature import read_nature
+from vinetrack.laboratory.ground_truth import read_nature
 from vinetrack.laboratory.refilm import before_the_camera
 from vinetrack.laboratory.tracks import VirtualTrial, grow, write_tracks, write_truth
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vinetrack import published
-from vinetrack.design.guess import guess_damping
-from vinetrack.naming import with_names
-from vinetrack.records import Trial
+from vinetrack.core import published
+from vinetrack.core.records import Trial
+from vinetrack.experiment.naming import with_names
+from vinetrack.planning.scaling_priors import damping_prior
 
 CAPTURE_FPS = published.CAPTURE_FPS
 PAPER_B = published.DAMPING_B
@@ -77,7 +77,7 @@ def paper_B(diameter_m: float, thickness_m: float) -> float:
     for scale, diameter_mm in published.DIAMETER_MM.items():
         if abs(1e3 * diameter_m / diameter_mm - 1) < 0.01:
             return PAPER_B[scale] * 1e6 * thickness_m / published.THICKNESS_UM[scale]
-    return guess_damping(diameter_m, thickness_m)
+    return damping_prior(diameter_m, thickness_m)
 
 
 def damping_pressures_kPa(scale: int, count: int = 10) -> np.ndarray:

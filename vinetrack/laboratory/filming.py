@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from vinetrack.core.records import Floats, Trial
+from vinetrack.core.tables import replacing
+from vinetrack.dynamics.simulate import simulate
 from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.render import Truth, render_recording
 from vinetrack.laboratory.scene import Scene, Tube, preset
 from vinetrack.laboratory.targets import Target, render_target
 from vinetrack.laboratory.tracks import VirtualTrial
-from vinetrack.model.simulate import simulate
-from vinetrack.records import Floats, Trial
-from vinetrack.tables import replacing
 
 FINE_STEPS = 8
 """Instants a frame at which the true motion is handed to the camera."""

@@ -11,10 +11,10 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
-from vinetrack.experiment import Experiment, read_experiment
+from vinetrack.core.tables import write_csv, write_text
+from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.sheet import SHEET
 from vinetrack.laboratory.filming import Filming
-from vinetrack.sheet import SHEET
-from vinetrack.tables import write_csv, write_text
 
 SETTINGS = "experiment.yaml"
 TARGET = "calibration/board.png"

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from vinetrack.laboratory import shading, textures
 from vinetrack.laboratory.scene import Scene, Tube
-from vinetrack.laboratory.staging import Motion, Staging
-from vinetrack.laboratory.subjects import BallLayer, DoorLayer, PathMaps, TubeLayer
+from vinetrack.laboratory.scene_motion import Motion, Staging
+from vinetrack.laboratory.scene_objects import BallLayer, DoorLayer, PathMaps, TubeLayer
 from vinetrack.laboratory.targets import lay_target, plane_seen
 
 Floats = NDArray[np.float64]

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from vinetrack.laboratory.nature import Nature
-from vinetrack.model.model import Model
-from vinetrack.model.simulate import Trajectory, simulate_many
-from vinetrack.model.terms import pressure_along
-from vinetrack.records import Floats, Track, Trial
-from vinetrack.tables import write_csv, write_json, write_text
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.tables import write_csv, write_json, write_text
+from vinetrack.dynamics.force_terms import pressure_along
+from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.simulate import Trajectory, simulate_many
+from vinetrack.laboratory.ground_truth import Nature
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from functools import partial
 import numpy as np
 from scipy.stats import t as student
 
-from vinetrack import published
-from vinetrack.constants import AMBIENT_PRESSURE_PA, GRAVITY_M_S2
-from vinetrack.design.guess import BURST_STRESS_PA, guess_damping, hoop_stress_Pa
-from vinetrack.motion.scaling import regress
+from vinetrack.core import published
+from vinetrack.core.constants import AMBIENT_PRESSURE_PA, GRAVITY_M_S2
+from vinetrack.kinematics.scaling import regress
 from vinetrack.paper.rows import COMPUTED, PaperRow
+from vinetrack.planning.scaling_priors import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
 
 GAMMAS = {"slow": 1.0, "fast": 1.4}
 """Isothermal and adiabatic: the chamber's gas lies between them."""
@@ -234,7 +234,7 @@ def _guess_rows() -> Iterator[PaperRow]:
             setting=f"R = {scale}",
             unit="N·(s/m)ⁿ",
             published=B,
-            ours=guess_damping(published.DIAMETER_MM[scale] / 1e3, published.THICKNESS_UM[scale] / 1e6),
+            ours=damping_prior(published.DIAMETER_MM[scale] / 1e3, published.THICKNESS_UM[scale] / 1e6),
             mark=COMPUTED,
             how="joins the printed values to within 15 %; off their common t/D it is a guess and nothing more",
         )

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from vinetrack import published
-from vinetrack.motion.conditions import mean_with_error
-from vinetrack.motion.efficiency import lead_velocity_at
+from vinetrack.core import published
+from vinetrack.core.records import Floats, Trial
+from vinetrack.kinematics.conditions import mean_with_error
+from vinetrack.kinematics.efficiency import lead_velocity_at
 from vinetrack.paper.departures import NONE, WITHIN, follow
-from vinetrack.records import Floats, Trial
 
 POSITION_COLUMNS = ("condition", "pressure_kPa", "n_trials", "rms_mean_m", "rms_single_m")
 SPEED_COLUMNS = (

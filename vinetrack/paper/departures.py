@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from vinetrack import effects, published
-from vinetrack.model.model import Model, base_model
-from vinetrack.model.simulate import Trajectory, simulate
-from vinetrack.motion.efficiency import lead_velocity_at
-from vinetrack.records import Trial
+from vinetrack import effects
+from vinetrack.core import published
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.model import Model, base_model
+from vinetrack.dynamics.simulate import Trajectory, simulate
+from vinetrack.kinematics.efficiency import lead_velocity_at
 
 WITHIN = 0.95
 """Of the length, up to which positions are compared: a motion that stalls would else be averaged for ever."""

@@ -9,16 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from vinetrack import published
-from vinetrack.constants import AIR_DENSITY_KG_M3
-from vinetrack.design.guess import guess_damping
-from vinetrack.model.simulate import Trajectory, simulate, simulate_many
-from vinetrack.motion.damping import fit_laws
-from vinetrack.motion.efficiency import lead_velocity_at
-from vinetrack.motion.force import paper_force_N
-from vinetrack.motion.paper_rule import paper_window
+from vinetrack.core import published
+from vinetrack.core.constants import AIR_DENSITY_KG_M3
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
+from vinetrack.kinematics.damping import fit_laws
+from vinetrack.kinematics.efficiency import lead_velocity_at
+from vinetrack.kinematics.force import paper_force_N
+from vinetrack.kinematics.paper_rule import paper_window
 from vinetrack.paper.departures import NONE, Departure, paper_trial
-from vinetrack.records import Floats, Track, Trial
+from vinetrack.planning.scaling_priors import damping_prior
 
 SLOWEST_S = 10.0
 """For as long the steady motions are followed; the slowest takes 2.3 s."""
@@ -28,7 +28,7 @@ def fast_vine_speeds(fractions: Sequence[float]) -> list[float]:
     """Speed of the fast vine's leading edge at fractions of its length by Eq. (2) with a guessed B, m/s."""
     fast = published.FAST_VINE
     trial = paper_trial(fast["diameter_mm"], fast["thickness_um"], fast["length_mm"], fast["pressure_kPa"])
-    model = NONE.model(guess_damping(trial.diameter_m, trial.thickness_m))
+    model = NONE.model(damping_prior(trial.diameter_m, trial.thickness_m))
     found = simulate(model, trial, np.linspace(0, 0.05, 50_001))
     return [lead_velocity_at(found.lead_position_m, found.lead_velocity_m_s, f * trial.length_m) for f in fractions]
 
@@ -41,7 +41,7 @@ def drag_shares(fractions: Sequence[float]) -> Iterator[tuple[float, float, floa
     """
     case = published.DRAG_EXAMPLE
     trial = paper_trial(case["diameter_mm"], case["thickness_um"], case["length_mm"], case["pressure_kPa"])
-    model = NONE.model(guess_damping(trial.diameter_m, trial.thickness_m))
+    model = NONE.model(damping_prior(trial.diameter_m, trial.thickness_m))
     found = simulate(model, trial, np.linspace(0, 0.05, 50_001))
     for fraction in fractions:
         lead = lead_velocity_at(found.lead_position_m, found.lead_velocity_m_s, fraction * trial.length_m)

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 
 import pandas as pd
 
-from vinetrack import published
-from vinetrack.design.guess import guess_damping
+from vinetrack.core import published
+from vinetrack.core.records import Trial
 from vinetrack.paper.departures import DEPARTURES
 from vinetrack.paper.expected import drag_shares, fast_vine_speeds, rule_on_noise_free
 from vinetrack.paper.rows import COMPUTED, NOT_CHECKABLE, PaperRow
-from vinetrack.records import Trial
+from vinetrack.planning.scaling_priors import damping_prior
 
 FAST_AT = (0.90, 0.95, 0.98, 0.99)
 DRAG_AT = (0.50, 0.95, 0.99)
@@ -33,7 +33,7 @@ def foretold_rows(trials: Sequence[Trial]) -> Iterator[PaperRow]:
 
 def _fast_rows() -> Iterator[PaperRow]:
     fast = published.FAST_VINE
-    B = guess_damping(fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
+    B = damping_prior(fast["diameter_mm"] / 1e3, fast["thickness_um"] / 1e6)
     size = f"{fast['diameter_mm']:g} mm × {fast['thickness_um']:g} µm × {fast['length_mm']:g} mm"
     for fraction, speed in zip(FAST_AT, fast_vine_speeds(FAST_AT), strict=True):
         yield PaperRow(

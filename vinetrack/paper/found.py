@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vinetrack import published
+from vinetrack.core import published
 from vinetrack.paper.foretold import departures_in_words
 from vinetrack.paper.found_sizes import size_rows
 from vinetrack.paper.rows import NOT_CHECKABLE, PREFERRED, SIMULATED, PaperRow, bounds, number

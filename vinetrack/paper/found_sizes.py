@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack import published
+from vinetrack.core import published
 from vinetrack.paper.rows import NOT_CHECKABLE, PREFERRED, SIMULATED, PaperRow, bounds, number
 
 nan = math.nan

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from vinetrack import published
+from vinetrack.core import published
+from vinetrack.core.records import Trial
 from vinetrack.paper.rows import NOT_CHECKABLE, SIMULATED, PaperRow
-from vinetrack.records import Trial
 
 
 def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> Iterator[PaperRow]:

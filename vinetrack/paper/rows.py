@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from vinetrack.published import SOURCE
+from vinetrack.core.published import SOURCE
 
 COMPUTED = "computed"
 SIMULATED = "simulated from printed parameters"

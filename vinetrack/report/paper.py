@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from vinetrack import published
+from vinetrack.core import published
 from vinetrack.figures.numbers import interval, number
 from vinetrack.figures.style import rows
 from vinetrack.report.section import ReportFigure, ReportSection, ReportTable

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.settings import Calibration, Charuco, Checkerboard, MmPerPx, TwoPoints
-from vinetrack.video.corners import CornersError, charuco_corners, checkerboard_corners
+from vinetrack.experiment.settings import Calibration, Charuco, Checkerboard, MmPerPx, TwoPoints
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 from vinetrack.video.plane_map import PlaneMap, fit_planes
+from vinetrack.video.target_corners import CornersError, charuco_corners, checkerboard_corners
 
 Floats = NDArray[np.float64]
 

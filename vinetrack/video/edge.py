@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
-from vinetrack.video.bands import disagreement
+from vinetrack.video.edge_bands import disagreement
+from vinetrack.video.edge_repair import ASTRAY_PX, FAINTEST, mend_jumps
 from vinetrack.video.edge_state import (
     CLEAR_PX,
-    State,
+    EdgeState,
     blur_lengths,
     clear_of_start,
     core_frames,
@@ -26,8 +27,7 @@ from vinetrack.video.edge_state import (
     repicture,
     residuals,
 )
-from vinetrack.video.ending import growth_end
-from vinetrack.video.mend import ASTRAY_PX, FAINTEST, mend_jumps
+from vinetrack.video.growth_end import growth_end
 from vinetrack.video.strip import Strip
 from vinetrack.video.tip_shape import ASSUMED_EXPOSURE, OPTICAL_BLUR_PX, find_exposure, find_shape
 
@@ -217,14 +217,14 @@ def after_jump(path: Floats) -> int:
     return begin
 
 
-def _first_state(strip: Strip, path: Floats, exposure: float) -> State:
+def _first_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
     rows, columns = strip.values.shape[1:]
     blank = np.zeros((4, rows, columns), np.float32)
-    state = State(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank, np.ones(3))
+    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank, np.ones(3))
     return repicture(strip, state, 0.0)
 
 
-def _second_path(strip: Strip, state: State, passed: tuple[int, int]) -> Floats:
+def _second_path(strip: Strip, state: EdgeState, passed: tuple[int, int]) -> Floats:
     """Front by what every pixel resembles, film or background."""
     contrast = np.abs(state.pictures[0] - state.pictures[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
@@ -251,7 +251,7 @@ def _novelty(strip: Strip, edge: Floats) -> NDArray[np.float32]:
     return np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
 
 
-def _restate(strip: Strip, state: State, fit: Floats, exposure: float) -> State:
+def _restate(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
     """Take over the fitted edges and renew blur lengths, pictures and how far noise adds up about the edge."""
     edge = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
@@ -263,7 +263,7 @@ def _restate(strip: Strip, state: State, fit: Floats, exposure: float) -> State:
     return replace(state, inflation=np.clip(smooth, 0.3, 50.0))
 
 
-def _disturbed_start(strip: Strip, state: State) -> float:
+def _disturbed_start(strip: Strip, state: EdgeState) -> float:
     """Share of the columns before the start that change before the edge reaches them: a door swings there."""
     begin, columns = state.edge[0], strip.values.shape[2]
     places = np.arange(int(begin) + 6, min(int(begin + CLEAR_PX), columns - 1))
@@ -282,7 +282,7 @@ def _disturbed_start(strip: Strip, state: State) -> float:
     return changed / len(places)
 
 
-def _finish(strip: Strip, state: State, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
+def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
     core = core_frames(state, fit)
     # Where the picture departs from the model (a door, a glint) the edge is worse than its curvature says.
     strain = np.sqrt(np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0))

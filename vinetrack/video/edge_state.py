@@ -32,7 +32,7 @@ CLEAR_PX = 60.0
 
 
 @dataclass(frozen=True)
-class State:
+class EdgeState:
     """What alternates.
 
     The edge (n_frames,) and its blur lengths, the tip's lag by row and optical blur, and the pictures
@@ -64,7 +64,7 @@ def moving_frames(edge: Floats) -> NDArray[np.bool_]:
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
 
 
-def repicture(strip: Strip, state: State, clip: float) -> State:
+def repicture(strip: Strip, state: EdgeState, clip: float) -> EdgeState:
     """Solve every pixel's brightness before and after, given the edge; `clip` > 0 weighs strays down."""
     early, late = _passing(state, strip.values.shape[2])
     sums = kernels.gather(
@@ -81,7 +81,7 @@ def repicture(strip: Strip, state: State, clip: float) -> State:
     return replace(state, pictures=pictures)
 
 
-def _film_from_the_start(state: State, pictures: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _film_from_the_start(state: EdgeState, pictures: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Columns about the start whose background looks like their film, shape (n_along,): it was film all along.
 
     An edge put too far back makes film its own background, without contrast and so without a say against it.
@@ -95,7 +95,7 @@ def _film_from_the_start(state: State, pictures: NDArray[np.float32]) -> NDArray
     return near & (contrast < SELFSAME * float(np.median(contrast[later])))
 
 
-def _passing(state: State, columns: int) -> tuple[Floats, Floats]:
+def _passing(state: EdgeState, columns: int) -> tuple[Floats, Floats]:
     """First and last frame in which the edge is over each column, shapes (n_along,).
 
     About the start, film counts only once the edge has got clear of it: a door may stand or swing there until then.
@@ -117,7 +117,7 @@ def clear_of_start(edge: Floats) -> float:
     return float(edge[0] + min(CLEAR_PX, 0.2 * (edge.max() - edge[0])))
 
 
-def core_frames(state: State, fit: Floats) -> NDArray[np.bool_]:
+def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
     """Moving frames clear of the start that fit no worse than most, shape (n_frames,): those that tell of the tip."""
     moving = moving_frames(state.edge)
     clear = moving & (state.edge > clear_of_start(state.edge))
@@ -127,7 +127,7 @@ def core_frames(state: State, fit: Floats) -> NDArray[np.bool_]:
     return good if good.sum() >= 5 else clear
 
 
-def fit_edges(strip: Strip, state: State) -> Floats:
+def fit_edges(strip: Strip, state: EdgeState) -> Floats:
     """Most likely edge of every frame, shape (n_frames, 6); see `edge_kernels.fit_edges`."""
     return kernels.fit_edges(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, state.pictures,
@@ -135,7 +135,7 @@ def fit_edges(strip: Strip, state: State) -> Floats:
     )  # fmt: skip
 
 
-def residuals(strip: Strip, state: State, fit: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
+def residuals(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
     """What the fit leaves in the frames of `use`; see `edge_kernels.residual_sums`."""
     filled = np.nan_to_num(fit)
     filled[:, 0] = state.edge

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from vinetrack.records import Trial
+from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
 from vinetrack.video.track import Tracking, capture_rate, track_frames
 
 if TYPE_CHECKING:
-    from vinetrack.settings import ExperimentSettings
+    from vinetrack.experiment.settings import ExperimentSettings
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.problems import Problem
-from vinetrack.records import Trial
-from vinetrack.settings import Axis, ExperimentSettings
-from vinetrack.terminal import progress
+from vinetrack.core.problems import Problem
+from vinetrack.core.records import Trial
+from vinetrack.core.terminal import progress
+from vinetrack.experiment.settings import Axis, ExperimentSettings
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.track import FEWEST_FRAMES, capture_rate
 
 if TYPE_CHECKING:
-    from vinetrack.experiment import Experiment
+    from vinetrack.experiment.folder import Experiment
 
 SETTINGS = "experiment.yaml"
 LARGEST_WALKED_BYTES = 64_000_000

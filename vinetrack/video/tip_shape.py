@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.video.edge_state import State, blur_lengths, core_frames, fit_edges, residuals
+from vinetrack.video.edge_state import EdgeState, blur_lengths, core_frames, fit_edges, residuals
 from vinetrack.video.strip import Strip
 
 Floats = NDArray[np.float64]
@@ -23,7 +23,7 @@ OPTICAL_BLUR_PX = (0.4, 3.0)
 """From a sharp pixel to a picture out of focus; more is taken for blur only where noise drowns the edge."""
 
 
-def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
+def find_shape(strip: Strip, state: EdgeState, fit: Floats, anew: bool) -> EdgeState:
     """Estimate how far each row of the tip lags behind its foremost point, then the optical blur.
 
     From the core frames with less blur by motion: not those in which a door may still stand before the tip.
@@ -42,7 +42,7 @@ def find_shape(strip: Strip, state: State, fit: Floats, anew: bool) -> State:
     return replace(state, blur=float(np.clip(_least(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
 
 
-def _misfit_refitted(strip: Strip, state: State, frames: NDArray[np.int_]) -> float:
+def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_]) -> float:
     """Misfit of some frames with their edges sought anew: a blur must not be judged by edges fitted with another."""
     edge = np.full(len(state.edge), np.nan)
     edge[frames] = state.edge[frames]
@@ -52,7 +52,7 @@ def _misfit_refitted(strip: Strip, state: State, frames: NDArray[np.int_]) -> fl
     return residuals(strip, replace(state, edge=edge), fit, use)[2]
 
 
-def find_exposure(strip: Strip, state: State, fit: Floats) -> float:
+def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
     """Exposure in frame periods that explains the blur of the faster frames best; a guess where none moves 2 px."""
     core = core_frames(state, fit)
     speed = blur_lengths(state.edge, 1.0)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.records import Track, Trial
+from vinetrack.core.records import Track, Trial
 from vinetrack.video.axis import Axis, find_axis, is_orderly
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
-from vinetrack.video.judge import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
+from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
 if TYPE_CHECKING:

@@ -1,0 +1,324 @@
+"""Reading tables in every dialect, strict numbers, safe paths, whole files or none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vinetrack.core import tables
+from vinetrack.core.tables import TableError, parse_number, parse_table, read_table, result_file, safe_join
+
+PLAIN = "trial,pressure_kPa\na,28.5\nb,14\n"
+ROWS = ({"trial": "a", "pressure_kPa": "28.5"}, {"trial": "b", "pressure_kPa": "14"})
+
+
+def table_of(tmp_path: Path, data: bytes) -> tables.Table:
+    path = tmp_path / "table.csv"
+    path.write_bytes(data)
+    return read_table(path)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        PLAIN.encode(),
+        PLAIN.encode("utf-8-sig"),
+        PLAIN.encode("utf-16"),
+        PLAIN.encode("utf-32"),
+        PLAIN.replace("\n", "\r\n").encode(),
+        PLAIN.replace("\n", "\r").encode(),
+        PLAIN.replace(",", ";").encode(),
+        PLAIN.replace(",", "\t").encode("utf-16"),
+        PLAIN.replace(",", ", ").encode(),
+        PLAIN.replace(",", " ,  ").encode(),
+        PLAIN.replace("\n", "\n\n,\n").encode(),
+        ("\n\n" + PLAIN).encode(),
+        ("sep=,\n" + PLAIN).encode(),
+        ("sep=;\n" + PLAIN.replace(",", ";")).encode("utf-8-sig"),
+        PLAIN.replace("28.5", '"28.5"').encode(),
+        PLAIN.rstrip("\n").encode(),
+        PLAIN.replace("\n", ",,\n").encode(),
+    ],
+    ids=[
+        "comma",
+        "bom",
+        "utf16",
+        "utf32",
+        "crlf",
+        "cr",
+        "semicolon",
+        "excel-unicode-text",
+        "blank-after-comma",
+        "blanks-around",
+        "blank-lines",
+        "leading-blank-lines",
+        "sep-line",
+        "sep-semicolon-bom",
+        "quoted",
+        "no-final-newline",
+        "trailing-commas",
+    ],
+)
+def test_every_dialect_reads_to_the_same_rows(tmp_path: Path, data: bytes) -> None:
+    table = table_of(tmp_path, data)
+    assert table.columns == ("trial", "pressure_kPa")
+    assert table.rows == ROWS
+    np.testing.assert_array_equal(table.numbers("pressure_kPa"), [28.5, 14.0])
+
+
+def test_semicolons_with_decimal_commas() -> None:
+    table = parse_table("t;x\n0,5;1,25\n1;2\n")
+    np.testing.assert_array_equal(table.numbers("x"), [1.25, 2.0])
+    np.testing.assert_array_equal(table.numbers("t"), [0.5, 1.0])
+
+
+def test_quoted_decimal_comma_in_a_comma_file() -> None:
+    np.testing.assert_array_equal(parse_table('t,x\n"0,5",1\n"1,5",2\n').numbers("t"), [0.5, 1.5])
+
+
+def test_cp1252_is_the_fallback(tmp_path: Path) -> None:
+    assert table_of(tmp_path, "trial,Größe\na,µ\n".encode("cp1252")).rows == ({"trial": "a", "Größe": "µ"},)
+
+
+def test_line_numbers_are_those_of_the_file() -> None:
+    table = parse_table('a,b\n\n1,2\n,\n"x\ny",3\n4,5\n')
+    assert table.lines == (3, 5, 7)
+
+
+def test_short_rows_are_blank_and_long_ones_keep_what_is_beyond() -> None:
+    table = parse_table("a,b\n1\n1,2,3,\n")
+    assert table.rows == ({"a": "1", "b": ""}, {"a": "1", "b": "2"})
+    assert table.extra == ((), ("3",))
+
+
+def test_a_column_without_a_name_is_noticed() -> None:
+    assert parse_table("a,,b\n1,remark,2\n").nameless
+    assert not parse_table("a,,b\n1,,2\n").nameless
+
+
+@pytest.mark.parametrize("text", ["", "\n \n", ",,\n"])
+def test_an_empty_file_is_refused(text: str) -> None:
+    with pytest.raises(TableError, match="is empty"):
+        parse_table(text)
+
+
+def test_a_column_named_twice_is_refused() -> None:
+    with pytest.raises(TableError, match="names the column 'x' twice"):
+        parse_table("x,y,x\n1,2,3\n")
+
+
+def test_a_quote_never_closed_is_refused() -> None:
+    with pytest.raises(TableError, match="never closed"):
+        parse_table('a,b\n1,"2\n3,4\n')
+
+
+def test_a_binary_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TableError, match="is not text"):
+        table_of(tmp_path, b"PK\x03\x04\x00\x00trials.xlsx")
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(TableError, match="does not exist"):
+        read_table(tmp_path / "none.csv")
+    with pytest.raises(TableError, match="is a folder"):
+        read_table(tmp_path)
+
+
+def test_a_recording_named_as_a_table_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "LARGEST_TABLE_BYTES", 10)
+    with pytest.raises(TableError, match="too large"):
+        table_of(tmp_path, PLAIN.encode())
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0", 0.0),
+        ("-1.5", -1.5),
+        ("+2", 2.0),
+        (".5", 0.5),
+        ("5.", 5.0),
+        ("1e3", 1000.0),
+        ("2,5E-1", 0.25),
+        (" 7 ", 7.0),
+    ],
+)
+def test_numbers(text: str, value: float) -> None:
+    assert parse_number(text) == value
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "nan",
+        "inf",
+        "-Infinity",
+        "1e400",
+        "1_000",
+        "12 kPa",
+        "١٢",
+        "²",
+        "0x10",
+        "1,2,3",
+        "1.2.3",
+        "1 000",
+        "--1",
+        "e5",
+        ".",
+        "−5",
+        "1e",
+        "=1",
+    ],
+)
+def test_what_is_no_number(text: str) -> None:
+    with pytest.raises(TableError, match=r"is not a number|too large"):
+        parse_number(text)
+
+
+@pytest.mark.parametrize("text", ["", "  ", "\t"])
+def test_blank_is_told_from_wrong(text: str) -> None:
+    with pytest.raises(TableError, match="is blank"):
+        parse_number(text)
+
+
+def test_thousands_and_decimals_are_not_guessed() -> None:
+    """1,069 fps read as 1.069 would be wrong by a factor of a thousand, in silence."""
+    with pytest.raises(TableError, match=r"write 1\.0690 or 1069"):
+        parse_number("1,069")
+    with pytest.raises(TableError, match=r"write 1\.0690 or 1069"):
+        parse_number("1.069", decimal=",")
+    assert parse_number("1,069", decimal=",") == parse_number("1.069") == 1.069
+    assert parse_number("0,069") == 0.069
+
+
+def test_a_file_that_uses_both_marks_is_read_where_it_is_clear() -> None:
+    table = parse_table("a;b;c\n0,5;0.5;1,069\n")
+    assert table.decimal == ""
+    assert table.numbers("a") == table.numbers("b") == [0.5]
+    with pytest.raises(TableError, match="thousands or decimals"):
+        table.numbers("c")
+
+
+def test_a_semicolon_file_of_three_decimals_has_decimal_commas() -> None:
+    np.testing.assert_array_equal(parse_table("a;b\n1,069;2,138\n").numbers("b"), [2.138])
+
+
+def test_a_wrong_number_is_named_with_line_and_column() -> None:
+    with pytest.raises(TableError, match=r"line 3, column x: 'abc' is not a number"):
+        parse_table("x\n1\nabc\n").numbers("x")
+    with pytest.raises(TableError, match=r"line 3, column x: '' is blank"):
+        parse_table("x,y\n1,1\n,1\n").numbers("x")
+
+
+def test_blank_numbers_are_nan_on_request() -> None:
+    np.testing.assert_array_equal(parse_table("x,y\n1,1\n,1\n").numbers("x", blank_is_nan=True), [1, np.nan])
+
+
+@pytest.mark.parametrize(
+    "relative", ["videos/a.mp4", r"videos\a.mp4", "./videos//a.mp4", "x/../videos/a.mp4", " videos/a.mp4 "]
+)
+def test_paths_inside(relative: str) -> None:
+    assert safe_join(Path("exp"), relative) == Path("exp/videos/a.mp4")
+
+
+@pytest.mark.parametrize(
+    "relative",
+    [
+        "",
+        ".",
+        "..",
+        "../a",
+        "a/../../b",
+        r"..\a",
+        "/etc/passwd",
+        r"\\server\share",
+        "C:/a",
+        r"c:\a",
+        "C:a",
+        "a\x00b",
+        "a\nb",
+    ],
+)
+def test_paths_outside_are_refused(relative: str) -> None:
+    with pytest.raises(TableError):
+        safe_join(Path("exp"), relative)
+
+
+def test_the_narrow_blank_that_macos_puts_in_names_is_kept() -> None:
+    assert safe_join(Path("exp"), "at 3.04\u202fPM.mov") == Path("exp/at 3.04\u202fPM.mov")
+
+
+def test_a_link_inside_the_folder_may_point_out(tmp_path: Path) -> None:
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "a.mp4").write_text("frames")
+    (tmp_path / "exp").mkdir()
+    (tmp_path / "exp" / "videos").symlink_to(tmp_path / "store")
+    assert safe_join(tmp_path / "exp", "videos/a.mp4").read_text() == "frames"
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../x", "a/b", r"a\b", ".hidden", "a b", "é", "a\n"])
+def test_result_names_cannot_leave_their_folder(name: str) -> None:
+    with pytest.raises(TableError, match="cannot name a file"):
+        result_file(Path("results/x/tracks"), name, ".csv")
+
+
+def test_a_condition_names_a_file() -> None:
+    name = "24mm-200um-280mm_28kPa_35.6g"
+    assert result_file(Path("r"), name, ".png") == Path(f"r/{name}.png")
+
+
+def test_csv_is_read_back_to_the_same_values(tmp_path: Path) -> None:
+    frame = pd.DataFrame(
+        {"trial": ["a", None], "x_m": [0.1 + 0.2, np.nan], "n": [1, 2], "flag": ["", "lost;gap"], "ok": [True, False]}
+    )
+    tables.write_csv(tmp_path / "deep" / "out.csv", frame)
+    lines = (tmp_path / "deep" / "out.csv").read_bytes().decode().split("\n")
+    assert lines[0] == "trial,x_m,n,flag,ok"
+    assert lines[1:] == [f"a,{0.1 + 0.2!r},1,,True", ",NaN,2,lost;gap,False", ""]
+
+
+def test_json_has_null_for_nan_and_plain_types(tmp_path: Path) -> None:
+    content = {
+        "n": np.float64("nan"),
+        "a": np.array([1.0, np.inf]),
+        "i": np.int64(3),
+        "p": Path("a/b"),
+        "t": (1, None),
+        "s": {"b", "a"},
+    }
+    tables.write_json(tmp_path / "x.json", content)
+    read = json.loads((tmp_path / "x.json").read_text())
+    assert read == {"n": None, "a": [1.0, None], "i": 3, "p": "a/b", "t": [1, None], "s": ["a", "b"]}
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "figure.png"
+    tables.write_text(path, "old")
+
+    def write_half() -> None:
+        with tables.replacing(path) as temporary:
+            temporary.write_text("half a f")
+            raise RuntimeError("broken")
+
+    with pytest.raises(RuntimeError, match="broken"):
+        write_half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_temporary_file_keeps_folder_and_suffix(tmp_path: Path) -> None:
+    with tables.replacing(tmp_path / "a.mp4") as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.suffix == ".mp4"
+        temporary.write_bytes(b"1")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_a_json_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(TypeError):
+        tables.write_json(tmp_path / "x.json", {"f": object()})
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,81 @@
+"""What trials take upon themselves, and what passes for noise, gives a model away that lacks something."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from hidden_truth import Pairs, grown, sheet
+
+import vinetrack as vt
+from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_motion
+from vinetrack.inference.fit_result import Fit
+from vinetrack.laboratory.campaign import damping_values
+from vinetrack.laboratory.ground_truth import BASE, Nature
+from vinetrack.laboratory.tracks import grow
+
+WANDER_M = 2e-4
+
+
+def fitted(pairs: Pairs) -> Fit:
+    return vt.fit(vt.base_model(), pairs, profile=False)
+
+
+def of_another_film(factors: dict[float, float]) -> Pairs:
+    """Trials whose B is another at some of the pressures, kPa, alike in replicates."""
+    pairs: Pairs = []
+    for k, trial in enumerate(sheet()):
+        values = damping_values([trial])
+        factor = factors.get(round(trial.pressure_Pa / 1e3), 1.0)
+        by_vine = values["eversion_damping.B"]
+        assert isinstance(by_vine, dict)
+        values["eversion_damping.B"] = {vine: B * factor for vine, B in by_vine.items()}
+        nature = Nature(
+            effects=BASE, values=values, damping_scatter=0.02, pressure_scatter=0.005, yield_error_kPa=0.1,
+            noise_m=1e-4, noise_correlation=0.3, seed=40 + k,
+        )  # fmt: skip
+        pairs += [(one.stated, one.track) for one in grow([trial], nature)]
+    return pairs
+
+
+def wandering(*, at_rest: bool) -> Pairs:
+    """Positions that wander slowly, in motion alone or all along."""
+    draw = np.random.default_rng(3)
+    pairs = grown(seed=31)
+    spoilt = []
+    for trial, track in pairs:
+        kicks = draw.standard_normal(track.time_s.size)
+        wander_m = np.zeros_like(kicks)
+        for k in range(1, kicks.size):
+            wander_m[k] = 0.9 * wander_m[k - 1] + WANDER_M * np.sqrt(1 - 0.9**2) * kicks[k]
+        moves = track.lead_position_m > track.lead_position_m[:5].mean() + 2e-3
+        begins = int(np.argmax(moves))
+        wander_m[:begins] *= at_rest
+        spoilt.append((trial, replace(track, lead_position_m=track.lead_position_m + wander_m)))
+    return spoilt
+
+
+def test_replicates_that_deviate_together_are_seen() -> None:
+    assert conditions_apart(fitted(of_another_film({20: 1.5, 22: 0.6}))) < 1e-5
+
+
+def test_replicates_that_scatter_are_not() -> None:
+    assert all(conditions_apart(fitted(grown(seed=seed))) > 0.05 for seed in (32, 33, 34))
+
+
+def test_what_is_louder_in_motion_than_at_rest_is_heard() -> None:
+    assert noisier_in_motion(fitted(wandering(at_rest=False))) < 1e-5
+
+
+def test_noise_that_is_the_same_at_rest_is_noise() -> None:
+    assert noisier_in_motion(fitted(wandering(at_rest=True))) > 1e-2
+    assert all(noisier_in_motion(fitted(grown(seed=seed))) > 1e-2 for seed in (35, 36))
+
+
+def test_recordings_are_not_held_against_their_rest() -> None:
+    filmed = []
+    for trial, track in wandering(at_rest=False):
+        stated = replace(track, lead_position_sigma_m=np.full(track.time_s.size, 1e-4))
+        filmed.append((replace(trial, video=Path("filmed.mp4")), stated))
+    assert noisier_in_motion(fitted(filmed)) == 1.0

@@ -1,0 +1,192 @@
+"""What was left out, weighed: numbers worked out by hand, and each rule that a trial may break."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vinetrack.core.records import Bend, Kinematics, Trial
+from vinetrack.dynamics.audit import COLUMNS, Audit, AuditedMotion, audit, measured_motion, simulated_motion
+from vinetrack.dynamics.model import Model, base_model
+from vinetrack.effects import catalogue
+
+A = math.pi * 24e-3**2 / 4
+BASE = base_model().with_values({"eversion_damping.B": 6.44})
+
+
+def trial(**others: object) -> Trial:
+    fields: dict[str, object] = {
+        "name": "t",
+        "vine": "v",
+        "condition": "c",
+        "diameter_m": 24e-3,
+        "thickness_m": 200e-6,
+        "length_m": 0.28,
+        "pressure_Pa": 28e3,
+        "yield_pressure_Pa": 3e3,
+        "payload_kg": 35.6e-3,
+        "chamber_m3": 3.7e-3,
+        "inlet_m": 6e-3,
+    }
+    return Trial(**{**fields, **others})  # type: ignore[arg-type]
+
+
+def steady(of: Trial, speed_m_s: float = 2.0, share: float = 0.95, pressure: np.ndarray | None = None) -> AuditedMotion:
+    y = np.linspace(0.0, share * of.length_m, 101)
+    return AuditedMotion(of, y / speed_m_s, y, np.full(101, speed_m_s), pressure)
+
+
+def row(found: Audit, term: str) -> pd.Series:
+    rows = found.table[found.table["term"] == term]
+    assert len(rows) == 1
+    return rows.iloc[0]
+
+
+def test_air_drag_by_hand() -> None:
+    # ¼ × 1.2 × A × 1 × 2² over ½ × 28000 × A = 1.2/14000
+    drag = row(audit(BASE, [steady(trial())]), "air_drag")
+    assert drag["share_of_drive"] == pytest.approx(-1.2 / 14000, rel=1e-9)
+    assert drag["force_N"] == pytest.approx(-1.2 * A, rel=1e-9)
+
+
+def test_depletion_by_hand_is_largest_at_the_end() -> None:
+    # adiabatic, at 0.95 of 0.28 m: V₀/(V₀ + A y)
+    y = 0.95 * 0.28
+    P = (28e3 + 101_325) * (3.7e-3 / (3.7e-3 + A * y)) ** 1.4 - 101_325
+    depletion = row(audit(BASE, [steady(trial())]), "reservoir_depletion")
+    assert depletion["share_of_drive"] == pytest.approx((P - 28e3) / 28e3, rel=1e-9)
+    assert depletion["y_over_L"] == pytest.approx(0.95)
+    assert depletion["time_s"] == pytest.approx(y / 2.0)
+
+
+def test_fold_inertia_helps_and_is_positive() -> None:
+    # ½ × ¼ × 18.0956 g/m × 4² over ½ × 28000 × A
+    fold = row(audit(BASE, [steady(trial())]), "fold_inertia")
+    assert fold["force_N"] == pytest.approx(0.125 * 18.0956e-3 * 16, rel=1e-5)
+
+
+def test_gas_inertia_holds_the_mass_it_adds_times_the_acceleration() -> None:
+    motion = steady(trial())
+    rho = (28e3 + 101_325) / (287 * 293)
+    m = 18.0956e-3 * (0.28 - motion.lead_position_m) + 35.6e-3
+    a = (0.5 * 25e3 * A - 0.5 * 6.44 * 4.0**0.37 + m * 9.81) / m
+    force = -0.5 * rho * A * 0.5 * 4 - 0.25 * rho * A * motion.lead_position_m * a
+    gas = row(audit(BASE, [motion]), "gas_inertia")
+    assert gas["force_N"] == pytest.approx(force[np.argmax(np.abs(force))], rel=1e-5)
+
+
+def test_tail_stretch_is_told_in_metres_at_the_edge() -> None:
+    # ½ L T₁/(EπDt), T₁ = ½ × 25000 A − ½ × 6.44 × 4^0.37
+    tension = 0.5 * 25e3 * A - 0.5 * 6.44 * 4.0**0.37
+    stretch = row(audit(BASE, [steady(trial())]), "tail_stretch")
+    expected = 0.5 * 0.28 * tension * 4e-8 / (math.pi * 24e-3 * 200e-6)
+    assert stretch["shift_m"] == pytest.approx(expected, rel=1e-9)
+    assert math.isnan(stretch["force_N"])
+
+
+def test_what_the_model_holds_is_not_audited() -> None:
+    found = audit(BASE + catalogue()["supply_refill"] + catalogue()["air_drag"], [steady(trial())])
+    assert not {"air_drag", "supply_refill", "reservoir_depletion", "gravity"} & set(found.table["term"])
+    assert not any("reservoir" in words for words in found.warnings)
+
+
+def test_a_measured_pressure_holds_what_happens_in_the_chamber() -> None:
+    found = audit(BASE, [steady(trial(), pressure=np.linspace(28e3, 20e3, 101))])
+    assert not {"supply_refill", "reservoir_depletion", "leak"} & set(found.table["term"])
+    assert not any("reservoir" in words for words in found.warnings)
+
+
+def test_measurement_effects_are_no_neglected_terms() -> None:
+    names = set(audit(BASE, [steady(trial())]).table["term"]) - {"tail_tension"}
+    assert all(catalogue()[name].kind == "physical" for name in names)
+    assert len(names) == sum(effect.kind == "physical" for effect in catalogue().values())
+
+
+def test_what_an_effect_lacks_is_said_in_its_row() -> None:
+    found = audit(BASE, [steady(trial(chamber_m3=math.nan, inlet_m=math.nan))])
+    assert "chamber_l" in row(found, "reservoir_depletion")["note"]
+    assert "inlet_mm" in row(found, "inlet_loss")["note"]
+    assert math.isnan(row(found, "inlet_loss")["force_N"])
+
+
+def test_the_table_has_its_columns_and_a_row_for_each_term_and_trial() -> None:
+    found = audit(BASE, [steady(trial(name="a")), steady(trial(name="b"))])
+    assert tuple(found.table.columns) == COLUMNS
+    assert not found.table.duplicated(["trial", "term"]).any()
+    assert set(found.table["trial"]) == {"a", "b"}
+
+
+@pytest.mark.parametrize(
+    ("P", "slow", "fast"), [(7e3, "51%", "71%"), (14e3, "27%", "38%"), (28e3, "15%", "21%")], ids=["7", "14", "28"]
+)
+def test_the_papers_own_reservoir_breaks_its_rule_at_every_pressure(P: float, slow: str, fast: str) -> None:
+    of = trial(pressure_Pa=P)
+    words = [w for w in audit(BASE, [steady(of, share=1.0)]).warnings if "reservoir" in w]
+    assert len(words) == 1
+    assert f"loses {slow} (slow) to {fast} (fast)" in words[0]
+
+
+def test_a_large_reservoir_keeps_the_rule() -> None:
+    assert not [w for w in audit(BASE, [steady(trial(chamber_m3=0.1))]).warnings if "reservoir" in w]
+
+
+@pytest.mark.parametrize(("speed", "broken"), [(40.0, False), (60.0, True)])
+def test_drag_above_a_twentieth_of_the_drive_is_warned_of(speed: float, broken: bool) -> None:
+    # C_D = 1: ½ × 1.2 × v²/P = 5 % of 28 kPa at 48 m/s
+    words = [w for w in audit(BASE, [steady(trial(), speed)]).warnings if "air drag" in w]
+    assert bool(words) == broken
+    assert not broken or "y/L = " in words[0]
+
+
+@pytest.mark.parametrize(("length", "broken"), [(0.29, False), (0.30, True), (0.6, True)])
+def test_friction_along_a_long_vine_is_warned_of(length: float, broken: bool) -> None:
+    words = [w for w in audit(BASE, [steady(trial(length_m=length))]).warnings if "friction along" in w]
+    assert bool(words) == broken
+
+
+@pytest.mark.parametrize(("degrees", "broken"), [(29.0, False), (31.0, True)])
+def test_bends_of_thirty_degrees_are_warned_of(degrees: float, broken: bool) -> None:
+    half = Bend(0.05, math.radians(degrees / 2) * 0.1, 0.1)
+    of = trial(bends=(half, Bend(0.15, half.arc_m, 0.1)))
+    words = [w for w in audit(BASE, [steady(of)]).warnings if "bends" in w]
+    assert bool(words) == broken
+
+
+@pytest.mark.parametrize(("P", "onset_s", "within_s"), [(7e3, 0.0, 4e-3), (14e3, 24e-3, 1e-3), (28e3, 145e-3, 2e-3)])
+def test_the_tail_that_would_have_to_push_is_found(P: float, onset_s: float, within_s: float) -> None:
+    of = trial(pressure_Pa=P)
+    found = audit(BASE, [simulated_motion(BASE, of, 30.0)])
+    tension = row(found, "tail_tension")
+    assert abs(tension["slack_from_s"] - onset_s) < within_s
+    assert tension["force_N"] < 0
+    assert any("would have to push" in words for words in found.warnings)
+
+
+def test_a_tail_let_go_slack_is_not_warned_of() -> None:
+    found = audit(BASE, [steady(trial(tail_slack="free"), 5.0)])
+    assert row(found, "tail_tension")["force_N"] < 0
+    assert not any("push" in words for words in found.warnings)
+
+
+def test_a_measured_motion_starts_at_release_and_at_nothing() -> None:
+    t = np.arange(10) * 0.01
+    y = 0.5 + np.maximum(t - 0.03, 0.0)
+    v = (t >= 0.03).astype(float)
+    kinematics = Kinematics(t, y, v, v, v, np.ones(10, int), 1e-4, 0.0, 2.0)
+    motion = measured_motion(trial(), kinematics, 0.03, (np.array([0.0, 1.0]), np.array([28e3, 18e3])))
+    np.testing.assert_allclose(motion.time_s, np.arange(7) * 0.01, atol=1e-12)
+    np.testing.assert_allclose(motion.lead_position_m, np.arange(7) * 0.01, atol=1e-12)
+    assert motion.pressure_Pa is not None
+    np.testing.assert_allclose(motion.pressure_Pa, 28e3 - 100 * np.arange(7), rtol=1e-12)
+
+
+def test_the_inputs_are_left_as_they_were() -> None:
+    motion = steady(trial())
+    before = motion.lead_position_m.copy()
+    model: Model = BASE
+    audit(model, [motion])
+    np.testing.assert_array_equal(motion.lead_position_m, before)
+    assert model is BASE

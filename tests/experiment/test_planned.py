@@ -1,0 +1,139 @@
+"""Trials that are only planned: judged as a sheet is, said of the option or of the cell."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from hand_sheet import GOOD, two_vines, write
+
+from vinetrack.core.problems import ExperimentError
+from vinetrack.experiment.planned import planned_sheet, planned_trial
+
+VINE = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "28"}
+
+
+def refused(**values: str) -> list[str]:
+    with pytest.raises(ExperimentError) as caught:
+        planned_trial({**VINE, **values})
+    return [str(problem) for problem in caught.value.problems]
+
+
+def test_a_trial_of_texts_is_in_si() -> None:
+    trial = planned_trial({**VINE, "payload_g": "35.6", "chamber_l": "3.7", "growth_angle_deg": "90"}).trials[0]
+    assert (trial.diameter_m, trial.thickness_m, trial.length_m) == pytest.approx((0.024, 2e-4, 0.28))
+    assert (trial.pressure_Pa, trial.payload_kg, trial.chamber_m3) == pytest.approx((28e3, 0.0356, 3.7e-3))
+    assert trial.growth_angle_rad == pytest.approx(math.pi / 2)
+    assert (trial.vine, trial.condition) == ("24mm-200um-280mm", "24mm-200um-280mm_28kPa_35.6g")
+
+
+def test_a_yield_pressure_that_is_not_given_is_not_known() -> None:
+    assert math.isnan(planned_trial(VINE).trials[0].yield_pressure_Pa)
+    given = planned_trial({**VINE, "yield_pressure_kPa": "3"}).trials[0]
+    assert (given.yield_pressure_Pa, given.yield_pressure_sigma_Pa) == (3e3, 200.0)
+
+
+def test_kilopascals_typed_as_pascals_are_recognised() -> None:
+    (line,) = refused(pressure_kPa="28000")
+    assert line.startswith("error: --pressure-kPa '28000' is above 1000 kPa")
+    assert "28000 Pa is 28 kPa" in line
+
+
+def test_everything_that_is_wrong_is_said_at_once() -> None:
+    with pytest.raises(ExperimentError) as caught:
+        planned_trial({"diameter_mm": "2400", "pressure_kPa": "twelve"})
+    options = [problem.column for problem in caught.value.problems]
+    assert options == ["--diameter-mm", "--pressure-kPa", "--thickness-um", "--length-mm"]
+
+
+def test_a_wall_that_no_tube_can_have() -> None:
+    (line,) = refused(thickness_um="7000")
+    assert "--thickness-um" in line
+    assert "quarter of the diameter" in line
+
+
+def test_a_body_that_moves_as_a_whole_is_not_predicted() -> None:
+    assert any("--travel-ratio" in line for line in refused(travel_ratio="1"))
+
+
+def test_a_pressure_below_the_yield_pressure_is_a_warning() -> None:
+    (problem,) = planned_trial({**VINE, "yield_pressure_kPa": "40"}).problems
+    assert (problem.severity, problem.column) == ("warning", "--yield-pressure-kPa")
+
+
+def test_a_sheet_needs_no_recordings(tmp_path: Path) -> None:
+    (tmp_path / "trials.csv").write_text("trial,diameter_mm,thickness_um,length_mm,pressure_kPa\na,24,200,280,28\n")
+    planned = planned_sheet(tmp_path)
+    assert [trial.name for trial in planned.trials] == ["a"]
+    assert planned.folder == tmp_path
+
+
+def test_a_sheet_by_itself_may_have_any_name(tmp_path: Path) -> None:
+    sheet = tmp_path / "ideas.csv"
+    sheet.write_text("trial;diameter_mm;thickness_um;length_mm;pressure_kPa\na;24;200;280;28,5\n")
+    assert planned_sheet(sheet).trials[0].pressure_Pa == pytest.approx(28.5e3)
+
+
+def test_replicates_are_one_condition_and_rows_not_in_use_none(tmp_path: Path) -> None:
+    header, *rows = GOOD.splitlines()
+    more = [rows[0].replace("a,a.csv", "c,c.csv"), rows[1].replace("b,b.csv", "d,d.csv")]
+    sheet = "\n".join([header + ",use", *(row + "," for row in (*rows, more[0])), more[1] + ",no"]) + "\n"
+    trials = planned_sheet(write(two_vines(tmp_path), sheet)).trials
+    assert [trial.name for trial in trials] == ["a", "b"]
+
+
+def test_shared_settings_and_the_model_are_those_of_the_experiment(tmp_path: Path) -> None:
+    settings = (
+        "chamber_l: 2\ntail_slack: free\nmodel: [pressure_drive, gravity, eversion_damping, yield_pressure, leak]\n"
+    )
+    planned = planned_sheet(write(two_vines(tmp_path), GOOD, settings))
+    assert planned.trials[0].chamber_m3 == pytest.approx(2e-3)
+    assert planned.trials[0].tail_slack == "free"
+    assert planned.settings.model[-1] == "leak"
+
+
+def test_a_fault_of_a_sheet_names_file_line_trial_and_column(tmp_path: Path) -> None:
+    folder = write(two_vines(tmp_path), GOOD.replace(",28,", ",28000,"))
+    with pytest.raises(ExperimentError) as caught:
+        planned_sheet(folder)
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.line, problem.trial, problem.column) == ("trials.csv", 2, "a", "pressure_kPa")
+
+
+@pytest.mark.parametrize("text", ["", "trial,diameter_mm\n"])
+def test_a_sheet_without_rows_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "trials.csv").write_text(text)
+    with pytest.raises(ExperimentError):
+        planned_sheet(tmp_path)
+
+
+def test_a_file_that_is_no_sheet_gets_one_sentence_and_not_one_a_row(tmp_path: Path) -> None:
+    (tmp_path / "track.csv").write_text("time_s,position_m\n" + "0.1,0.2\n" * 100, encoding="utf-8")
+    with pytest.raises(ExperimentError) as caught:
+        planned_sheet(tmp_path / "track.csv")
+    (line,) = (str(problem) for problem in caught.value.problems)
+    assert line.startswith("error: track.csv: has no column diameter_mm, thickness_um, length_mm, pressure_kPa")
+    assert "give a trial sheet" in line
+
+
+def test_a_column_that_no_sheet_has_is_named_and_not_passed_over(tmp_path: Path) -> None:
+    """A payload under a wrong name would else be taken for none."""
+    text = "diameter_mm,thickness_um,length_mm,pressure_kPa,payload_gr\n24,200,280,28,35.6\n"
+    (tmp_path / "ideas.csv").write_text(text.replace("d", "trial,d", 1).replace("\n24", "\na,24"), encoding="utf-8")
+    planned = planned_sheet(tmp_path / "ideas.csv")
+    (line,) = (str(problem) for problem in planned.problems)
+    assert "payload_gr" in line
+    assert "did you mean payload_g?" in line
+
+
+def test_a_column_may_stand_in_the_settings_instead(tmp_path: Path) -> None:
+    (tmp_path / "experiment.yaml").write_text("pressure_kPa: 28\n", encoding="utf-8")
+    (tmp_path / "trials.csv").write_text("trial,diameter_mm,thickness_um,length_mm\na,24,200,280\n", encoding="utf-8")
+    assert planned_sheet(tmp_path).trials[0].pressure_Pa == 28e3
+
+
+def test_a_sheet_that_is_not_there_suggests_the_nearest(tmp_path: Path) -> None:
+    (tmp_path / "ideas.csv").write_text("trial\n")
+    with pytest.raises(ExperimentError, match=r"did you mean ideas\.csv"):
+        planned_sheet(tmp_path / "idea.csv")

@@ -1,0 +1,161 @@
+"""A vine followed by SciPy from an equation that a test writes out in full, and the same vine by the compiled model.
+
+One compiled model serves all tests: the whole catalogue, with every effect at no size that the test does not name.
+Nothing here but `simulated` uses the package's own physics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.model import Model, make_model
+from vinetrack.dynamics.simulate import Trace, Trajectory, simulate
+from vinetrack.effects import catalogue
+
+G = 9.81
+ATM = 101_325.0
+RT_AIR = 287.0 * 293.0
+N = 0.37
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Vine:
+    """Numbers of one trial, worked out by hand; r = 2."""
+
+    D: float
+    t: float
+    L: float
+    P: float
+    P_y: float
+    B: float
+    payload: float = 0.0
+    down: float = 1.0
+
+    @property
+    def A(self) -> float:
+        return math.pi * self.D**2 / 4
+
+    @property
+    def lam(self) -> float:
+        return 1200 * math.pi * self.D * self.t
+
+    def m(self, x: float) -> float:
+        """Tail and payload; the tests stop before the film's mass comes to its floor."""
+        return self.lam * self.L - self.lam / 2 * x + self.payload
+
+    def base(self, x: float, v: float, *, P: float | None = None, A: float | None = None) -> float:
+        """Right side of Eq. (2): ½(P − P_y)A + m g cosθ − ½Bẋⁿ."""
+        P = self.P if P is None else P
+        A = self.A if A is None else A
+        return 0.5 * (P - self.P_y) * A + self.m(x) * G * self.down - 0.5 * self.B * max(v, 0.0) ** N
+
+    def trial(self, **others: object) -> Trial:
+        fields: dict[str, object] = {
+            "name": "t",
+            "vine": "v",
+            "diameter_m": self.D,
+            "thickness_m": self.t,
+            "length_m": self.L,
+            "pressure_Pa": self.P,
+            "yield_pressure_Pa": self.P_y,
+            "payload_kg": self.payload,
+            "growth_angle_rad": math.acos(self.down),
+            "chamber_m3": 3.7e-3,
+            "inlet_m": 6e-3,
+        }
+        return Trial(**{**fields, **others})  # type: ignore[arg-type]
+
+
+LOADED = Vine(D=24e-3, t=200e-6, L=0.28, P=28e3, P_y=3e3, B=6.44, payload=35.6e-3)
+BARE = Vine(D=12e-3, t=100e-6, L=0.30, P=40e3, P_y=5e3, B=1.83)
+LEVEL = Vine(D=24e-3, t=200e-6, L=0.28, P=28e3, P_y=3e3, B=6.44, payload=35.6e-3, down=0.0)
+
+
+def whole_catalogue(sizes: Mapping[str, float], names: Sequence[str] | None = None) -> Model:
+    """Every effect at no size but those whose sizes are given, and the base effects."""
+    model = make_model(names or catalogue())
+    nothing = {f"{e.name}.{p.name}": p.zero for e in model for p in e.parameters if e.kind != "base"}
+    return model.with_values({**nothing, **sizes})
+
+
+def simulated(
+    vine: Vine, sizes: Mapping[str, float], times: Floats, trace: Trace | None = None, **others: object
+) -> Trajectory:
+    """The compiled model's answer."""
+    model = whole_catalogue({"eversion_damping.B": vine.B, "eversion_damping.n": N, **sizes})
+    return simulate(model, vine.trial(**others), times, trace=trace)
+
+
+def followed(
+    acceleration: Callable[..., float],
+    stop: float,
+    *,
+    chamber: tuple[float, Callable[..., float]] | None = None,
+    until: float = 20.0,
+    max_step: float = np.inf,
+) -> Callable[[Floats], Floats]:
+    """Tail travel against time by SciPy, from rest to x = `stop`.
+
+    `acceleration(t, x, v)`, or `acceleration(t, x, v, P)` with `chamber` = its first pressure and Ṗ(t, x, v, P). Ends
+    without the answer's tail after `stop`; its last time is kept as the attribute `end`.
+    """
+
+    def slope(t: float, s: Floats) -> list[float]:
+        v = max(s[1], 0.0)
+        extra = [] if chamber is None else [s[2]]
+        rate = [] if chamber is None else [chamber[1](t, s[0], v, s[2])]
+        return [v, acceleration(t, s[0], v, *extra), *rate]
+
+    def there(_t: float, s: Floats) -> float:
+        return s[0] - stop
+
+    there.terminal = True  # type: ignore[attr-defined]
+    start = [0.0, 0.0] if chamber is None else [0.0, 0.0, chamber[0]]
+    done = solve_ivp(
+        slope,
+        (0.0, until),
+        start,
+        "LSODA",
+        rtol=1e-10,
+        atol=[1e-13, 1e-12, 1e-6][: len(start)],
+        dense_output=True,
+        events=there,
+        max_step=max_step,
+    )
+    assert done.success, done.message
+    end = float(done.t[-1])
+
+    def travel(times: Floats) -> Floats:
+        return np.asarray(done.sol(times)[0])
+
+    travel.end = end  # type: ignore[attr-defined]
+    return travel
+
+
+def assert_same_motion(
+    vine: Vine,
+    sizes: Mapping[str, float],
+    acceleration: Callable[..., float],
+    *,
+    share: float = 0.9,
+    chamber: tuple[float, Callable[..., float]] | None = None,
+    trace: Trace | None = None,
+    **others: object,
+) -> None:
+    """Lead positions agree to 10⁻⁵ of the distance, up to `share` of the length; and the effect does something."""
+    travel = followed(acceleration, 2 * share * vine.L, chamber=chamber)
+    times = np.linspace(0.0, travel.end, 61)  # type: ignore[attr-defined]
+    truth = travel(times) / 2
+    got = simulated(vine, sizes, times, trace, **others).lead_position_m
+    assert np.max(np.abs(got - truth)) < 1e-5 * truth[-1]
+    without = simulated(vine, {}, times, **others).lead_position_m
+    assert np.max(np.abs(without - truth)) > 1e-4 * truth[-1]

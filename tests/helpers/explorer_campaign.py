@@ -1,0 +1,136 @@
+"""Results folders for the explorer's tests: vines of the demonstration's kind, grown with a small chamber, as tracks.
+
+The truth is that of the demonstration: two vines, n 0.37, B 1.83 and 6.44, reservoir depletion (γ 1.4) that the model
+in use lacks. Seed 20 everywhere; nothing here scores a method.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import pandas as pd
+from typer.testing import CliRunner
+
+from vinetrack.cli.main import app
+from vinetrack.laboratory.__main__ import DEMO
+from vinetrack.laboratory.__main__ import main as grow
+from vinetrack.results.folder_layout import Results
+
+DEMO_SHEET = Path(__file__).parents[2] / "data" / "demo" / "trials.csv"
+SETTINGS = "# what all trials share\ncapture_fps: 1069\nyield_pressure_kPa: 3   # from a slow ramp\nchamber_l: 2\n"
+SMALL = ("d24_24kPa_1", "d24_24kPa_2", "d24_36kPa_1", "d24_36kPa_2", "d24_20g_48kPa_1", "d24_20g_48kPa_2")
+
+
+def make_experiment(folder: Path, names: tuple[str, ...] = (), settings: str = SETTINGS) -> Path:
+    """The demonstration's trials, or those named, measured instead of filmed."""
+    folder.mkdir(parents=True)
+    with DEMO_SHEET.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if not names or row["trial"] in names]
+    columns = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
+    lines = [",".join(("trial", "track", *columns))]
+    lines += [",".join([row["trial"], f"tracks/{row['trial']}.csv", *(row[c] for c in columns)]) for row in rows]
+    (folder / "trials.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "experiment.yaml").write_text(settings, encoding="utf-8")
+    grow([str(folder), "--nature", str(DEMO)])
+    return folder
+
+
+def run(*arguments: object) -> str:
+    """A command of vinetrack that has to succeed; what it said."""
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def make_results(experiment: Path, results: Path) -> Path:
+    """What snakemake makes of it, as far as the explorer reads it."""
+    few = ("--settings", '{"damping": {"resamples": 100}}')
+    run("tracks", experiment, results)
+    run("gather", experiment, results)
+    run("damping", results, *few)
+    run("model", experiment, results)
+    Results(results).provenance.write_text(json.dumps({"experiment": experiment.absolute().as_posix()}))
+    return results
+
+
+def write_diagnosis(results: Path) -> Path:
+    """A diagnosis in the shape of `diagnosis.json`, with a tie and a next trial."""
+    ranking = [
+        {"effect": "reservoir_depletion", "delta_chi2": 4000.0, "in_answer_set": True, "reason": ""},
+        {"effect": "leak", "delta_chi2": 3995.0, "in_answer_set": True, "reason": ""},
+        {"effect": "air_drag", "delta_chi2": 12.0, "in_answer_set": False, "reason": "excluded"},
+        {"effect": "inlet_loss", "delta_chi2": None, "in_answer_set": False, "reason": "needs inlet_mm"},
+    ]
+    content = {
+        "verdict": "ambiguous",
+        "explanation": "Either of two effects explains these trials.",
+        "answer_set": ["reservoir_depletion", "leak"],
+        "rounds": [{"model": [], "verdict": "ambiguous", "ranking": ranking}],
+        "cosines": {
+            "effects": ["reservoir_depletion", "leak", "air_drag"],
+            "matrix": [[1.0, 0.97, 0.2], [0.97, 1.0, -0.75], [0.2, -0.75, None]],
+        },
+        "next_experiment": {
+            "text": "Grow the 24 mm vine at 60 kPa from a chamber of 4 L.",
+            "trials": [
+                {
+                    "pressure_kPa": 60.0,
+                    "payload_g": 0.0,
+                    "diameter_mm": 24.0,
+                    "thickness_um": 200.0,
+                    "chamber_l": 4.0,
+                    "replicates": 3,
+                    "new_vine": False,
+                    "changed": ["chamber_l"],
+                },
+            ],
+            "separation_sigma": {"reservoir_depletion | leak": 12.3},
+            "calibration": None,
+        },
+    }
+    path = results / "diagnosis.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def film_of(experiment: Path, results: Path, trial: str) -> Path:
+    """Make one trial of a results folder one that was filmed: a bright bar whose right end is where the track has it.
+
+    4 px a millimetre, the axis along row 48 from column 20.
+    """
+    track = pd.read_csv(results / "tracks" / f"{trial}.csv", keep_default_na=False, na_values=["", "NaN"])
+    position_m = track["lead_position_m"].interpolate(limit_direction="both").to_numpy()
+    edge_px = 20 + 4e3 * (position_m - position_m[0])
+    path = experiment / "videos" / f"{trial}.mp4"
+    write_bars(path, 20 + edge_px)
+    track.assign(edge_px=edge_px, flag="").to_csv(results / "tracks" / f"{trial}.csv", index=False)
+    analysed = results / "analysed" / f"{trial}.json"
+    axis = {"axis": {"from_px": [20, 48], "to_px": [940, 48], "width_px": 30}}
+    analysed.write_text(json.dumps(json.loads(analysed.read_text()) | axis))
+    sheet = experiment / "trials.csv"
+    head, *rows = sheet.read_text().splitlines()
+    rows = [
+        f"{row},videos/{trial}.mp4".replace(f"tracks/{trial}.csv", "") if row.startswith(f"{trial},") else f"{row},"
+        for row in rows
+    ]
+    sheet.write_text("\n".join([f"{head},video", *rows]) + "\n")
+    return path
+
+
+def write_bars(path: Path, ends_px: np.ndarray, width: int = 960, height: int = 96) -> Path:
+    """A clip with a bright bar on dark grey in every frame, from the left to where it ends."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"crf": "12"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for end_px in ends_px:
+            picture = np.full((height, width), 40, np.uint8)
+            picture[30:66, : max(round(float(end_px)), 0)] = 200
+            frame = av.VideoFrame.from_ndarray(np.stack([picture] * 3, axis=2), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path

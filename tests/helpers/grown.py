@@ -1,0 +1,108 @@
+"""Campaigns from the virtual laboratory for the tests of where a model fails and what drifts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from vinetrack.core.records import Track, Trial
+from vinetrack.dynamics.model import Model, make_model
+from vinetrack.effects import Effect
+from vinetrack.effects._own import own_effects
+from vinetrack.experiment.naming import with_names
+from vinetrack.laboratory.campaign import CAPTURE_FPS, campaign, damping_values, isometric_vine
+from vinetrack.laboratory.ground_truth import BASE, Nature
+from vinetrack.laboratory.tracks import VirtualTrial, grow
+
+Pairs = list[tuple[Trial, Track]]
+PRESSURES = {1: (16.0, 22.0, 30.0), 2: (30.0, 40.0, 50.0, 60.0), 4: (24.0, 30.0, 38.0, 48.0)}
+
+
+def sheet(
+    scales: Sequence[int] = (2, 4),
+    replicates: int = 3,
+    payloads_g: Sequence[float] = (0.0,),
+    chamber_m3: float = 3.7e-3,
+    capture_fps: float = CAPTURE_FPS,
+) -> list[Trial]:
+    """Isometric vines at a few pressures each, with these payloads."""
+    trials = [
+        replace(trial, chamber_m3=chamber_m3, capture_fps=capture_fps)
+        for scale in scales
+        for payload_g in payloads_g
+        for trial in campaign(
+            isometric_vine(scale), PRESSURES[scale], replicates, payload_g, prefix=f"R{scale}_{payload_g:g}g_"
+        )
+    ]
+    return list(with_names(trials))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hiding(Nature):
+    """A nature with effects of a user's own files."""
+
+    own: Mapping[str, Effect] = field(default_factory=dict)
+
+    def model(self) -> Model:
+        return make_model(self.effects, self.own).with_values(self.values)
+
+
+def grown(
+    trials: Sequence[Trial],
+    seed: int,
+    effects: Sequence[str] = (),
+    values: Mapping[str, float] | None = None,
+    own: Sequence[Path] = (),
+    **more: float,
+) -> list[VirtualTrial]:
+    """The trials grown with the printed B and n and these effects hidden."""
+    hidden = own_effects(own)
+    nature = Hiding(
+        effects=(*BASE, *effects, *hidden),
+        values={**damping_values(trials), **(values or {})},
+        seed=seed,
+        own=hidden,
+        **more,  # type: ignore[arg-type]
+    )
+    return grow(trials, nature)
+
+
+def pairs_of(virtual: Sequence[VirtualTrial]) -> Pairs:
+    """What the analysis gets of them."""
+    return [(one.stated, one.track) for one in virtual]
+
+
+def effect_file(folder: Path, name: str, forces: Sequence[str]) -> Path:
+    """A user's effect: a tail force of size `a`, N, times one of these expressions of `s` and `rig`, by `kind`.
+
+    One file for many forces is compiled once.
+    """
+    choices = "\n".join(
+        f"    if kind == {k}.0:\n        return a * ({force}) + 0.0 * s.time" for k, force in enumerate(forces)
+    )
+    text = f'''"""Forces that no catalogue has.
+
+Its size is a.
+
+    tail force a · shape
+"""
+
+import numpy as np
+
+from vinetrack.effects import Parameter
+
+KIND = "physical"
+PARAMETERS = (
+    Parameter("a", "a", "N", 0.0, bounds=(-100.0, 100.0), meaning="size"),
+    Parameter("kind", "kind", "1", 0.0, bounds=(0.0, 100.0), meaning="which"),
+)
+
+
+def tail_force(s, rig, a, kind):
+{choices}
+    return 0.0 * s.time
+'''
+    path = folder / f"{name}.py"
+    path.write_text(text, encoding="utf-8")
+    return path

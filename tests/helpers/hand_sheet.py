@@ -1,0 +1,40 @@
+"""A trial sheet of two vines written by hand, for tests to break."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vinetrack.experiment.folder import Experiment, ExperimentError, Problem, read_experiment
+
+HEADER = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,payload_g"
+GOOD = f"{HEADER}\na,a.csv,24,200,280,28,3,35.6\nb,b.csv,24,200,280,14,3,\n"
+TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i * i / 1e6}\n" for i in range(20))
+
+
+def two_vines(tmp_path: Path) -> Path:
+    path = tmp_path / "my-vines"
+    path.mkdir()
+    write(path, GOOD)
+    for name in "ab":
+        (path / f"{name}.csv").write_text(TRACK)
+    return path
+
+
+def write(folder: Path, sheet: str, settings: str | None = None) -> Path:
+    (folder / "trials.csv").write_text(sheet, encoding="utf-8")
+    if settings is not None:
+        (folder / "experiment.yaml").write_text(settings, encoding="utf-8")
+    return folder
+
+
+def one(folder: Path, columns: str, cells: str, settings: str | None = None) -> Experiment:
+    """An experiment of the one trial `a` with further columns."""
+    return read_experiment(write(folder, f"{HEADER},{columns}\na,a.csv,24,200,280,28,3,35.6,{cells}\n", settings))
+
+
+def stopped(folder: Path, strict: bool | None = None) -> tuple[Problem, ...]:
+    with pytest.raises(ExperimentError) as caught:
+        read_experiment(folder, strict)
+    return caught.value.problems

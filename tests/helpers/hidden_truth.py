@@ -1,0 +1,41 @@
+"""Small campaigns with a truth that the diagnosis does not see."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from vinetrack.core.records import Track, Trial
+from vinetrack.experiment.naming import with_names
+from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
+from vinetrack.laboratory.ground_truth import BASE, Nature
+from vinetrack.laboratory.tracks import grow
+
+Pairs = list[tuple[Trial, Track]]
+
+
+def sheet(payload_g: float = 0.0) -> list[Trial]:
+    """Two vines, three pressures each, two trials a pressure, a chamber of 3.7 L."""
+    trials = campaign(isometric_vine(4), (14, 20, 28), 2, payload_g=payload_g, prefix="a")
+    trials += campaign(isometric_vine(3), (14, 22, 40), 2, payload_g=payload_g, prefix="b")
+    return [replace(trial, chamber_m3=3.7e-3) for trial in with_names(trials)]
+
+
+def grown(
+    values: Mapping[str, float] | None = None, *, seed: int, payload_g: float = 0.0, trials: list[Trial] | None = None
+) -> Pairs:
+    """Trials as a sheet and tracks state them, with effects whose values are given at work behind them."""
+    trials = trials if trials is not None else sheet(payload_g)
+    values = dict(values or {})
+    effects = tuple(dict.fromkeys(name.split(".")[0] for name in values))
+    nature = Nature(
+        effects=(*BASE, *effects),
+        values={**damping_values(trials), **values},
+        damping_scatter=0.02,
+        pressure_scatter=0.005,
+        yield_error_kPa=0.1,
+        noise_m=1e-4,
+        noise_correlation=0.3,
+        seed=seed,
+    )
+    return [(one.stated, one.track) for one in grow(trials, nature)]

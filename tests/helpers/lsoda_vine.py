@@ -1,0 +1,125 @@
+"""Vines grown by scipy, for tests: Eq. (2) of the physics written out once more, nothing of the package's own model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from vinetrack.core.records import Track, Trial
+from vinetrack.experiment.naming import with_names
+
+FPS = 1000.0
+B_TRUE = {24.0: 6.4, 18.0: 4.5}
+N_TRUE = 0.4
+NOISE_M = 1e-4
+
+
+def vine_trial(name: str, pressure_kPa: float, diameter_mm: float = 24.0, **more: object) -> Trial:
+    """A trial of an everting vine straight down, P_y 3 kPa, wall D/120, length 11.67 D."""
+    settings: dict[str, object] = {
+        "capture_fps": FPS,
+        "diameter_m": diameter_mm / 1e3,
+        "thickness_m": diameter_mm / 120e3,
+        "length_m": 0.28 * diameter_mm / 24,
+        "pressure_Pa": 1e3 * pressure_kPa,
+        "pressure_sigma_Pa": 10 * pressure_kPa,
+        "yield_pressure_Pa": 3e3,
+        "yield_pressure_sigma_Pa": 200.0,
+    }
+    return Trial(name=name, **{**settings, **more})  # type: ignore[arg-type]
+
+
+def grown_position(
+    trial: Trial,
+    time_s: np.ndarray,
+    B: float,
+    n: float = N_TRUE,
+    pressure_gain: float = 1.0,
+    pressure_along: Callable[[float], float] | None = None,
+) -> np.ndarray:
+    """Lead position at times since release, NaN beyond 96 % of the length; x and ẋ are those of the tail.
+
+    `pressure_along` gives the gauge pressure by lead position, in place of the set one.
+    """
+    area = math.pi * trial.diameter_m**2 / 4
+    film = trial.film_density_kg_m3 * math.pi * trial.diameter_m * trial.thickness_m
+
+    def drive(x: float) -> float:
+        pressure_Pa = trial.pressure_Pa if pressure_along is None else pressure_along(x / 2)
+        return 0.5 * (pressure_Pa * pressure_gain - trial.yield_pressure_Pa) * area
+
+    def rate(_t: float, state: np.ndarray) -> list[float]:
+        x, v = state
+        mass = film * trial.length_m - 0.5 * film * x + trial.payload_kg
+        gravity = 9.81 * math.cos(trial.growth_angle_rad)
+        return [v, (drive(x) - 0.5 * B * max(v, 0.0) ** n) / mass + gravity]
+
+    def end(_t: float, state: np.ndarray) -> float:
+        return float(state[0] - 2 * 0.96 * trial.length_m)
+
+    end.terminal = True  # type: ignore[attr-defined]
+    last = float(time_s[-1])
+    run = solve_ivp(rate, (0, last), [0, 0], "LSODA", rtol=1e-9, atol=1e-10, dense_output=True, events=end)
+    out = np.where(time_s <= run.t[-1], run.sol(np.clip(time_s, 0, run.t[-1]))[0] / 2, np.nan)
+    return np.where(time_s < 0, 0.0, out)
+
+
+def as_track(time_s: np.ndarray, position_m: np.ndarray, pressure_Pa: np.ndarray | None = None) -> Track:
+    """A bare track of these positions."""
+    blank = np.full(time_s.size, math.nan)
+    return Track(time_s, position_m, blank, np.full(time_s.size, "", dtype="<U32"), blank, pressure_Pa)
+
+
+def ar1(count: int, rho: float, draw: np.random.Generator) -> np.ndarray:
+    """Stationary noise of standard deviation 1."""
+    out = draw.standard_normal(count)
+    for k in range(1, count):
+        out[k] = rho * out[k - 1] + math.sqrt(1 - rho**2) * out[k]
+    return out
+
+
+def filmed(
+    trial: Trial,
+    draw: np.random.Generator,
+    *,
+    damping: float = 1.0,
+    pressure: float = 1.0,
+    n: float = N_TRUE,
+    rho: float = 0.0,
+    rest_frames: int = 20,
+) -> tuple[Track, float, float]:
+    """A track of a trial whose B and P are off by these factors, its release, s, and its origin, m."""
+    release_s = (rest_frames - draw.uniform()) / FPS
+    origin_m = float(draw.uniform(-0.05, 0.05))
+    time_s = np.arange(4000) / FPS
+    B = B_TRUE[round(trial.diameter_m * 1e3, 3)] * damping
+    position = grown_position(trial, time_s - release_s, B, n, pressure)
+    seen = np.isfinite(position)
+    noise = NOISE_M * ar1(int(seen.sum()), rho, draw)
+    return as_track(time_s[seen], origin_m + position[seen] + noise), release_s, origin_m
+
+
+def small_campaign(
+    seed: int, damping: float = 0.03, pressure: float = 0.01, rho: float = 0.0, replicates: int = 2
+) -> tuple[list[tuple[Trial, Track]], list[dict[str, float]]]:
+    """Two vines, four pressures; sheet and tracks, and the truth of every trial."""
+    draw = np.random.default_rng(seed)
+    trials = [
+        vine_trial(f"D{D:g}_{P:g}_{k}".replace(".", "p"), P, D)
+        for D, pressures in ((24.0, (12, 16, 22, 30)), (18.0, (16, 22, 30, 42)))
+        for P in pressures
+        for k in range(replicates)
+    ]
+    pairs, truth = [], []
+    for trial in with_names(trials):
+        factors = {
+            "damping": math.exp(damping * draw.standard_normal()),
+            "pressure": 1 + pressure * draw.standard_normal(),
+        }
+        track, release_s, origin_m = filmed(trial, draw, rho=rho, **factors)
+        pairs.append((trial, track))
+        truth.append({**factors, "release_s": release_s, "origin_m": origin_m})
+    return pairs, truth

@@ -1,0 +1,160 @@
+"""The command `vinetrack explore` in a process of its own, and its page as a person meets it in a browser."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from chrome import Chrome, until
+
+PROGRAM = "from vinetrack.cli.main import main; main()"
+
+
+class Served:
+    """`vinetrack explore RESULTS --no-browser`, from its first line to Ctrl-C. Use it as a context."""
+
+    def __init__(self, results: Path, *arguments: str) -> None:
+        self.lines: list[str] = []
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, "explore", str(results), "--no-browser", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip("\n"))
+
+    @property
+    def address(self) -> str:
+        """Where it says the page is."""
+
+        def found() -> str:
+            assert self.process.poll() is None, self.lines
+            return next((m.group() for line in self.lines if (m := re.search(r"http://\S+", line))), "")
+
+        return str(until(found, "the server to say where it is", 120))
+
+    def interrupt(self) -> int:
+        """Ctrl-C; the exit status."""
+        self.process.send_signal(signal.SIGINT)
+        status = self.process.wait(30)
+        self._reader.join(10)
+        return status
+
+    def __enter__(self) -> Served:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(20)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait(20)
+        self._reader.join(10)
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+class Visitor:
+    """What a person sees and does: widgets are found by their names, and used with the mouse."""
+
+    def __init__(self, chrome: Chrome, address: str) -> None:
+        self.chrome = chrome
+        chrome.open(address)
+        chrome.wait("window.Bokeh && Bokeh.documents.length === 1 && Bokeh.documents[0].is_idle", "the page", 90)
+        chrome.wait(f"{self.model('model_curves')}.data.xs.length > 0", "the first curves", 240)
+
+    @staticmethod
+    def model(name: str) -> str:
+        """JavaScript of a widget or figure."""
+        return f"Bokeh.documents[0].get_model_by_name({name!r})"
+
+    def value(self, name: str, what: str) -> Any:
+        """A property of it."""
+        return self.chrome.run(f"{self.model(name)}.{what}")
+
+    def text(self, name: str) -> str:
+        """Its words."""
+        return str(self.value(name, "text"))
+
+    def until(self, script: str, what: str, seconds: float = 120) -> None:
+        """Wait for an expression over `model(name)`."""
+        self.chrome.wait(re.sub(r"\$(\w+)", lambda m: self.model(m.group(1)), script), what, seconds)
+
+    def place(self, name: str, inside: str) -> list[float]:
+        """Middle of an element of a widget in the window, once it has been brought into sight; and its width."""
+        view = f"Bokeh.index.find_one({self.model(name)})"
+        self.chrome.run(f"{view}.el.scrollIntoView({{block: 'center'}})")
+        time.sleep(0.2)
+        box: list[float] = self.chrome.run(
+            f"(() => {{ const r = {view}.shadow_el.querySelector({inside!r}).getBoundingClientRect();"
+            " return [r.x + r.width / 2, r.y + r.height / 2, r.width]; })()"
+        )
+        return box
+
+    def click(self, name: str, inside: str = "button") -> None:
+        """Click on it."""
+        x, y, _ = self.place(name, inside)
+        self.chrome.click(x, y)
+
+    def drag(self, name: str, path: list[float], after: Callable[[], None]) -> None:
+        """Drag the handle of a slider through parts of its whole width, to the right where positive.
+
+        `after` is called after every move, the button still down.
+        """
+        _, _, whole = self.place(name, ".noUi-target")
+        x, y, _ = self.place(name, ".noUi-handle")
+        self.chrome.mouse("move", x, y)
+        self.chrome.mouse("press", x, y)
+        for part in path:
+            self.chrome.mouse("move", x + part * whole, y, held=True)
+            after()
+        self.chrome.mouse("release", x + path[-1] * whole, y)
+
+    def time_redraws(self, slider: str) -> None:
+        """From now on, note for every redraw the time from the first move it answers to the frame that shows it."""
+        self.chrome.run(
+            f"""(() => {{
+              window.redraws_ms = [];
+              let moved = 0;
+              {self.model(slider)}.properties.value.change.connect(() => {{ moved ||= performance.now(); }});
+              {self.model("model_curves")}.properties.data.change.connect(() => {{
+                const begun = moved;
+                moved = 0;
+                if (begun) requestAnimationFrame(() => setTimeout(() => redraws_ms.push(performance.now() - begun)));
+              }});
+            }})()"""
+        )
+
+    def redraws_ms(self) -> list[float]:
+        """What was noted."""
+        found: list[float] = self.chrome.run("redraws_ms")
+        return found
+
+    def one_redraw(self) -> None:
+        """Wait, within the page, until one more redraw was noted; for two seconds at most."""
+        self.chrome.run(
+            """(async () => {
+              const count = window.redraws_seen ?? 0;
+              const end = performance.now() + 2000;
+              while (redraws_ms.length <= count && performance.now() < end) await new Promise((r) => setTimeout(r, 2));
+              window.redraws_seen = redraws_ms.length;
+            })()"""
+        )

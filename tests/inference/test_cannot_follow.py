@@ -1,0 +1,27 @@
+"""A fit that comes to a place beside which the model cannot be followed keeps what it had reached."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_let_in import campaign
+
+import vinetrack as vt
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.sensitivity import Predictor
+
+
+def test_a_step_into_the_unfollowable_ends_the_fit_where_it_was(monkeypatch: pytest.MonkeyPatch):
+    whole, calls = Predictor.linearise, []
+
+    def breaks_later(self: Predictor, theta: Floats, own: Floats, *, own_only: bool = False) -> list[Floats]:
+        calls.append(own_only)
+        if not own_only and calls.count(False) > 2:
+            raise SimulationError("Trial slow0: the model could not be integrated beyond 0.3 s.")
+        return whole(self, theta, own, own_only=own_only)
+
+    monkeypatch.setattr(Predictor, "linearise", breaks_later)
+    fit = vt.fit(vt.base_model(), campaign()[:1], profile=False, thorough=False)
+    assert not fit.converged
+    assert np.isfinite(fit["n"].value)

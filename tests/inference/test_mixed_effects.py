@@ -1,0 +1,233 @@
+"""The statistics under the fit, held against dense matrices and textbook numbers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.linalg import toeplitz
+from scipy.stats import multivariate_normal
+
+from vinetrack.inference.intervals import degrees_of_freedom, precision
+from vinetrack.inference.mixed_effects import (
+    FitState,
+    MixedProblem,
+    cross_products,
+    deviance,
+    estimate_noise,
+    estimate_spreads,
+    marginal,
+    newton_step,
+)
+from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
+from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
+
+RHO, SIGMA = 0.45, 0.3
+
+
+def covariance(count: int, rho: float, sigma: float) -> np.ndarray:
+    return np.asarray(sigma**2 * toeplitz(rho ** np.arange(count)))
+
+
+def frame_of(n_trials: int, count: int, keys: int, flat_sd: float = 1e3) -> MixedProblem:
+    return MixedProblem(
+        index=np.tile(np.arange(keys), (n_trials, 1)),
+        feels=np.tile([False, True], (n_trials, 1)),
+        gauge_error=np.zeros(n_trials),
+        own_centre=np.zeros((n_trials, 2)),
+        own_precision=np.full((n_trials, 2), flat_sd**-2),
+        prior_mean=np.zeros(keys),
+        prior_precision=np.zeros(keys),
+        lower=np.full(keys, -np.inf),
+        upper=np.full(keys, np.inf),
+        free=np.ones(keys, dtype=bool),
+        points=np.full(n_trials, float(count)),
+        stretches=np.ones(n_trials),
+    )
+
+
+def state_of(n_trials: int, keys: int, spread: float, rho: float = RHO, sigma: float = SIGMA) -> FitState:
+    variance = np.full(n_trials, sigma**2 * (1 - rho**2))
+    return FitState(np.zeros(keys), np.zeros((n_trials, 4)), (1e-5, spread), rho, variance)
+
+
+def columns_of(n_trials: int, count: int, keys: int, seed: int) -> list[np.ndarray]:
+    """Random columns; the pressure deviation is silent, the deviation of B moves what the first key moves."""
+    draw = np.random.default_rng(seed)
+    out = []
+    for _ in range(n_trials):
+        shared = draw.standard_normal((count, keys))
+        own = np.column_stack([draw.standard_normal(count), np.ones(count), np.zeros(count), shared[:, 0]])
+        out.append(np.column_stack([own, shared, draw.standard_normal(count)]))
+    return out
+
+
+def test_products_are_those_of_the_inverse_covariance() -> None:
+    columns = np.random.default_rng(0).standard_normal((30, 4))
+    first = np.zeros(30, dtype=bool)
+    first[[0, 17]] = True
+    white = at_correlation(products(columns, first)[None], RHO)[0]
+    dense = np.zeros((30, 30))
+    for part in (slice(0, 17), slice(17, 30)):
+        dense[part, part] = covariance(part.stop - part.start, RHO, 1.0)
+    assert white / (1 - RHO**2) == pytest.approx(columns.T @ np.linalg.solve(dense, columns))
+
+
+def test_whitened_squares_are_the_products() -> None:
+    residual = np.random.default_rng(1).standard_normal(40)
+    first = np.arange(40) % 13 == 0
+    white = whiten(residual, first, RHO)
+    assert white @ white == pytest.approx(at_correlation(products(residual[:, None], first)[None], RHO)[0, 0, 0])
+
+
+def test_the_marginal_likelihood_is_that_of_the_dense_gaussian() -> None:
+    n_trials, count, keys, spread, flat_sd = 3, 12, 2, 0.7, 50.0
+    columns = columns_of(n_trials, count, keys, seed=2)
+    first = [np.arange(count) == 0] * n_trials
+    frame, state = frame_of(n_trials, count, keys, flat_sd), state_of(n_trials, keys, spread)
+    part = marginal(all_products(columns, first), frame, state)
+    found = deviance(part, frame, state, state.spread, restricted=False)
+    # The same by brute force: shared numbers by least squares, then the density of what is left.
+    noise = covariance(count, RHO, SIGMA)
+    dense = [noise + flat_sd**2 * c[:, :2] @ c[:, :2].T + spread**2 * np.outer(c[:, 3], c[:, 3]) for c in columns]
+    square = sum(c[:, 4:6].T @ np.linalg.solve(v, c[:, 4:6]) for c, v in zip(columns, dense, strict=True))
+    slope = sum(c[:, 4:6].T @ np.linalg.solve(v, c[:, 6]) for c, v in zip(columns, dense, strict=True))
+    best = np.linalg.solve(square, slope)
+    direct = -2 * sum(
+        multivariate_normal(np.zeros(count), v).logpdf(c[:, 6] - c[:, 4:6] @ best)
+        for c, v in zip(columns, dense, strict=True)
+    )
+    assert found == pytest.approx(direct, rel=1e-8)
+
+
+def test_the_restricted_likelihood_adds_the_information() -> None:
+    columns = columns_of(4, 20, 2, seed=3)
+    first = [np.arange(20) == 0] * 4
+    frame, state = frame_of(4, 20, 2), state_of(4, 2, 0.5)
+    part = marginal(all_products(columns, first), frame, state)
+    more = deviance(part, frame, state, state.spread) - deviance(part, frame, state, state.spread, restricted=False)
+    covariance_of_numbers = precision(Solution(state, frame, all_products(columns, first), (), (False, True), True, 1))
+    assert more == pytest.approx(-np.linalg.slogdet(covariance_of_numbers.covariance)[1], rel=1e-8)
+
+
+def balanced(n_trials: int, count: int, spread: float, seed: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """A level of its own for every trial about a common one: the textbook's one-way layout, white noise of 0.01."""
+    draw = np.random.default_rng(seed)
+    level = 2.0 + spread * draw.standard_normal(n_trials)
+    columns = []
+    for i in range(n_trials):
+        own = np.zeros((count, 4))
+        own[:, 3] = 1.0
+        seen = level[i] + 0.01 * draw.standard_normal(count)
+        columns.append(np.column_stack([own, np.ones(count), seen]))
+    return columns, np.array([c[:, -1].mean() for c in columns])
+
+
+def one_way(n_trials: int, count: int, spread: float, seed: int) -> tuple[Solution, np.ndarray]:
+    columns, means = balanced(n_trials, count, spread, seed)
+    grams = all_products(columns, [np.arange(count) == 0] * n_trials)
+    frame = frame_of(n_trials, count, 1)
+    state = state_of(n_trials, 1, 0.3, rho=0.0, sigma=0.01)
+    found = estimate_spreads(marginal(grams, frame, state), frame, state, (False, True), search=True)
+    state = FitState(state.theta, state.own, found, 0.0, state.variance)
+    return Solution(state, frame, grams, (), (False, True), True, 1), means
+
+
+def test_the_spread_of_a_one_way_layout_is_that_of_the_analysis_of_variance() -> None:
+    solution, means = one_way(12, 25, 0.05, seed=4)
+    expected = math.sqrt(means.var(ddof=1) - 0.01**2 / 25)
+    assert solution.state.spread[1] == pytest.approx(expected, rel=2e-3)
+
+
+def test_the_error_of_a_common_level_is_that_of_a_mean_of_trials() -> None:
+    solution, means = one_way(12, 25, 0.05, seed=5)
+    assert math.sqrt(precision(solution).covariance[0, 0]) == pytest.approx(means.std(ddof=1) / math.sqrt(12), rel=2e-3)
+
+
+def test_degrees_of_freedom_of_a_common_level_are_the_trials_less_one() -> None:
+    solution, _ = one_way(12, 25, 0.05, seed=6)
+    assert degrees_of_freedom(solution)[0] == pytest.approx(11, rel=0.03)
+
+
+def test_noise_is_estimated_without_the_bias_of_what_was_fitted() -> None:
+    draw = np.random.default_rng(7)
+    n_trials, count, rho = 300, 30, 0.4
+    columns = []
+    for _ in range(n_trials):
+        line = np.linspace(-1, 1, count)
+        noise = np.linalg.cholesky(covariance(count, rho, 1.0)) @ draw.standard_normal(count)
+        flat = np.column_stack([line, np.ones(count)])
+        noise -= flat @ np.linalg.lstsq(flat, noise, rcond=None)[0]
+        columns.append(np.column_stack([flat, np.zeros((count, 2)), noise]))
+    grams = all_products(columns, [np.arange(count) == 0] * n_trials)
+    frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
+    found, variance = estimate_noise(grams, frame, state)
+    # 9000 points: ρ to 0.01, σ² to 2 %. Without counting the line ρ would come out 0.06 too small.
+    assert found == pytest.approx(rho, abs=0.03)
+    assert variance.mean() == pytest.approx(1 - rho**2, rel=0.05)
+
+
+def test_one_step_solves_a_straight_problem() -> None:
+    columns = columns_of(3, 25, 2, seed=8)
+    truth = np.array([0.3, -0.7])
+    for c in columns:
+        c[:, -1] = c[:, 4:6] @ truth + 0.2 * c[:, 0] - 0.1
+    frame, state = frame_of(3, 25, 2, flat_sd=1e6), state_of(3, 2, 1e-3, sigma=1e-3)
+    step, own, promised = newton_step(all_products(columns, [np.arange(25) == 0] * 3), frame, state, 0.0)
+    assert step == pytest.approx(truth, abs=1e-6)
+    assert own[:, 0] == pytest.approx(0.2, abs=1e-6)
+    assert promised > 0
+
+
+def test_a_number_at_its_bound_does_not_leave_it() -> None:
+    columns = columns_of(3, 25, 2, seed=9)
+    for c in columns:
+        c[:, -1] = c[:, 4:6] @ np.array([0.3, -0.7])
+    frame = frame_of(3, 25, 2)
+    bounded = MixedProblem(**{**frame.__dict__, "lower": np.array([-np.inf, 0.0])})
+    step, _, _ = newton_step(all_products(columns, [np.arange(25) == 0] * 3), bounded, state_of(3, 2, 0.1), 0.0)
+    assert step[1] == 0.0
+    assert step[0] > 0
+
+
+def test_two_numbers_that_move_the_trajectories_alike_are_found_out() -> None:
+    columns = columns_of(4, 25, 3, seed=10)
+    for c in columns:
+        c[:, 6] = 2 * c[:, 5]
+    solution = Solution(
+        state_of(4, 3, 0.1), frame_of(4, 25, 3), all_products(columns, [np.arange(25) == 0] * 4), (), (False, True),
+        True, 1,
+    )  # fmt: skip
+    found = precision(solution)
+    assert found.tied.tolist() == [False, True, True]
+    assert np.isinf(found.covariance[1, 1])
+    assert np.isfinite(found.covariance[0, 0])
+
+
+def test_blocks_of_a_trial_go_to_the_numbers_it_feels() -> None:
+    frame = frame_of(2, 5, 3)
+    frame = MixedProblem(**{**frame.__dict__, "index": np.array([[0, 2], [1, -1]])})
+    total = cross_products(np.ones((2, 2, 2)), frame)
+    assert total.tolist() == [[1, 0, 1], [0, 1, 0], [1, 0, 1]]
+
+
+def test_a_distance_of_two_numbers_is_given_as_the_deviate_of_one() -> None:
+    # χ² with two degrees of freedom exceeds 5.9915 in 5 % of cases, a single number 1.96 standard errors as often.
+    assert _deviate(np.array([math.sqrt(5.991465), 0.0]), np.eye(2)) == pytest.approx(1.959964, abs=1e-4)
+    assert _deviate(np.zeros(2), np.eye(2)) == pytest.approx(0.0, abs=1e-9)
+    # Far out both tails fall like exp(−s/2).
+    assert _deviate(np.array([40.0, 0.0]), np.eye(2)) == pytest.approx(39.9, abs=0.15)
+
+
+def test_the_columns_of_the_model_check_are_those_agreed_upon() -> None:
+    assert list(pd.DataFrame(columns=list(CHECK_COLUMNS))) == [
+        "vine",
+        "n_steady",
+        "n_trajectory",
+        "B_steady",
+        "B_trajectory",
+        "z",
+    ]

@@ -1,0 +1,43 @@
+"""Trials filmed only in motion: their releases have more than one likely place, and the likeliest is found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lsoda_vine import N_TRUE, as_track, small_campaign
+
+import vinetrack as vt
+from vinetrack.inference.fit import fit
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.optimiser import FixedTerms, solve
+
+
+@pytest.fixture(scope="module")
+def only_in_motion() -> Fit:
+    """Eight trials, grown by scipy and let go 10 ms before the first frame that is kept."""
+    pairs, _ = small_campaign(seed=7, replicates=1)
+    seen = [track.time_s > 0.03 for _, track in pairs]
+    cut = [
+        (trial, as_track(track.time_s[keep], track.lead_position_m[keep]))
+        for (trial, track), keep in zip(pairs, seen, strict=True)
+    ]
+    return fit(vt.base_model(), cut)
+
+
+def test_what_makes_the_vine_is_found_without_a_frame_at_rest(only_in_motion: Fit) -> None:
+    assert only_in_motion.converged
+    assert abs(only_in_motion["n"].value - N_TRUE) < 3 * only_in_motion["n"].sigma
+    assert only_in_motion["n"].sigma < 0.02
+
+
+@pytest.mark.parametrize("early_frames", [5, 20, 45])
+def test_the_same_likelihood_is_reached_wherever_the_releases_begin(only_in_motion: Fit, early_frames: int) -> None:
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    own = solution.state.own.copy()
+    own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
+    elsewhere = solve(predictor, solution.frame, replace(solution.state, own=own), FixedTerms(), warm=True)
+    found = vt.refit(replace(only_in_motion, solution=elsewhere))
+    assert found.log_likelihood == pytest.approx(only_in_motion.log_likelihood, abs=0.5)
+    assert np.isfinite(found["n"].sigma)

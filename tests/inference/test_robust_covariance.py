@@ -1,0 +1,77 @@
+"""Errors of fitted numbers hold where the model of the noise does not know what went wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lsoda_vine import B_TRUE, N_TRUE, small_campaign
+
+import vinetrack as vt
+from vinetrack.core.records import Track, Trial
+from vinetrack.inference.intervals import precision
+from vinetrack.inference.robust_covariance import robust_covariance
+from vinetrack.inference.systematics import PRESSURE_ERROR_PA
+
+Pairs = list[tuple[Trial, Track]]
+
+
+def misread(seed: int) -> Pairs:
+    """Trials that hardly scatter, and a gauge read wrong by 30 Pa or so, anew for every condition."""
+    pairs, _ = small_campaign(seed, damping=5e-4, pressure=5e-4, replicates=5)
+    draw = np.random.default_rng(seed)
+    wrong = {one: PRESSURE_ERROR_PA * draw.standard_normal() for one in sorted({t.condition for t, _ in pairs})}
+    return [(replace(trial, pressure_Pa=trial.pressure_Pa + wrong[trial.condition]), track) for trial, track in pairs]
+
+
+def bent(seed: int) -> Pairs:
+    """Pictures that are bent, each trial's in another way, and some far more than others."""
+    pairs, _ = small_campaign(seed, damping=1e-3, pressure=1e-3)
+    draw = np.random.default_rng(seed)
+    bends_m = 4e-4 * draw.standard_t(3, len(pairs))
+    return [
+        (trial, replace(track, lead_position_m=track.lead_position_m + bend * np.sin(6 * _part(track))))
+        for (trial, track), bend in zip(pairs, bends_m, strict=True)
+    ]
+
+
+def _part(track: Track) -> np.ndarray:
+    grown_m = track.lead_position_m - track.lead_position_m[0]
+    return np.asarray(grown_m / grown_m.max())
+
+
+def deviations(make: Callable[[int], Pairs], seeds: Iterable[int]) -> tuple[float, float]:
+    """Root mean square error of n and both B in standard errors, by the model of the noise and by what a fit says."""
+    by_noise, stated = [], []
+    for seed in seeds:
+        found = vt.fit(vt.base_model(), make(seed), profile=False)
+        narrow = np.sqrt(np.diag(precision(found.solution).covariance))
+        for k, number in enumerate(found.numbers):
+            if number.key == "yield_pressure.P_y":
+                continue
+            known = {
+                f"{round(t.trial.diameter_m * 1e3)}": B_TRUE[round(t.trial.diameter_m * 1e3, 3)] for t in found.trials
+            }
+            truth = N_TRUE if number.title == "n" else known[number.vine.split("mm")[0]]
+            free = found.predictor.layout.free[k]
+            by_noise.append((free.inside(number.value) - free.inside(truth)) / narrow[k])
+            stated.append((number.value - truth) / number.sigma)
+    return tuple(float(np.sqrt(np.mean(np.square(z)))) for z in (by_noise, stated))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize(("make", "seeds"), [(misread, range(60, 65)), (bent, range(60, 72))])
+def test_errors_hold_where_those_of_the_noise_are_too_small(make: Callable[[int], Pairs], seeds: range) -> None:
+    by_noise, stated = deviations(make, seeds)
+    assert by_noise > 1.4
+    assert 0.5 < stated < 1.3
+
+
+def test_trials_that_scatter_as_the_model_says_have_the_errors_of_the_model() -> None:
+    ratios = []
+    for seed in range(60, 64):
+        found = vt.fit(vt.base_model(), small_campaign(seed)[0], profile=False)
+        plain, robust = robust_covariance(found.predictor, found.solution)
+        ratios.append(np.sqrt(np.diag(robust) / np.diag(plain)))
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.2)

@@ -1,0 +1,144 @@
+"""The force in a steady window against sums by hand, and which trials enter the fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vinetrack import effects
+from vinetrack.core.records import Kinematics, Track, Trial, Window
+from vinetrack.dynamics.model import base_model
+from vinetrack.effects import EffectError
+from vinetrack.kinematics.force import SteadyForce, known_pressure, steady_force, why_not_force, why_not_in_fit
+from vinetrack.kinematics.release import Release
+
+G = 9.81
+AREA = math.pi * 0.012**2
+FILM = 1200 * math.pi * 0.024 * 200e-6
+VINE = Trial(
+    name="v",
+    diameter_m=0.024,
+    thickness_m=200e-6,
+    length_m=0.28,
+    pressure_Pa=14e3,
+    pressure_sigma_Pa=140.0,
+    yield_pressure_Pa=3e3,
+    yield_pressure_sigma_Pa=200.0,
+)
+START_S, ORIGIN_M, SPEED = 0.05, 0.02, 1.0
+TIME = START_S + np.arange(200) / 1000
+WINDOW = Window("gated", True, "", from_s=START_S + 0.0499, to_s=START_S + 0.1501, n_points=101, x_ss_m_s=2 * SPEED)
+RELEASE = Release(
+    time_s=START_S, lead_position_m=ORIGIN_M, lead_position_sigma_m=1e-5, moving_from_start=False, reason=""
+)
+
+
+def moved(pressure_Pa: np.ndarray | None = None) -> tuple[Track, Kinematics]:
+    """Growth at 1 m/s of the edge from 20 mm on; in WINDOW from 50 to 150 mm of growth, 100 mm in the mean."""
+    y = ORIGIN_M + SPEED * (TIME - START_S)
+    nan, ones = np.full(TIME.size, math.nan), np.ones(TIME.size)
+    track = Track(TIME, y, nan, np.full(TIME.size, "", dtype="<U8"), nan, pressure_Pa)
+    points = np.full(TIME.size, 7)
+    return track, Kinematics(TIME, y, SPEED * ones, 0.01 * ones, 0 * ones, points, 1e-4, 0.0, 2.0)
+
+
+def force_of(trial: Trial, window: Window = WINDOW, pressure_Pa: np.ndarray | None = None, model=None) -> SteadyForce:
+    track, kinematics = moved(pressure_Pa)
+    return steady_force(trial, track, kinematics, RELEASE, window, model or base_model())
+
+
+def test_force_is_the_excess_pressure_and_the_weight_of_what_still_moves() -> None:
+    """Mean growth in the window 0.1 m: 0.18 m of film left, and its weight counts r = 2 times."""
+    force = force_of(VINE)
+    assert force.force_N == pytest.approx(11e3 * AREA + 2 * FILM * 0.18 * G, rel=1e-9)
+    assert force.paper_N == pytest.approx(11e3 * AREA, rel=1e-12)
+    assert force.sigma_N == pytest.approx(140 * AREA, rel=1e-12)
+    assert force.yield_sigma_N == pytest.approx(200 * AREA, rel=1e-12)
+    assert force.window_pressure_Pa == pytest.approx(14e3, rel=1e-12)
+    assert force.pressure_source == "set"
+
+
+@pytest.mark.parametrize(("angle_deg", "share"), [(0, 1), (60, 0.5), (90, 0), (180, -1)])
+def test_weight_counts_along_the_growth(angle_deg: float, share: float) -> None:
+    force = force_of(replace(VINE, growth_angle_rad=math.radians(angle_deg)))
+    assert force.force_N == pytest.approx(11e3 * AREA + share * 2 * FILM * 0.18 * G, rel=1e-9)
+
+
+def test_a_measured_pressure_takes_the_place_of_the_set_one() -> None:
+    """A trace that falls by 20 Pa a frame is 12 kPa in the mean, at the middle of the window; a fall is no error."""
+    trace = 12e3 - 20.0 * (np.arange(200) - 100)
+    force = force_of(VINE, pressure_Pa=trace)
+    assert force.window_pressure_Pa == pytest.approx(12e3, rel=1e-9)
+    assert force.force_N == pytest.approx(9e3 * AREA + 2 * FILM * 0.18 * G, rel=1e-9)
+    assert force.sigma_N == pytest.approx(0, abs=1e-9)
+    assert force.pressure_source == "trace"
+    assert force.paper_N == pytest.approx(11e3 * AREA)
+
+
+def test_noise_of_a_measured_pressure_becomes_the_error_of_its_mean() -> None:
+    trace = 12e3 + 100.0 * np.random.default_rng(3).standard_normal(200)
+    assert force_of(VINE, pressure_Pa=trace).sigma_N == pytest.approx(100 / math.sqrt(101) * AREA, rel=0.2)
+
+
+def test_a_trace_that_is_silent_in_the_window_leaves_the_set_pressure() -> None:
+    trace = np.full(200, 12e3)
+    trace[40:160] = math.nan
+    assert force_of(VINE, pressure_Pa=trace).pressure_source == "set"
+
+
+def test_the_model_in_use_says_what_the_pressure_was() -> None:
+    """An isothermal litre: the mean over the window of the gas law at 50 … 150 mm."""
+    trial = replace(VINE, chamber_m3=1e-3)
+    model = (base_model() + effects.reservoir_depletion).with_values({"reservoir_depletion.gamma": 1.0})
+    y = np.arange(50, 151) / 1000
+    mean = np.mean((14e3 + 101_325) * 1e-3 / (1e-3 + AREA * y) - 101_325)
+    force = force_of(trial, model=model)
+    assert force.window_pressure_Pa == pytest.approx(mean, rel=1e-9)
+    assert force.pressure_source == "set"
+    assert mean < 10e3
+
+
+def test_a_model_that_lacks_what_it_needs_says_so() -> None:
+    with pytest.raises(EffectError, match="needs `chamber_l`"):
+        force_of(VINE, model=base_model() + effects.reservoir_depletion)
+
+
+def test_in_a_quasi_steady_window_inertia_is_taken_off() -> None:
+    """A drift of 10 % of 2 m/s over 0.1 s: ẍ = 2 m/s²."""
+    window = replace(WINDOW, rule="quasi_steady", from_s=START_S + 0.05, to_s=START_S + 0.15, drift=0.1)
+    exact = 11e3 * AREA + 2 * FILM * 0.18 * (G - 2.0)
+    assert force_of(VINE, window).force_N == pytest.approx(exact, rel=1e-3)
+    assert force_of(VINE).force_N - force_of(VINE, window).force_N == pytest.approx(2 * FILM * 0.18 * 2.0, rel=1e-2)
+
+
+def test_pressure_along_the_motion_is_known_from_a_trace_or_a_model_only() -> None:
+    track, kinematics = moved()
+    assert known_pressure(VINE, track, kinematics, RELEASE, base_model()) is None
+    traced, _ = moved(np.where(np.arange(200) % 2, 12e3 + np.arange(200), math.nan))
+    found = known_pressure(VINE, traced, kinematics, RELEASE, base_model())
+    assert found is not None
+    np.testing.assert_allclose(found[1:], 12e3 + np.arange(1, 200))
+
+
+@pytest.mark.parametrize(
+    ("trial", "reason"),
+    [
+        (VINE, ""),
+        (replace(VINE, payload_kg=0.0356), "carries a payload of 35.6 g"),
+        (replace(VINE, travel_ratio=1.0), "a body that moves as a whole has no eversion damping"),
+    ],
+    ids=["bare", "loaded", "ball"],
+)
+def test_which_trials_can_enter_the_fit(trial: Trial, reason: str) -> None:
+    assert why_not_in_fit(trial) == reason
+
+
+def test_which_forces_can_enter_the_fit() -> None:
+    assert why_not_force(None) == "no steady window"
+    assert why_not_force(force_of(VINE)) == ""
+    weak = force_of(replace(VINE, pressure_Pa=2e3))
+    assert weak.force_N < 0
+    assert "the pressure does not exceed the yield pressure" in why_not_force(weak)

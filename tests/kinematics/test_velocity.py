@@ -1,0 +1,164 @@
+"""Velocity against vines integrated by SciPy and against formulas. Scored on seeds 1000 and up (tuned on 0–99)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
+
+from vinetrack.kinematics.velocity import estimate_kinematics
+from vinetrack.kinematics.windows import fit_all_windows
+
+SINGLE_WINDOWS = (5, 7, 9, 11, 15, 21, 29, 39, 53, 71, 95, 127, 171)
+TRIALS = [
+    pytest.param(vine, noise_m, rho, id=f"R{vine.scale}-{vine.tail_speed_m_s}m_s-{noise_m * 1e3}mm-{rho}")
+    for vine in (Vine(1, 0.2), Vine(2, 1.0), Vine(3, 5.0), Vine(4, 3.0), Vine(4, 10.0))
+    for noise_m, rho in ((3e-5, 0.0), (1e-4, 0.6), (3e-4, 0.3))
+]
+
+
+@pytest.mark.parametrize(("vine", "noise_m", "rho"), TRIALS)
+def test_as_good_as_the_best_single_window_with_the_truth_in_hand(vine, noise_m, rho):
+    ours, single = [], {width: [] for width in SINGLE_WINDOWS}
+    for seed in range(1000, 1006):
+        trial = record(vine, np.random.default_rng(seed), noise_m=noise_m, rho=rho, rest_frames=60)
+        track, scored = trial.track, trial.track.time_s > trial.release_s - 0.01
+        kinematics = estimate_kinematics(track, travel_ratio=2)
+        ours.append(np.mean((kinematics.lead_velocity_m_s - trial.lead_velocity_m_s)[scored] ** 2))
+        for width in [width for width in SINGLE_WINDOWS if width <= scored.size]:
+            fits = fit_all_windows(track.time_s, track.lead_position_m, width, 3, 0.0)
+            error = fits.velocities(track.time_s, 0.0)[1] - trial.lead_velocity_m_s
+            single[width].append(np.mean(error[scored] ** 2))
+    best = min(np.mean(values) for values in single.values() if len(values) == 6)
+    assert np.sqrt(np.mean(ours) / best) < 1.2
+
+
+@pytest.mark.parametrize(("vine", "noise_m", "rho"), TRIALS)
+def test_stated_error_holds_within_a_factor_of_two_from_four_frames_after_release(vine, noise_m, rho):
+    pulls = []
+    for seed in range(1000, 1010):
+        trial = record(vine, np.random.default_rng(seed), noise_m=noise_m, rho=rho, rest_frames=60)
+        kinematics = estimate_kinematics(trial.track, travel_ratio=2)
+        late = trial.track.time_s > trial.release_s + 4 / CAPTURE_FPS
+        error = kinematics.lead_velocity_m_s - trial.lead_velocity_m_s
+        pulls.append((error / kinematics.lead_velocity_sigma_m_s)[late])
+    pull = np.concatenate(pulls)
+    assert 0.6 < np.sqrt(np.mean(pull**2)) < 2.0
+    assert np.mean(np.abs(pull) > 3) < 0.1
+
+
+def test_constant_velocity_of_the_widest_window_is_within_its_error():
+    time_s = np.arange(400) / 1069
+    pulls = []
+    for seed in range(1000, 1060):
+        y = 0.7 * time_s + ar1(400, 1e-4, 0.0, np.random.default_rng(seed))
+        kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=2)
+        pulls.append((kinematics.lead_velocity_m_s[200] - 0.7) / kinematics.lead_velocity_sigma_m_s[200])
+    assert 0.75 < np.std(pulls) < 1.3
+
+
+def test_free_fall_has_the_acceleration_of_gravity():
+    time_s = np.arange(300) / 1000
+    found = []
+    for seed in range(1000, 1040):
+        y = 0.5 * 9.81 * time_s**2 + ar1(300, 1e-4, 0.0, np.random.default_rng(seed))
+        kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=1)
+        np.testing.assert_array_equal(kinematics.tail_velocity_m_s, kinematics.lead_velocity_m_s)
+        found.append(kinematics.lead_acceleration_m_s2[150])
+    standard_error = np.std(found) / np.sqrt(len(found))
+    assert abs(np.mean(found) - 9.81) < 3 * standard_error
+    assert standard_error < 0.02
+
+
+def test_exact_cubic_is_returned_exactly_and_without_division_by_its_noise():
+    time_s = np.arange(100) / 1000
+    cubic = np.polynomial.Polynomial([0.2, 0.4, 3.0, -11.0])
+    kinematics = estimate_kinematics(make_track(time_s, cubic(time_s)), travel_ratio=2)
+    np.testing.assert_allclose(kinematics.lead_position_m, cubic(time_s), rtol=1e-9)
+    np.testing.assert_allclose(kinematics.lead_velocity_m_s, cubic.deriv()(time_s), rtol=1e-6)
+    assert np.all(np.isfinite(kinematics.lead_velocity_sigma_m_s))
+
+
+def test_position_and_velocity_belong_together():
+    trial = record(Vine(4, 1.0), np.random.default_rng(1000), noise_m=3e-5, rest_frames=30)
+    kinematics = estimate_kinematics(trial.track, travel_ratio=2)
+    late = kinematics.time_s > trial.release_s + 0.1
+    travelled = np.trapezoid(kinematics.lead_velocity_m_s[late], kinematics.time_s[late])
+    assert travelled == pytest.approx(np.ptp(kinematics.lead_position_m[late]), rel=2e-3)
+
+
+@pytest.mark.parametrize("drop", [[], [150], [150, 151, 152, 153, 154], list(range(0, 300, 9))])
+def test_missing_frames_do_not_bias(drop):
+    time_s = np.delete(np.arange(300) / 1069, drop)
+    y = 0.5 * time_s + ar1(time_s.size, 1e-4, 0.0, np.random.default_rng(1000))
+    kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=2)
+    pull = (kinematics.lead_velocity_m_s - 0.5) / kinematics.lead_velocity_sigma_m_s
+    assert np.max(np.abs(pull)) < 5
+
+
+def test_points_without_position_are_left_out():
+    time_s = np.arange(100) / 1069
+    y = 0.5 * time_s
+    y[[0, 40, 41, 99]] = np.nan
+    kinematics = estimate_kinematics(make_track(time_s, y), travel_ratio=2)
+    assert kinematics.time_s.size == 96
+    np.testing.assert_allclose(kinematics.lead_velocity_m_s, 0.5, rtol=1e-9)
+
+
+def test_flagged_points_are_left_out():
+    time_s = np.arange(100) / 1069
+    y = 0.5 * time_s
+    y[50] = 7.0
+    track = make_track(time_s, y)
+    flag = track.flag.copy()
+    flag[50] = "rejected"
+    kinematics = estimate_kinematics(replace(track, flag=flag), travel_ratio=2)
+    np.testing.assert_allclose(kinematics.lead_velocity_m_s, 0.5, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 6, 7])
+def test_very_short_tracks_have_a_velocity(n):
+    time_s = np.arange(n) / 1000
+    kinematics = estimate_kinematics(make_track(time_s, 0.5 * time_s), travel_ratio=2)
+    np.testing.assert_allclose(kinematics.lead_velocity_m_s, 0.5, rtol=1e-9)
+
+
+def test_one_point_is_refused_in_words():
+    with pytest.raises(ValueError, match="has 1 usable points; a velocity needs at least 2"):
+        estimate_kinematics(make_track(np.zeros(1), np.zeros(1)), travel_ratio=2)
+
+
+def test_times_that_do_not_increase_are_refused_in_words():
+    with pytest.raises(ValueError, match="do not increase"):
+        estimate_kinematics(make_track(np.array([0.0, 0.1, 0.1, 0.2]), np.arange(4.0)), travel_ratio=2)
+
+
+def test_zeros_of_time_and_position_do_not_matter():
+    trial = record(Vine(2, 1.0), np.random.default_rng(1000), noise_m=1e-4)
+    moved = make_track(trial.track.time_s + 1000.0, trial.track.lead_position_m - 5.0)
+    here, there = (estimate_kinematics(track, travel_ratio=2) for track in (trial.track, moved))
+    np.testing.assert_allclose(there.lead_velocity_m_s, here.lead_velocity_m_s, atol=1e-5)
+
+
+def test_the_track_is_left_as_it_was():
+    trial = record(Vine(2, 1.0), np.random.default_rng(1000), noise_m=1e-4)
+    before = trial.track.lead_position_m.copy()
+    first = estimate_kinematics(trial.track, travel_ratio=2)
+    again = estimate_kinematics(trial.track, travel_ratio=2)
+    np.testing.assert_array_equal(trial.track.lead_position_m, before)
+    np.testing.assert_array_equal(first.lead_velocity_m_s, again.lead_velocity_m_s)
+
+
+def test_four_thousand_frames_take_tens_of_milliseconds():
+    time_s = np.arange(4000) / 1069
+    y = np.maximum(time_s - 0.1, 0) * 0.3 + ar1(4000, 1e-4, 0.3, np.random.default_rng(1000))
+    track = make_track(time_s, y)
+    spent = []
+    for _ in range(4):
+        begun = time.process_time()
+        estimate_kinematics(track, travel_ratio=2)
+        spent.append(time.process_time() - begun)
+    assert min(spent) < 0.2  # 20 ms on a quiet core; room for a slow one

@@ -1,0 +1,228 @@
+"""The model in use on a results folder: exact columns, what a refused fit leaves, and tracks read back.
+
+Tracks are those of vines grown by scipy with B 6.4 and 4.5, n 0.4; seed 21 was used for nothing else.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import Result
+from lsoda_vine import small_campaign
+from typer.testing import CliRunner
+
+from vinetrack.cli.main import app
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.experiment.settings import run_settings
+from vinetrack.pipeline.model_stage import fit_model, measured, read_back
+from vinetrack.results.folder_layout import Results, read_json, read_result
+
+COMPARISON_HEADER = (
+    "model,condition,rms_position_m,rms_final_velocity_m_s,replicate_floor_m,ratio,worst_at_s,worst_at_m"
+)
+CHECK_HEADER = "vine,n_steady,n_trajectory,B_steady,B_trajectory,z"
+AUDIT_HEADER = (
+    "trial,condition,term,size,force_N,share_of_drive,shift_m,time_s,lead_position_m,y_over_L,slack_from_s,note"
+)
+TRAJECTORY_HEADER = "trial,time_s,lead_position_m,model_position_m,replicates_mean_m,replicates_sigma_m"
+SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+def write_experiment(folder: Path, settings: str = "") -> Path:
+    """Two vines, four pressures, two replicates, and one broken track."""
+    (folder / "tracks").mkdir(parents=True)
+    rows = [SHEET]
+    for trial, track in small_campaign(seed=21)[0]:
+        table = pd.DataFrame({"time_s": track.time_s, "position_m": track.lead_position_m})
+        table.to_csv(folder / "tracks" / f"{trial.name}.csv", index=False)
+        size = f"{1e3 * trial.diameter_m:g},{1e6 * trial.thickness_m:g},{1e3 * trial.length_m:g}"
+        rows.append(f"{trial.name},tracks/{trial.name}.csv,{size},{trial.pressure_Pa / 1e3:g},3\n")
+    (folder / "tracks" / "torn.csv").write_text("time_s,position_m\n0,0\n")
+    rows.append("torn,tracks/torn.csv,24,200,280,12,3\n")
+    (folder / "trials.csv").write_text("".join(rows))
+    if settings:
+        (folder / "experiment.yaml").write_text(settings)
+    return folder
+
+
+def analysed(experiment: Path, results: Path) -> Path:
+    for arguments in (("tracks", experiment, results), ("gather", experiment, results)):
+        assert run(*arguments).exit_code == 0
+    assert run("damping", results, "--settings", '{"damping": {"resamples": 200}}').exit_code == 0
+    return results
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
+    """Experiment, results folder, and what the command said."""
+    folder = tmp_path_factory.mktemp("campaign")
+    experiment = write_experiment(folder / "vines")
+    results = analysed(experiment, folder / "results")
+    done = run("model", experiment, results)
+    assert done.exit_code == 0, done.output
+    return experiment, results, done.output
+
+
+def header(path: Path) -> str:
+    return path.read_text(encoding="utf-8").splitlines()[0]
+
+
+def test_headers_are_exactly_those_people_rely_on(campaign: tuple[Path, Path, str]) -> None:
+    _, results, _ = campaign
+    assert header(results / "comparison.csv") == COMPARISON_HEADER
+    assert header(results / "model_check.csv") == CHECK_HEADER
+    assert header(results / "audit.csv") == AUDIT_HEADER
+    assert {header(path) for path in (results / "comparison").iterdir()} == {TRAJECTORY_HEADER}
+
+
+def test_every_condition_has_a_row_and_its_trajectories(campaign: tuple[Path, Path, str]) -> None:
+    _, results, _ = campaign
+    with (results / "comparison.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 8
+    assert {row["model"] for row in rows} == {"pressure_drive+gravity+eversion_damping+yield_pressure"}
+    assert {path.stem for path in (results / "comparison").iterdir()} == {row["condition"] for row in rows}
+
+
+def test_the_fit_is_written_with_its_numbers_and_their_errors(campaign: tuple[Path, Path, str]) -> None:
+    content = read_json(campaign[1] / "fit.json")
+    n = next(entry for entry in content["numbers"] if entry["parameter"] == "eversion_damping.n")
+    assert content["refused"] is None
+    assert n["low_95"] < n["value"] < n["high_95"]
+    assert abs(n["value"] - 0.4) < 4 * n["sigma"]
+    assert {"spreads", "noise_m", "messages", "warnings", "covariance", "trials"} <= set(content)
+    assert len(content["trials"]) == 16
+
+
+def test_steady_windows_and_trajectories_agree_on_the_model_the_tracks_were_grown_with(
+    campaign: tuple[Path, Path, str],
+) -> None:
+    check = read_result(campaign[1] / "model_check.csv")
+    assert len(check) == 2
+    assert check["n_trajectory"].iloc[0] == check["n_trajectory"].iloc[1]
+    assert (check["z"] < 4).all()
+
+
+def test_compare_prints_a_finished_folder_aligned_and_with_units(campaign: tuple[Path, Path, str]) -> None:
+    _, results, said = campaign
+    done = run("compare", results)
+    assert done.exit_code == 0
+    assert done.output == said
+    lines = done.output.splitlines()
+    assert " ".join(lines[1].split()) == "condition rms position replicates ratio rms final speed worst at"
+    assert lines[2].split() == ["mm", "mm", "m/s", "ms", "mm"]
+    assert lines[3].startswith("24mm-200um-280mm_12kPa_0g ")
+    assert len({len(line) for line in lines[3:11]}) == 1
+
+
+def test_compare_of_a_folder_without_a_fit_says_what_to_run(tmp_path: Path) -> None:
+    done = run("compare", tmp_path)
+    assert done.exit_code == 1
+    assert "fit.json does not exist: run the stage that makes it, or snakemake for all" in done.output
+
+
+def test_tracks_are_read_back_as_they_were_written(campaign: tuple[Path, Path, str]) -> None:
+    experiment, results, _ = campaign
+    pairs, kinematics = measured(read_experiment(experiment), Results(results))
+    names = [trial.name for trial, _ in pairs]
+    assert "torn" not in names
+    assert list(kinematics) == names
+    by_hand = pd.read_csv(experiment / "tracks" / f"{names[0]}.csv")
+    np.testing.assert_array_equal(pairs[0][1].lead_position_m, by_hand["position_m"].to_numpy())
+
+
+def test_a_pressure_measured_along_comes_back_with_the_track(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(
+        "time_s,position_m,pressure_kPa\n" + "".join(f"{i / 1000},{i / 1e4},{20 - i / 10}\n" for i in range(20))
+    )
+    (tmp_path / "trials.csv").write_text(SHEET + "a,a.csv,12,100,300,20,3\n")
+    trial = read_experiment(tmp_path).trial("a")
+    time_s = np.arange(20) / 1000
+    table = pd.DataFrame({"frame": range(20), "time_s": time_s, "edge_px": np.nan, "lead_position_m": time_s / 10})
+    track = read_back(trial, table.assign(lead_position_sigma_m=np.nan, flag=""))
+    assert track.pressure_Pa is not None
+    np.testing.assert_allclose(track.pressure_Pa, 1e3 * (20 - np.arange(20) / 10))
+
+
+def refused(experiment: Path, results: Path) -> str:
+    """The reason in `fit.json`, once every table has its header alone."""
+    content = fit_model(read_experiment(experiment), results, run_settings({}))
+    assert (results / "comparison.csv").read_text() == COMPARISON_HEADER + "\n"
+    assert (results / "model_check.csv").read_text() == CHECK_HEADER + "\n"
+    assert (results / "audit.csv").read_text() == AUDIT_HEADER + "\n"
+    assert not list((results / "comparison").iterdir())
+    assert json.loads((results / "fit.json").read_text()) == content
+    return str(content["refused"])
+
+
+def test_where_all_trials_failed_the_run_goes_on_and_says_so(tmp_path: Path) -> None:
+    experiment = tmp_path / "vines"
+    experiment.mkdir()
+    (experiment / "a.csv").write_text("time_s,position_m\n0,0\n")
+    (experiment / "trials.csv").write_text(SHEET + "a,a.csv,12,100,300,20,3\n")
+    results = analysed(experiment, tmp_path / "results")
+    assert refused(experiment, results).startswith("No trial can be fitted")
+    assert "was not fitted: No trial can be fitted" in run("compare", results).output
+
+
+def test_an_effect_that_needs_a_column_is_refused_by_its_name(tmp_path: Path) -> None:
+    effects = "[pressure_drive, gravity, eversion_damping, yield_pressure, capstan_friction, inlet_loss]"
+    experiment = write_experiment(tmp_path / "vines", f"model: {effects}\n")
+    results = tmp_path / "results"
+    base = write_experiment(tmp_path / "base")
+    analysed(base, results)
+    assert "inlet_mm" in refused(experiment, results)
+
+
+def test_of_bodies_that_fall_by_gravity_alone_the_fit_says_g(tmp_path: Path) -> None:
+    """Three balls let go, filmed at 240 frames a second with 0.2 mm of noise; g = 9.80665."""
+    experiment = tmp_path / "balls"
+    experiment.mkdir()
+    draw = np.random.default_rng(21)
+    sheet = ["trial,track,diameter_mm,pressure_kPa,yield_pressure_kPa,payload_g\n"]
+    for name in ("a", "b", "c"):
+        time_s = np.arange(120) / 240
+        fallen_m = 0.5 * 9.80665 * np.maximum(time_s - 0.0513, 0) ** 2 + 2e-4 * draw.standard_normal(120)
+        pd.DataFrame({"time_s": time_s, "position_m": fallen_m}).to_csv(experiment / f"{name}.csv", index=False)
+        sheet.append(f"{name},{name}.csv,40,0,0,2.7\n")
+    (experiment / "trials.csv").write_text("".join(sheet))
+    (experiment / "experiment.yaml").write_text("travel_ratio: 1\nmodel: [gravity]\n")
+    results = analysed(experiment, tmp_path / "results")
+    content = fit_model(read_experiment(experiment), results, run_settings({}))
+    (g,) = content["numbers"]
+    assert abs(g["value"] - 9.80665) < 4 * g["sigma"] < 0.04
+    (row,) = read_result(results / "comparison.csv").itertuples()
+    assert row.rms_position_m == pytest.approx(2e-4, rel=0.15)
+    assert row.ratio == pytest.approx(1.0, abs=0.15)
+
+
+def test_trajectories_of_an_earlier_run_go(campaign: tuple[Path, Path, str]) -> None:
+    experiment, results, _ = campaign
+    (results / "comparison" / "gone.csv").write_text(TRAJECTORY_HEADER + "\n")
+    fit_model(read_experiment(experiment), results, run_settings({}))
+    assert not (results / "comparison" / "gone.csv").exists()
+
+
+def test_an_unforeseen_fault_stops_nothing_and_stands_in_the_log(
+    campaign: tuple[Path, Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fault(*_: object, **__: object) -> None:
+        raise RuntimeError("surprise")
+
+    monkeypatch.setattr("vinetrack.inference.fit.fit", fault)
+    experiment, source, _ = campaign
+    results = analysed(experiment, tmp_path / "results")
+    done = run("model", experiment, results, "--log", tmp_path / "log.txt")
+    assert done.exit_code == 0
+    assert "a fault of the program" in done.output
+    assert "surprise" in (tmp_path / "log.txt").read_text()
+    assert source.exists()

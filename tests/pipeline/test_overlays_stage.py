@@ -1,0 +1,211 @@
+"""Clips from a results folder: which recordings get one, where predictions stand in pixels, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import av
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from vinetrack.cli.main import app
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.experiment.settings import OverlaySettings
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
+from vinetrack.pipeline.overlays_stage import (
+    REST_FRAMES,
+    chosen_trials,
+    draw_overlays,
+    edges_of,
+    frames_to_show,
+    metres_to_px,
+    overlay_one,
+    pace,
+)
+from vinetrack.results.folder_layout import Results, ResultsError, read_result
+from vinetrack.video.write import write_clip
+
+N, WIDTH, HEIGHT = 60, 480, 120
+MM_PER_PX = 0.5
+
+
+def edge_px() -> np.ndarray:
+    """At rest for 20 frames, then 10 px a frame for 30, then at rest."""
+    return 40.0 + 10.0 * np.clip(np.arange(N) - 20, 0, 30)
+
+
+def film(path: Path) -> None:
+    pictures = []
+    for edge in edge_px():
+        picture = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
+        picture[40:80, : int(edge)] = 180
+        pictures.append(picture)
+    write_clip(path, pictures, 30)
+
+
+def campaign(folder: Path, diagnosed: bool = True) -> tuple[Path, Path]:
+    """An experiment of two filmed replicates, one of another condition and one that failed, and its results."""
+    experiment, results = folder / "vines", folder / "out"
+    (experiment / "videos").mkdir(parents=True)
+    film(experiment / "videos" / "a.mp4")
+    rows = ["trial,video,capture_fps,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,mm_per_px"]
+    trials = {"a": 24, "b": 24, "c": 30, "torn": 36}
+    rows += [f"{name},videos/a.mp4,1000,20,100,180,{kPa},3,{MM_PER_PX}" for name, kPa in trials.items()]
+    (experiment / "trials.csv").write_text("\n".join(rows) + "\n")
+    for part in ("tracks", "analysed", "diagnosis/predictions"):
+        (results / part).mkdir(parents=True)
+    edge, time_s = edge_px(), np.arange(N) / 1000
+    position_m = 1e-3 * MM_PER_PX * edge
+    track = pd.DataFrame({"frame": range(N), "time_s": time_s, "edge_px": edge, "lead_position_m": position_m})
+    track = track.assign(lead_position_sigma_m=1e-5, flag="")
+    said = pd.DataFrame({"time_s": time_s, "lead_position_m": position_m})
+    said = said.assign(model_before_m=position_m + 20e-3, model_after_m=position_m - 5e-3)
+    axis = {"from_px": [0.0, 60.0], "to_px": [479.0, 60.0], "width_px": 40.0}
+    for name in trials:
+        track.iloc[: 0 if name == "torn" else N].to_csv(results / "tracks" / f"{name}.csv", index=False)
+        content = {"row": {"mm_per_px": MM_PER_PX}, "axis": axis}
+        (results / "analysed" / f"{name}.json").write_text(json.dumps(content))
+        if diagnosed and name != "torn":
+            said.to_csv(results / "diagnosis" / "predictions" / f"{name}.csv", index=False)
+    status = ["ok", "ok", "warning", "failed"]
+    pd.DataFrame({"trial": list(trials), "status": status}).to_csv(results / "trials.csv", index=False)
+    provenance = {"experiment": str(experiment), "settings": {"overlays": {"seconds": 2.0, "width_px": 480}}}
+    (results / "provenance.json").write_text(json.dumps(provenance))
+    if diagnosed:
+        (results / "diagnosis.json").write_text(json.dumps({"effects": ["air_drag"]}))
+        release = {"trials": {"a": {"release_s": 0.02}}}
+        (results / "fit.json").write_text(json.dumps(release))
+    return experiment, results
+
+
+def test_a_clip_shows_tracked_and_predicted_edges_where_they_are(tmp_path: Path) -> None:
+    _, results = campaign(tmp_path)
+    path = overlay_one(results, "a")
+    assert path == results / "overlays" / "a.mp4"
+    with av.open(str(path)) as container:
+        pictures = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+    shown = frames_to_show(read_result(Results(results).track("a")))
+    assert len(pictures) == len(shown)
+    frame = 35
+    picture = pictures[frame - shown.start]
+    # 20 mm ahead is 40 px, 5 mm behind 10 px.
+    for colour, place in ((TRACKED, 190), (BEFORE, 230), (AFTER, 180)):
+        target = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+        away = np.abs(picture[-HEIGHT:] - target).sum(axis=2)
+        # Half of the colour is lost on lines of three pixels: the column that comes nearest is the line's.
+        assert np.sort(away, axis=0)[:8].mean(axis=0).argmin() == pytest.approx(place, abs=2), colour
+
+
+def test_without_a_diagnosis_the_tracked_edge_is_drawn_alone(tmp_path: Path) -> None:
+    _, results = campaign(tmp_path, diagnosed=False)
+    assert overlay_one(results, "a").stat().st_size > 1000
+    edges, release_s = edges_of("a", Results(results), read_result(Results(results).track("a")))
+    assert [edge.name for edge in edges] == ["tracked edge"]
+    assert release_s == pytest.approx(0.021)
+
+
+def test_where_nothing_was_added_there_is_no_model_after(tmp_path: Path) -> None:
+    _, results = campaign(tmp_path)
+    (results / "diagnosis.json").write_text(json.dumps({"effects": []}))
+    edges, release_s = edges_of("a", Results(results), read_result(Results(results).track("a")))
+    assert [edge.name for edge in edges] == ["tracked edge", "the model you came with"]
+    assert release_s == 0.02
+    assert edges[1].off_mm == pytest.approx(np.full(N, 20.0))
+
+
+def test_a_prediction_that_ends_is_not_drawn_beyond_its_end(tmp_path: Path) -> None:
+    _, results = campaign(tmp_path)
+    path = results / "diagnosis" / "predictions" / "a.csv"
+    pd.read_csv(path).iloc[5:40].to_csv(path, index=False)
+    edges, _ = edges_of("a", Results(results), read_result(Results(results).track("a")))
+    assert np.isfinite(edges[1].along_px[:40]).all()
+    assert np.isnan(edges[1].along_px[40:]).all()
+
+
+def test_edges_go_along_with_a_shaken_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, results = campaign(tmp_path)
+    drawn: list[np.ndarray] = []
+
+    def seen(_view: object, picture: np.ndarray, frame: int, _time_ms: float, edges: list[Edge]) -> np.ndarray:
+        drawn.append(np.array([edge.along_px[frame] for edge in edges]))
+        return np.repeat(picture[:, :, None], 3, axis=2)
+
+    monkeypatch.setattr("vinetrack.figures.overlay.compose", seen)
+    overlay_one(results, "a", seconds=2)
+    still, drawn = drawn, []
+    path = results / "analysed" / "a.json"
+    content = json.loads(path.read_text())
+    shake_px = 2.0 * np.sin(np.arange(N))
+    content["axis"]["shake_px"] = shake_px.tolist()
+    path.write_text(json.dumps(content))
+    overlay_one(results, "a", seconds=2)
+    first = frames_to_show(read_result(Results(results).track("a"))).start
+    for k, (was, now) in enumerate(zip(still, drawn, strict=True)):
+        np.testing.assert_allclose(now - was, shake_px[first + k], atol=1e-9)
+
+
+def test_metres_turn_into_pixels_through_lens_and_tilt() -> None:
+    edge = np.linspace(10, 900, 200)
+    metres = 2.4e-4 * edge * (1 + 5e-5 * edge)
+    track = pd.DataFrame({"edge_px": edge, "lead_position_m": metres})
+    track.loc[3:9, "edge_px"] = math.nan
+    assert metres_to_px(track)(metres) == pytest.approx(edge, abs=0.6)
+
+
+def test_one_recording_a_condition_unless_all_or_none_are_asked_for(tmp_path: Path) -> None:
+    experiment, results = campaign(tmp_path)
+    read = read_experiment(experiment)
+    chosen = {of: chosen_trials(read, Results(results), of) for of in ("one_per_condition", "all", "none")}
+    assert chosen == {"one_per_condition": ["a", "c"], "all": ["a", "b", "c"], "none": []}
+
+
+def test_a_recording_that_cannot_be_drawn_does_not_stop_the_others(tmp_path: Path) -> None:
+    experiment, results = campaign(tmp_path)
+    (results / "analysed" / "a.json").write_text(json.dumps({"row": {"mm_per_px": 0.5}}))
+    said = draw_overlays(read_experiment(experiment), results, OverlaySettings(seconds=1, width_px=320))
+    assert len(said) == 1
+    assert said[0].startswith("a: no clip: ")
+    assert [path.name for path in (results / "overlays").iterdir()] == ["c.mp4"]
+
+
+def test_the_folder_is_there_even_without_a_clip(tmp_path: Path) -> None:
+    experiment, results = campaign(tmp_path)
+    assert draw_overlays(read_experiment(experiment), results, OverlaySettings(of="none")) == []
+    assert (results / "overlays").is_dir()
+
+
+def test_a_clip_begins_a_little_before_the_motion_and_ends_a_little_after() -> None:
+    shown = frames_to_show(pd.DataFrame({"edge_px": edge_px()}))
+    assert shown.start == 21 - REST_FRAMES
+    assert 49 + REST_FRAMES <= shown.stop <= 51 + REST_FRAMES
+
+
+@pytest.mark.parametrize("n_frames", [10, 30, 200, 1000, 20_000])
+def test_a_clip_lasts_about_as_long_as_asked_and_plays_at_a_rate_that_players_know(n_frames: int) -> None:
+    play_fps, stride = pace(n_frames, 6.0)
+    assert 4 <= play_fps <= 30
+    lasts_s = n_frames / stride / play_fps
+    assert lasts_s == pytest.approx(6, rel=0.2) or (n_frames < 24 and lasts_s < 6)
+
+
+@pytest.mark.parametrize(
+    ("trial", "words"),
+    [("torn", "its edge was not found"), ("nobody", "there are a, b, c, torn")],
+)
+def test_what_cannot_be_drawn_is_said_in_a_sentence(tmp_path: Path, trial: str, words: str) -> None:
+    _, results = campaign(tmp_path)
+    with pytest.raises(ResultsError, match=words):
+        overlay_one(results, trial)
+
+
+def test_the_command_says_where_the_clip_is_or_why_there_is_none(tmp_path: Path) -> None:
+    _, results = campaign(tmp_path)
+    done = CliRunner().invoke(app, ["overlay", str(results), "a", "--seconds", "1"])
+    assert (done.exit_code, done.output) == (0, f"Clip: {results / 'overlays' / 'a.mp4'}\n")
+    wrong = CliRunner().invoke(app, ["overlay", str(tmp_path / "nowhere"), "a"])
+    assert wrong.exit_code == 1
+    assert "provenance.json does not exist" in wrong.output

@@ -1,0 +1,3 @@
+"""Vines grown by scipy stand with the tests of the model."""
+
+from __future__ import annotations

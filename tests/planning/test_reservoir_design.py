@@ -1,0 +1,110 @@
+"""The chamber that keeps the pressure, against the gas law worked by hand and against a vine grown out of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vinetrack.core.records import Trial
+from vinetrack.dynamics.model import make_model
+from vinetrack.dynamics.simulate import simulate
+from vinetrack.experiment.planned import planned_trial
+from vinetrack.planning.input_sources import StatedValues, predictive_inputs
+from vinetrack.planning.reservoir_design import (
+    GAMMAS,
+    chamber_by_gauge,
+    chamber_for,
+    chambers,
+    final_with,
+    gauge_loss,
+    supplied_chamber,
+    supplied_loss,
+    swept_m3,
+)
+
+ATM = 101_325.0
+
+
+def trial(**values: object) -> Trial:
+    known = {
+        "diameter_mm": 24,
+        "thickness_um": 200,
+        "length_mm": 280,
+        "pressure_kPa": 28,
+        "yield_pressure_kPa": 3,
+        "chamber_l": 3.7,
+    }
+    return planned_trial({name: str(value) for name, value in {**known, **values}.items()}).trials[0]
+
+
+@pytest.mark.parametrize(
+    ("pressure_kPa", "slow", "fast"),
+    [(28, 0.15, 0.21), (14, 0.27, 0.38), (7, 0.51, 0.71)],
+    ids=lambda value: f"{value}",
+)
+def test_the_losses_of_the_papers_reservoir(pressure_kPa: float, slow: float, fast: float) -> None:
+    swept = swept_m3(trial())
+    for gamma, expected in ((1.0, slow), (1.4, fast)):
+        assert gauge_loss(1e3 * pressure_kPa, swept, 3.7e-3, gamma, ATM) == pytest.approx(expected, abs=0.005)
+
+
+def test_the_injectors_1_7_per_cent_are_5_3_of_gauge() -> None:
+    one = trial(
+        diameter_mm=2.5, thickness_um=50, length_mm=12.5, pressure_kPa=48, chamber_l=20 * math.pi * 7.5**2 / 1e6
+    )
+    assert swept_m3(one) / one.chamber_m3 == pytest.approx(0.017, abs=5e-4)
+    assert gauge_loss(48e3, swept_m3(one), one.chamber_m3, 1.0, ATM) == pytest.approx(0.053, abs=5e-4)
+
+
+@pytest.mark.parametrize("gamma", GAMMAS.values())
+@pytest.mark.parametrize("loss", [0.01, 0.05, 0.5])
+def test_a_chamber_that_is_sized_loses_just_what_it_may(gamma: float, loss: float) -> None:
+    volume = chamber_for(28e3, 1e-4, loss, gamma, ATM)
+    assert gauge_loss(28e3, 1e-4, volume, gamma, ATM) == pytest.approx(loss)
+
+
+def test_a_chamber_by_hand() -> None:
+    # 62 kPa, 5 %: (163.325 − 3.1)/163.325 = 0.98102; 0.98102/0.01898 = 51.69 times what is swept.
+    assert chamber_for(62e3, 1.0, 0.05, 1.0, ATM) == pytest.approx(51.69, rel=1e-3)
+    assert chamber_by_gauge(1.0, 0.05) == pytest.approx(19.0)
+
+
+def test_the_gauge_rule_is_too_small_and_fast_growth_needs_most() -> None:
+    asked, slow, fast, naive = chambers(trial(), 0.05)
+    assert asked.volume_m3 == pytest.approx(3.7e-3)
+    assert naive.volume_m3 < slow.volume_m3 < fast.volume_m3
+    assert min(naive.losses.values()) > 0.15
+
+
+def test_speeds_with_a_chamber_are_those_of_the_effect() -> None:
+    belief = predictive_inputs(trial(payload_g=35.6), StatedValues(B=6.44, n=0.37))
+    model = make_model([*belief.model.names, "reservoir_depletion"]).with_values(
+        {**belief.model.values, "reservoir_depletion.gamma": 1.0}
+    )
+    times = np.linspace(0.0, 1.0, 20_001)
+    found = simulate(model, belief.trial, times)
+    assert final_with(belief, 3.7e-3, 1.0, 0.95) == pytest.approx(2 * found.end_lead_velocity_m_s, rel=2e-3)
+
+
+def test_a_supply_that_is_shut_is_a_closed_chamber() -> None:
+    belief = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
+    closed = gauge_loss(28e3, swept_m3(belief.trial), 3.7e-3, 1.4, ATM)
+    assert supplied_loss(belief, 3.7e-3, 1e4, 1.4) == pytest.approx(closed, rel=0.01)
+
+
+def test_a_quick_supply_saves_a_chamber() -> None:
+    belief = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
+    closed = chamber_for(28e3, swept_m3(belief.trial), 0.05, 1.4, ATM)
+    volumes = [supplied_chamber(belief, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
+    assert volumes[0] < volumes[1] < closed
+    assert supplied_loss(belief, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)
+
+
+def test_a_law_of_the_chamber_in_the_model_gives_way_to_the_one_asked_about() -> None:
+    plain = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
+    with_law = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37, effects=("reservoir_depletion",)))
+    small = replace(plain, trial=replace(plain.trial, chamber_m3=1e-3))
+    assert final_with(with_law, 3.7e-3, 1.0, 0.95) == pytest.approx(final_with(small, 3.7e-3, 1.0, 0.95))

@@ -1,0 +1,170 @@
+"""What a diagnosis left in a results folder, read back for pictures and page: whole, in parts, and not there."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vinetrack.figures.style import render
+from vinetrack.results.diagnosis_tables import (
+    draw_diagnosed,
+    figure_tables,
+    in_order_of_rank,
+    predicted_trials,
+    question,
+    ranking_table,
+    read_diagnosed,
+    with_after,
+    worst_condition,
+)
+from vinetrack.results.folder_layout import Results
+from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, moved, one_round, refused
+
+RELEASE_S, ORIGIN_M = 0.05, 0.2
+TRIALS = {"a": "slow", "b": "slow", "c": "fast"}
+PICTURES = {"ladder", "before_after", "where", "missing_force", "candidates", "cosines", "drift"}
+
+
+def conditions() -> pd.DataFrame:
+    labels = {"slow": "12 mm, 24 kPa", "fast": "12 mm, 60 kPa"}
+    rows = [{"trial": t, "vine": "v", "condition": c, "condition_label": labels[c]} for t, c in TRIALS.items()]
+    return pd.DataFrame(rows)
+
+
+def prediction(off_m: float, after: bool) -> pd.DataFrame:
+    """0.2 m in 0.1 s, of which the model before misses `off_m` at the end, the one after nothing."""
+    since_s = np.arange(-20, 101) * 1e-3
+    growth_m = 2.0 * np.maximum(since_s, 0)
+    table = pd.DataFrame({"time_s": since_s + RELEASE_S, "lead_position_m": ORIGIN_M + growth_m})
+    before_m = table["lead_position_m"] - off_m * growth_m / 0.2
+    return table.assign(model_before_m=before_m, model_after_m=table["lead_position_m"] if after else math.nan)
+
+
+def folder(path: Path, content: dict | None, after: bool = True, compared: bool = True) -> Results:
+    results = Results(path)
+    (path / "diagnosis" / "predictions").mkdir(parents=True)
+    (path / "comparison").mkdir()
+    if content is not None:
+        (path / "diagnosis.json").write_text(json.dumps(content))
+    ladder("", *content.get("effects", []) if content else ()).to_csv(results.ladder, index=False)
+    moved().to_csv(results.diagnosed("moved.csv"), index=False)
+    for condition in ("slow", "fast"):
+        parts = []
+        for trial in (t for t, c in TRIALS.items() if c == condition):
+            table = prediction(0.02 if condition == "slow" else 0.004, after)
+            table.to_csv(results.predictions(trial), index=False)
+            since = {"time_s": table["time_s"] - RELEASE_S, "lead_position_m": table["lead_position_m"] - ORIGIN_M}
+            model = {"model_position_m": table["model_before_m"] - ORIGIN_M}
+            parts.append(pd.DataFrame({"trial": trial, **since, **model}))
+        if compared:
+            pd.concat(parts).to_csv(results.trajectories(condition), index=False)
+    return results
+
+
+@pytest.mark.parametrize("compared", [True, False])
+def test_predictions_count_from_release_and_origin(tmp_path: Path, compared: bool) -> None:
+    trials = predicted_trials(folder(tmp_path / "r", diagnosis(), compared=compared), conditions())
+    one = trials[trials["trial"] == "a"]
+    # Without the comparison the release is the first frame that moves: a frame or two late.
+    assert one["time_s"].iloc[0] == pytest.approx(-0.02, abs=1e-9 if compared else 2.5e-3)
+    assert one["lead_position_m"].iloc[-1] == pytest.approx(0.2)
+
+
+def test_the_worst_condition_is_the_one_the_first_model_misses_most(tmp_path: Path) -> None:
+    found = read_diagnosed(folder(tmp_path / "r", diagnosis()), conditions())
+    assert found is not None
+    assert found.worst == "slow"
+    assert set(found.before_after["trial"]) == {"a", "b"}
+    assert worst_condition(found.before_after.iloc[:0]) == ""
+
+
+def test_misfits_are_averaged_along_the_growth_before_and_after(tmp_path: Path) -> None:
+    found = read_diagnosed(folder(tmp_path / "r", diagnosis()), conditions())
+    assert found is not None
+    slow = found.where[found.where["condition"] == "slow"]
+    middle = (slow["growth_from"] + slow["growth_to"]) / 2
+    assert slow["misfit_before_m"].to_numpy() == pytest.approx(0.02 * middle.to_numpy(), abs=3e-4)
+    assert slow["misfit_after_m"].to_numpy() == pytest.approx(np.zeros(len(slow)), abs=1e-12)
+    assert set(found.where["condition_label"]) == {"12 mm, 24 kPa", "12 mm, 60 kPa"}
+    assert slow["n_trials"].tolist() == [2] * len(slow)
+
+
+def test_misfits_that_the_diagnosis_found_are_taken_with_their_errors(tmp_path: Path) -> None:
+    results = folder(tmp_path / "r", diagnosis())
+    row = {"vine": "v", "condition": "slow", "from_m": 0.1, "to_m": 0.2, "lead_position_m": 0.15}
+    row |= {"mean_residual_m": 0.011, "sigma_m": 0.001, "z": 11.0, "n_trials": 2}
+    pd.DataFrame([row, row | {"condition": ""}]).to_csv(results.diagnosed("along_position.csv"), index=False)
+    found = read_diagnosed(results, conditions())
+    assert found is not None
+    (slow,) = found.where[found.where["condition"] == "slow"].to_dict("records")
+    assert (slow["growth_from"], slow["growth_to"]) == (0.5, 1.0)
+    assert (slow["misfit_before_m"], slow["scatter_m"]) == (0.011, 0.001)
+    assert slow["misfit_after_m"] == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_every_verdict_has_all_its_pictures(tmp_path: Path, verdict: str) -> None:
+    found = read_diagnosed(folder(tmp_path / "r", diagnosis(verdict), after=verdict == "missing"), conditions())
+    pictures = draw_diagnosed(found)
+    assert set(pictures) == PICTURES
+    for figure in pictures.values():
+        assert render(figure, ["svg"])["svg"]
+    tables = figure_tables(found)
+    assert {"ladder", "before_after", "where", "candidates", "cosines"} <= set(tables)
+    assert "drift" not in tables
+
+
+@pytest.mark.parametrize("content", [None, refused()], ids=["none", "refused"])
+def test_without_a_verdict_every_picture_says_so(tmp_path: Path, content: dict | None) -> None:
+    found = read_diagnosed(folder(tmp_path / "r", content), conditions())
+    assert found is None
+    assert figure_tables(found) == {}
+    assert all(figure.texts for figure in draw_diagnosed(found).values())
+
+
+def test_a_diagnosis_without_predictions_has_the_rest(tmp_path: Path) -> None:
+    results = Results(tmp_path)
+    (tmp_path / "diagnosis.json").write_text(json.dumps(diagnosis()))
+    found = read_diagnosed(results, conditions())
+    assert found is not None
+    assert set(figure_tables(found)) == {"candidates", "cosines"}
+    assert set(draw_diagnosed(found)) == PICTURES
+
+
+def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path: Path) -> None:
+    results = folder(tmp_path / "r", diagnosis())
+    trajectories = {
+        "slow": pd.read_csv(results.trajectories("slow")),
+        "fast": pd.read_csv(results.trajectories("fast")),
+    }
+    joined = with_after(trajectories, read_diagnosed(results, conditions()))
+    difference = joined["slow"]["model_after_m"] - joined["slow"]["lead_position_m"]
+    assert float(np.abs(difference).max()) < 1e-12
+    assert "model_after_m" not in with_after(trajectories, None)["slow"]
+    shorter = {"slow": trajectories["slow"].iloc[1:]}
+    assert "model_after_m" not in with_after(shorter, read_diagnosed(results, conditions()))["slow"]
+
+
+def test_rankings_keep_what_could_not_be_tested_and_round_two_says_what_was_added() -> None:
+    rounds = [one_round("missing", "air_drag"), one_round("adequate", model=[*BASE, "air_drag"])]
+    table = ranking_table(rounds[0])
+    assert table["effect"].tolist() == ["air_drag", "leak", "time_base", "payload_drag"]
+    assert math.isnan(table["delta_chi2"].iloc[-1])
+    assert question(0, rounds) == "What does the model you came with lack?"
+    assert question(1, rounds) == "And with air drag added?"
+
+
+def test_ties_stand_in_the_order_of_the_ranking() -> None:
+    cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
+    ordered = in_order_of_rank(cosines, [one_round("missing", "air_drag")])
+    assert ordered == {
+        "effects": ["air_drag", "leak", "time_base"],
+        "matrix": [[1, 0.3, 0.2], [0.3, 1, 0.1], [0.2, 0.1, 1]],
+    }
+    assert in_order_of_rank({}, []) == {"effects": [], "matrix": []}

@@ -1,0 +1,196 @@
+"""Repeated and dropped frames put into vines integrated by SciPy. Scored on seeds 1000 and up (tuned on 0–99)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
+
+from vinetrack.core.records import Track
+from vinetrack.tracks.frame_timing import correct_frames
+
+FRAME_S = 1 / CAPTURE_FPS
+CLEAR = [  # speeds at which one frame's step is at least 8 standard deviations of a position
+    pytest.param(vine, noise_m, rho, id=f"R{vine.scale}-{vine.tail_speed_m_s}m_s-{noise_m * 1e3}mm-{rho}")
+    for vine, noise_m, rho in (
+        (Vine(1, 1.0), 3e-5, 0.0),
+        (Vine(2, 5.0), 1e-4, 0.0),
+        (Vine(2, 5.0), 1e-4, 0.6),
+        (Vine(3, 10.0), 1e-4, 0.6),
+        (Vine(4, 3.0), 1e-4, 0.0),
+        (Vine(4, 10.0), 3e-4, 0.3),
+    )
+]
+
+
+def stale(track: Track, row: int) -> Track:
+    """The frame at `row` shows the one before it again."""
+    y = track.lead_position_m.copy()
+    y[row] = y[row - 1]
+    return replace(track, lead_position_m=y)
+
+
+def inserted(track: Track, row: int) -> Track:
+    """A copy of the frame before `row` stands at `row`, and all later ones are a frame late."""
+    y = np.insert(track.lead_position_m, row, track.lead_position_m[row - 1])
+    return make_track(np.append(track.time_s, track.time_s[-1] + FRAME_S), y)
+
+
+def dropped(track: Track, row: int, count: int = 1) -> Track:
+    """`count` frames from `row` on are missing, and all later ones are as many frames early."""
+    y = np.delete(track.lead_position_m, range(row, row + count))
+    return make_track(track.time_s[: y.size], y)
+
+
+def flags(track: Track) -> dict[int, str]:
+    return {int(row): str(track.flag[row]) for row in np.flatnonzero(track.flag != "")}
+
+
+def steady_track(noise_m: float = 2e-5, n: int = 120) -> Track:
+    time_s = np.arange(n) * FRAME_S
+    y = 1.0 * np.maximum(time_s - time_s[30], 0) + ar1(n, noise_m, 0.0, np.random.default_rng(1000))
+    return make_track(time_s, y)
+
+
+def test_a_stale_copy_is_flagged_and_times_stay():
+    track = stale(steady_track(), 70)
+    out = correct_frames(track)
+    assert flags(out) == {70: "duplicate"}
+    np.testing.assert_array_equal(out.time_s, track.time_s)
+    assert len(out.notes) == 1
+    assert "repeats the one before it" in out.notes[0]
+
+
+def test_after_an_inserted_copy_times_go_back_by_one_frame():
+    clean = steady_track()
+    out = correct_frames(inserted(clean, 70))
+    assert flags(out) == {70: "duplicate"}
+    np.testing.assert_allclose(np.delete(out.time_s, 70), clean.time_s, atol=1e-12)
+    assert np.all(np.diff(out.time_s) > 0)
+    assert "inserted copy" in out.notes[0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_after_dropped_frames_times_go_on_by_as_many(count):
+    clean = steady_track()
+    out = correct_frames(dropped(clean, 70, count))
+    assert flags(out) == {70: "gap;corrected"}
+    np.testing.assert_allclose(out.time_s, np.delete(clean.time_s, range(70, 70 + count)), atol=1e-12)
+    assert ("1 frame is missing" if count == 1 else f"{count} frames are missing") in out.notes[0]
+
+
+def test_several_faults_in_one_track_are_all_put_right():
+    clean = steady_track()
+    out = correct_frames(stale(inserted(dropped(clean, 60), 80), 100))
+    assert flags(out) == {60: "gap;corrected", 80: "duplicate", 100: "duplicate"}
+    np.testing.assert_allclose(out.time_s[-1], clean.time_s[-1], atol=1e-12)
+
+
+def test_a_gap_that_the_times_show_is_flagged_and_nothing_moved():
+    track = steady_track()
+    rows = np.delete(np.arange(120), [70, 71])
+    gapped = make_track(track.time_s[rows], track.lead_position_m[rows])
+    out = correct_frames(gapped)
+    assert flags(out) == {70: "gap"}
+    np.testing.assert_array_equal(out.time_s, gapped.time_s)
+    assert "2 frames are missing" in out.notes[0]
+
+
+@pytest.mark.parametrize(("vine", "noise_m", "rho"), CLEAR)
+@pytest.mark.parametrize("fault", [stale, inserted, dropped], ids=lambda fault: fault.__name__)
+def test_faults_in_clear_motion_are_found(vine, noise_m, rho, fault):
+    right = tried = 0
+    for seed in range(1000, 1025):
+        rng = np.random.default_rng(seed)
+        trial = record(vine, rng, noise_m=noise_m, rho=rho, rest_frames=int(rng.integers(0, 80)))
+        clear = np.flatnonzero(trial.lead_velocity_m_s * FRAME_S > 8 * noise_m)[4:-5]
+        row = int(rng.choice(clear))
+        expected = "gap;corrected" if fault is dropped else "duplicate"
+        right += flags(correct_frames(fault(trial.track, row))) == {row: expected}
+        tried += 1
+    assert right / tried >= 0.9
+
+
+@pytest.mark.parametrize("noise_m", [3e-5, 1e-4, 3e-4])
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_nothing_is_found_in_clean_trials(noise_m, rho):
+    alarms = []
+    for scale, speed in ((1, 0.2), (1, 3.0), (1, 10.0), (2, 5.0), (3, 10.0), (4, 10.0)):
+        for seed in range(1000, 1020):
+            rng = np.random.default_rng(seed)
+            rest, end = int(rng.integers(0, 80)), int(rng.integers(0, 2)) * 30
+            vine = Vine(scale, speed)
+            trial = record(vine, rng, noise_m=noise_m, rho=rho, rest_frames=rest, end_frames=end)
+            alarms += correct_frames(trial.track).notes
+    assert alarms == []
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5])
+def test_wild_points_of_heavy_tails_move_no_times(rho):
+    """Student's t with 3 degrees of freedom puts a point a whole step ahead or behind now and then."""
+    moved = []
+    for seed in range(1000, 1150):
+        rng = np.random.default_rng(seed)
+        trial = record(Vine(4, 2.0), rng, noise_m=1e-9, rho=0.0, rest_frames=int(rng.integers(0, 60)))
+        kicks = rng.standard_t(3, trial.track.time_s.size) / np.sqrt(3)
+        wild = np.empty_like(kicks)
+        before = 0.0
+        for k, kick in enumerate(np.sqrt(1 - rho**2) * kicks):
+            before = wild[k] = rho * before + kick
+        track = replace(trial.track, lead_position_m=trial.track.lead_position_m + 1e-4 * wild)
+        moved += [note for note in correct_frames(track).notes if "later times" in note]
+    assert len(moved) <= 1
+
+
+def test_release_is_not_a_dropped_frame():
+    time_s = np.arange(100) * FRAME_S
+    y = 0.5 * 4000 * np.maximum(time_s - time_s[50], 0) ** 2
+    assert correct_frames(make_track(time_s, y)).notes == ()
+
+
+def test_the_end_of_growth_is_not_a_repeated_frame():
+    time_s = np.arange(100) * FRAME_S
+    y = np.minimum(3.0 * time_s, 3.0 * time_s[60]) + ar1(100, 3e-5, 0.0, np.random.default_rng(1000))
+    assert correct_frames(make_track(time_s, y)).notes == ()
+
+
+def test_slow_motion_is_left_alone():
+    time_s = np.arange(200) * FRAME_S
+    y = 0.1 * time_s + ar1(200, 1e-4, 0.0, np.random.default_rng(1000))
+    out = correct_frames(dropped(make_track(time_s, y), 100))
+    assert flags(out) == {}
+
+
+def test_irregular_times_are_left_alone():
+    rng = np.random.default_rng(1000)
+    time_s = np.cumsum(rng.uniform(0.5, 2.5, 200)) * FRAME_S
+    track = make_track(time_s, 1.0 * time_s + ar1(200, 3e-5, 0.0, rng))
+    assert correct_frames(track) is track
+
+
+def test_rows_without_position_do_not_pass_for_dropped_frames():
+    track = steady_track()
+    track.lead_position_m[[60, 61, 75]] = np.nan
+    assert correct_frames(track).notes == ()
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 6])
+def test_very_short_tracks_are_left_alone(n):
+    time_s = np.arange(n) * FRAME_S
+    assert correct_frames(make_track(time_s, 1.0 * time_s)).notes == ()
+
+
+def test_the_track_given_is_left_as_it_was():
+    track = inserted(steady_track(), 70)
+    before = track.time_s.copy()
+    correct_frames(track)
+    np.testing.assert_array_equal(track.time_s, before)
+    assert flags(track) == {}
+
+
+def test_a_corrected_track_is_corrected_once():
+    once = correct_frames(dropped(steady_track(), 70))
+    twice = correct_frames(once)
+    np.testing.assert_array_equal(once.time_s, twice.time_s)

@@ -1,0 +1,142 @@
+"""Commands of the diagnosis: what is missing from the model, and what becomes of the errors once it is added."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from vinetrack.experiment.folder import Experiment
+
+Moved = Annotated[
+    Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
+]
+LogFile = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.", show_default=False)]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.command()(diagnose)
+    app.command()(add)
+    app.command(name="diagnosis", rich_help_panel="Stages of the workflow")(diagnosis_stage)
+
+
+def diagnose(
+    target: Annotated[Path, typer.Argument(help="A results folder, or an experiment.", metavar="TARGET")],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the answer to this file, and no other.", show_default=False)
+    ] = None,
+    experiment: Moved = None,
+    log: LogFile = None,
+) -> None:
+    """What the model lacks: verdict, candidates with their sizes, errors before and after, what to do next."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.diagnosis.diagnose import diagnose as ask
+        from vinetrack.experiment.provenance import PROVENANCE
+        from vinetrack.pipeline.workflow import find_experiment
+
+        with _told() as report:
+            if (target / PROVENANCE).exists():
+                from vinetrack.pipeline.diagnosis_stage import diagnose_pairs, write_diagnosis
+                from vinetrack.pipeline.model_stage import measured
+                from vinetrack.pipeline.source_experiment import experiment_behind
+                from vinetrack.results.folder_layout import Results
+
+                read = experiment_behind(target, experiment)
+                found = diagnose_pairs(read, measured(read, Results(target))[0], report)
+                if json_file is None:
+                    write_diagnosis(Results(target), found)
+            else:
+                found = ask(_tracks_only(find_experiment(target)), report=report)
+        if json_file is not None:
+            from vinetrack.core.tables import write_json
+
+            write_json(json_file, {**found.to_json(), "refused": None})
+        typer.echo(str(found))
+
+
+def add(
+    effect: Annotated[str, typer.Argument(help="Name of the effect.", metavar="EFFECT")],
+    results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
+    save: Annotated[bool, typer.Option("--save", help="Write it to `model:` of the experiment.")] = False,
+    experiment: Moved = None,
+    log: LogFile = None,
+) -> None:
+    """Put an effect in the model, refit, and show the error before and after."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.pipeline.diagnosis_stage import add_effect
+        from vinetrack.pipeline.source_experiment import experiment_behind
+
+        read = experiment_behind(results, experiment)
+        with _told() as report:
+            lines = add_effect(read, results, effect, report)
+        for line in lines:
+            typer.echo(line)
+        if save:
+            from vinetrack.pipeline.save_model import save_model
+
+            path = save_model(read.folder, [*read.settings.model, effect])
+            typer.echo(f"Saved to {path}; run snakemake again to have everything with it.")
+
+
+def diagnosis_stage(
+    experiment: Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")],
+    results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
+    settings: Annotated[
+        str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")
+    ] = "{}",
+    log: LogFile = None,
+) -> None:
+    """What the model lacks, as diagnosis.json, ladder.csv and the folder diagnosis."""
+    from vinetrack.cli.main import _run_settings, _sentences
+
+    with _sentences(log):
+        from vinetrack.experiment.folder import read_experiment
+        from vinetrack.pipeline.diagnosis_stage import diagnose_results, diagnosis_lines
+        from vinetrack.pipeline.workflow import find_experiment
+
+        with _told() as report:
+            diagnose_results(read_experiment(find_experiment(experiment)), results, report, _run_settings(settings))
+        for line in diagnosis_lines(results):
+            typer.echo(line)
+
+
+def _tracks_only(folder: Path) -> Experiment:
+    """An experiment whose trials are tracks; recordings must go through the workflow first."""
+    from vinetrack.experiment.folder import read_experiment
+    from vinetrack.results.folder_layout import ResultsError
+
+    experiment = read_experiment(folder)
+    if experiment.trials and all(trial.track is None for trial in experiment.trials):
+        raise ResultsError(
+            f"{folder}: its trials are recordings, which must be tracked first: "
+            f"snakemake --cores 2 --config experiment={folder}, then vinetrack diagnose results/{experiment.name}"
+        )
+    return experiment
+
+
+@contextmanager
+def _told() -> Iterator[Callable[[str], None]]:
+    """Say on a terminal what is being done, on one line that is wiped at the end; nothing elsewhere."""
+    shown = sys.stderr.isatty()
+
+    def report(what: str) -> None:
+        if shown:
+            sys.stderr.write(f"\r\x1b[K{what} …")
+            sys.stderr.flush()
+
+    try:
+        yield report
+    finally:
+        if shown:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()

@@ -1,0 +1,53 @@
+"""The command `vinetrack explore`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
+Names = Annotated[list[str] | None, typer.Option("--add", help="Put this effect in (may be given again).")]
+Drops = Annotated[list[str] | None, typer.Option("--drop", help="Take this effect out (may be given again).")]
+Sizes = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="A size, NAME=VALUE in SI units, such as air_drag.C_D=0.8 (may be given again)."),
+]
+Exports = Annotated[
+    list[Path] | None,
+    typer.Option("--export", help="Write curves (.csv) or figure (.svg, .png, .pdf), and open no page."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command(name="explore")(explore)
+
+
+def explore(
+    results: ResultsPath,
+    add: Names = None,
+    drop: Drops = None,
+    sizes: Sizes = None,
+    refit: Annotated[bool, typer.Option("--refit", help="Fit it, print what was found, and open no page.")] = False,
+    export: Exports = None,
+    save: Annotated[bool, typer.Option("--save", help="Write the model to experiment.yaml; opens no page.")] = False,
+    experiment: Annotated[
+        Path | None, typer.Option("--experiment", help="Where the experiment is, if it has moved.")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option("--port", min=0, max=65535, help="Port to serve on; 0 for any that is free.")
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a browser.")] = True,
+    log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
+) -> None:
+    """A local page to see where the model fails, try effects, refit, and watch the error fall."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.explorer.command import Wanted
+        from vinetrack.explorer.command import explore as run
+
+        asked = Wanted(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)
+        run(results, experiment, asked, typer.echo)

@@ -1,0 +1,359 @@
+"""The command line: thin, quick to start, and without tracebacks.
+
+What is wrong with the input is one sentence a problem; what is wrong with the program is one sentence that names the
+log, where the traceback is.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from vinetrack.cli.design_commands import register as register_design
+from vinetrack.cli.diagnose_commands import register as register_diagnose
+from vinetrack.cli.explore_commands import register as register_explore
+
+if TYPE_CHECKING:
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import RunSettings
+
+SENTENCES = frozenset(
+    {"ResultsError", "EffectError", "TableError", "FitError", "SimulationError", "ChoiceError", "PageError"}
+)
+"""Errors that say themselves what is wrong and what to do; by name, so that nothing is loaded to know them."""
+
+app = typer.Typer(
+    name="vinetrack",
+    help="From recordings of everting vine robots to the physics that a model of them lacks.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
+ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
+SettingsText = Annotated[str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")]
+Threads = Annotated[int, typer.Option("--threads", min=1, help="Processes to use.")]
+LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")]
+
+
+def main() -> None:
+    """Entry of the `vinetrack` command."""
+    app()
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        import vinetrack
+
+        typer.echo(f"vinetrack {vinetrack.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """See the commands below."""
+
+
+@app.command()
+def check(experiment: ExperimentPath) -> None:
+    """Check the sheet, settings, effects, tracks and videos, in seconds, before any work."""
+    with _sentences(None):
+        from vinetrack.core.terminal import severity_first
+        from vinetrack.experiment.folder import check_experiment, format_problems
+        from vinetrack.pipeline.effects_stage import model_problems
+        from vinetrack.pipeline.workflow import find_experiment
+        from vinetrack.video.survey import survey
+
+        folder = find_experiment(experiment)
+        problems = [*check_experiment(folder, survey), *model_problems(folder)]
+        for line in format_problems(problems):
+            typer.echo(severity_first(line))
+        if any(problem.severity == "error" for problem in problems):
+            raise typer.Exit(1)
+        if not problems:
+            typer.echo(f"{experiment}: nothing to mend.")
+
+
+@app.command()
+def effects(
+    name: Annotated[str | None, typer.Argument(help="Explain this one.", metavar="NAME", show_default=False)] = None,
+    experiment: Annotated[
+        Path | None, typer.Option("--experiment", help="Folder whose own effects to include.", show_default=False)
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", help="Draw what NAME does, to this file.", show_default=False)
+    ] = None,
+) -> None:
+    """The catalogue of effects, with formulas, parameters and units; or one explained."""
+    with _sentences(None):
+        from vinetrack.pipeline.effects_stage import describe_effects
+        from vinetrack.pipeline.workflow import find_experiment
+
+        folder = None if experiment is None else find_experiment(experiment)
+        for line in describe_effects(name, folder, figure):
+            typer.echo(line)
+
+
+@app.command()
+def compare(results: ResultsPath) -> None:
+    """The model against the measurement of every condition, beside what repeated trials differ by."""
+    with _sentences(None):
+        from vinetrack.pipeline.model_stage import comparison_lines
+
+        for line in comparison_lines(results):
+            typer.echo(line)
+
+
+@app.command()
+def overlay(
+    results: ResultsPath,
+    trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],
+    experiment: Annotated[
+        Path | None, typer.Option("--experiment", help="The experiment, where it has moved.", show_default=False)
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.5, help="About how long it plays.", show_default=False)
+    ] = None,
+) -> None:
+    """The recording of one trial, slowed down, with the tracked edge and the models' edges drawn."""
+    with _sentences(None):
+        from vinetrack.pipeline.overlays_stage import overlay_one
+
+        with _busy(f"drawing over {trial}", None):
+            path = overlay_one(results, trial, experiment, seconds)
+        typer.echo(f"Clip: {path}")
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def overlays(
+    experiment: ExperimentPath,
+    results: ResultsPath,
+    settings: SettingsText = "{}",
+    threads: Threads = 1,
+    log: LogPath = None,
+) -> None:
+    """Clips of the recordings that the settings choose, with the tracked edge and the models' edges drawn."""
+    with _sentences(log):
+        from vinetrack.pipeline.overlays_stage import draw_overlays
+
+        for line in draw_overlays(_read(experiment), results, _run_settings(settings).overlays, threads):
+            typer.echo(f"  {line}")
+
+
+register_explore(app)
+register_diagnose(app)
+register_design(app)
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def recording(
+    experiment: ExperimentPath,
+    trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],
+    results: ResultsPath,
+    settings: SettingsText = "{}",
+    log: LogPath = None,
+) -> None:
+    """One recording to its track, kinematics and strip."""
+    with _sentences(log):
+        from vinetrack.pipeline.recordings_stage import analyse_recording
+
+        read = _read(experiment)
+        if trial not in [one.name for one in read.trials if one.video is not None]:
+            raise typer.BadParameter(f"{trial!r} is no trial with a recording in {experiment}", param_hint="TRIAL")
+        with _busy(f"tracking {trial}", log):
+            said = analyse_recording(read, trial, results, _run_settings(settings))
+        typer.echo(said)
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def tracks(
+    experiment: ExperimentPath,
+    results: ResultsPath,
+    settings: SettingsText = "{}",
+    threads: Threads = 1,
+    log: LogPath = None,
+) -> None:
+    """Positions measured elsewhere to tracks, kinematics and steady windows."""
+    with _sentences(log):
+        from vinetrack.pipeline.tracks_stage import analyse_tracks
+
+        failed = analyse_tracks(_read(experiment), results, _run_settings(settings), threads)
+        for line in failed[:10]:
+            typer.echo(f"  {line}")
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def gather(
+    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
+) -> None:
+    """What every trial gave, as trials.csv, conditions.csv, steady.csv and damping_points.csv."""
+    with _sentences(log):
+        from vinetrack.pipeline.tracks_stage import gather as gather_trials
+
+        table = gather_trials(_read(experiment), results, _run_settings(settings))
+        typer.echo(f"{len(table)} trials, {int((table['status'] == 'failed').sum())} failed.")
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+    """Steady points to the damping law, damping.json."""
+    with _sentences(log):
+        from vinetrack.narrative.law_text import headline
+        from vinetrack.pipeline.damping_stage import fit_law
+
+        with _busy("fitting the law and resampling its trials", log):
+            law = fit_law(results, _run_settings(settings).damping)
+        typer.echo(headline(law))
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def model(experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+    """The model in use fitted to the tracks: fit.json, comparison.csv, model_check.csv, audit.csv."""
+    with _sentences(log):
+        from vinetrack.pipeline.model_stage import comparison_lines, fit_model
+
+        with _busy("fitting the model", log):
+            fit_model(_read(experiment), results, _run_settings(settings))
+        for line in comparison_lines(results):
+            typer.echo(line)
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def figures(
+    experiment: ExperimentPath,
+    results: ResultsPath,
+    of: Annotated[str, typer.Option("--of", help="`trials`, `campaign` or `all`.")] = "all",
+    settings: SettingsText = "{}",
+    threads: Threads = 1,
+    log: LogPath = None,
+) -> None:
+    """Draw the figures of the trials, of the whole experiment, or both."""
+    with _sentences(log):
+        from vinetrack.pipeline.figures_stage import draw_campaign, draw_trials
+
+        if of not in ("trials", "campaign", "all"):
+            raise typer.BadParameter(f"{of!r} is none of trials, campaign, all", param_hint="--of")
+        chosen = _run_settings(settings).figures
+        read = _read(experiment)
+        if of != "campaign":
+            draw_trials(read, results, chosen, threads)
+        if of != "trials":
+            with _busy("drawing the experiment", log):
+                draw_campaign(read, results, chosen)
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def paper(experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+    """Set the paper's published numbers and figures beside ours: paper.csv."""
+    with _sentences(log):
+        from vinetrack.pipeline.paper_stage import draw_paper, set_beside_paper
+        from vinetrack.report.paper import tally
+
+        typer.echo(f"Beside the paper: {tally(set_beside_paper(_read(experiment), results))}")
+        draw_paper(results, _run_settings(settings).figures)
+
+
+@app.command(rich_help_panel="Stages of the workflow")
+def report(
+    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
+) -> None:
+    """Put everything in report.html, and what it was made with in provenance.json."""
+    with _sentences(log):
+        from vinetrack.pipeline.report_stage import write_report
+
+        with _busy("writing the report", log):
+            path = write_report(
+                _read(experiment),
+                results,
+                _run_settings(settings).model_dump(mode="json", exclude={"experiment", "results"}),
+            )
+        typer.echo(f"Report: {path}")
+
+
+def _busy(what: str, log: Path | None) -> AbstractContextManager[object]:
+    """A sign of life while a stage runs; none in the workflow, where each has a log and Snakemake tells how it goes."""
+    from vinetrack.core.terminal import waiting
+
+    return waiting(what) if log is None else nullcontext()
+
+
+def _read(folder: Path) -> Experiment:
+    from vinetrack.experiment.folder import read_experiment
+    from vinetrack.pipeline.workflow import find_experiment
+
+    return read_experiment(find_experiment(folder))
+
+
+def _run_settings(text: str) -> RunSettings:
+    import json
+
+    from vinetrack.experiment.settings import run_settings
+
+    try:
+        values = json.loads(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"is not JSON ({error})", param_hint="--settings") from None
+    if not isinstance(values, dict):
+        raise typer.BadParameter('is not a JSON object such as {"damping": {"seed": 7}}', param_hint="--settings")
+    return run_settings(values)
+
+
+@contextmanager
+def _sentences(log: Path | None) -> Iterator[None]:
+    """Turn every failure into sentences and exit status 1; tracebacks go to the log."""
+    from vinetrack.core.problems import ExperimentError, format_problems
+
+    _log_to(log)
+    try:
+        yield
+    except (typer.Exit, typer.BadParameter, typer.Abort):
+        raise
+    except ExperimentError as error:
+        _stop("\n".join(format_problems(error.problems)))
+    except KeyboardInterrupt:
+        _stop("Stopped; what was finished is kept.")
+    except BrokenPipeError:
+        # Whoever reads (`| head`) has seen enough; Python would complain once more when it closes the pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(1) from None
+    except Exception as error:
+        logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
+        if type(error).__name__ in SENTENCES:
+            _stop(str(error))
+        place = f"; the traceback is in {log}" if log else "; run it with --log FILE to have the traceback"
+        _stop(f"A fault of the program, not of your data ({type(error).__name__}: {error}){place}.")
+
+
+def _stop(message: str) -> None:
+    from vinetrack.core.terminal import severity_first
+
+    typer.echo("\n".join(severity_first(line, sys.stderr) for line in message.splitlines()), err=True)
+    raise typer.Exit(1)
+
+
+def _log_to(path: Path | None) -> None:
+    """Send messages of every module to a file alone; the terminal shows sentences, never logs."""
+    handler: logging.Handler = logging.NullHandler()
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    logging.basicConfig(
+        handlers=[handler], level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What every package stands on: records, units, tables, problems, the terminal."""

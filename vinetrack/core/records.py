@@ -1,0 +1,178 @@
+"""The nouns that every stage hands on: a trial, its track, its kinematics.
+
+Plain data in SI units, without files and without behaviour beyond what follows from the data themselves.
+`lead_` is the leading edge (what a camera sees), `tail_` the tail and a payload riding on it; the tail moves
+`travel_ratio` times as fast as the lead.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.constants import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3
+
+Floats = NDArray[np.float64]
+
+FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "gap", "corrected", "after_end")
+"""Every flag a point of a track can carry; several are joined by `;`."""
+
+UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
+"""A point with one of these says nothing about where the leading edge was."""
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A bend of the path: where it starts along the growth axis, its arc length and its radius, in metres."""
+
+    start_m: float
+    arc_m: float
+    radius_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One row of the trial sheet, shared settings filled in, in SI units; NaN where the sheet is blank.
+
+    `vine` names the trials of one diameter, thickness and length; `condition` the replicates: trials whose
+    nominal settings are all the same.
+    """
+
+    name: str
+    vine: str = ""
+    condition: str = ""
+    video: Path | None = None
+    track: Path | None = None
+    pressure_trace: Path | None = None
+    capture_fps: float = math.nan
+    exposure_s: float = math.nan
+    diameter_m: float = math.nan
+    thickness_m: float = math.nan
+    length_m: float = math.nan
+    pressure_Pa: float = math.nan
+    pressure_sigma_Pa: float = math.nan
+    yield_pressure_Pa: float = math.nan
+    yield_pressure_sigma_Pa: float = math.nan
+    payload_kg: float = 0.0
+    growth_angle_rad: float = 0.0
+    chamber_m3: float = math.nan
+    inlet_m: float = math.nan
+    bends: tuple[Bend, ...] = ()
+    film_density_kg_m3: float = FILM_DENSITY_KG_M3
+    m_per_px: float = math.nan
+    travel_ratio: float = 2.0
+    steady_window_s: tuple[float, float] | None = None
+    use: bool = True
+    ambient_pressure_Pa: float = AMBIENT_PRESSURE_PA
+    mass_loss: str = "geometric"
+    tail_slack: str = "taut"
+    tail_store: str = "body"
+
+    @property
+    def area_m2(self) -> float:
+        """Cross-section A = πD²/4."""
+        return math.pi * self.diameter_m**2 / 4
+
+    @property
+    def linear_density_kg_m(self) -> float:
+        """Film mass per metre λ = ρ_film π D t; 0 for a body that moves as a whole."""
+        if self.travel_ratio == 1 and not math.isfinite(self.thickness_m):
+            return 0.0
+        return self.film_density_kg_m3 * math.pi * self.diameter_m * self.thickness_m
+
+    @property
+    def mass_loss_kg_m(self) -> float:
+        """Mass c that the tail loses per metre of *tail* travel: λ(r−1)/r, or λ where the paper is taken literally."""
+        if self.mass_loss == "as_printed":
+            return self.linear_density_kg_m
+        return self.linear_density_kg_m * (self.travel_ratio - 1) / self.travel_ratio
+
+    def moving_mass_kg(self, lead_travel_m: Floats | float) -> Floats:
+        """Mass of tail and payload m = λL + m_pay − c·x after `lead_travel_m` of growth (x = r·y), never negative."""
+        length_m = self.length_m if math.isfinite(self.length_m) else 0.0
+        film_kg = self.linear_density_kg_m * length_m
+        tail_travel_m = self.travel_ratio * np.asarray(lead_travel_m, dtype=float)
+        return np.maximum(film_kg - self.mass_loss_kg_m * tail_travel_m, 0.0) + self.payload_kg
+
+
+def join_flags(*flags: str) -> str:
+    """`;`-join flags in the order of FLAGS, each once, blanks dropped."""
+    present = {part for flag in flags for part in flag.split(";") if part}
+    return ";".join(flag for flag in FLAGS if flag in present)
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where the leading edge was at each frame of one trial. All arrays have shape (n_frames,).
+
+    `lead_position_m` is NaN where there is none; `lead_position_sigma_m` the random error of that point alone (NaN
+    where unknown); `flag` holds strings, see FLAGS; `pressure_Pa` the gauge pressure measured along with it, if any;
+    `notes` are sentences about the track as a whole that a person should read.
+    """
+
+    time_s: Floats
+    lead_position_m: Floats
+    lead_position_sigma_m: Floats
+    flag: NDArray[np.str_]
+    edge_px: Floats
+    pressure_Pa: Floats | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Mask, shape (n_frames,): points that say where the leading edge was."""
+        usable = np.isfinite(self.lead_position_m) & np.isfinite(self.time_s)
+        for flag in {str(flag) for flag in self.flag[self.flag != ""]}:
+            if UNUSABLE_FLAGS.intersection(flag.split(";")):
+                usable &= self.flag != flag
+        return usable
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Motion of the leading edge at the usable points of a track. All arrays have shape (n,), SI units.
+
+    `window_points` is the width of the smoothing window chosen at each point; `noise_m` the standard deviation of a
+    single position and `noise_correlation` its lag-one autocorrelation.
+    """
+
+    time_s: Floats
+    lead_position_m: Floats
+    lead_velocity_m_s: Floats
+    lead_velocity_sigma_m_s: Floats
+    lead_acceleration_m_s2: Floats
+    window_points: NDArray[np.int_]
+    noise_m: float
+    noise_correlation: float
+    travel_ratio: float
+
+    @property
+    def tail_velocity_m_s(self) -> Floats:
+        """Speed of the tail: `travel_ratio` times that of the leading edge, shape (n,)."""
+        return self.travel_ratio * self.lead_velocity_m_s
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stretch of a trial judged for steadiness by one rule, with the verdict and why.
+
+    `rule` is `gated`, `paper` or `user`; `x_ss_m_s` the mean **tail** speed in the window and `x_ss_sigma_m_s` its
+    standard error; `drift` the relative change of speed across the window with its 95 % interval `drift_95`; `cv` the
+    coefficient of variation of the velocities in it. Numbers are NaN where there is no window.
+    """
+
+    rule: str
+    accepted: bool
+    reason: str
+    from_s: float = math.nan
+    to_s: float = math.nan
+    n_points: int = 0
+    x_ss_m_s: float = math.nan
+    x_ss_sigma_m_s: float = math.nan
+    drift: float = math.nan
+    drift_95: tuple[float, float] = field(default=(math.nan, math.nan))
+    cv: float = math.nan

@@ -1,0 +1,354 @@
+"""Tables and files as people have them: read in any dialect Excel writes, written whole or not at all.
+
+Reading accepts comma, semicolon or tab; decimal points or commas; UTF-8 with or without BOM, UTF-16 (Excel's "Unicode
+text") and cp1252; any line ends. Cells stay text, so that a message can quote what the person wrote; `parse_number`
+and `Table.numbers` are strict about what a number is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import re
+import unicodedata
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LARGEST_TABLE_BYTES = 200_000_000
+"""Beyond this a file is no table: probably a recording named in the wrong column."""
+
+_NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
+"""1,069 or 1.069: a decimal mark or a thousands separator, depending on the country."""
+_PLAIN_COLUMN = re.compile(r"[0-9eE+.\n-]*")
+_SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", re.ASCII)
+
+
+class TableError(Exception):
+    """A file that cannot be read as a table, or a cell that is no number: one sentence, with a remedy."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells of a CSV, as text without blanks around it.
+
+    `rows[i]` maps each column to its cell ("" where blank or where the line is short); `lines[i]` is its line in the
+    file, from 1; `extra[i]` holds what stands beyond the last column; `nameless` tells that a column without a name
+    holds something. `decimal` is the decimal mark the file uses, "."
+    or ",", or "" where it uses both.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[dict[str, str], ...]
+    lines: tuple[int, ...]
+    extra: tuple[tuple[str, ...], ...]
+    delimiter: str
+    decimal: str
+    nameless: bool = False
+
+    def numbers(self, column: str, *, blank_is_nan: bool = False) -> NDArray[np.float64]:
+        """A column as numbers, shape (n_rows,); blank cells are NaN if `blank_is_nan`, else refused.
+
+        Raises
+        ------
+        TableError
+            Naming line, column and cell of the first that is not a number.
+        """
+        cells = [row[column] for row in self.rows]
+        # Plain numbers, the usual case, are read 10 times faster without looking at each cell.
+        joined = "\n".join(cells).replace(",", ".") if self.decimal == "," else "\n".join(cells)
+        unambiguous = self.decimal == "." or (self.decimal == "," and not any("." in cell for cell in cells))
+        if unambiguous and _PLAIN_COLUMN.fullmatch(joined):
+            with contextlib.suppress(ValueError):
+                values = np.array([float(cell) for cell in joined.split("\n")], dtype=float)
+                if len(values) == len(cells) and np.all(np.isfinite(values)):
+                    return values
+        values = np.full(len(cells), np.nan)
+        for i, cell in enumerate(cells):
+            if cell == "" and blank_is_nan:
+                continue
+            try:
+                values[i] = parse_number(cell, self.decimal)
+            except TableError as error:
+                raise TableError(f"line {self.lines[i]}, column {column}: {cell[:40]!r} {error}") from None
+        return values
+
+
+def parse_number(text: str, decimal: str = ".") -> float:
+    """Read one number strictly: ASCII digits, at most one decimal mark (point or comma), an exponent, nothing else.
+
+    `decimal` ("." or ",", or "" for unknown) only settles what 1,069 and 1.069 are.
+
+    Raises
+    ------
+    TableError
+        Saying what is wrong with it, without repeating it.
+
+    Examples
+    --------
+    >>> parse_number("0,5"), parse_number(" 2.5e3 "), parse_number("1,069", decimal=",")
+    (0.5, 2500.0, 1.069)
+    >>> parse_number("12 kPa")
+    Traceback (most recent call last):
+    vinetrack.core.tables.TableError: is not a number: write digits only, without unit or separators
+    """
+    text = text.strip()
+    if text == "":
+        raise TableError("is blank: write a number")
+    if not _NUMBER.fullmatch(text):
+        raise TableError("is not a number: write digits only, without unit or separators")
+    mark = "," if "," in text else "."
+    if _GROUPED.fullmatch(text) and mark != decimal:
+        joined, pointed = re.sub("[.,]", "", text), text.replace(",", ".")
+        mended = f"{pointed}0 or {joined}"
+        raise TableError(f"may be thousands or decimals: write {mended}, whichever is meant")
+    value = float(text.replace(",", "."))
+    if not math.isfinite(value):
+        raise TableError("is too large to be a number here")
+    return value
+
+
+def decode_text(data: bytes) -> str:
+    r"""Text of a file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`.
+
+    >>> decode_text("µ\r\n".encode("cp1252")), decode_text("µ".encode("utf-16"))
+    ('µ\n', 'µ')
+    """
+    if data.startswith((b"\xff\xfe\x00\x00", b"\x00\x00\xfe\xff")):
+        encodings = ["utf-32"]
+    elif data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        encodings = ["utf-16"]
+    else:
+        encodings = ["utf-8-sig", "cp1252"]
+        if b"\x00" in data:
+            raise TableError("is not text: save the table as CSV (comma or semicolon separated)")
+    for encoding in encodings:
+        with contextlib.suppress(UnicodeDecodeError):
+            return data.decode(encoding).replace("\r\n", "\n").replace("\r", "\n")
+    raise TableError("is not readable as text: save it as CSV in UTF-8")
+
+
+def read_text(path: Path) -> str:
+    """Decoded text of a file of at most `LARGEST_TABLE_BYTES`.
+
+    Raises
+    ------
+    TableError
+        If there is no such file, it cannot be opened, is too large or is not text.
+    """
+    try:
+        if path.stat().st_size > LARGEST_TABLE_BYTES:
+            raise TableError("is too large to be a table: is it a recording?")
+        return decode_text(path.read_bytes())
+    except FileNotFoundError:
+        raise TableError("does not exist: check the path and its upper and lower case") from None
+    except IsADirectoryError:
+        raise TableError("is a folder, not a file") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "it cannot be opened"
+        raise TableError(f"cannot be read: {reason}") from None
+
+
+def read_table(path: Path) -> Table:
+    """Read a CSV file whose first line (after blank ones) is the header.
+
+    Raises
+    ------
+    TableError
+        A sentence without the file's name, which the caller knows.
+    """
+    return parse_table(read_text(path))
+
+
+def parse_table(text: str, skip_lines: int = 0) -> Table:
+    r"""Read the text of a CSV; `skip_lines` lines stand before its header.
+
+    >>> table = parse_table("trial; pressure_kPa\n a ;28,5\n;\n\n")
+    >>> table.rows, table.lines, table.decimal
+    (({'trial': 'a', 'pressure_kPa': '28,5'},), (2,), ',')
+    """
+    lines = text.split("\n")[skip_lines:]
+    if lines and (match := re.fullmatch(r'"?sep=(.)"?[;,\t]*', lines[0].strip("\ufeff "))):
+        delimiter, lines, skip_lines = match[1], lines[1:], skip_lines + 1
+    else:
+        delimiter = _find_delimiter(next((line for line in lines if line.strip()), ""))
+    records = _records("\n".join(lines), delimiter)
+    header = next(((line, cells) for line, cells in records if any(cells)), None)
+    if header is None:
+        raise TableError("is empty: its first line must name the columns")
+    columns = tuple(header[1])
+    named = [column for column in columns if column]
+    if repeated := sorted({column for column in named if named.count(column) > 1}):
+        raise TableError(f"names the column {repeated[0]!r} twice: keep one of them")
+    body = [(line, cells) for line, cells in records if line > header[0] and any(cells)]
+    width = len(columns)
+    rows = tuple(
+        {name: cell for name, cell in zip(columns, cells + [""] * (width - len(cells)), strict=False) if name}
+        for _, cells in body
+    )
+    extra = tuple(tuple(filter(None, cells[width:])) for _, cells in body)
+    nameless = any(cell and not name for _, cells in body for name, cell in zip(columns, cells, strict=False))
+    found = [cell for _, cells in body for cell in cells]
+    lines_of_rows = tuple(line + skip_lines for line, _ in body)
+    return Table(tuple(named), rows, lines_of_rows, extra, delimiter, _find_decimal(found, delimiter), nameless)
+
+
+def _find_delimiter(header: str) -> str:
+    """The separator that cuts the header in most cells; headers hold no decimal commas, so this is safe."""
+    bare = re.sub(r'"[^"]*"', "", header)
+    return max("\t;,", key=bare.count) if any(mark in bare for mark in "\t;,") else ","
+
+
+def _records(text: str, delimiter: str) -> list[tuple[int, list[str]]]:
+    """Lines cut in stripped cells, each with the number of the line it starts on."""
+    try:
+        return _cut(text, delimiter, strict=True)
+    except csv.Error as error:
+        if "end of data" in str(error):
+            raise TableError("has a quotation mark that is never closed: remove it") from None
+    try:
+        return _cut(text, delimiter, strict=False)
+    except csv.Error as error:
+        raise TableError(f"is not a table ({error}): save it as CSV") from None
+
+
+def _cut(text: str, delimiter: str, strict: bool) -> list[tuple[int, list[str]]]:
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True, strict=strict)
+    records, start = [], 1
+    for cells in reader:
+        records.append((start, [cell.strip() for cell in cells]))
+        start = reader.line_num + 1
+    return records
+
+
+def _find_decimal(cells: list[str], delimiter: str) -> str:
+    """Decimal mark of a table: that of the numbers that can be read one way only, else what its separator suggests."""
+    if not any("," in cell for cell in cells):
+        return "."
+    marks: set[str] = set()
+    doubtful: set[str] = set()
+    for cell in cells:
+        if ("," in cell or "." in cell) and _NUMBER.fullmatch(cell):
+            (doubtful if _GROUPED.fullmatch(cell) else marks).add("," if "," in cell else ".")
+    if not marks and delimiter == ";":
+        marks = doubtful
+    if len(marks) == 2:
+        return ""
+    return marks.pop() if marks else "."
+
+
+def safe_join(folder: Path, relative: str) -> Path:
+    r"""Path of a file inside `folder`, judged by its text alone: a link inside the folder may point out of it.
+
+    Windows' backslashes count as slashes.
+
+    Raises
+    ------
+    TableError
+        If `relative` is blank, absolute, starts with a drive letter or climbs out of the folder.
+
+    Examples
+    --------
+    >>> safe_join(Path("exp"), r"videos\a.mp4").as_posix()
+    'exp/videos/a.mp4'
+    >>> safe_join(Path("exp"), "../a.mp4")
+    Traceback (most recent call last):
+    vinetrack.core.tables.TableError: leads out of the experiment folder: move the file into it, or put a link there
+    """
+    text = relative.strip().replace("\\", "/")
+    # Control characters, line and paragraph separators; macOS itself puts unusual blanks in the names of recordings.
+    if any(unicodedata.category(char) in ("Cc", "Cs", "Zl", "Zp") for char in text):
+        raise TableError("contains characters that no path should have: type it anew")
+    if text.startswith("/") or re.match(r"[A-Za-z]:", text):
+        raise TableError("is an absolute path: write it relative to the experiment folder")
+    parts: list[str] = []
+    for part in text.split("/"):
+        if part == ".." and not parts:
+            raise TableError("leads out of the experiment folder: move the file into it, or put a link there")
+        if part == "..":
+            parts.pop()
+        elif part not in ("", "."):
+            parts.append(part)
+    if not parts:
+        raise TableError("names no file: write a path relative to the experiment folder")
+    return folder.joinpath(*parts)
+
+
+def result_file(folder: Path, name: str, suffix: str) -> Path:
+    """Path of a result named after a trial, vine or condition; a name that could leave `folder` is refused.
+
+    >>> result_file(Path("results/demo/tracks"), "v1-a", ".csv").as_posix()
+    'results/demo/tracks/v1-a.csv'
+    """
+    if not _SAFE_NAME.fullmatch(name):
+        raise TableError(f"{name[:40]!r} cannot name a file: use letters, digits, _ and -")
+    return folder / f"{name}{suffix}"
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, with its suffix; on success it takes the place of `path`, else it goes.
+
+    For writers that want a path (figures, videos); the folder is made where it is missing.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".tmp-{uuid.uuid4().hex}{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a whole file or none."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a whole file or none, in UTF-8; line ends stay as they are."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_csv(path: Path, frame: pd.DataFrame) -> None:
+    """Write a table with its header as first line; missing numbers are `NaN`, missing text is blank.
+
+    Floats are written with all digits needed to read back the same value.
+    """
+    text_columns = frame.columns[[dtype.kind not in "fiub" for dtype in frame.dtypes]]
+    filled = frame.astype(dict.fromkeys(text_columns, object))
+    filled[text_columns] = filled[text_columns].where(filled[text_columns].notna(), "")
+    write_text(path, filled.to_csv(index=False, na_rep="NaN", lineterminator="\n"))
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON with NaN and infinities as `null`, arrays as lists and paths as text."""
+    write_text(path, json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def _plain(content: Any) -> Any:
+    """Content in the types JSON knows."""
+    if isinstance(content, dict):
+        return {str(key): _plain(value) for key, value in content.items()}
+    if isinstance(content, np.ndarray | np.generic):
+        return _plain(content.tolist())
+    if isinstance(content, list | tuple | set | frozenset):
+        return [_plain(value) for value in (sorted(content) if isinstance(content, set | frozenset) else content)]
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, Path):
+        return content.as_posix()
+    return content

@@ -1,0 +1,193 @@
+"""YAML as people expect it: a key twice is an error, 10:20 is text, and every key knows its line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import TableError, read_text
+
+MOST_KEYS = 10_000
+
+
+@dataclass(frozen=True)
+class YamlDocument:
+    """Content of a YAML file; `lines` maps the path to each key, as a tuple, to its line from 1."""
+
+    content: Any
+    lines: dict[tuple[Any, ...], int]
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe loader without YAML 1.1's surprises: no base-60 numbers (10:20), octals (010), dates or underscores."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [pair for pair in pairs if pair[0] in ("tag:yaml.org,2002:bool", "tag:yaml.org,2002:null")]
+    for first, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver("tag:vinetrack,number", re.compile(r"^[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?$"), None)
+_Loader.add_implicit_resolver("tag:yaml.org,2002:merge", re.compile(r"^<<$"), ["<"])
+
+
+def _construct_number(loader: yaml.SafeLoader, node: Any) -> int | float | str:
+    text = str(loader.construct_scalar(node))
+    if re.fullmatch(r"[+-]?\d{1,18}", text):
+        return int(text)
+    value = float(text)
+    return value if abs(value) != float("inf") else text
+
+
+_Loader.add_constructor("tag:vinetrack,number", _construct_number)
+
+
+def read_yaml(path: Path) -> YamlDocument:
+    """Read a YAML file that holds one mapping; an empty file is an empty mapping.
+
+    Raises
+    ------
+    ExperimentError
+        If it cannot be read, is not YAML, holds no mapping or holds a key twice.
+    """
+    try:
+        text = read_text(path)
+    except TableError as error:
+        message, _, remedy = str(error).partition(": ")
+        raise ExperimentError([Problem(message=message, file=path.name, remedy=remedy)]) from None
+    return parse_yaml(text, path.name)
+
+
+def parse_yaml(text: str, file: str) -> YamlDocument:
+    r"""Parse YAML text; see `read_yaml`.
+
+    >>> parse_yaml("steady: 10:20\ncapture_fps: 1e3", "experiment.yaml").content
+    {'steady': '10:20', 'capture_fps': 1000.0}
+    """
+    loader = None
+    try:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        lines: dict[tuple[Any, ...], int] = {}
+        repeated: list[Problem] = []
+        _walk(node, (), lines, repeated, file)
+        content = loader.construct_document(node) if node is not None else {}
+    except (yaml.YAMLError, RecursionError, ValueError, OverflowError, TypeError) as error:
+        raise ExperimentError([_syntax_problem(error, file)]) from None
+    finally:
+        if loader is not None:
+            loader.dispose()
+    content = {} if content is None else content
+    if repeated:
+        raise ExperimentError(repeated)
+    if not isinstance(content, dict):
+        raise ExperimentError(
+            [Problem(message="holds no settings", file=file, remedy="write lines such as 'key: value'")]
+        )
+    return YamlDocument(content, lines)
+
+
+def _walk(
+    node: Any, path: tuple[Any, ...], lines: dict[tuple[Any, ...], int], repeated: list[Problem], file: str
+) -> None:
+    """Note the line of every key below a node, and every key that is written twice."""
+    # Aliases of aliases can stand for more keys than memory holds; no settings come near either limit.
+    if len(path) > 20 or len(lines) > MOST_KEYS:
+        raise ValueError("too large")
+    if isinstance(node, yaml.MappingNode):
+        for key_node, value_node in node.value:
+            line = key_node.start_mark.line + 1
+            key = (*path, key_node.value if isinstance(key_node, yaml.ScalarNode) else "?")
+            if key in lines and key_node.tag != "tag:yaml.org,2002:merge":
+                remedy = f"keep one; the first is on line {lines[key]}"
+                dotted = ".".join(str(part) for part in key)
+                repeated.append(Problem(message="is set twice", file=file, line=line, column=dotted, remedy=remedy))
+            lines[key] = line
+            _walk(value_node, key, lines, repeated, file)
+    elif isinstance(node, yaml.SequenceNode):
+        for i, item in enumerate(node.value):
+            lines[(*path, i)] = item.start_mark.line + 1
+            _walk(item, (*path, i), lines, repeated, file)
+
+
+def _syntax_problem(error: Exception, file: str) -> Problem:
+    """Where and why the text is not YAML, in one sentence."""
+    mark = getattr(error, "problem_mark", None)
+    reason = getattr(error, "problem", None) or "it cannot be understood"
+    remedy = "use spaces (no tabs) to indent, a blank after each colon, and quotes round text that holds : or #"
+    line = mark.line + 1 if mark is not None else 0
+    return Problem(message=f"is not YAML ({reason})", file=file, line=line, remedy=remedy)
+
+
+def with_list(text: str, key: str, values: Sequence[str], file: str = "experiment.yaml") -> str:
+    r"""The text with a top-level key set to a list of plain words; all else, comments included, stays as it is.
+
+    A list that stands in brackets on one line stays so, one with a line for each value too; a comment behind the value
+    or between its lines stays. The key is added at the end where there is none.
+
+    Raises
+    ------
+    ExperimentError
+        If the text is not YAML, or what comes out would not hold just that (the key is an anchor's alias, say).
+
+    Examples
+    --------
+    >>> with_list("a: 1  # one\nmodel: [x]  # now\n", "model", ["x", "y"])
+    'a: 1  # one\nmodel: [x, y]  # now\n'
+    """
+    before = parse_yaml(text, file).content
+    flow = f"[{', '.join(values)}]"
+    node = _value_of(text, key)
+    if node is None:
+        gap = "" if not text or text.endswith("\n") else "\n"
+        changed = f"{text}{gap}{key}: {flow}\n"
+    elif isinstance(node, yaml.SequenceNode) and not node.flow_style:
+        changed = _with_block_items(text, node, values)
+    else:
+        begin, end = node.start_mark.index, node.end_mark.index
+        changed = text[:begin] + (" " if begin == end else "") + flow + text[end:]
+    try:
+        correct = parse_yaml(changed, file).content == {**before, key: list(values)}
+    except ExperimentError:
+        correct = False
+    if not correct:
+        remedy = f"set it yourself: {key}: {flow}"
+        raise ExperimentError([Problem(message="cannot be set without harm", file=file, column=key, remedy=remedy)])
+    return changed
+
+
+def _value_of(text: str, key: str) -> Any:
+    """The node of a top-level key's value; None where there is no such key, or no mapping."""
+    loader = _Loader(text)
+    try:
+        node = loader.get_single_node()
+    finally:
+        loader.dispose()
+    pairs = node.value if isinstance(node, yaml.MappingNode) else []
+    return next((value for name, value in pairs if getattr(name, "value", None) == key), None)
+
+
+def _with_block_items(text: str, node: Any, values: Sequence[str]) -> str:
+    """A list with a line for each value: lines of values that go are removed, new ones follow the last that stays."""
+    lines = text.splitlines(keepends=True)
+    items = [(item.start_mark.line, str(getattr(item, "value", ""))) for item in node.value]
+    indent = " " * node.start_mark.column
+    at = {value: line for line, value in items}
+    gone = {line for line, value in items if value not in values}
+    kept = [value for value in values if value in at]
+    if [value for _, value in items if value in values] != kept or list(values[: len(kept)]) != kept:
+        gone, kept = set(at.values()), []
+    new = [f"{indent}- {value}\n" for value in values[len(kept) :]]
+    after = max((at[value] for value in kept), default=node.start_mark.line - 1)
+    out: list[str] = []
+    for number, line in enumerate(lines):
+        if number not in gone:
+            out.append(line if line.endswith("\n") or number < len(lines) - 1 else line + "\n")
+        if number == after:
+            out += new
+    return "".join(out if after >= 0 else [*new, *out])

@@ -1,0 +1,267 @@
+"""Every effect alone, and pairs of them: which hypotheses are worth a fit, and their fits."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.multi_start import SubsetFit, SubsetFitter, best_subset_fit, full_fit, start_of, starts_of
+from vinetrack.dynamics.model import Value
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Effect
+from vinetrack.inference.fit import FitError, refit
+from vinetrack.inference.fit_result import Fit
+
+Report = Callable[[str], None]
+"""Told in a few words what is being done."""
+
+WEAK = 100.0
+"""Δχ² up to which what the sensitivities predict is good to a per cent: hypotheses are then fitted without a climb."""
+
+PART_KEPT = 0.1
+"""Part of what a climb gained that a fit to all trials must gain, or it is begun again."""
+
+WORSE = -1.0
+"""An effect added can do no harm: Δχ² below this is a fit that has lost its way."""
+
+WITHIN_REACH = 16.0
+ALIKE = 0.95
+SHARE_WORTH_A_CLIMB = 0.2
+FEWEST_CLIMBED, LOUDEST = 5, 4
+"""The most promising and those with the largest scores: what is left of a fit far off may show in either way alone."""
+
+REACH_OF_CLIMBS, SHARE_OF_REACH, ALIKE_REACH = 40.0, 0.1, 5.0
+"""How far behind the best in −2 ln L a climb may end to be worth a fit: this, or this part of what the best gains, and
+so many times further where the two look alike."""
+
+MOST_FITTED = 7
+STARTS_EACH = 3
+SURELY = 6.0
+"""Standard deviations from nothing beyond which a number is there."""
+
+FIRSTS, PARTNERS, SHARE_OF_BEST = 3, 4, 0.3
+"""Pairs are built on the three best effects alone, if they explain this part of what the best explains, with the four
+that promise most beside each."""
+
+
+@dataclass
+class CandidateFits:
+    """Hypotheses tried so far from one fit. Climbs and fits are made once each."""
+
+    questions: MisfitTests
+    report: Report
+    climbs: dict[str, SubsetFit] = field(default_factory=dict)
+    fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
+    silent: set[str] = field(default_factory=set)
+    simplified: set[int] = field(default_factory=set)
+    asked: dict[int, MisfitTests] = field(default_factory=dict)
+    most_fitted: int = MOST_FITTED
+
+    def __post_init__(self) -> None:
+        self.slope = SubsetFitter(self.questions.found)
+        self.goal = math.inf
+        self.base = -math.inf
+
+    @property
+    def weak(self) -> bool:
+        """Whether predictions from sensitivities are good enough to choose by."""
+        settled = not self.questions.far_off and not self.questions.suspect
+        return settled and max(map(self.questions.promise, self.names), default=0.0) < WEAK
+
+    @property
+    def names(self) -> list[str]:
+        """Effects that may be missing, the most promising first."""
+        names = dict.fromkeys(self.questions.answers.effects)
+        return sorted(names, key=lambda name: -self.questions.promise(name))
+
+    def after(self, fit: Fit) -> MisfitTests:
+        """What one of its fits leaves, asked once."""
+        if id(fit) not in self.asked:
+            self.asked[id(fit)] = misfit_tests(fit, self.questions.effects, LATER_LEVEL)
+        return self.asked[id(fit)]
+
+    def singles(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
+        """Fit the hypotheses that may be the best or near it, each effect alone."""
+        if self.weak:
+            return self._fit_weak(all_of_them=all_of_them)
+        self._climb_all(self.names if all_of_them else self._worth_a_climb())
+        leaders = sorted(self.climbs.values(), key=lambda one: (one.hopeless, one.deviance))
+        if not leaders:
+            return []
+        best = leaders[0]
+        base = self.slope.climb((), {}, iterations=4)
+        self.base = base.deviance if base else best.deviance
+        gain = max(self.base - best.deviance, 0.0)
+        reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
+        alike = [c for c in leaders if self.questions.cosine(c.names[0], best.names[0]) > ALIKE]
+        near = [
+            one for one in leaders if one.deviance - best.deviance < (ALIKE_REACH * reach if one in alike else reach)
+        ]
+        chosen = [one for one in near if not one.hopeless] or near
+        for climb in chosen[: self.most_fitted + 3 * all_of_them]:
+            self._fit(climb)
+        self._fit_what_is_contained()
+        return list(self.fitted.values())
+
+    def _fit_what_is_contained(self) -> None:
+        """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
+        found = self.questions.found
+        best = max((one.fit.log_likelihood for one in self.fitted.values()), default=0.0)
+        for one in list(self.fitted.values()):
+            # The simpler is in the larger one, and can be no better.
+            behind = 2 * (best - one.fit.log_likelihood) > ANSWER_SET * MOST_INFLATION
+            if behind or id(one.fit) in self.simplified:
+                continue
+            self.simplified.add(id(one.fit))
+            for both, fit in simpler_forms(found, one, self.questions.effects):
+                simpler = likelihood_ratio(found, both, fit)
+                known = self.fitted.get(simpler.label)
+                if known is None or simpler.delta_chi2 > max(known.delta_chi2, WORSE):
+                    self.fitted[simpler.label] = simpler
+
+    def _worth_a_climb(self) -> list[str]:
+        top = self.questions.promise(self.names[0]) if self.names else 0.0
+        loudest = self._loudest()
+        return [
+            name
+            for k, name in enumerate(self.names)
+            if k < FEWEST_CLIMBED
+            or name in loudest
+            or self.questions.promise(name) > SHARE_WORTH_A_CLIMB * top
+            or self.questions.cosine(name, self.names[0]) > ALIKE
+        ]
+
+    def _loudest(self) -> list[str]:
+        return sorted(self.names, key=lambda name: -self.questions.best_z(name)[0])[:LOUDEST]
+
+    def _climb_all(self, names: Iterable[str]) -> None:
+        for name in names:
+            if name in self.climbs or name in self.silent:
+                continue
+            self.report(f"trying {name}")
+            places = self.questions.of(name)[:STARTS_EACH]
+            sizes = self.questions.gains[1]
+            starts = starts_of((self.questions.answers.shapes[i], float(sizes[i])) for i in places)
+            found = best_subset_fit(self.slope, starts, self.goal)
+            if found is None:
+                self.silent.add(name)
+                continue
+            self.goal = min(self.goal, found.deviance)
+            self.climbs[name] = found
+
+    def _fit_weak(self, *, all_of_them: bool) -> list[LikelihoodRatio]:
+        names = self.names
+        if not names:
+            return []
+        top, loudest = self.questions.promise(names[0]), self._loudest()[:1]
+        for name in names:
+            near = self.questions.promise(name) > max(min(top - WITHIN_REACH, 0.6 * top), 0.25 * top)
+            alike = self.questions.cosine(name, names[0]) > ALIKE or name in loudest
+            if (near or alike or all_of_them) and name not in self.fitted and name not in self.silent:
+                self.report(f"fitting {name}")
+                self._fit_from_prediction(name)
+        self._fit_what_is_contained()
+        return list(self.fitted.values())
+
+    def _fit_from_prediction(self, name: str) -> None:
+        """The best fit from the shapes that promise most."""
+        sizes = self.questions.gains[1]
+        for place in self.questions.of(name)[:STARTS_EACH]:
+            shape = self.questions.answers.shapes[place]
+            self._fit(SubsetFit((shape.effect,), math.nan, start_of(shape, float(sizes[place]))))
+            if name in self.fitted and self.fitted[name].delta_chi2 > 0.7 * self.questions.promise(name):
+                break
+
+    def _smallest(self, effects: Sequence[Effect]) -> dict[str, Value]:
+        """Values at which the effects hardly act."""
+        values: dict[str, Value] = {}
+        for effect in effects:
+            places = self.questions.of(effect.name)
+            if places:
+                shape = self.questions.answers.shapes[places[0]]
+                values |= start_of(shape, math.copysign(abs(shape.step), float(self.questions.gains[1][places[0]])))
+        return values
+
+    def _fit(self, climb: SubsetFit) -> None:
+        name = "+".join(climb.names)
+        if name in self.fitted and not math.isnan(climb.deviance):
+            return
+        self.report(f"fitting {name}")
+        best = max((one.fit.log_likelihood for one in self.fitted.values()), default=-math.inf)
+        found = self._from_climb(climb, best)
+        promised = self.base - climb.deviance if math.isfinite(climb.deviance) else 0.0
+        if found is not None and found.delta_chi2 < max(WORSE, PART_KEPT * promised):
+            # The smaller model is in this one, and part of the trials gained more: it was led astray by its start.
+            smallest = SubsetFit(climb.effects, math.nan, self._smallest(climb.effects))
+            others = (self._from_climb(climb, best, afresh=True), self._from_climb(smallest, best))
+            found = max((one for one in (found, *others) if one is not None), key=_gain)
+        if found is None or found.delta_chi2 < WORSE:
+            self.silent.add(name)
+        elif name not in self.fitted or found.delta_chi2 > self.fitted[name].delta_chi2:
+            self.fitted[name] = found
+
+    def _from_climb(self, climb: SubsetFit, best: float, *, afresh: bool = False) -> LikelihoodRatio | None:
+        fit = full_fit(self.questions.found, climb, best, afresh=afresh)
+        return None if fit is None else likelihood_ratio(self.questions.found, climb.effects, fit)
+
+
+def _gain(one: LikelihoodRatio) -> float:
+    return one.delta_chi2
+
+
+def pairs(
+    before: Fit, firsts: Sequence[LikelihoodRatio], effects: Sequence[Effect], report: Report
+) -> list[LikelihoodRatio]:
+    """Fits of two effects together: to each of the best single ones, those that promise to mend what it leaves."""
+    found: dict[frozenset[str], LikelihoodRatio] = {}
+    top = max((one.delta_chi2 for one in firsts), default=0.0)
+    for first in [one for one in firsts if one.delta_chi2 >= SHARE_OF_BEST * top][:FIRSTS]:
+        later = misfit_tests(first.fit, effects, LATER_LEVEL)
+        search = CandidateFits(later, report, most_fitted=PARTNERS)
+        search.singles()
+        ranked = sorted(search.fitted.values(), key=lambda one: -one.fit.log_likelihood)
+        for second in ranked[:PARTNERS]:
+            names = frozenset((*first.names, *second.names))
+            both = likelihood_ratio(before, (*first.effects, *second.effects), second.fit)
+            if names not in found or both.fit.log_likelihood > found[names].fit.log_likelihood:
+                found[names] = both
+    for one in sorted(found.values(), key=lambda one: -one.fit.log_likelihood)[:PARTNERS]:
+        for effects_both, fit in simpler_forms(before, one, effects):
+            names = frozenset(effect.name for effect in effects_both)
+            if names not in found or fit.log_likelihood > found[names].fit.log_likelihood:
+                found[names] = likelihood_ratio(before, effects_both, fit)
+    return sorted(found.values(), key=lambda one: -one.fit.log_likelihood)
+
+
+def simpler_forms(
+    before: Fit, one: LikelihoodRatio, effects: Sequence[Effect]
+) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
+    """A hypothesis with one of its effects in the simpler form that it contains, fitted from where it ended."""
+    for held in one.effects:
+        for simpler in effects:
+            if simpler.name not in held.replaces or simpler.name in one.names or _needs_more(one.fit, held, simpler):
+                continue
+            both = tuple(simpler if effect is held else effect for effect in one.effects)
+            model = before.model
+            for effect in both:
+                model = model + effect
+            values = one.fit.model.values
+            sizes = {f"{simpler.name}.{p.name}": values.get(f"{held.name}.{p.name}") for p in simpler.parameters}
+            start = {key: size for key, size in sizes.items() if size is not None}
+            with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
+                yield both, refit(one.fit, model, start=start, thorough=False)
+
+
+def _needs_more(fit: Fit, held: Effect, simpler: Effect) -> bool:
+    """Whether a number that only the larger form has is known so well that it cannot lie where the two are one."""
+    extra = {p.name for p in held.parameters} - {p.name for p in simpler.parameters}
+    numbers = [n for n in fit.numbers if n.key.split(".")[0] == held.name and n.key.split(".")[1] in extra]
+    return any(
+        math.isfinite(n.sigma) and not math.isfinite(n.bound) and abs(n.value) > SURELY * n.sigma for n in numbers
+    )

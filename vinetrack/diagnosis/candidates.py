@@ -1,0 +1,166 @@
+"""What may be missing: the candidates of a diagnosis, in which shapes each is tried, and which cannot be tested."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.trial_inputs import check_needs, stated
+from vinetrack.effects import Effect, EffectError, Parameter, catalogue, find_effect, load_effect
+from vinetrack.inference.fit_data import FitTrial
+
+PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
+
+WIDE_RANGE = 10.0
+"""Plausible values that differ by more than this factor are tried at geometric steps."""
+
+NARROW, ROOM_BELOW = 2.0, 3.0
+"""Where plausible values differ by more than the first, an effect may be smaller than them by the second."""
+
+AMPLITUDES = (0.03, 0.2, 0.7)
+"""Fractions of the plausible range at which an effect is tried whose small sizes do nothing."""
+
+LADDER = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
+"""The same for a threshold: its answer jumps, and a start too far below or above leads nowhere."""
+
+
+@dataclass(frozen=True)
+class CandidateShape:
+    """One way to try an effect: its first parameter is the size, the others are held at `rest`.
+
+    `step` is how much of the size is put in to see what it does; a `whole` one is a size in itself, because small
+    sizes of this effect do something else or nothing.
+    """
+
+    effect: Effect
+    rest: tuple[float, ...]
+    step: float
+    whole: bool = False
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Parameters of the effect with the step put in."""
+        return (self.size.zero + self.step, *self.rest) if self.effect.parameters else ()
+
+    @property
+    def size(self) -> Parameter:
+        """The parameter that makes it large or small."""
+        return self.effect.parameters[0]
+
+
+def candidates_of(
+    model: Model, wanted: Iterable[str] | None, own: Mapping[str, Effect] | None = None
+) -> tuple[Effect, ...]:
+    """Effects to question: those `wanted` (default the catalogue) and the user's own, less what is in the model.
+
+    Raises
+    ------
+    EffectError
+        If a name is unknown; the message suggests the nearest.
+    """
+    own = own or {}
+    names = [name for name, effect in catalogue().items() if effect.kind != "base"] if wanted is None else list(wanted)
+    names += [name for name in own if name not in names]
+    replaced = {name for effect in model for name in effect.replaces}
+    return tuple(find_effect(name, own) for name in names if name not in model and name not in replaced)
+
+
+def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
+    """Candidates that the sheet lets act, and for the others the reason why not, by name."""
+    found, reasons = [], {}
+    for effect in candidates:
+        if effect.in_trace and all(item.trace is not None for item in data):
+            reasons[effect.name] = "the measured pressure already holds it"
+            continue
+        if absent := [column for column in effect.needs if not any(stated(column, item.trial) for item in data)]:
+            reasons[effect.name] = f"it needs `{absent[0]}`, which is blank or zero for every trial"
+            continue
+        try:
+            check_needs(Model((effect,)), *(item.trial for item in data))
+        except EffectError:
+            blank = " and ".join(f"`{column}`" for column in effect.needs)
+            reasons[effect.name] = f"it needs {blank}, which the sheet leaves blank for some trials"
+            continue
+        found.append(effect)
+    return tuple(found), reasons
+
+
+@lru_cache(maxsize=1)
+def probe() -> Effect:
+    """The probe force, see its file."""
+    return load_effect(PROBE_FILE)
+
+
+def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
+    """One model that holds all that may be asked for, so that one compiled form serves every hypothesis."""
+    held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
+    return Model(tuple(held[name] for name in held))
+
+
+def shapes_of(effect: Effect) -> list[CandidateShape]:
+    """The ways in which an effect is tried: every combination of two or three plausible values of what shapes it."""
+    if not effect.parameters:
+        return [CandidateShape(effect, (), 1.0, whole=True)]
+    size, *others = effect.parameters
+    combinations = list(itertools.product(*(typical_values(parameter) for parameter in others)))
+    shapes = [CandidateShape(effect, rest, first_step(size)) for rest in combinations]
+    if others:
+        middle = [rest for k, rest in enumerate(combinations) if k == len(combinations) // 2]
+        shapes += whole_shapes(effect, middle)
+    return shapes
+
+
+def whole_shapes(effect: Effect, rests: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
+    """An effect at finite sizes of its plausible range."""
+    low, high = plausible_range(effect.parameters[0])
+    largest = high if abs(high) >= abs(low) else low
+    zero = effect.parameters[0].zero
+    parts = LADDER if "rest_force" in effect.functions else AMPLITUDES
+    return [CandidateShape(effect, rest, part * (largest - zero), whole=True) for rest in rests for part in parts]
+
+
+def first_step(size: Parameter) -> float:
+    """A size small against what is plausible."""
+    low, high = plausible_range(size)
+    return 0.01 * max(abs(high - size.zero), abs(low - size.zero))
+
+
+def plausible_range(parameter: Parameter) -> tuple[float, float]:
+    """What an experimenter would believe; where the effect does not say, a factor of three about its default."""
+    if parameter.plausible is not None:
+        return parameter.plausible
+    low, high = parameter.bounds
+    reach = 3 * abs(parameter.default - parameter.zero) or 1.0
+    return max(low, parameter.zero - reach), min(high, parameter.zero + reach)
+
+
+def typical_values(parameter: Parameter) -> tuple[float, ...]:
+    """Three values that span what is plausible, two where that is narrow."""
+    low, high = plausible_range(parameter)
+    if low > 0 and high / low > WIDE_RANGE:
+        return tuple(np.geomspace(low, high, 5)[1:4].tolist())
+    if low > 0 and high / low < NARROW:
+        return ((low + high) / 2,)
+    return tuple((low + part * (high - low)) for part in (0.15, 0.5, 0.85))
+
+
+def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0, widened: float = 1.0) -> bool:
+    """Whether a value lies in the plausible range, or no further outside than `reach` of its errors.
+
+    `widened` is how many times further from zero it may lie.
+    """
+    if parameter.plausible is None or value == parameter.zero:
+        return True
+    low, high = parameter.plausible
+    if low > 0 and high / low > NARROW:
+        low /= ROOM_BELOW
+    low, high = min(low / widened, low * widened), max(high * widened, high / widened)
+    room = reach * sigma if math.isfinite(sigma) else math.inf
+    return bool(low - room <= value <= high + room)

@@ -1,0 +1,118 @@
+"""How the trajectories of a fit answer to effects that are not in its model.
+
+Every column is what one unit of an effect's size does to the positions of a trial, the effect added to the fitted
+model and nothing else moved. With the sensitivities of the fit itself they make one set of sums of products, from which
+scores, cosines and predicted gains follow by linear algebra alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.candidates import CandidateShape, whole_shapes
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.sensitivity import moved_by
+
+AIMED_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
+"""A step is good that moves a trajectory by this part of its travel, and done again where it moves it by more than the
+second or less than the third: beyond, curvature counts, below the integrator's error does."""
+
+STARTS = 0.1
+"""Part of its travel that a vine must still make with a whole effect put in."""
+
+SILENT_RESPONSE = 3e-6
+"""Part of its travel by which a trajectory must answer to count as answering: the integrator is no better."""
+
+
+@dataclass(frozen=True)
+class EffectSensitivities:
+    """Columns of shape (n_points, n_shapes) for every trial, in the order of `shapes`, per unit of each size.
+
+    `silent` names effects to which no trajectory answers at any plausible size.
+    """
+
+    shapes: tuple[CandidateShape, ...]
+    columns: tuple[Floats, ...]
+    silent: tuple[str, ...]
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Name of the effect of each shape."""
+        return tuple(shape.effect.name for shape in self.shapes)
+
+
+def effect_sensitivities(found: Fit, shapes: Sequence[CandidateShape]) -> EffectSensitivities:
+    """Ask every shape; those that do nothing by a small step are tried at finite sizes before they count as silent."""
+    plain = [trial.predicted_position_m - trial.origin_m for trial in found.trials]
+    kept: list[tuple[CandidateShape, list[Floats]]] = []
+    heard: set[str] = set()
+    names = dict.fromkeys(shape.effect.name for shape in shapes)
+    for name in names:
+        of_effect = [shape for shape in shapes if shape.effect.name == name]
+        answered = [one for shape in of_effect if (one := _answer(found, shape, plain)) is not None]
+        if not answered and any(shape.effect.parameters for shape in of_effect):
+            rest = of_effect[0].rest
+            finite = whole_shapes(of_effect[0].effect, [rest])
+            answered = [one for shape in finite if (one := _answer(found, shape, plain)) is not None]
+        kept += answered
+        heard |= {name} if answered else set()
+    columns = tuple(
+        np.column_stack([column[i] for _, column in kept]) if kept else np.zeros((position.size, 0))
+        for i, position in enumerate(plain)
+    )
+    return EffectSensitivities(
+        tuple(shape for shape, _ in kept), columns, tuple(name for name in names if name not in heard)
+    )
+
+
+def _answer(found: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> tuple[CandidateShape, list[Floats]] | None:
+    """What one unit of its size does to every trial, and the shape with the step that was good; None where nothing."""
+    try:
+        change = _change(found, shape, plain)
+        response = _response(found, change)
+        if shape.whole:
+            speaks = response > SILENT_RESPONSE and not _holds_back(plain, change)
+            return (shape, [one / shape.step for one in change]) if speaks else None
+        if response <= SILENT_RESPONSE * 1e-3:
+            return None
+        if not LEAST_RESPONSE < response < LARGEST_RESPONSE:
+            size = shape.size
+            step = shape.step * AIMED_RESPONSE / response
+            room = size.bounds[1] - size.zero if shape.step > 0 else size.zero - size.bounds[0]
+            shape = replace(shape, step=min(step, room) if room > 0 else step)
+            change = _change(found, shape, plain)
+            response = _response(found, change)
+    except SimulationError:
+        return None
+    return (shape, [one / shape.step for one in change]) if response > SILENT_RESPONSE else None
+
+
+def _holds_back(plain: Sequence[Floats], change: Sequence[Floats]) -> bool:
+    """Whether some vine hardly starts any more, although it was seen to grow: no such size can hide."""
+    return any(
+        float(np.max(before + one)) < STARTS * float(np.max(before)) for before, one in zip(plain, change, strict=True)
+    )
+
+
+def _response(found: Fit, change: Sequence[Floats]) -> float:
+    """Largest answer, as part of a trial's travel; infinite where one cannot be followed."""
+    spans = [max(float(np.ptp(trial.lead_position_m)), 1e-9) for trial in found.trials]
+    parts = [float(np.max(np.abs(one))) / span for one, span in zip(change, spans, strict=True)]
+    worst = max(parts, default=0.0)
+    return worst if math.isfinite(worst) else math.inf
+
+
+def _change(found: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> list[Floats]:
+    """By how much the positions of every trial change with the step put in, m."""
+    predictor, state = found.predictor, found.solution.state
+    jobs = predictor.jobs(state.theta, state.own)
+    rows = np.array([[*job.row, *shape.values] for job in jobs]).reshape(len(jobs), -1)
+    model = found.predictor.layout.model + shape.effect
+    moved = predictor.run_as(model, jobs, rows)
+    return [moved_by(before, trajectory) for before, trajectory in zip(plain, moved, strict=True)]

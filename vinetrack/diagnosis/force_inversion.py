@@ -1,0 +1,212 @@
+"""Least squares for forces that a model lacks, beside its own numbers and those of every trial."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.replicate_scatter import LEAST_SPREAD, Scatter
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.mixed_effects import SPREAD_COLUMNS, FitState, trial_effect_prior
+from vinetrack.inference.optimiser import FixedTerms, floor, solve, track_correlation
+from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.whitening import whiten
+
+PER_TRIAL = 10.0
+"""Independent pieces of information that one trial counts for: its frames err together."""
+
+OWN_ITERATIONS = 8
+SILENT = 1e-9
+"""Part of the largest information below which a force moves nothing, or only what others move too."""
+
+SMOOTHNESS = np.geomspace(1e-6, 1e2, 17)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What forces explain: the fall of χ², their amplitudes, N, and the error of one.
+
+    `terms` counts the amplitudes that the data feel: chance alone lets χ² fall by as much. `numbers` is how the model's
+    own numbers move along, as the fit holds them.
+    """
+
+    chi2: float
+    amplitude: Floats
+    sigma: float
+    numbers: Floats
+    terms: int
+
+    @property
+    def beyond(self) -> float:
+        """The fall of χ² beyond what chance gives."""
+        return max(self.chi2 - self.terms, 0.0)
+
+
+class ForceFit:
+    """The trials of a fit laid out for any number of forces.
+
+    The noise is that of the tracks: what the model misses is no noise. Pressure and B of a trial scatter as replicates
+    do. `chi2` is what is left without any further force. `own`, shape (n_trials, 4), is where the trials' own numbers
+    begin: each comes as near to its track as they let it, so that little is left for forces.
+    """
+
+    def __init__(self, found: Fit, own: Floats, scatter: Scatter) -> None:
+        data, frame = found.predictor.data, found.solution.frame
+        rho = track_correlation(data)
+        noise = np.array([item.noise_m**2 for item in data]) * (1 - rho**2)
+        spread = (max(scatter.pressure, LEAST_SPREAD[0]), max(scatter.damping, LEAST_SPREAD[1]))
+        before = found.solution.state
+        state = FitState(before.theta, own, spread, rho, np.maximum(noise, floor(data)))
+        still = replace(frame, free=np.zeros_like(frame.free))
+        held = FixedTerms(spread, (rho, state.variance))
+        solution = solve(found.predictor, still, state, held, warm=True, most_iterations=OWN_ITERATIONS)
+        self.data, self.frame = data, frame
+        self.state, self.columns = solution.state, solution.columns
+        self.precision = trial_effect_prior(frame, self.state)[1]
+        self.pull = -frame.prior_precision * (state.theta - frame.prior_mean)
+        self.conditions = [item.trial.condition for item in data]
+        self.points = float(sum(item.time_s.size for item in data))
+
+    @property
+    def own(self) -> Floats:
+        """The trials' own numbers, about which everything is linear, shape (n_trials, 4)."""
+        return self.state.own
+
+    def _blocks(self, answers: Sequence[Floats]) -> Floats:
+        """Products of [keys, forces, residual] of every trial, its own numbers eliminated."""
+        blocks = []
+        for i, (columns, more) in enumerate(zip(self.columns, answers, strict=True)):
+            left = columns[:, -1] + columns[:, list(SPREAD_COLUMNS)] @ self.state.own[i, list(SPREAD_COLUMNS)]
+            rows = np.column_stack([columns[:, :-1], more, left])
+            white = whiten(rows, self.data[i].first, self.state.rho)
+            gram = white.T @ white / self.state.variance[i]
+            own = gram[:OWN, :OWN] + np.diag(self.precision[i])
+            blocks.append(gram[OWN:, OWN:] - gram[OWN:, :OWN] @ np.linalg.solve(own, gram[:OWN, OWN:]))
+        return np.array(blocks)
+
+    def _spread(self, blocks: Floats) -> tuple[Floats, Floats, Floats]:
+        """Sums over trials: numbers with themselves (p, p), with forces and residual (p, L + 1), and the rest."""
+        k, p = self.frame.index.shape[1], self.pull.size
+        index = self.frame.index
+        square, cross = np.zeros((p + 1, p + 1)), np.zeros((p + 1, blocks.shape[1] - k))
+        np.add.at(square, (index[:, :, None], index[:, None, :]), blocks[:, :k, :k])
+        np.add.at(cross, index, blocks[:, :k, k:])
+        square, cross = square[:p, :p] + np.diag(self.frame.prior_precision), cross[:p].copy()
+        cross[:, -1] += self.pull
+        still = ~self.frame.free | ~(np.diag(square) > 0)
+        square[still, :] = square[:, still] = cross[still] = 0.0
+        return square, cross, blocks[:, k:, k:].sum(axis=0)
+
+    def _inverse(self, square: Floats) -> Floats:
+        scale = np.where(np.diag(square) > 0, 1 / np.sqrt(np.maximum(np.diag(square), 1e-300)), 0.0)
+        inverse = np.linalg.pinv(square * scale[:, None] * scale, rcond=1e-11, hermitian=True)
+        return np.asarray(inverse * scale[:, None] * scale)
+
+    def gains(self, answers: Sequence[Floats], columns: Sequence[int]) -> list[Gain]:
+        """What each of several forces explains alone; `columns` counts the columns of each among the answers."""
+        blocks = self._blocks(answers)
+        square, cross, total = self._spread(blocks)
+        inverse = self._inverse(square)
+        lever = inverse @ cross
+        left = total - cross.T @ lever
+        ends = np.concatenate([[0], np.cumsum(columns)])
+        return [self._gain(blocks, lever, left, slice(a, b)) for a, b in itertools.pairwise(ends.tolist())]
+
+    def _gain(self, blocks: Floats, lever: Floats, left: Floats, place: slice) -> Gain:
+        information, score = left[place, place], left[place, -1]
+        size = np.diag(information)
+        heard = size > SILENT * max(float(size.max()), 1e-300)
+        if not heard.any():
+            return Gain(0.0, np.zeros(score.size), math.inf, np.zeros(lever.shape[0]), 0)
+        scale = np.where(heard, 1 / np.sqrt(np.maximum(size, 1e-300)), 0.0)
+        covariance = np.linalg.pinv(information * scale[:, None] * scale, rcond=SILENT, hermitian=True)
+        covariance = covariance * scale[:, None] * scale
+        amplitude = covariance @ score
+        numbers = lever[:, -1] - lever[:, place] @ amplitude
+        single = self._scores(blocks, lever[:, place], place, amplitude, numbers)
+        count = len(single)
+        robust = covariance @ (single.T @ single * count / max(count - numbers.size - score.size, 1)) @ covariance
+        sigma = math.sqrt(max(float(np.trace(covariance)), float(np.trace(robust))) / score.size)
+        return Gain(float(score @ amplitude), amplitude, sigma, numbers, int(np.count_nonzero(heard)))
+
+    def _scores(self, blocks: Floats, lever: Floats, place: slice, amplitude: Floats, numbers: Floats) -> Floats:
+        """What single trials say beyond the fit about amplitudes, shape (n_trials, n_columns)."""
+        k = self.frame.index.shape[1]
+        index = self.frame.index
+        moved = np.append(numbers, 0.0)[index]
+        forces = slice(k + place.start, k + place.stop)
+        left = blocks[:, :, -1] - np.einsum("nqk,nk->nq", blocks[:, :, :k], moved) - blocks[:, :, forces] @ amplitude
+        levers = np.vstack([lever, np.zeros((1, lever.shape[1]))])[index]
+        return np.asarray(left[:, forces] - np.einsum("nkl,nk->nl", levers, left[:, :k]))
+
+    def together(self, answers: Sequence[Floats]) -> Gain:
+        """What forces explain all together, the same in every trial."""
+        return self.gains(answers, [answers[0].shape[1]])[0]
+
+    def by_condition(self, answers: Sequence[Floats]) -> Gain:
+        """What forces explain all together, each condition with amplitudes of its own."""
+        names = list(dict.fromkeys(self.conditions))
+        count = answers[0].shape[1]
+        wide = []
+        for condition, one in zip(self.conditions, answers, strict=True):
+            own = np.zeros((len(one), count * len(names)))
+            k = names.index(condition) * count
+            own[:, k : k + count] = one
+            wide.append(own)
+        return self.together(wide)
+
+    @cached_property
+    def chi2(self) -> float:
+        """What is left without any further force."""
+        blocks = self._blocks([np.zeros((len(c), 0)) for c in self.columns])
+        square, cross, total = self._spread(blocks)
+        return float(total[-1, -1] - cross[:, -1] @ self._inverse(square) @ cross[:, -1])
+
+    def bic(self, chi2: float, numbers: int, most: float) -> float:
+        """How badly forces of so many numbers do beside the `most` that any explained: smaller is better.
+
+        What not even that explains is no noise but counts as if it were, once for every independent piece.
+        """
+        pieces = PER_TRIAL * len(self.data)
+        beyond = max(self.chi2 - most - self.points, 0.0)
+        return (most - chi2) / (1 + beyond / pieces) + numbers * math.log(pieces)
+
+    def smooth(self, answers: Sequence[Floats], numbers: Floats) -> dict[str, tuple[Floats, Floats]]:
+        """A smooth force in every condition, the model's numbers moved by `numbers`: coefficients and covariance.
+
+        As smooth as generalised cross-validation finds best, the same in all conditions.
+        """
+        blocks = self._blocks(answers)
+        k = self.frame.index.shape[1]
+        moved = np.append(numbers, 0.0)[self.frame.index]
+        names = list(dict.fromkeys(self.conditions))
+        place = np.array([names.index(condition) for condition in self.conditions])
+        count = answers[0].shape[1]
+        square, slope = np.zeros((len(names), count, count)), np.zeros((len(names), count))
+        rest = blocks[:, k:, -1] - np.einsum("nlk,nk->nl", blocks[:, k:, :k], moved)
+        np.add.at(square, place, blocks[:, k:-1, k:-1])
+        np.add.at(slope, place, rest[:, :-1])
+        bend = np.diff(np.eye(count), 2, axis=0)
+        unit = float(np.mean(np.einsum("nkk->n", square))) / count
+        rough = unit * (bend.T @ bend + 1e-6 * np.eye(count))
+        best: tuple[float, Floats, Floats] | None = None
+        pieces = PER_TRIAL * len(self.data)
+        whole = float(np.sum(slope * np.linalg.solve(square + 1e-9 * rough, slope[:, :, None])[:, :, 0]))
+        for strength in SMOOTHNESS:
+            inverse = np.linalg.inv(square + strength * rough)
+            found = np.einsum("nkl,nl->nk", inverse, slope)
+            missed = whole - float(np.sum(2 * found * slope) - np.einsum("nk,nkl,nl->", found, square, found))
+            freedom = float(np.einsum("nkl,nlk->", inverse, square))
+            score = (missed + pieces) / max(pieces - freedom, 1.0) ** 2
+            if best is None or score < best[0]:
+                best = score, found, inverse
+        assert best is not None
+        spare = max(self.points - count * len(names), 1.0)
+        noise = max(1.0, (self.chi2 - whole) / spare) if not numbers.any() else 1.0
+        return {name: (best[1][i], noise * best[2][i]) for i, name in enumerate(names)}

@@ -1,0 +1,301 @@
+"""A simple law of force fitted in full: its size and shape, the model's numbers, and every trial's own.
+
+Linear answers tell laws apart; but a force that slows a vine down keeps it longer where the force acts, and the size of
+a tenth of the drive comes out a fifth too large. Here the motions follow the force as it is (`force_answers.pushed`),
+and Gauss and Newton's steps go on from there. They begin from the fitted motions, which lie near the tracks, so that a
+force need not first lose what the model without it would have run ahead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.force_inversion import ForceFit, Gain
+from vinetrack.diagnosis.force_laws import Law
+from vinetrack.diagnosis.force_sensitivities import (
+    FittedMotion,
+    as_it_was,
+    push_sensitivities,
+    pushed,
+    with_derivatives,
+)
+from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.mixed_effects import trial_effect_prior
+from vinetrack.inference.parameters import YIELD_PRESSURE
+from vinetrack.inference.sensitivity import ORIGIN, OWN, RELEASE, Job
+from vinetrack.inference.whitening import whiten
+
+STEPS, ROUNDS = 12, 2
+BARE, SHAPED = 5, 2
+"""So many first steps are bare ones of Gauss and Newton, the cost rising or not: pressure and B of a trial do nearly
+the same, a first step along their difference overshoots, and the next ones mend it. Place and scale wait for two."""
+
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
+"""Of Levenberg and Marquardt, for steps that may only lower the cost: the first where bare ones lead nowhere."""
+
+MENDED = 0.5
+"""Part of χ² that the bare steps may leave, to have led anywhere."""
+
+SMALL = 1e-3
+"""Step of a difference, as the fit holds numbers, and relative for places and scales."""
+
+END = 0.96
+"""Part of the length up to which points count."""
+
+SETTLED = 1e-3
+"""Part of χ² by which a step must lower it for another to follow."""
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A law as the full fit found it: amplitudes, N, with the error of one, errors of its place or scale, what is left.
+
+    `numbers` is how far the model's own numbers moved, as the fit holds them.
+    """
+
+    law: Law
+    amplitude: Floats
+    sigma: float
+    shape_sigma: Floats
+    chi2: float
+    numbers: Floats
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where the search stands; `motions` are those of these numbers, with the force."""
+
+    theta: Floats
+    own: Floats
+    law: Law
+    amplitude: Floats
+    motions: list[FittedMotion]
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Cost at a place, its curvature and slope by numbers, amplitudes, shapes and the own numbers of all trials."""
+
+    cost: float
+    square: Floats
+    slope: Floats
+
+
+def refine(
+    found: Fit, fit: ForceFit, motions: Sequence[FittedMotion], law: Law, gain: Gain, *, thorough: bool = False
+) -> Refined | None:
+    """Fit a law in full, begun from its linear fit; None where it cannot be followed.
+
+    Parameters
+    ----------
+    motions
+        The fitted motions that `gain` belongs to.
+    thorough
+        Whether to search once more with care where the quick way leads nowhere.
+    """
+    start = _Place(fit.state.theta, fit.own, law, 0.0 * gain.amplitude, list(motions))
+    best = _searched(found, fit, start, 0.0)
+    if thorough and (best is None or best[1].cost > MENDED * fit.chi2):
+        best = _searched(found, fit, start, FIRST_DAMPING)
+    if best is None:
+        return None
+    place, normal = best
+    p, q = place.theta.size, place.amplitude.size
+    inflated = max(1.0, normal.cost / fit.points)
+    sigma = np.sqrt(np.maximum(np.diag(_inverse(normal.square)), 0.0) * inflated)
+    relative = gain.sigma / max(float(np.hypot.reduce(gain.amplitude)), 1e-300)
+    return Refined(
+        law=place.law,
+        amplitude=place.amplitude,
+        sigma=max(float(np.sqrt(np.mean(sigma[p : p + q] ** 2))), relative * float(np.hypot.reduce(place.amplitude))),
+        shape_sigma=sigma[p + q : p + q + len(place.law.shape_names)],
+        chi2=normal.cost,
+        numbers=place.theta - fit.state.theta,
+    )
+
+
+def _searched(found: Fit, fit: ForceFit, start: _Place, damping: float) -> tuple[_Place, _Normal] | None:
+    """The best place on the way down from `start`; without damping the first steps may lead up."""
+    best: tuple[_Place, _Normal] | None = None
+    place, bare = start, 0 if damping else BARE
+    for turn in range(STEPS):
+        try:
+            with np.errstate(all="raise", under="ignore"):
+                place = _as_driven(found, place)
+                normal = _normal(found, fit, place)
+        except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
+            break
+        before = best
+        if best is None or normal.cost < best[1].cost:
+            best = place, normal
+        if turn < bare:
+            place = _stepped(fit, place, normal, 0.0, shaped=turn >= SHAPED)
+            continue
+        if bare and best[1].cost > MENDED * fit.chi2:
+            break
+        if before is not None and best is not before:
+            damping *= 0.3
+            if best[1].cost > before[1].cost * (1 - SETTLED):
+                break
+        elif before is not None and turn > bare:
+            damping = max(5 * damping, LEAST_DAMPING)
+        place = _stepped(fit, *best, damping, shaped=turn >= SHAPED)
+    return best
+
+
+def _force(place: _Place, motion: FittedMotion) -> Floats:
+    return place.law.along(motion) @ place.amplitude
+
+
+def _as_driven(found: Fit, place: _Place) -> _Place:
+    """The motions of these numbers and this force, corrected from those of the place before."""
+    jobs = found.predictor.jobs(place.theta, place.own)
+    motions = [with_derivatives(_with_numbers(found, *one)) for one in zip(place.motions, jobs, strict=True)]
+    return replace(place, motions=pushed(motions, lambda motion: _force(place, motion), ROUNDS))
+
+
+def _with_numbers(found: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
+    """The motion as it is, its model and trial with other numbers."""
+    values = dict(zip(found.model.parameter_names, job.row.tolist(), strict=True))
+    trial = as_it_was(found.predictor.data[job.trial].trial, job)
+    return replace(motion, model=found.model.with_values(values), trial=trial)
+
+
+def _normal(found: Fit, fit: ForceFit, place: _Place) -> _Normal:
+    """Normal equations of all unknowns at a place."""
+    theta, own, q, s = place.theta, place.own, place.amplitude.size, len(place.law.shape_names)
+    p, n = theta.size, own.shape[0]
+    columns = push_sensitivities(found, own, place.motions, _pushes(found, place))
+    centre, precision = trial_effect_prior(fit.frame, fit.state)
+    size = p + q + s + n * OWN
+    square, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
+    cost = float(np.sum(precision * (own - centre) ** 2))
+    cost += float(np.sum(fit.frame.prior_precision * (theta - fit.frame.prior_mean) ** 2))
+    for i, item in enumerate(found.predictor.data):
+        position, velocity = _seen(place.motions[i], item.time_s - own[i, RELEASE])
+        left = item.lead_position_m - own[i, ORIGIN] - position
+        answers = columns[i]
+        rows = np.column_stack([answers[:, 2:], -velocity, np.ones(left.size), answers[:, :2], left])
+        growing = _growing(item, own[i])
+        white = whiten(rows[growing], item.first[growing], fit.state.rho) / math.sqrt(fit.state.variance[i])
+        gram = white.T @ white
+        mine = p + q + s + i * OWN + np.arange(OWN)
+        keys = np.where(fit.frame.index[i] >= 0, fit.frame.index[i], size)
+        index = np.concatenate([keys, p + np.arange(q + s), mine])
+        square[np.ix_(index, index)] += gram[:-1, :-1]
+        np.add.at(slope, index, gram[:-1, -1])
+        square[mine, mine] += precision[i]
+        slope[mine] -= precision[i] * (own[i] - centre[i])
+        cost += float(gram[-1, -1])
+    square, slope = square[:size, :size], slope[:size]
+    square[np.arange(p), np.arange(p)] += fit.frame.prior_precision
+    slope[:p] -= fit.frame.prior_precision * (theta - fit.frame.prior_mean)
+    still = np.flatnonzero(~fit.frame.free)
+    square[still, :] = square[:, still] = slope[still] = 0.0
+    return _Normal(cost, square, slope)
+
+
+def _inverse(square: Floats) -> Floats:
+    scale = np.where(np.diag(square) > 0, 1 / np.sqrt(np.maximum(np.diag(square), 1e-300)), 0.0)
+    inverse = np.linalg.pinv(square * scale[:, None] * scale, rcond=1e-12, hermitian=True)
+    return np.asarray(inverse * scale[:, None] * scale)
+
+
+def _growing(item: FitTrial, own: Floats) -> slice:
+    """The points before the end of growth: a motion that is corrected does not end where it ought to."""
+    length_m = item.trial.length_m if math.isfinite(item.trial.length_m) else math.inf
+    beyond = np.flatnonzero(item.lead_position_m - own[ORIGIN] > END * length_m)
+    return slice(0, int(beyond[0]) if beyond.size else item.time_s.size)
+
+
+def _seen(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
+    """Position and speed of the leading edge as the camera sees them, cubic between the points of the grid."""
+    from scipy.interpolate import CubicHermiteSpline
+
+    curve = CubicHermiteSpline(motion.time_s, motion.lead_position_m, motion.lead_velocity_m_s)
+    at = np.clip(since_s, 0.0, motion.time_s[-1])
+    moving = (since_s > 0) & (since_s < motion.time_s[-1])
+    offset = np.interp(at, motion.time_s, motion.offset_m)
+    seen = np.interp(at, motion.time_s, motion.seen)
+    return np.asarray(curve(at) + offset), np.where(moving, curve(at, 1) * seen, 0.0)
+
+
+def _pushes(found: Fit, place: _Place) -> list[Floats]:
+    """Accelerations by a unit of [pressure, B of the trial, every key, amplitudes, shapes], (n_times, n) each."""
+    layout, theta = found.predictor.layout, place.theta
+    jobs = found.predictor.jobs(theta, place.own)
+    damping = found.predictor.damping_column
+    pushes = []
+    for i, (motion, job) in enumerate(zip(place.motions, jobs, strict=True)):
+        varied = [replace(job, pressure_deviation=job.pressure_deviation + SMALL)]
+        varied.append(_with(job, damping, job.row[damping] * math.exp(SMALL)) if damping >= 0 else job)
+        for column, key in enumerate(layout.keys):
+            number = layout.free[layout.index[i, column]] if layout.index[i, column] >= 0 else None
+            if number is None:
+                varied.append(job)
+                continue
+            at = theta[layout.index[i, column]]
+            change = number.outside(at + SMALL) - number.outside(at)
+            if key == YIELD_PRESSURE:
+                varied.append(replace(job, yield_pressure_Pa=job.yield_pressure_Pa + change))
+            else:
+                k = layout.model.parameter_names.index(key)
+                factor = number.outside(at + SMALL) / number.outside(at) if number.logarithmic else 0.0
+                varied.append(_with(job, k, job.row[k] * factor if number.logarithmic else job.row[k] + change))
+        felt = [found.predictor.feels_pressure[i], found.predictor.feels_damping[i], *[True] * len(layout.keys)]
+        changes = [
+            (_acceleration(found, motion, one) - motion.free) / SMALL if feels and one is not job else 0.0 * motion.free
+            for one, feels in zip(varied, felt, strict=True)
+        ]
+        pushes.append(np.column_stack([*changes, _law_pushes(place, motion)]))
+    return pushes
+
+
+def _with(job: Job, column: int, value: float) -> Job:
+    row = job.row.copy()
+    row[column] = value
+    return replace(job, row=row)
+
+
+def _acceleration(found: Fit, motion: FittedMotion, job: Job) -> Floats:
+    other = _with_numbers(found, motion, job)
+    y, v = motion.lead_position_m, motion.lead_velocity_m_s
+    return evaluate(other.model, other.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
+
+
+def _law_pushes(place: _Place, motion: FittedMotion) -> Floats:
+    """Accelerations by a unit of each amplitude and of each number that shapes the law."""
+    shape = place.law.along(motion)
+    changes = [
+        (place.law.shifted(name, step).along(motion) - shape) @ place.amplitude / step
+        for name, step in ((name, SMALL * place.law.size_of(name)) for name in place.law.shape_names)
+    ]
+    return np.column_stack([shape, *changes]) / motion.mass_kg[:, None]
+
+
+def _stepped(fit: ForceFit, place: _Place, normal: _Normal, damping: float, *, shaped: bool) -> _Place:
+    """The next place; a law's place or scale moves by no more than a fifth of its size at once."""
+    p, q = place.theta.size, place.amplitude.size
+    law = place.law
+    square = normal.square + damping * np.diag(np.diag(normal.square))
+    if not shaped:
+        held = p + q + np.arange(len(law.shape_names))
+        square[held, :] = square[:, held] = 0.0
+    step = _inverse(square) @ normal.slope
+    for k, name in enumerate(law.shape_names):
+        reach = 0.2 * law.size_of(name)
+        law = law.shifted(name, float(np.clip(step[p + q + k], -reach, reach)))
+    law = law.kept_inside(max(float(motion.lead_position_m.max()) for motion in place.motions))
+    reach_s = 2 * np.array([item.frame_s for item in fit.data])
+    own = place.own + step[p + q + len(law.shape_names) :].reshape(-1, OWN)
+    own[:, RELEASE] = place.own[:, RELEASE] + np.clip(own[:, RELEASE] - place.own[:, RELEASE], -reach_s, reach_s)
+    theta = np.clip(place.theta + step[:p], fit.frame.lower, fit.frame.upper)
+    return replace(place, theta=theta, own=own, law=law, amplitude=place.amplitude + step[p : p + q])

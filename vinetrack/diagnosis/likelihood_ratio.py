@@ -1,0 +1,166 @@
+"""What refits say: by how much each hypothesis is better, what it needs for that, and whether that can be believed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.diagnosis.candidates import is_plausible
+from vinetrack.effects import Effect
+from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
+
+ANSWER_SET = 9.0
+"""Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
+
+MOST_INFLATION = 6.0
+"""How many times the variance of the noise model trials may be seen to scatter: beyond, few trials say too little."""
+
+CREDIBLE = 3.0
+"""How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag."""
+
+LIMIT_DISTANCE = 4.0
+"""Squared distance, in units of the noise, below which what two hypotheses predict is the same curve."""
+
+
+@dataclass(frozen=True)
+class LikelihoodRatio:
+    """One hypothesis refitted: the effects it adds to a fit, its own fit, and what came of it.
+
+    `delta_chi2` is the fall of −2 ln L from the fit without them, `sigma` that in standard deviations, brought down
+    where trials scatter more than the model of the noise says. A size beyond what is `plausible` is said to be so; one
+    not even `credible`, several times beyond, loses a tie and is no explanation. `inflation` is how many times more the
+    sizes scatter than the model of the noise says, in variance, at least 1: by so much differences of −2 ln L do, too.
+    """
+
+    effects: tuple[Effect, ...]
+    fit: Fit
+    delta_chi2: float
+    sigma: float
+    plausible: bool
+    reason: str
+    credible: bool = True
+    inflation: float = 1.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects it adds."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def label(self) -> str:
+        """Names joined, by which it is kept."""
+        return "+".join(self.names)
+
+    @property
+    def numbers(self) -> tuple[Number, ...]:
+        """Its sizes; numbers that move no trajectory are left out."""
+        return tuple(
+            number
+            for number in self.fit.numbers
+            if number.key.split(".")[0] in self.names and math.isfinite(number.sigma)
+        )
+
+    @property
+    def others(self) -> tuple[Number, ...]:
+        """All other numbers of its fit."""
+        return tuple(number for number in self.fit.numbers if number.key.split(".")[0] not in self.names)
+
+
+def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> LikelihoodRatio:
+    """Hold a refit against the fit without the effects."""
+    fall = 2 * (after.log_likelihood - before.log_likelihood)
+    ratio = _robust_ratio(after, [effect.name for effect in effects])
+    plausible, reason = belief(effects, after)
+    return LikelihoodRatio(
+        effects=tuple(effects),
+        fit=after,
+        delta_chi2=fall,
+        sigma=math.copysign(math.sqrt(abs(fall)), fall) / ratio,
+        plausible=plausible,
+        reason=reason,
+        credible=belief(effects, after, CREDIBLE)[0],
+        inflation=min(ratio**2, MOST_INFLATION),
+    )
+
+
+def belief(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:
+    """Whether an experimenter would believe the sizes, and why not; `widened` stretches what is plausible."""
+    for effect in effects:
+        for parameter in effect.parameters:
+            for number in after.numbers:
+                if number.key != f"{effect.name}.{parameter.name}" or not math.isfinite(number.sigma):
+                    continue
+                low, high = parameter.plausible or (math.nan, math.nan)
+                # At its bound, beyond what is plausible, it wants more than any rig has, whatever its error says.
+                pressed = math.isfinite(number.bound) and (number.bound < low or number.bound > high)
+                if pressed or not is_plausible(parameter, number.value, number.sigma, widened=widened):
+                    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+                    needs = f"it would need {number.symbol} = {number.value:.3g}{unit}"
+                    return False, f"{needs}, and {low:.3g} to {high:.3g} is plausible"
+    return True, ""
+
+
+def _robust_ratio(after: Fit, names: Sequence[str]) -> float:
+    """How much larger the error of an effect's size is by the scatter of trials than by the noise model; at least 1."""
+    if len(after.trials) < FEWEST_CLUSTERS:
+        return 1.0
+    matrices = robust_covariance(after.predictor, after.solution)
+    plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in matrices)
+    mine = [k for k, number in enumerate(after.numbers) if number.key.split(".")[0] in names and plain[k] > 0]
+    return max([1.0, *(float(robust[k] / plain[k]) for k in mine)])
+
+
+def distance(one: Fit, other: Fit) -> float:
+    """Squared distance of what two fits predict, in units of the noise of the first, its correlation counted."""
+    rho = one.noise_correlation
+    total = 0.0
+    for a, b, variance in zip(one.trials, other.trials, one.solution.state.variance, strict=True):
+        gap = a.predicted_position_m - b.predicted_position_m
+        total += float(np.sum((gap[1:] - rho * gap[:-1]) ** 2) + (1 - rho**2) * gap[0] ** 2) / float(variance)
+    return total
+
+
+def complexity(one: LikelihoodRatio) -> int:
+    """Parameters that its effects bring."""
+    return sum(len(effect.parameters) for effect in one.effects)
+
+
+def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, str]]:
+    """Hypotheses that cannot be excluded, best first, and for those set aside the reason in words, by their names.
+
+    Set aside are those that hold a simpler one as a limit and are no better by 9 than it, and those that need a size
+    beyond belief where another does not.
+    """
+    first = max(hypotheses, key=lambda one: one.fit.log_likelihood)
+    best, reach = first.fit.log_likelihood, ANSWER_SET * first.inflation
+    near = [one for one in hypotheses if 2 * (best - one.fit.log_likelihood) <= reach]
+    near.sort(key=lambda one: -one.fit.log_likelihood)
+    aside: dict[str, str] = {}
+    kept = []
+    for one in near:
+        simpler = [
+            other
+            for other in near
+            if 2 * (one.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET
+            and complexity(other) < complexity(one)
+            and (_contains(one, other) or distance(other.fit, one.fit) < LIMIT_DISTANCE)
+        ]
+        if simpler:
+            aside[one.label] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
+        else:
+            kept.append(one)
+    believed = [one for one in kept if one.credible]
+    if believed and len(believed) < len(kept):
+        aside |= {one.label: one.reason for one in kept if not one.credible}
+        kept = believed
+    return kept, aside
+
+
+def _contains(one: LikelihoodRatio, other: LikelihoodRatio) -> bool:
+    """Whether an effect of one says that it contains that of the other."""
+    replaced = {name for effect in one.effects for name in effect.replaces}
+    return bool(replaced & set(other.names))

@@ -1,0 +1,210 @@
+"""One fit questioned: is anything missing, and what could it be, without a single refit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.candidates import CandidateShape, plausible_range, shapes_of
+from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect_sensitivities
+from vinetrack.diagnosis.score_test import (
+    Products,
+    Scores,
+    Structure,
+    family_threshold,
+    linear_gains,
+    products_of,
+    scores_of,
+    structure_of,
+)
+from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_motion
+from vinetrack.effects import Effect
+from vinetrack.inference.fit import is_poor_fit, missed_fraction
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.optimiser import track_correlation
+from vinetrack.inference.systematics import systematics_of
+
+FIRST_LEVEL, LATER_LEVEL = 3e-3, 1e-4
+"""Chance at which nothing missing may be taken for something by the best of all candidates; once an effect was added
+the gate is stricter, for a pair of effects can imitate what no catalogue holds."""
+
+LOUD_PROBE = 3e-4
+"""Chance at which the loudest probe of a fit with nothing missing may stand out."""
+
+FAR_OFF = 4.0
+"""χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
+
+OFF, OFF_OTHERWISE = 6e-4, 1.5e-4
+"""Part of its growth by which the median trial is missed beyond any tracker's slow errors: 0.1 mm of 170 mm. Positions
+that somebody else measured, and pressures that were set, have no such errors that anybody knows of."""
+
+SUSPECT, SUSPECT_CHANCE, SUSPECT_SIGMAS = 1.5, 1e-2, 6.0
+"""χ² per degree of freedom, and chance of what trials bend, from which effects are fitted although no score is high,
+and what one must then be worth in standard deviations. Heavy tails alone reach 1.5."""
+
+TESTABLE_SIGMAS = 3.0
+"""An effect whose largest plausible size would show by less than this cannot be tested here."""
+
+ONE_SIDED_95 = 1.645
+
+
+@dataclass(frozen=True)
+class MisfitTests:
+    """What a fit leaves, held against every candidate. Arrays have shape (n_shapes,), see `EffectSensitivities`."""
+
+    found: Fit
+    effects: tuple[Effect, ...]
+    answers: EffectSensitivities
+    sums: Products
+    scores: Scores
+    structure: Structure
+    level: float
+
+    @cached_property
+    def possible(self) -> Floats:
+        """The z of every shape where its size can have that sign, 0 where it cannot, always positive.
+
+        As a quantile of the normal distribution: by the noise model, or, where that is less, by the scatter of single
+        trials, which has Student's t for few of them.
+        """
+        from scipy.stats import norm, t
+
+        size, signs = self.scores.size, np.array(self.signs)
+        one_way = np.where(signs == 0, np.abs(size), np.maximum(size * signs, 0.0))
+        plain, robust = self.scores.plain_sigma, self.scores.robust_sigma
+        z = one_way / plain
+        with np.errstate(divide="ignore", invalid="ignore"):
+            by_scatter = np.where(robust > 0, one_way / robust, np.inf)
+        tail = t.logsf(np.minimum(by_scatter, 1e6), max(self.scores.degrees, 3.0))
+        return np.asarray(np.minimum(z, norm.isf(np.exp(np.maximum(tail, -700.0)))))
+
+    @property
+    def signs(self) -> list[int]:
+        """1 or −1 where physics fixes the sign of a shape's size."""
+        return [shape.size.sign if shape.effect.parameters else 1 for shape in self.answers.shapes]
+
+    @cached_property
+    def threshold(self) -> float:
+        """The z that the best of all shapes exceeds by chance with probability `level`."""
+        return family_threshold(self.scores.cosines, self.signs, self.level)
+
+    @property
+    def something(self) -> bool:
+        """Whether anything is missing, known or not."""
+        return bool(self.off or self.fails or (self.possible.size and self.possible.max() > self.threshold))
+
+    @property
+    def fails(self) -> bool:
+        """Whether what is left has a shape, is alike in replicates, or is louder in motion than at rest."""
+        return self.shaped or self.hidden < 0.1 * self.level
+
+    @cached_property
+    def hidden(self) -> float:
+        """Chance of what trials take upon themselves, or lets pass for noise."""
+        return min(conditions_apart(self.found), noisier_in_motion(self.found))
+
+    @property
+    def suspect(self) -> bool:
+        """Whether a fit that passes is worth a search all the same: it may have bent everything until it fits."""
+        return self.found.chi2_per_dof > SUSPECT or self.hidden < SUSPECT_CHANCE
+
+    @cached_property
+    def whispers(self) -> bool:
+        """Whether any candidate stands out as far as would say of a first model that something is missing."""
+        first = family_threshold(self.scores.cosines, self.signs, FIRST_LEVEL)
+        return bool(self.possible.max(initial=0.0) > first)
+
+    @property
+    def shaped(self) -> bool:
+        """Whether what is left has a shape that some smooth force would give it."""
+        return self.structure.p < 0.1 * self.level or self.structure.loudest < min(LOUD_PROBE, self.level)
+
+    @property
+    def far_off(self) -> bool:
+        """Whether the fit misses more than any noise could."""
+        return self.found.chi2_per_dof > FAR_OFF
+
+    @property
+    def off(self) -> bool:
+        """Whether it misses more than noise, and more of the growth than a tracker's slow errors amount to."""
+        return self.far_off and missed_fraction(self.found.predictor, self.found.solution) > self._allowed
+
+    @property
+    def _allowed(self) -> float:
+        """The part that may be missed: less where neither the tracks nor a gauge have slow errors to own up to."""
+        data = self.found.predictor.data
+        slow = any(math.isfinite(item.tracker_sigma_m) or item.trace is not None for item in data)
+        return OFF if slow else OFF_OTHERWISE
+
+    @property
+    def lost(self) -> bool:
+        """Whether it misses so much of the growth besides that no tracker's slow errors explain it either."""
+        return is_poor_fit(self.found.predictor, self.found.solution)
+
+    @cached_property
+    def gains(self) -> tuple[Floats, Floats]:
+        """Fall of −2 ln L that each shape promises, and the size it is promised for."""
+        if self.far_off:
+            return linear_gains(self.found, self.sums, track_correlation(self.found.predictor.data))
+        signs, size = np.array(self.signs), self.scores.size
+        right = (signs == 0) | (size * signs > 0)
+        return np.where(right, self.scores.score * size, 0.0), size
+
+    def of(self, name: str) -> list[int]:
+        """Places of an effect's shapes, the most promising first."""
+        gains = self.gains[0]
+        places = [i for i, effect in enumerate(self.answers.effects) if effect == name]
+        return sorted(places, key=lambda i: -gains[i])
+
+    def promise(self, name: str) -> float:
+        """The largest fall of −2 ln L that any shape of an effect promises."""
+        places = self.of(name)
+        return float(self.gains[0][places[0]]) if places else 0.0
+
+    def best_z(self, name: str) -> tuple[float, int]:
+        """Largest z of an effect and the place of its shape; 0 and −1 where it is silent."""
+        places = [i for i, effect in enumerate(self.answers.effects) if effect == name]
+        if not places:
+            return 0.0, -1
+        place = max(places, key=lambda i: self.possible[i])
+        return float(self.possible[place]), place
+
+    def cosine(self, one: str, other: str) -> float:
+        """Largest |cosine| between shapes of two effects."""
+        a = [i for i, effect in enumerate(self.answers.effects) if effect == one]
+        b = [i for i, effect in enumerate(self.answers.effects) if effect == other]
+        return float(np.max(np.abs(self.scores.cosines[np.ix_(a, b)]), initial=0.0))
+
+    def largest(self, effect: Effect) -> tuple[dict[str, float], bool]:
+        """The largest sizes that could hide, one-sided 95 %, and whether a plausible one would show at all."""
+        places = [i for i, name in enumerate(self.answers.effects) if name == effect.name]
+        if not places or not effect.parameters:
+            return {}, bool(places)
+        # The shape that shows least: whatever form the effect has, it is no larger than this.
+        place = max(places, key=lambda i: self.scores.sigma[i])
+        size, sigma = float(self.scores.size[place]), float(self.scores.sigma[place])
+        parameter = self.answers.shapes[place].size
+        top = max(abs(bound - parameter.zero) for bound in plausible_range(parameter))
+        key = f"{effect.name}.{parameter.name}"
+        if not math.isfinite(sigma) or top < TESTABLE_SIGMAS * self.scores.sigma[places].min():
+            return {}, False
+        if parameter.sign:
+            return {
+                key: parameter.zero + parameter.sign * (max(parameter.sign * size, 0.0) + ONE_SIDED_95 * sigma)
+            }, True
+        return {key: parameter.zero + math.copysign(abs(size) + ONE_SIDED_95 * sigma, size)}, True
+
+
+def misfit_tests(found: Fit, effects: Sequence[Effect], level: float) -> MisfitTests:
+    """Question a fit about these effects."""
+    effects = tuple(effect for effect in effects if effect.name not in found.model)
+    shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect)]
+    answers = effect_sensitivities(found, shapes)
+    doubts = systematics_of(found.predictor, found.solution, found.trials)
+    sums = products_of(found, answers, doubts)
+    return MisfitTests(found, effects, answers, sums, scores_of(found, sums), structure_of(found, doubts), level)

@@ -1,0 +1,252 @@
+"""Fits of hypotheses: a quick climb on a part of the trials, then a fit to all of them.
+
+A climb takes one trial of every condition, spreads as a batch of vines shows them, and noise as correlated as in the
+tracks: so it is guided by what a hypothesis misses. Left free, correlation and spreads would take that in and hold the
+fit where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.candidates import CandidateShape, is_plausible
+from vinetrack.dynamics.model import Value
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Effect
+from vinetrack.inference.fit import is_poor_fit, refit
+from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.mixed_effects import deviance, marginal
+from vinetrack.inference.optimiser import FixedTerms, first_state, make_problem, solve, track_correlation
+from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
+from vinetrack.inference.starts import align, one_of_each_condition
+
+Start = tuple[Sequence[Effect], Mapping[str, Value]]
+"""Effects to add and values to begin from."""
+
+CLIMB_SPREADS = (0.01, 0.03)
+FIRST_ITERATIONS, MORE_ITERATIONS = 4, 10
+MOST_CLIMBED = 14
+"""Trials of a climb: one of every condition, no more than this."""
+
+FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
+SLOW_NOISE = 0.99
+LOWER, LOWER_PER_POINT = 1.0, 0.02
+"""By how much −2 ln L of a climb must end lower for its start to be worth a fit."""
+
+FAR_BEYOND = 6.0
+"""Times its plausible range."""
+
+HOPELESS = 0.5
+"""A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far."""
+
+
+@dataclass(frozen=True)
+class SubsetFit:
+    """Where a climb ended: −2 ln L on its trials and the values to begin a full fit from."""
+
+    effects: tuple[Effect, ...]
+    deviance: float
+    values: Mapping[str, Value]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects that were added."""
+        return tuple(effect.name for effect in self.effects)
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether it ended at sizes so far beyond belief that a full fit will not bring it back."""
+        return any(
+            not is_plausible(parameter, value, 0.0, widened=FAR_BEYOND)
+            for effect in self.effects
+            for parameter in effect.parameters
+            if isinstance(value := self.values.get(f"{effect.name}.{parameter.name}"), float)
+        )
+
+
+class SubsetFitter:
+    """Climbs from one fit, all on the same trials, so that their deviances can be held against each other."""
+
+    def __init__(self, found: Fit) -> None:
+        self.found = found
+        self.chosen = one_of_each(found.predictor.data)
+        self.data = [found.predictor.data[i] for i in self.chosen]
+        self.correlation = track_correlation(self.data)
+
+    def climb(
+        self, effects: Sequence[Effect], start: Mapping[str, Value], *, iterations: int, align_first: bool = True
+    ) -> SubsetFit | None:
+        """Fit with these effects added from `start`; None where the start cannot be followed."""
+        model = self.found.model
+        for effect in effects:
+            model = model + effect
+        fitted = self.found.model.values
+        model = model.with_values({**fitted, **start})
+        layout = make_layout(model, self.data, fixed=self._fixed(model.parameter_names), shared={})
+        predictor = Predictor(layout, self.data, self.found.predictor.host)
+        own = self.found.solution.state.own[self.chosen].copy()
+        own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+        held = FixedTerms(spread=CLIMB_SPREADS, correlation=self.correlation)
+        try:
+            theta = layout.start
+            if align_first:
+                own, _ = align(self.data, predictor, theta, own)
+            frame = make_problem(predictor, own)
+            state = first_state(self.data, theta, own)
+            solution = solve(predictor, frame, state, held, warm=True, most_iterations=iterations)
+            part = marginal(solution.grams, solution.frame, solution.state)
+        except (SimulationError, FitError, np.linalg.LinAlgError):
+            return None
+        level = deviance(part, solution.frame, solution.state, CLIMB_SPREADS, restricted=False)
+        return SubsetFit(tuple(effects), level, _values(layout, solution.state.theta)) if math.isfinite(level) else None
+
+    def here(self) -> float:
+        """−2 ln L where a few steps from the fit itself end; infinite where it cannot be followed."""
+        climb = self.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
+        return math.inf if climb is None else climb.deviance
+
+    def _fixed(self, names: Iterable[str]) -> tuple[str, ...]:
+        held = self.found.options["fixed"]
+        return tuple(name for name in held if name in names or any(name == full.split(".")[1] for full in names))
+
+
+def _values(layout: ParameterMap, theta: Floats) -> dict[str, Value]:
+    """Parameters by name, those of single vines as mappings; yield pressures have priors and find their way."""
+    found: dict[str, Value] = {}
+    for number, value in zip(layout.free, layout.values(theta), strict=True):
+        if number.key == YIELD_PRESSURE:
+            continue
+        if number.vine:
+            former = found.get(number.key, {})
+            assert isinstance(former, dict)
+            found[number.key] = {**former, number.vine: float(value)}
+        else:
+            found[number.key] = float(value)
+    return found
+
+
+def one_of_each(data: Sequence[FitTrial]) -> list[int]:
+    """Places of one trial of every condition, the one with the most points; spread evenly where there are too many."""
+    places = one_of_each_condition(data)
+    if len(places) <= MOST_CLIMBED:
+        return places
+    vines = {data[i].trial.vine for i in places}
+    take = [places[k] for k in np.unique(np.linspace(0, len(places) - 1, MOST_CLIMBED).round().astype(int))]
+    lacking = vines - {data[i].trial.vine for i in take}
+    return sorted({*take, *(next(i for i in places if data[i].trial.vine == vine) for vine in lacking)})
+
+
+def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
+    """Values of an effect's parameters to begin from: the predicted size brought inside what is possible."""
+    effect = shape.effect
+    if not effect.parameters:
+        return {}
+    parameter = shape.size
+    low, high = parameter.bounds
+    if shape.whole:
+        size = shape.step
+    elif parameter.plausible is not None:
+        # A prediction far beyond belief is a straight line drawn too far.
+        reach = 3 * max(abs(bound - parameter.zero) for bound in parameter.plausible)
+        size = float(np.clip(size, -reach, reach))
+    if parameter.sign * size < 0 or size == 0:
+        size = parameter.sign * abs(shape.step) or shape.step
+    values = (float(np.clip(parameter.zero + size, low, high)), *shape.rest)
+    return {f"{effect.name}.{one.name}": value for one, value in zip(effect.parameters, values, strict=True)}
+
+
+def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -> SubsetFit | None:
+    """The best of several starts of one hypothesis: each a few steps, the best of them on to the end.
+
+    One that stays far above `goal`, the best deviance of any hypothesis so far, is not followed further.
+    """
+    first = [
+        one
+        for effects, start in starts
+        if (one := slope.climb(effects, start, iterations=FIRST_ITERATIONS)) is not None
+    ]
+    if not first:
+        return None
+    best = min(first, key=lambda one: one.deviance)
+    points = sum(item.time_s.size for item in slope.data)
+    if best.deviance - goal > HOPELESS * points:
+        return best
+    for _ in range(3):
+        again = slope.climb(best.effects, best.values, iterations=MORE_ITERATIONS)
+        if again is None or again.deviance > best.deviance - 0.1:
+            break
+        best = again
+    return best
+
+
+def full_fit(found: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: bool = False) -> Fit | None:
+    """The hypothesis fitted to all trials from where its climb ended; None where it cannot be followed.
+
+    `afresh` begins with nothing of what the fit had bent to do without it. One whose ln L is still far below the `best`
+    after the first iterations is left unsettled.
+    """
+    model = found.model
+    for effect in climb.effects:
+        model = model + effect
+    try:
+        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False, afresh=afresh)
+        if fit.noise_correlation > SLOW_NOISE and is_poor_fit(fit.predictor, fit.solution):
+            # Noise that wanders as it likes makes anything likely.
+            return None
+        if fit.converged or fit.log_likelihood < best - FAR_BEHIND or is_poor_fit(fit.predictor, fit.solution):
+            return fit
+        return refit(fit, most_iterations=MORE_OF_FIT, thorough=False)
+    except (FitError, SimulationError, np.linalg.LinAlgError):
+        return None
+
+
+def from_other_starts(found: Fit) -> Fit:
+    """The same model fitted from where climbs from several exponents end, if that is better; else the fit itself."""
+    if EXPONENT not in found.model.parameter_names or EXPONENT in found.options["fixed"]:
+        return found
+    slope = SubsetFitter(found)
+    points = sum(item.time_s.size for item in slope.data)
+    starts: list[Start] = [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
+    return _from(slope, starts, slope.here(), LOWER_PER_POINT * points)
+
+
+def without(found: Fit, other: Fit) -> Fit:
+    """The model of a fit begun from the numbers of another fit, which holds it, if that is better; else the fit.
+
+    It is fitted where a climb from there makes up for half of what the other fit is better by.
+    """
+    slope, names = SubsetFitter(found), set(found.model.parameter_names)
+    added = [effect for effect in other.model if effect.name not in found.model]
+    here, there = slope.here(), slope.climb(added, other.model.values, iterations=1)
+    lower = math.inf if there is None else max(LOWER, 0.5 * (here - there.deviance))
+    return _from(slope, [((), {key: value for key, value in other.model.values.items() if key in names})], here, lower)
+
+
+def _from(slope: SubsetFitter, starts: Sequence[Start], here: float, lower: float) -> Fit:
+    """The model of a fit begun elsewhere, where a climb from there ends lower than `here` by this."""
+    found = slope.found
+    climb = best_subset_fit(slope, starts, here)
+    if climb is None or climb.deviance > here - lower:
+        return found
+    other = full_fit(found, climb, found.log_likelihood)
+    return other if other is not None and other.log_likelihood > found.log_likelihood else found
+
+
+def starts_of(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
+    """Starts of one effect from its shapes and the sizes predicted for them."""
+    seen: set[tuple[float, ...]] = set()
+    starts: list[Start] = []
+    for shape, size in shapes:
+        start = start_of(shape, size)
+        key = tuple(round(float(value), 12) for value in start.values())  # type: ignore[arg-type]
+        if key not in seen:
+            seen.add(key)
+            starts.append(((shape.effect,), start))
+    return starts

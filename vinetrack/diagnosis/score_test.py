@@ -1,0 +1,293 @@
+"""Score tests: what every candidate could explain of what a fit leaves, by linear algebra alone.
+
+About a fitted model, measured minus predicted positions of trial i are r_i = X_i Δθ + C_i a + Z_i u_i + e_i, with C_i
+the answers to the candidates' sizes a (`vinetrack.diagnosis.effect_sensitivities`). Release, origin and the
+deviations of pressure and B of every trial are integrated out, the free numbers projected off. What remains of a
+candidate has a score, an
+information, and a cosine with every other.
+
+The information is taken twice: from the noise and spreads of the fit, and from how much the scores of single trials
+scatter (White, Econometrica 48, 817, 1980, with trials as clusters), which holds whatever the noise within a trial is
+like. Tests go by the larger error of the two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.candidates import CandidateShape, probe
+from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect_sensitivities
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.mixed_effects import (
+    FitState,
+    cross_products,
+    cross_products_vector,
+    inverse_among,
+    trial_effects_eliminated,
+)
+from vinetrack.inference.robust_covariance import scatter_of
+from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.whitening import products
+
+BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
+SHARE_LEFT = 1e-4
+"""Part of its information that a shape must keep once everything else is fitted, to count as a shape of its own."""
+
+
+@dataclass(frozen=True)
+class Products:
+    """Sums of products of a fit's columns and of answers, see `whitened`.
+
+    In order: own numbers, keys, residual, shapes, doubts.
+    """
+
+    grams: Floats
+    n_keys: int
+    n_shapes: int
+    n_doubts: int = 0
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What is left of each shape beside the fit, shape (n_shapes,) or squared, per unit of its size.
+
+    `score` and `information` are sums of those of single trials, `scores`, shape (n_trials, n_shapes), and
+    `informations`, shape (n_trials, n_shapes, n_shapes). `sigma` is the error of a size, the larger of the two kinds.
+    """
+
+    score: Floats
+    information: Floats
+    scores: Floats
+    informations: Floats
+    degrees: float
+
+    @property
+    def size(self) -> Floats:
+        """One-step estimate of every size, alone; 0 where the data say nothing."""
+        diagonal = np.diag(self.information)
+        return np.where(diagonal > 0, self.score / np.maximum(diagonal, 1e-300), 0.0)
+
+    @property
+    def sigma(self) -> Floats:
+        """Its standard error; infinite where the data say nothing."""
+        return np.maximum(self.plain_sigma, self.robust_sigma)
+
+    @property
+    def plain_sigma(self) -> Floats:
+        """Its error by the noise and spreads of the fit."""
+        diagonal = np.diag(self.information)
+        return np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), math.inf)
+
+    @property
+    def robust_sigma(self) -> Floats:
+        """Its error by how much the scores of single trials scatter, once the size has explained its part of them."""
+        diagonal = np.diag(self.information)
+        left = self.scores - np.einsum("njj->nj", self.informations) * self.size
+        scatter = np.sqrt(scatter_of(left, self.degrees))
+        return np.where(diagonal > 0, scatter / np.maximum(diagonal, 1e-300), math.inf)
+
+    @property
+    def z(self) -> Floats:
+        """Sizes in standard errors."""
+        return self.size / self.sigma
+
+    @property
+    def cosines(self) -> Floats:
+        """How alike the shapes are, −1 to 1, shape (n_shapes, n_shapes)."""
+        root = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
+        return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
+
+
+def products_of(found: Fit, answers: EffectSensitivities, doubts: Sequence[Floats]) -> Products:
+    """All sums of products that the tests need; `doubts` are those of `doubts_of`."""
+    columns = found.solution.columns
+    grams = np.stack(
+        [
+            products(np.column_stack([own, more, doubt]), item.first)
+            for own, more, doubt, item in zip(columns, answers.columns, doubts, found.predictor.data, strict=True)
+        ]
+    )
+    return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes), doubts[0].shape[1])
+
+
+def scores_of(found: Fit, sums: Products, state: FitState | None = None) -> Scores:
+    """Scores at a fit, or with the noise and spreads of another `state`."""
+    solution = found.solution
+    frame, state = solution.frame, state or solution.state
+    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, solution.frame, state)
+    p, size = sums.n_keys, frame.prior_mean.size
+    index = frame.index
+    asked = sums.n_shapes + sums.n_doubts
+    X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
+    square = cross_products(blocks[:, X, X], frame) + np.diag(frame.prior_precision)
+    slope = cross_products_vector(blocks[:, X, r], frame) - frame.prior_precision * (state.theta - frame.prior_mean)
+    cross = np.zeros((size + 1, asked))
+    np.add.at(cross, index, blocks[:, X, C])
+    cross = cross[:size]
+    moving = np.flatnonzero(frame.free & (np.diag(square) > 0) & ~_pressed(found))
+    inverse = inverse_among(square, moving)
+    lever, step = inverse @ cross, inverse @ slope
+    total = blocks[:, C, C].sum(axis=0)
+    information = total - cross.T @ lever
+    # What rounding leaves of a shape that the free numbers imitate exactly is nothing.
+    gone = np.diag(information) < 1e-9 * np.maximum(np.diag(total), 1e-300)
+    information[gone, :] = information[:, gone] = 0.0
+    levers = np.vstack([lever, np.zeros((1, asked))])[index]
+    steps = np.append(step, 0.0)[index]
+    left = blocks[:, :, r] - np.einsum("nqk,nk->nq", blocks[:, :, X], steps)
+    single = left[:, C] - np.einsum("nkj,nk->nj", levers, left[:, X])
+    mixed = np.swapaxes(levers, 1, 2) @ blocks[:, X, C]
+    alone = blocks[:, C, C] - mixed - np.swapaxes(mixed, 1, 2)
+    alone = alone + np.swapaxes(levers, 1, 2) @ blocks[:, X, X] @ levers
+    single[:, gone] = 0.0
+    score = blocks[:, C, r].sum(axis=0) - cross.T @ step
+    score[gone] = 0.0
+    degrees = max(len(single) - moving.size, 1)
+    return _doubts_aside(Scores(score, information, single, alone, float(degrees)), sums.n_shapes)
+
+
+def _doubts_aside(scores: Scores, n_shapes: int) -> Scores:
+    """What is left of the shapes once all that is in doubt, each of standard deviation 1, is integrated out."""
+    asked = scores.score.size
+    turn = np.zeros((asked, n_shapes))
+    turn[:n_shapes] = np.eye(n_shapes)
+    if asked > n_shapes:
+        inner = scores.information[n_shapes:, n_shapes:] + np.eye(asked - n_shapes)
+        turn[n_shapes:] = -np.linalg.solve(inner, scores.information[n_shapes:, :n_shapes])
+    score, information = turn.T @ scores.score, scores.information[:n_shapes] @ turn
+    gone = np.diag(information) < 1e-9 * np.maximum(np.diag(scores.information)[:n_shapes], 1e-300)
+    information[gone, :] = information[:, gone] = 0.0
+    score[gone] = 0.0
+    informations = turn.T @ scores.informations[:, :, :n_shapes]
+    return Scores(score, information, scores.scores @ turn, informations, scores.degrees)
+
+
+def _pressed(found: Fit) -> NDArray[np.bool_]:
+    """Numbers at a bound, which cannot give way."""
+    return np.array([math.isfinite(number.bound) for number in found.numbers], dtype=bool)
+
+
+def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
+    """How far −2 ln L would fall with each shape, and at which size, if everything were linear.
+
+    The noise is as correlated as in the tracks, of whatever size is left: where a model is far off, the noise of its
+    fit has taken in what it misses, and says nothing of what is missing.
+    """
+    state = found.solution.state
+    points = found.solution.frame.points
+    total = points.sum()
+    variance = state.variance
+    for _ in range(4):
+        trial_state = FitState(state.theta, state.own, (0.01, 0.03), rho, variance)
+        scores = scores_of(found, sums, trial_state)
+        rest = _rest(found, sums, trial_state)
+        variance = np.full_like(variance, float(np.mean(variance)) * max(rest / total, 1e-6))
+    diagonal = np.maximum(np.diag(scores.information), 1e-300)
+    fall = np.where(np.diag(scores.information) > 0, scores.score**2 / diagonal, 0.0)
+    left = np.maximum(rest - fall, 1e-3 * rest)
+    return np.asarray(total * np.log(rest / left)), scores.size
+
+
+def _rest(found: Fit, sums: Products, state: FitState) -> float:
+    """Sum of squares that the fit's own numbers leave, with the priors' part."""
+    frame = found.solution.frame
+    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, frame, state)
+    p = sums.n_keys
+    square = cross_products(blocks[:, :p, :p], frame) + np.diag(frame.prior_precision)
+    away = state.theta - frame.prior_mean
+    slope = cross_products_vector(blocks[:, :p, p], frame) - frame.prior_precision * away
+    step = np.linalg.lstsq(square, slope, rcond=1e-11)[0]
+    whole = blocks[:, p, p].sum() + float(np.sum(frame.prior_precision * away**2))
+    return max(float(whole - step @ slope), 1e-9 * float(whole))
+
+
+def probe_shapes(found: Fit) -> list[CandidateShape]:
+    """Bumps of force along the growth, over speed and over time, with and without a factor P."""
+    longest_s = max(float(trial.time_s[-1] - trial.release_s) for trial in found.trials)
+    fastest = max(
+        trial.trial.travel_ratio * float(np.quantile(trial.predicted_velocity_m_s, 0.98)) for trial in found.trials
+    )
+    lengths = [trial.trial.length_m for trial in found.trials]
+    reaches = [float(np.max(trial.lead_position_m) - trial.origin_m) for trial in found.trials]
+    reach = max(
+        grown / length if math.isfinite(length) and length > 0 else grown
+        for grown, length in zip(reaches, lengths, strict=True)
+    )
+    varied = len({round(trial.trial.pressure_Pa, 1) for trial in found.trials}) > 1
+    shapes = []
+    for kind, count, top in ((0, BUMPS_ALONG, reach), (1, BUMPS_SPEED, fastest), (2, BUMPS_TIME, longest_s)):
+        centres = (np.arange(count) + 0.5) / count * top
+        for centre in centres:
+            for offset in (0, 3) if varied and kind == 0 else (0,):
+                shapes.append(CandidateShape(probe(), (float(kind + offset), float(centre), 0.6 * top / count), 1e-3))
+    return shapes
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What probes find: χ² of their scores for `degrees` of freedom, its upper tail `p`, and that as a `z`.
+
+    `loudest` is the chance at which the loudest of as many probes stands out alone: something narrow shows in one of
+    them, and drowns in the sum over all.
+    """
+
+    chi2: float
+    degrees: int
+    p: float
+    z: float
+    loudest: float = 1.0
+
+
+def structure_of(found: Fit, doubts: Sequence[Floats]) -> Structure:
+    """Whether anything that a smooth force could explain is left beside a fit.
+
+    All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
+    """
+    from scipy.stats import f as fisher
+    from scipy.stats import norm, t
+
+    answers = effect_sensitivities(found, probe_shapes(found))
+    if not answers.shapes:
+        return Structure(0.0, 0, 1.0, 0.0)
+    scores = scores_of(found, products_of(found, answers, doubts))
+    root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
+    live = np.diag(scores.information) > 0
+    information = (scores.information / root[:, None] / root)[np.ix_(live, live)]
+    score = (scores.score / root)[live]
+    values, vectors = np.linalg.eigh(information)
+    keep = values > SHARE_LEFT * values.max(initial=0.0)
+    along = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
+    turn = (vectors / root[live][:, None])[:, keep] / np.sqrt(values[keep])
+    single = scores.scores[:, live] @ turn
+    explained = np.einsum("jk,njl,lk->nk", turn, scores.informations[:, live][:, :, live], turn) * along
+    robust = scatter_of(single - explained, scores.degrees)
+    chi2 = float(np.sum(along**2 / np.maximum(1.0, robust)))
+    degrees = int(np.count_nonzero(keep))
+    p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0
+    # A probe that few trials feel has as few degrees of freedom, however many there are in all.
+    each = np.einsum("njj->nj", scores.informations)[:, live]
+    felt = each.sum(axis=0) ** 2 / np.maximum(np.sum(each**2, axis=0), 1e-300)
+    chances = 2 * t.sf(np.abs(scores.z[live]), np.clip(felt - 1, 1.0, max(scores.degrees, 3.0)))
+    loudest = min(degrees * float(np.min(chances, initial=1.0)), 1.0)
+    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), loudest)
+
+
+def family_threshold(cosines: Floats, signs: Sequence[int], level: float, draws: int = 40_000) -> float:
+    """The z that the largest of correlated scores exceeds with this probability where nothing is missing.
+
+    Candidates are correlated and some have one sign only: sixteen may act like four.
+    """
+    count = len(signs)
+    if not count:
+        return 0.0
+    values, vectors = np.linalg.eigh(cosines)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    normal = np.random.default_rng(20).standard_normal((draws, count)) @ root.T
+    sided = np.where(np.array(signs) == 0, np.abs(normal), normal * np.array(signs))
+    return float(np.quantile(sided.max(axis=1), 1 - level))

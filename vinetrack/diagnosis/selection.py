@@ -1,0 +1,251 @@
+"""From a fit to verdicts: is something missing, which effect, is anything left once it is there.
+
+A verdict is never more certain than the data. One effect alone must mend everything; if something is left, two effects
+together must; if something is left then, the truth is not in the catalogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vinetrack.diagnosis.candidate_fits import CandidateFits, Report, pairs
+from vinetrack.diagnosis.likelihood_ratio import (
+    ANSWER_SET,
+    MOST_INFLATION,
+    LikelihoodRatio,
+    answer_set,
+    likelihood_ratio,
+)
+from vinetrack.diagnosis.misfit_tests import (
+    FAR_OFF,
+    FIRST_LEVEL,
+    LATER_LEVEL,
+    SUSPECT_SIGMAS,
+    MisfitTests,
+    misfit_tests,
+)
+from vinetrack.diagnosis.multi_start import from_other_starts, without
+from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, UNEXPLAINED
+from vinetrack.effects import Effect
+from vinetrack.inference.fit_result import Fit
+
+MOST_AGAIN = 2
+"""Times that all is asked again of a better minimum."""
+
+LOUD = 1.0
+"""Standard deviations above the threshold from which a score is no chance, even if no refit bears it out."""
+
+NO_BETTER = 1.0
+"""Difference in ln L that counts as a better minimum."""
+
+
+@dataclass(frozen=True)
+class SelectionStep:
+    """One round before it is put in words.
+
+    `kept` are the hypotheses in the answer set (of pairs: the partners, given what was added before), `tried` all that
+    were fitted, `aside` what was set aside and why, by name.
+    """
+
+    verdict: str
+    questions: MisfitTests
+    kept: tuple[LikelihoodRatio, ...] = ()
+    tried: tuple[LikelihoodRatio, ...] = ()
+    aside: tuple[tuple[str, str], ...] = ()
+    answer: tuple[str, ...] = ()
+    search: CandidateFits | None = None
+    note: str = ""
+
+
+def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[SelectionStep]:
+    """The findings of all rounds, the first about the fit itself.
+
+    A fit may have ended in a local minimum, from which any effect seems to help. So one that is far off is begun again
+    elsewhere before it is questioned, and again from where the best hypothesis ended: if it then does better without
+    the effect, all is asked again of that, twice at most.
+    """
+    if found.chi2_per_dof > FAR_OFF and not again:
+        report("fitting the model from other starts")
+        found = from_other_starts(found)
+    report("questioning the model")
+    questions = misfit_tests(found, effects, FIRST_LEVEL)
+    if not questions.something and not questions.suspect:
+        return [SelectionStep(ADEQUATE, questions)]
+    search = CandidateFits(questions, report)
+    tried = search.singles()
+    if not questions.something and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
+        return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
+    if tried and again < MOST_AGAIN:
+        rival = without(found, best_of(tried).fit)
+        if rival.log_likelihood > found.log_likelihood + NO_BETTER:
+            return select_effects(rival, effects, report, again=again + 1)
+    alone = _alone(questions, search, tried)
+    if alone is not None:
+        return alone
+    tried = search.singles(all_of_them=True)
+    alone = _alone(questions, search, tried)
+    if alone is not None:
+        return alone
+    believed = [one for one in tried if one.credible]
+    if not believed or best_of(believed).sigma < questions.threshold:
+        # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
+        loud = questions.possible.max(initial=0.0) > questions.threshold + LOUD
+        fails = questions.fails or questions.off or loud
+        verdict = UNEXPLAINED if fails else ADEQUATE
+        return [SelectionStep(verdict, questions, tried=tuple(tried), search=search)]
+    report("two effects together")
+    return _together(questions, search, tried, effects, report)
+
+
+def best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:
+    """The hypothesis with the highest likelihood."""
+    return max(tried, key=lambda one: one.fit.log_likelihood)
+
+
+def _alone(
+    questions: MisfitTests, search: CandidateFits, tried: Sequence[LikelihoodRatio]
+) -> list[SelectionStep] | None:
+    """Findings where one effect mends everything; None where none does."""
+    if not tried:
+        return None
+    best = best_of(tried)
+    if best.sigma < questions.threshold:
+        return None
+    kept, aside, after = _mending(tried, search)
+    if after is None:
+        return None
+    verdict = verdict_of(kept)
+    first = SelectionStep(
+        verdict,
+        questions,
+        tuple(kept),
+        tuple(tried),
+        tuple(aside.items()),
+        tuple(one.names[0] for one in kept),
+        search,
+    )
+    return [first, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [first]
+
+
+def _mending(
+    hypotheses: Sequence[LikelihoodRatio], search: CandidateFits
+) -> tuple[list[LikelihoodRatio], dict[str, str], MisfitTests | None]:
+    """The hypotheses that cannot be excluded and leave nothing, why others were set aside, and what the best leaves.
+
+    One that leaves something is excluded, and with it whatever it was better by: where all of the answer set leave
+    something, those next to it are asked, as far as misjudged noise could have put them behind.
+    """
+    kept, aside = answer_set(hypotheses)
+    best = max(one.fit.log_likelihood for one in hypotheses)
+    behind = sorted((one for one in hypotheses if one not in kept), key=lambda one: -one.fit.log_likelihood)
+    next_to_it = [
+        one
+        for one in behind
+        if one.label not in aside and 2 * (best - one.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
+    ]
+    for group in (kept, next_to_it):
+        mending: list[LikelihoodRatio] = []
+        after: MisfitTests | None = None
+        for one in group:
+            asked = search.after(one.fit) if one.credible else None
+            # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
+            if asked is None or asked.something or (len(one.effects) > 1 and asked.whispers):
+                aside[one.label] = one.reason if asked is None else "something is left once it is added"
+            elif not mending or one in answer_set([*mending, one])[0]:
+                mending.append(one)
+                after = after or asked
+        if mending:
+            return mending, aside, after
+    return [], aside, None
+
+
+def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
+    """What an answer set amounts to; of each hypothesis the last effect counts."""
+    kinds = {one.effects[-1].kind for one in kept}
+    if kinds == {"measurement"}:
+        return ARTEFACT
+    return MISSING if len(kept) == 1 else AMBIGUOUS
+
+
+def _together(
+    questions: MisfitTests,
+    search: CandidateFits,
+    tried: Sequence[LikelihoodRatio],
+    effects: Sequence[Effect],
+    report: Report,
+) -> list[SelectionStep]:
+    """Findings where two effects together mend what none does alone; else nothing known does."""
+    ranked = sorted(tried, key=lambda one: -one.fit.log_likelihood)
+    both = pairs(questions.found, ranked, effects, report)
+    nothing = [
+        SelectionStep(UNEXPLAINED, questions, tried=(*ranked, *both), search=search, aside=_why_not(ranked, both))
+    ]
+    if not both:
+        return nothing
+    kept, aside, after = _mending(both, search)
+    if after is None or 2 * (kept[0].fit.log_likelihood - ranked[0].fit.log_likelihood) < after.threshold**2:
+        return nothing
+    common = set.intersection(*(set(one.names) for one in kept))
+    by_name = {one.names[0]: one for one in ranked if len(one.names) == 1}
+    if not common:
+        names = tuple(dict.fromkeys(name for one in kept for name in one.names))
+        answer = _ordered(names, by_name)
+        first = SelectionStep(AMBIGUOUS, questions, tuple(kept), (*ranked, *both), tuple(aside.items()), answer, search)
+        return [first]
+    return _in_order(questions, search, kept, common, by_name, (*ranked, *both), aside, after)
+
+
+def _ordered(names: Sequence[str], by_name: dict[str, LikelihoodRatio]) -> tuple[str, ...]:
+    """Names by how much each mends alone."""
+    return tuple(sorted(names, key=lambda name: -by_name[name].delta_chi2 if name in by_name else 0.0))
+
+
+def _in_order(
+    questions: MisfitTests,
+    search: CandidateFits,
+    kept: Sequence[LikelihoodRatio],
+    common: set[str],
+    by_name: dict[str, LikelihoodRatio],
+    tried: Sequence[LikelihoodRatio],
+    aside: dict[str, str],
+    after: MisfitTests,
+) -> list[SelectionStep]:
+    """Two rounds from pairs that share an effect: that one first, physics before faults of the measurement."""
+    kinds = {effect.name: effect.kind for one in kept for effect in one.effects}
+    order = sorted(common, key=lambda name: (kinds[name] == "measurement", -_alone_gain(name, by_name)))
+    first_name = order[0]
+    turned = [_turned(one, first_name) for one in kept]
+    verdict = ARTEFACT if kinds[first_name] == "measurement" else MISSING
+    first = SelectionStep(
+        verdict, questions, tuple(turned[:1]), tuple(tried), tuple(aside.items()), (first_name,), search,
+        note="two effects are missing: none alone mends everything",
+    )  # fmt: skip
+    if verdict != MISSING:
+        return [first]
+    base = by_name.get(first_name)
+    later = misfit_tests(base.fit if base else turned[0].fit, questions.effects, LATER_LEVEL)
+    seconds = tuple(likelihood_ratio(later.found, one.effects[1:], one.fit) for one in turned)
+    second_verdict = verdict_of(seconds)
+    names = tuple(one.names[0] for one in seconds)
+    second = SelectionStep(second_verdict, later, seconds, seconds, answer=names)
+    return [first, second, SelectionStep(ADEQUATE, after)] if second_verdict == MISSING else [first, second]
+
+
+def _alone_gain(name: str, by_name: dict[str, LikelihoodRatio]) -> float:
+    return by_name[name].delta_chi2 if name in by_name else 0.0
+
+
+def _turned(one: LikelihoodRatio, first: str) -> LikelihoodRatio:
+    """The same pair with the effect of that name in front."""
+    from dataclasses import replace
+
+    ordered = sorted(one.effects, key=lambda effect: effect.name != first)
+    return replace(one, effects=tuple(ordered))
+
+
+def _why_not(ranked: Sequence[LikelihoodRatio], both: Sequence[LikelihoodRatio]) -> tuple[tuple[str, str], ...]:
+    return tuple(
+        (one.label, one.reason if not one.credible else "something is left once it is added")
+        for one in (*ranked[:1], *both[:1])
+    )

@@ -1,0 +1,103 @@
+"""Two further looks at what a fit leaves, where trials have numbers of their own to hide it in.
+
+A model that lacks something lets every trial bend its own pressure and B until it fits. What is bent by chance differs
+between replicates of a condition; what makes up for the model is the same in all of them. And what no bending mends
+passes for noise: then the positions are noisier in motion than at rest, over stretches that any slow error needs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.inference.fit_result import Fit
+
+STRETCH = 8
+"""Frames over which noise is summed: slow against the noise, short enough for a rest of two dozen frames."""
+
+FEWEST_STRETCHES = 12
+FEWEST_REPLICATED = 4
+"""Degrees of freedom between replicates from which their scatter can be told."""
+
+MORE_THAN_STATED, MORE_THAN_VINES = 2.0, 0.04
+"""What conditions may differ by: twice the error that the sheet states of a pressure, and 4 % of B."""
+
+FEW_PER_CENT = 0.02
+
+
+def conditions_apart(found: Fit) -> float:
+    """Chance at which conditions differ in their trials' own pressure, or B, by so much more than replicates do.
+
+    1 where replicates are too few, or where conditions differ by no more than an experimenter's care allows.
+    """
+    stated = [
+        trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in found.trials if trial.trial.pressure_Pa > 0
+    ]
+    known = [one for one in stated if math.isfinite(one)]
+    pressure = max(MORE_THAN_STATED * float(np.median(known)) if known else 0.0, FEW_PER_CENT)
+    conditions = [trial.trial.condition for trial in found.trials]
+    fitted = sum(1 for number in found.numbers if not math.isfinite(number.bound))
+    chances = [
+        _one_way(np.array([trial.pressure_deviation for trial in found.trials]), conditions, fitted, pressure),
+        _one_way(np.log1p([trial.damping_deviation for trial in found.trials]), conditions, fitted, MORE_THAN_VINES),
+    ]
+    return min(2 * min(chances), 1.0)
+
+
+def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
+    """Upper tail of the F test between groups, 1 where their means differ by less than `allowed`, root mean square."""
+    from scipy.stats import f
+
+    names = sorted(set(groups))
+    members = [values[[group == name for group in groups]] for name in names]
+    within = sum(float(np.sum((one - one.mean()) ** 2)) for one in members)
+    inner, outer = values.size - len(names), max(len(names) - fitted, 1)
+    between = sum(one.size * float(one.mean()) ** 2 for one in members)
+    if inner < FEWEST_REPLICATED or not within > 0 or math.sqrt(between / values.size) < allowed:
+        return 1.0
+    # Those of replicates that hardly differ are held against what an experimenter's care allows.
+    care = max(within / inner, allowed**2 / 9)
+    return float(f.sf(between / outer / care, outer, inner))
+
+
+def noisier_in_motion(found: Fit) -> float:
+    """Chance at which positions in motion are so much noisier, over stretches, than at rest; 1 where nobody can tell.
+
+    Positions read from recordings are not asked, for a tracker's slow errors in motion are larger than those at rest,
+    and none under a recorded pressure, for a gauge's noise moves what the model predicts.
+    """
+    from scipy.stats import f
+
+    rest: list[Floats] = []
+    motion: list[Floats] = []
+    freedom = 0.0
+    for trial, item in zip(found.trials, found.predictor.data, strict=True):
+        if math.isfinite(item.tracker_sigma_m) or item.gauge_error > 0:
+            continue
+        here = _sums(trial.whitened[: item.n_rest])
+        if here.size < 2:
+            continue
+        rest.append((here - here.mean()) * math.sqrt(here.size / (here.size - 1)))
+        motion.append(_sums(trial.whitened[item.n_rest :]))
+        freedom += here.size - 1
+    if freedom < FEWEST_STRETCHES:
+        return 1.0
+    still, moving = np.concatenate(rest), np.concatenate(motion)
+    ratio = float(np.mean(moving**2) / np.mean(still**2))
+    return float(f.sf(ratio, _degrees(moving, moving.size), _degrees(still, freedom)))
+
+
+def _sums(white: Floats) -> Floats:
+    """Sums over successive stretches, each of variance 1 where the noise is white."""
+    count = white.size // STRETCH
+    return np.asarray(white[: count * STRETCH].reshape(count, STRETCH).sum(axis=1) / math.sqrt(STRETCH))
+
+
+def _degrees(values: Floats, count: float) -> float:
+    """Degrees of freedom of their mean square, fewer where the tails are heavy."""
+    square = float(np.mean(values**2))
+    kurtosis = float(np.mean(values**4)) / square**2 if square > 0 else 3.0
+    return 2 * count / max(kurtosis - 1, 2.0)

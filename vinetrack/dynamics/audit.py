@@ -1,0 +1,266 @@
+"""What a model leaves out, weighed along the motion that was filmed: an audit of each trial.
+
+Every effect of the catalogue that is not in the model is asked, at its typical size, what force it would have put on
+the tail. That is set against the drive ½PA. Beside it stands the tail's tension, and in words which of the paper's
+rules for leaving things out a trial breaks: drag above 5 % of the drive, friction along 30 cm and more, bends of 30°
+and more, a reservoir whose pressure changes by more than 5 %, a tail that would have to push.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from vinetrack.core.records import Floats, Kinematics, Trial
+from vinetrack.dynamics.force_terms import Terms, evaluate
+from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.simulate import Trace, simulate
+from vinetrack.dynamics.trial_inputs import trial_inputs
+from vinetrack.effects import Effect, EffectError, catalogue
+
+DRAG_SHARE = 0.05
+PRESSURE_SHARE = 0.05
+LONG_M = 0.30
+BENT_RAD = math.radians(30)
+
+TENSION = "tail_tension"
+COLUMNS = (
+    "trial",
+    "condition",
+    "term",
+    "size",
+    "force_N",
+    "share_of_drive",
+    "shift_m",
+    "time_s",
+    "lead_position_m",
+    "y_over_L",
+    "slack_from_s",
+    "note",
+)
+
+
+@dataclass(frozen=True)
+class AuditedMotion:
+    """How one trial moved since release, from measurement or simulation; arrays of shape (n,), SI.
+
+    `pressure_Pa` is the gauge pressure measured along with it, where there is one.
+    """
+
+    trial: Trial
+    time_s: Floats
+    lead_position_m: Floats
+    lead_velocity_m_s: Floats
+    pressure_Pa: Floats | None = None
+
+    def thinned(self, most: int = 200) -> AuditedMotion:
+        """Every so-many-th point, at most `most`."""
+        every = slice(None, None, max(1, math.ceil(self.time_s.size / most)))
+        pressure = None if self.pressure_Pa is None else self.pressure_Pa[every]
+        return AuditedMotion(
+            self.trial, self.time_s[every], self.lead_position_m[every], self.lead_velocity_m_s[every], pressure
+        )
+
+
+@dataclass(frozen=True)
+class Audit:
+    """`table`, columns `COLUMNS`: a row for each neglected term and one for the tension, of every trial.
+
+    `force_N` is the force on the tail where it is largest against the drive (negative: it would hold back), there also
+    time and place; `shift_m` what the camera would see elsewhere. The row `tail_tension` has the least tension, and
+    when it first was negative. `warnings` are sentences.
+    """
+
+    table: pd.DataFrame
+    warnings: tuple[str, ...]
+
+
+def simulated_motion(model: Model, trial: Trial, until_s: float, trace: Trace | None = None) -> AuditedMotion:
+    """What the model says of a trial up to the end of its growth or to `until_s`, at 200 times, dense at first."""
+    spread = np.linspace(0.0, 1.0, 200) ** 2
+    times = until_s * spread
+    found = simulate(model, trial, times, trace=trace)
+    if found.status == "ended":
+        times = found.end_time_s * spread[:-1]
+        found = simulate(model, trial, times, trace=trace)
+    pressure = None if trace is None else np.interp(times, *trace)
+    return AuditedMotion(trial, times, found.lead_position_m, found.lead_velocity_m_s, pressure)
+
+
+def measured_motion(
+    trial: Trial, kinematics: Kinematics, release_s: float, trace: Trace | None = None
+) -> AuditedMotion:
+    """What was filmed of a trial, from its release on; `trace` holds times since release."""
+    k = kinematics
+    moving = (k.time_s >= release_s) & np.isfinite(k.lead_position_m) & np.isfinite(k.lead_velocity_m_s)
+    origin_m = np.interp(release_s, k.time_s, k.lead_position_m)
+    time_s = k.time_s[moving] - release_s
+    pressure = None if trace is None else np.interp(time_s, *trace)
+    position_m = np.maximum(k.lead_position_m[moving] - origin_m, 0.0)
+    return AuditedMotion(trial, time_s, position_m, np.maximum(k.lead_velocity_m_s[moving], 0.0), pressure)
+
+
+def audit(model: Model, motions: Sequence[AuditedMotion], effects: Iterable[Effect] | None = None) -> Audit:
+    """Weigh what `model` leaves out along each motion.
+
+    Parameters
+    ----------
+    effects : what might have been in the model; default the physical effects of the catalogue, at their default sizes
+
+    Raises
+    ------
+    EffectError
+        If a trial lacks what an effect *of the model* needs; what a neglected one lacks is said in its row.
+    """
+    candidates = list(catalogue().values()) if effects is None else list(effects)
+    rows: list[dict[str, Any]] = []
+    warnings: list[str] = []
+    for motion in (motion.thinned() for motion in motions):
+        terms = _along(model, motion)
+        neglected = [e for e in candidates if e.kind != "measurement" and not _held(e, model, motion)]
+        found = [_neglected_row(model, effect, motion, terms) for effect in neglected]
+        tension = _tension_row(motion, terms)
+        rows += [*found, tension]
+        warnings += [f"Trial {motion.trial.name}: {words}." for words in _broken_rules(model, motion, found, tension)]
+    return Audit(pd.DataFrame(rows, columns=list(COLUMNS)), tuple(warnings))
+
+
+def _along(model: Model, motion: AuditedMotion) -> Terms:
+    return evaluate(
+        model,
+        motion.trial,
+        motion.time_s,
+        motion.lead_position_m,
+        motion.lead_velocity_m_s,
+        measured_Pa=motion.pressure_Pa,
+    )
+
+
+def _held(effect: Effect, model: Model, motion: AuditedMotion) -> bool:
+    """Whether the model, or a pressure measured during growth, already holds an effect."""
+    if effect.name in model or (effect.in_trace and motion.pressure_Pa is not None):
+        return True
+    return any(effect.name in other.replaces for other in model)
+
+
+def _drive_N(motion: AuditedMotion) -> Floats:
+    """The drive on the tail ½PA (PA/r), shape (n,), with the set pressure unless it was measured."""
+    rig = trial_inputs(motion.trial)
+    pressure = rig.set_pressure if motion.pressure_Pa is None else motion.pressure_Pa
+    return np.broadcast_to(np.asarray(pressure * rig.area / rig.travel_ratio, dtype=float), motion.time_s.shape)
+
+
+def _place(motion: AuditedMotion, i: int) -> dict[str, float]:
+    y = float(motion.lead_position_m[i])
+    length = motion.trial.length_m
+    share = y / length if math.isfinite(length) and length > 0 else math.nan
+    return {"time_s": float(motion.time_s[i]), "lead_position_m": y, "y_over_L": share}
+
+
+def _row(motion: AuditedMotion, term: str) -> dict[str, Any]:
+    blank: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
+    return {**blank, "trial": motion.trial.name, "condition": motion.trial.condition, "term": term, "note": ""}
+
+
+def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without: Terms) -> dict[str, Any]:
+    """What one effect would have changed: the sum of forces on the tail, less the inertia of mass it adds."""
+    row = _row(motion, effect.name)
+    row["size"] = ", ".join(
+        f"{p.symbol} = {p.default:g}{'' if p.unit == '1' else ' ' + p.unit}" for p in effect.parameters
+    )
+    try:
+        terms = _along(model + effect, motion)
+    except EffectError as error:
+        return {**row, "note": str(error)}
+    if not set(effect.functions) - {"observed_position"}:
+        return {**row, **_shift(effect, motion, without)}
+    if not set(effect.functions) - {"rest_force"}:
+        return {**row, "note": "acts on a vine at rest only"}
+    force = _total_N(terms) - _total_N(without) - (terms.inertia_kg - without.inertia_kg) * without.acceleration_m_s2
+    drive = _drive_N(motion)
+    share = np.divide(force, drive, out=np.zeros_like(force), where=drive > 0)
+    i = int(np.argmax(np.abs(share if np.any(drive > 0) else force)))
+    return {**row, "force_N": float(force[i]), "share_of_drive": float(share[i]), **_place(motion, i)}
+
+
+def _total_N(terms: Terms) -> Floats:
+    """All that acts on the tail, N."""
+    return terms.tension_N + sum(terms.tail_N.values(), np.zeros_like(terms.tension_N))
+
+
+def _shift(effect: Effect, motion: AuditedMotion, terms: Terms) -> dict[str, float]:
+    """How far off an effect that only shows to the camera puts the leading edge, from where it does at release."""
+    rig = trial_inputs(motion.trial)
+    state = terms.state._replace(tail_tension=np.maximum(terms.tension_N, 0.0))  # type: ignore[arg-type]
+    seen = effect.functions["observed_position"](state, rig, *(parameter.default for parameter in effect.parameters))
+    shift = np.asarray(seen, dtype=float) - motion.lead_position_m
+    i = int(np.argmax(np.abs(shift)))
+    return {"shift_m": float(shift[i]), **_place(motion, i)}
+
+
+def _tension_row(motion: AuditedMotion, terms: Terms) -> dict[str, Any]:
+    tension = terms.tension_N
+    i = int(np.argmin(tension))
+    drive = float(_drive_N(motion)[i])
+    negative = np.flatnonzero(tension < 0)
+    return {
+        **_row(motion, TENSION),
+        "force_N": float(tension[i]),
+        "share_of_drive": float(tension[i]) / drive if drive > 0 else math.nan,
+        **_place(motion, i),
+        "slack_from_s": float(motion.time_s[negative[0]]) if negative.size else math.nan,
+    }
+
+
+def _broken_rules(
+    model: Model, motion: AuditedMotion, rows: Sequence[dict[str, Any]], tension: dict[str, Any]
+) -> Iterator[str]:
+    trial = motion.trial
+    neglected = {row["term"]: row for row in rows}
+    drag = neglected.get("air_drag")
+    if drag and abs(drag["share_of_drive"]) > DRAG_SHARE:
+        yield (
+            f"air drag is {abs(drag['share_of_drive']):.1%} of the drive at y/L = {drag['y_over_L']:.2f} "
+            f"({drag['size']}), above {DRAG_SHARE:.0%}; add air_drag to the model"
+        )
+    if "tail_friction" in neglected and trial.length_m >= LONG_M:
+        yield (
+            f"friction along the length is left out of a vine of {100 * trial.length_m:.0f} cm, which is safe below "
+            f"{100 * LONG_M:.0f} cm; add tail_friction to the model"
+        )
+    bent = sum(bend.arc_m / bend.radius_m for bend in trial.bends)
+    if "capstan_friction" in neglected and bent >= BENT_RAD:
+        yield (
+            f"the path bends by {math.degrees(bent):.0f}° in all, which is safe to leave out below "
+            f"{math.degrees(BENT_RAD):.0f}°; add capstan_friction to the model"
+        )
+    yield from _fallen_pressure(model, motion, neglected)
+    if math.isfinite(tension["slack_from_s"]) and trial.tail_slack != "free":
+        yield (
+            f"the tail would have to push from {1e3 * tension['slack_from_s']:.0f} ms on (tension down to "
+            f"{tension['force_N']:.2f} N); `tail_slack: free` lets it go slack"
+        )
+
+
+def _fallen_pressure(model: Model, motion: AuditedMotion, neglected: dict[str, dict[str, Any]]) -> Iterator[str]:
+    """The reservoir's rule, by the gas law in absolute pressure, between slow and fast."""
+    row = neglected.get("reservoir_depletion")
+    pressure = motion.trial.pressure_Pa
+    if row is None or row["note"] or not pressure > 0:
+        return
+    effect = catalogue()["reservoir_depletion"]
+    shares = []
+    for gamma in (1.0, 1.4):
+        left = _along((model + effect).with_values({"reservoir_depletion.gamma": gamma}), motion).pressure_Pa
+        shares.append(1 - float(np.min(left)) / pressure)
+    if shares[1] > PRESSURE_SHARE:
+        yield (
+            f"the reservoir of {1e3 * motion.trial.chamber_m3:.3g} L loses {shares[0]:.0%} (slow) to {shares[1]:.0%} "
+            f"(fast) of its gauge pressure while the vine grows, above {PRESSURE_SHARE:.0%}, unless a supply refills "
+            "it; add reservoir_depletion or supply_refill to the model, or measure the pressure"
+        )

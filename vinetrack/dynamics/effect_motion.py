@@ -1,0 +1,122 @@
+"""What one effect does to the motion of a reference vine: the table behind its picture."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from vinetrack.core.records import Bend, Floats, Trial
+from vinetrack.dynamics.model import Model, base_model, make_model
+from vinetrack.dynamics.simulate import Trace, Trajectory, simulate
+from vinetrack.effects import Effect, catalogue
+
+REFERENCE = Trial(
+    name="reference",
+    vine="reference",
+    diameter_m=24e-3,
+    thickness_m=200e-6,
+    length_m=0.4,
+    pressure_Pa=28e3,
+    yield_pressure_Pa=3e3,
+    payload_kg=35.6e-3,
+    chamber_m3=3.7e-3,
+    inlet_m=6e-3,
+)
+"""The largest vine of Alvarez et al. (2025), grown downwards with their payload, 0.4 m long."""
+
+REFERENCE_VALUES = {"eversion_damping.B": 6.44, "eversion_damping.n": 0.37}
+
+BENDS = (Bend(0.1, 0.1, 0.1),)
+"""One radian after 10 cm, for what happens in bends."""
+
+SLOW_PRESSURE: Trace = (np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e3, 1e3, 5.9e3, 1e3]))
+"""A pressure that rises and falls through the threshold, for effects that act on a vine at rest."""
+
+
+def effect_motion(effect: Effect) -> pd.DataFrame:
+    """Motion of the reference vine with an effect at its default size and without it.
+
+    An effect of the base model is taken out of it, another is put in.
+
+    Returns
+    -------
+    table
+        `time_s, without_position_m, with_position_m, without_velocity_m_s, with_velocity_m_s, difference_m`; positions
+        of the leading edge as the camera reports them, up to the end of growth of whichever ends first.
+    """
+    with_it, without = _models(effect)
+    trial = replace(REFERENCE, bends=BENDS) if effect.name == "capstan_friction" else REFERENCE
+    at_rest = _acts_at_rest(effect)
+    trial = replace(trial, growth_angle_rad=math.pi / 2) if at_rest else trial
+    trace = SLOW_PRESSURE if at_rest else None
+    until = _end_s(with_it, without, trial, trace)
+    times = np.linspace(0.0, until, 400)
+    a, b = simulate(without, trial, times, trace=trace), simulate(with_it, trial, times, trace=trace)
+    return pd.DataFrame(
+        {
+            "time_s": times,
+            "without_position_m": a.observed_position_m,
+            "with_position_m": b.observed_position_m,
+            "without_velocity_m_s": _seen_velocity(a),
+            "with_velocity_m_s": _seen_velocity(b),
+            "difference_m": b.observed_position_m - a.observed_position_m,
+        }
+    )
+
+
+def reference_words(effect: Effect) -> str:
+    """The vine and trial of `effect_motion`, for the caption of a picture."""
+    vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
+    if _acts_at_rest(effect):
+        return f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
+    bends = ", one radian of bend after 100 mm" if effect.name == "capstan_friction" else ""
+    return f"{vine}, 28 kPa, straight down, chamber 3.7 L, inlet 6 mm{bends}"
+
+
+def size_words(effect: Effect) -> str:
+    """Its parameters with the values of `effect_motion`, such as `C_D = 1`; blank where it has none."""
+    values = [REFERENCE_VALUES.get(f"{effect.name}.{p.name}", p.default) for p in effect.parameters]
+    return ", ".join(
+        f"{p.symbol} = {value:g}{'' if p.unit == '1' else ' ' + p.unit}"
+        for p, value in zip(effect.parameters, values, strict=True)
+    )
+
+
+def _acts_at_rest(effect: Effect) -> bool:
+    return set(effect.functions) == {"rest_force"}
+
+
+def _models(effect: Effect) -> tuple[Model, Model]:
+    """The base model with an effect and without.
+
+    Out of the whole catalogue, all else at no size: that is one compiled model for all pictures.
+    """
+    if effect.kind == "base" and not effect.parameters:
+        base = base_model().with_values(REFERENCE_VALUES)
+        return base, base - effect
+    whole = make_model(catalogue()) if catalogue().get(effect.name) == effect else base_model() + effect
+    nothing = {f"{e.name}.{p.name}": p.zero for e in whole for p in e.parameters if e.kind != "base"}
+    none = whole.with_values({**nothing, **REFERENCE_VALUES})
+    own = {f"{effect.name}.{p.name}": p for p in effect.parameters}
+    if effect.kind == "base":
+        return none, none.with_values({name: p.zero for name, p in own.items()})
+    return none.with_values({name: p.default for name, p in own.items()}), none
+
+
+def _end_s(with_it: Model, without: Model, trial: Trial, trace: Trace | None) -> float:
+    if trace is not None:
+        return float(trace[0][-1])
+    ends = []
+    for model in (with_it, without):
+        found = simulate(model, trial, np.linspace(0.0, 2.0, 50))
+        ends.append(found.end_time_s if found.status == "ended" else math.inf)
+    end = min(ends)
+    return 0.99 * end if math.isfinite(end) else 0.5
+
+
+def _seen_velocity(motion: Trajectory) -> Floats:
+    """Speed of the edge as it is reported."""
+    return np.gradient(motion.observed_position_m, motion.time_s)

@@ -1,0 +1,189 @@
+"""A model is a sum of effects with values for their parameters."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
+
+Value = float | Mapping[str, float]
+"""A parameter's value: one number, or one for each vine by name."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A sum of effects; `model + effect` and `model - effect` (or its name) give new models.
+
+    `values` holds parameters by `effect.parameter` (B of `eversion_damping` is `"eversion_damping.B"`), SI; what is not
+    given stands at its default. A value shared per vine may be a mapping from the vine's name.
+
+    Examples
+    --------
+    >>> import vinetrack.effects as effects
+    >>> model = base_model() + effects.reservoir_depletion
+    >>> print(model)
+    m(x) ẍ = tip force +PA, on the tail +½PA, by ½ = 1/r
+             tail force +m(x) g cosθ
+             tip force −B ẋⁿ, on the tail −½B ẋⁿ, by ½ = 1/r
+             tip force −P_y A, on the tail −½P_y A, by ½ = 1/r
+             P → (P₀ + P_atm) (V₀ / (V₀ + A y))^γ − P_atm
+      g = 9.81 m/s²
+      B = 3 N·(s/m)ⁿ
+      n = 0.37
+      γ = 1.4
+    """
+
+    effects: tuple[Effect, ...]
+    values: Mapping[str, Value] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names = [effect.name for effect in self.effects]
+        if len(set(names)) != len(names):
+            raise EffectError(f"An effect stands twice in the model: {', '.join(names)}.")
+        unknown = set(self.values) - set(self.parameter_names)
+        if unknown:
+            raise EffectError(
+                f"No effect of the model has the parameter {', '.join(sorted(unknown))}; it has "
+                f"{', '.join(self.parameter_names) or 'none'}."
+            )
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, in order."""
+        return tuple(effect.name for effect in self.effects)
+
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Every parameter as `effect.parameter`, in the order of `parameters_for`."""
+        return tuple(f"{effect.name}.{parameter.name}" for effect in self.effects for parameter in effect.parameters)
+
+    def __add__(self, other: Effect) -> Model:
+        return replace(self, effects=(*self.effects, other))
+
+    def __sub__(self, other: Effect | str) -> Model:
+        name = other if isinstance(other, str) else other.name
+        if name not in self.names:
+            raise EffectError(f"The model has no effect {name!r}; it has {', '.join(self.names)}.")
+        values = {key: value for key, value in self.values.items() if key.split(".")[0] != name}
+        return Model(tuple(effect for effect in self.effects if effect.name != name), values)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __iter__(self) -> Iterator[Effect]:
+        return iter(self.effects)
+
+    def with_values(self, values: Mapping[str, Value]) -> Model:
+        """The same sum with these parameter values in place of its own."""
+        return replace(self, values={**self.values, **values})
+
+    def parameters_for(self, vine: str) -> Floats:
+        """Values of all parameters for one vine, shape (n_parameters,), in the order of `parameter_names`.
+
+        Raises
+        ------
+        EffectError
+            If a value is given per vine and this vine is not among them.
+        """
+        numbers = []
+        for effect in self.effects:
+            for parameter in effect.parameters:
+                value = self.values.get(f"{effect.name}.{parameter.name}", parameter.default)
+                if isinstance(value, Mapping):
+                    if vine not in value:
+                        raise EffectError(f"{effect.name}.{parameter.name} has no value for the vine {vine!r}.")
+                    value = value[vine]
+                numbers.append(float(value))
+        return np.array(numbers)
+
+    def __str__(self) -> str:
+        terms = "\n         ".join(effect.formula for effect in self.effects)
+        lines = [f"m(x) ẍ = {terms}"]
+        for effect in self.effects:
+            for parameter in effect.parameters:
+                value = self.values.get(f"{effect.name}.{parameter.name}", parameter.default)
+                unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+                pairs = sorted(value.items()) if isinstance(value, Mapping) else [("", value)]
+                lines += [
+                    f"  {parameter.symbol}{f' ({vine})' if vine else ''} = {number:.6g}{unit}" for vine, number in pairs
+                ]
+        return "\n".join(lines)
+
+
+def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
+    """Which effects act, shape (n_trials, n_effects), for parameters of shape (n_trials, n_parameters).
+
+    An effect of no size (every parameter at its `zero`) does not act, nor one that an acting effect replaces: so one
+    compiled model serves all the smaller ones in it.
+    """
+    on = np.ones((len(parameters), len(model.effects)), dtype=bool)
+    places = _places(model)
+    for i, (effect, place) in enumerate(zip(model.effects, places, strict=True)):
+        if effect.parameters:
+            on[:, i] = np.any(parameters[:, place] != np.array(effect.zero), axis=1)
+    acting = on.copy()
+    for i, effect in enumerate(model.effects):
+        for j, other in enumerate(model.effects):
+            if other.name in effect.replaces:
+                on[:, j] &= ~acting[:, i]
+    return on
+
+
+def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
+    """Parameters of a model as those of a larger one that holds it, shape (n_trials, n_parameters of the host).
+
+    What the model lacks stands at its `zero`.
+
+    Raises
+    ------
+    EffectError
+        If the host lacks an effect of the model.
+    """
+    lacking = [name for name in model.names if name not in host]
+    if lacking:
+        raise EffectError(f"The host model has no effect {', '.join(lacking)}.")
+    zeros = [number for effect in host.effects for number in effect.zero]
+    wider = np.tile(np.array(zeros, dtype=float), (len(parameters), 1))
+    places = [host.parameter_names.index(name) for name in model.parameter_names]
+    wider[:, places] = parameters
+    return wider
+
+
+def asked(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]]:
+    """The functions of a hook in the order in which they are asked: place of the effect, function, its parameters."""
+    found = [
+        (effect.order, i, effect.functions[hook], place)
+        for i, (effect, place) in enumerate(zip(model.effects, _places(model), strict=True))
+        if hook in effect.functions
+    ]
+    return [(i, function, place) for _, i, function, place in sorted(found, key=lambda entry: entry[0])]
+
+
+def _places(model: Model) -> list[slice]:
+    """Where in the parameters each effect finds its own."""
+    ends = list(itertools.accumulate((len(effect.parameters) for effect in model.effects), initial=0))
+    return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def make_model(names: Iterable[str] = BASE_EFFECTS, own: Mapping[str, Effect] | None = None) -> Model:
+    """The model with these effects, looked up among the user's `own` and in the catalogue.
+
+    Raises
+    ------
+    EffectError
+        If a name is unknown or stands twice.
+    """
+    return Model(tuple(find_effect(name, own) for name in names))
+
+
+def base_model() -> Model:
+    """The four base effects: the equation of motion of the paper, Eq. (2)."""
+    return make_model()

@@ -1,0 +1,372 @@
+"""The trajectory that a model gives for a trial."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Callable, Sequence, Sized
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.kernel import kernel
+from vinetrack.dynamics.model import Model, asked, effects_on, hosted
+from vinetrack.dynamics.trial_inputs import check_needs, trial_inputs
+from vinetrack.effects import State, TrialInputs
+
+RELATIVE_TOLERANCE = 1e-4
+"""Local tolerance on the speed. Hairer's estimate is of order 3, the method of order 5: positions come out good to 10⁻⁶
+of the distance travelled on every trial of the paper's protocol (`benchmarks/integrator.py` measures it)."""
+
+STATUS = ("running", "ended", "stalled", "too hard")
+
+_NOTHING = State(*(math.nan,) * len(State._fields))
+
+SMALLEST_SHARE = 64
+"""Trials, about a millisecond of work, below which another thread costs more than it saves."""
+
+Trace = tuple[Floats, Floats]
+"""Times since release, s, and gauge pressures, Pa, measured there."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Motion of one trial since release; arrays have shape (n_times,), SI.
+
+    `observed_position_m` is the lead position as the camera reports it: another where the model has measurement
+    effects. `status` is `ended` where all film was everted before the last time asked for, `stalled` where it stopped
+    for good before, else `running`. `end_time_s` is when growth ended (or last stalled), NaN if it did not;
+    `slack_from_s` when the tail of a trial that lets it (`tail_slack: free`) first went slack.
+    """
+
+    time_s: Floats
+    lead_position_m: Floats
+    lead_velocity_m_s: Floats
+    lead_acceleration_m_s2: Floats
+    observed_position_m: Floats
+    travel_ratio: float
+    status: str
+    end_time_s: float
+    end_lead_velocity_m_s: float
+    n_steps: int
+    slack_from_s: float = math.nan
+
+    @property
+    def tail_velocity_m_s(self) -> Floats:
+        """Speed of the tail while it is taut, shape (n_times,)."""
+        return self.travel_ratio * self.lead_velocity_m_s
+
+
+class SimulationError(RuntimeError):
+    """A trajectory could not be followed; the message names the trial."""
+
+
+def simulate(
+    model: Model,
+    trial: Trial,
+    times_s: Floats,
+    *,
+    trace: Trace | None = None,
+    relative_tolerance: float = RELATIVE_TOLERANCE,
+) -> Trajectory:
+    """Follow one trial from rest at release.
+
+    Parameters
+    ----------
+    times_s : array, shape (n_times,), s since release, increasing; before 0 the vine is at rest
+    trace : measured gauge pressure, which then takes the place of the set pressure and of what happens in the chamber
+
+    Raises
+    ------
+    EffectError
+        If the trial lacks what an effect needs.
+    SimulationError
+        If the integration does not get through.
+    """
+    return simulate_many(model, [trial], [times_s], traces=[trace], relative_tolerance=relative_tolerance)[0]
+
+
+def simulate_many(
+    model: Model,
+    trials: Sequence[Trial],
+    times_s: Sequence[Floats],
+    *,
+    traces: Sequence[Trace | None] | None = None,
+    parameters: Floats | None = None,
+    host: Model | None = None,
+    relative_tolerance: float = RELATIVE_TOLERANCE,
+) -> list[Trajectory]:
+    """`simulate` for many trials in one call of the compiled kernel.
+
+    `parameters`, shape (n_trials, n_parameters) in the order of `model.parameter_names`, gives every trial values of
+    its own in place of the model's. A `host` is a larger model whose compiled form serves this one: its other effects
+    rest.
+    """
+    batch = prepare(model, trials, times_s, traces=traces, parameters=parameters, host=host)
+    ratios = [trial.travel_ratio for trial in trials]
+    return trajectories(batch, ratios, [trial.name for trial in trials], relative_tolerance)
+
+
+def trajectories(
+    batch: Batch, ratios: Sequence[float], names: Sequence[str], relative_tolerance: float = RELATIVE_TOLERANCE
+) -> list[Trajectory]:
+    """Run a batch; travel ratios and names by trial.
+
+    Raises
+    ------
+    SimulationError
+        If the integration does not get through.
+    """
+    out, ends = batch.run(relative_tolerance)
+    edges = batch.starts.tolist()
+    return [
+        _trajectory(names[i], ratios[i], batch.times_s[i], out[edges[i] : edges[i + 1]], end)
+        for i, end in enumerate(ends.tolist())
+    ]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Many trials laid out for the compiled kernel: prepared once, run as often as one likes.
+
+    Trial i has rows `starts[i]:starts[i + 1]` of the answer. `thetas`, shape (n_trials, n_parameters), may be replaced
+    between runs as long as no effect changes between none and some.
+    """
+
+    integrate_many: Callable[..., None]
+    times_s: list[Floats]
+    starts: NDArray[np.int64]
+    times: Floats
+    on: NDArray[np.bool_]
+    rigs: Floats
+    thetas: Floats
+    trace_starts: NDArray[np.int64]
+    trace_time: Floats
+    trace_pressure: Floats
+    bend_starts: NDArray[np.int64]
+    bends: Floats
+    kinks: Floats
+    stops: Floats
+
+    def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
+        """Integrate every trial.
+
+        Parameters
+        ----------
+        threads
+            Threads to share the trials among, by default one for every 64 trials and no more than there are cores:
+            the kernel runs outside the interpreter's lock.
+
+        Returns
+        -------
+        out : array, shape (n_times, 4): x, v, a of the tail, position of the leading edge as the camera reports it
+        ends : array, shape (n_trials, 5): status, end time, end speed, number of steps, first slack
+        """
+        count = self.starts.size - 1
+        out, ends = np.empty((self.times.size, 4)), np.empty((count, 5))
+        threads = threads or max(1, min(os.cpu_count() or 1, count // SMALLEST_SHARE))
+        edges = np.linspace(0, count, threads + 1).astype(int).tolist()
+        if threads == 1:
+            self._part(0, count, relative_tolerance, out, ends)
+        else:
+            rest = relative_tolerance, out, ends
+            (begin, end), *others = itertools.pairwise(edges)
+            shares = [_pool(os.getpid(), threads).submit(self._part, a, b, *rest) for a, b in others]
+            self._part(begin, end, *rest)
+            for share in shares:
+                share.result()
+        return out, ends
+
+    def _part(self, a: int, b: int, relative_tolerance: float, out: Floats, ends: Floats) -> None:
+        """Trials a to b, each into its own rows of `out` and `ends`."""
+        self.integrate_many(
+            self.starts[a : b + 1],
+            self.times,
+            self.on[a:b],
+            self.rigs[a:b],
+            self.thetas[a:b],
+            self.trace_starts[a : b + 1],
+            self.trace_time,
+            self.trace_pressure,
+            self.bend_starts[a : b + 1],
+            self.bends,
+            self.kinks[a:b],
+            self.stops[a:b],
+            relative_tolerance,
+            out,
+            ends[a:b],
+        )
+
+
+@lru_cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
+    """Threads that wait for work; a process that was forked off has its own."""
+    return ThreadPoolExecutor(threads)
+
+
+def prepare(
+    model: Model,
+    trials: Sequence[Trial],
+    times_s: Sequence[Floats],
+    *,
+    traces: Sequence[Trace | None] | None = None,
+    parameters: Floats | None = None,
+    host: Model | None = None,
+) -> Batch:
+    """Lay out trials for the compiled kernel; arguments as those of `simulate_many`.
+
+    Raises
+    ------
+    EffectError
+        If a trial lacks what an effect needs, or the host does not hold the model.
+    """
+    check_needs(model, *trials)
+    rigs = np.array([trial_inputs(trial) for trial in trials], dtype=float).reshape(
+        len(trials), len(TrialInputs._fields)
+    )
+    if parameters is None:
+        of_vine = {vine: model.parameters_for(vine) for vine in {trial.vine for trial in trials}}
+        parameters = np.array([of_vine[trial.vine] for trial in trials])
+    bends = [bends_of(trial) for trial in trials]
+    return lay_out(model, rigs, bends, times_s, traces=traces, parameters=parameters, host=host)
+
+
+def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
+    """Start, arc and radius of a trial's bends, m."""
+    return [(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]
+
+
+def lay_out(
+    model: Model,
+    rigs: Floats,
+    bends: Sequence[Sequence[tuple[float, float, float]]],
+    times_s: Sequence[Floats],
+    *,
+    traces: Sequence[Trace | None] | None = None,
+    parameters: Floats,
+    host: Model | None = None,
+) -> Batch:
+    """As `prepare`, for trials that are rows of rigs already, shape (n_trials, n_fields of `TrialInputs`)."""
+    count = len(rigs)
+    traces = traces or [None] * count
+    thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
+    given = [trace for trace in traces if trace is not None]
+    if host is not None and host.names != model.names:
+        resting = np.array([name not in model for name in host.names])
+        model, thetas = host, hosted(host, model, thetas)
+        on = effects_on(model, thetas) & ~resting
+    else:
+        on = effects_on(model, thetas)
+    kinks, stops = _limits(model, rigs, thetas, on, bends)
+    given_times = [np.asarray(t, dtype=float) for t in times_s]
+    true_times = _true_times(model, rigs, thetas, on, given_times)
+    tail_free = bool(rigs[:, TrialInputs._fields.index("tail_free")].any()) if count else False
+    return Batch(
+        integrate_many=kernel(model.effects, tail_free).integrate_many,
+        times_s=given_times,
+        starts=_starts(given_times),
+        times=np.concatenate(true_times) if true_times else np.empty(0),
+        on=on,
+        rigs=rigs,
+        thetas=thetas,
+        trace_starts=_starts([() if trace is None else trace[0] for trace in traces]),
+        trace_time=np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0),
+        trace_pressure=np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0),
+        bend_starts=_starts(bends),
+        bends=np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
+        kinks=kinks,
+        stops=stops,
+    )
+
+
+def _starts(parts: Sequence[Sized]) -> NDArray[np.int64]:
+    """Where each part begins when all are laid end to end, and where the last ends, shape (n_parts + 1,)."""
+    return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+
+
+def _limits(
+    model: Model,
+    rigs: Floats,
+    thetas: Floats,
+    on: NDArray[np.bool_],
+    bends: Sequence[Sequence[tuple[float, float, float]]],
+) -> tuple[Floats, Floats]:
+    """Tail travel at which forces have corners, rising, and at which growth ends, m; infinite where they do not.
+
+    Of shape (n_trials, n_corners) and (n_trials,). Corners are where the film's mass reaches its floor, where bends
+    begin and end, and what effects say of theirs.
+    """
+    rig = TrialInputs(*rigs.T)
+    film = np.ones(len(rigs))
+    for effect, function, place in asked(model, "film_gain"):
+        for k in np.flatnonzero(on[:, effect]).tolist():
+            film[k] *= function(_NOTHING, TrialInputs(*rigs[k]), *thetas[k, place])
+    end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
+    left = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
+    loss = np.asarray(rig.mass_loss)
+    floor = np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf)
+    cornered = [i for i, effect in enumerate(model.effects) if effect.corners is not None and on[:, i].any()]
+    if not cornered and not any(bends):
+        return floor[:, None].copy(), end
+    found = [[edge for start, arc, _ in rows for edge in (start, start + arc)] for rows in bends]
+    for i in cornered:
+        corners = model.effects[i].corners
+        assert corners is not None
+        for k in np.flatnonzero(on[:, i]).tolist():
+            found[k] += corners(TrialInputs(*rigs[k]))
+    kinks = np.full((len(rigs), 1 + max(map(len, found), default=0)), math.inf)
+    kinks[:, 0] = floor
+    for k, positions in enumerate(found):
+        kinks[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
+    return np.sort(kinks, axis=1), end
+
+
+def _true_times(
+    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], times_s: Sequence[Floats]
+) -> list[Floats]:
+    """When what the camera stamps `times_s` really happened, by trial."""
+    found = list(times_s)
+    for effect, function, place in asked(model, "true_time"):
+        for i in np.flatnonzero(on[:, effect]):
+            state = _NOTHING._replace(time=found[i])  # type: ignore[arg-type]
+            found[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float)
+    return found
+
+
+def _trajectory(name: str, r: float, times_s: Floats, out: Floats, end: Sequence[float]) -> Trajectory:
+    status = STATUS[int(end[0])]
+    if status == "too hard":
+        raise SimulationError(f"Trial {name}: the model could not be integrated beyond {end[1]:.6g} s.")
+    return Trajectory(
+        time_s=times_s,
+        lead_position_m=out[:, 0] / r,
+        lead_velocity_m_s=out[:, 1] / r,
+        lead_acceleration_m_s2=out[:, 2] / r,
+        observed_position_m=out[:, 3],
+        travel_ratio=r,
+        status=status,
+        end_time_s=end[1],
+        end_lead_velocity_m_s=end[2] / r,
+        n_steps=int(end[3]),
+        slack_from_s=end[4],
+    )
+
+
+__all__ = [
+    "Batch",
+    "SimulationError",
+    "Trajectory",
+    "bends_of",
+    "check_needs",
+    "lay_out",
+    "prepare",
+    "simulate",
+    "simulate_many",
+    "trajectories",
+    "trial_inputs",
+]

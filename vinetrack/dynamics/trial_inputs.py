@@ -1,0 +1,95 @@
+"""A trial as the effects see it: SI numbers that stay the same while it grows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vinetrack.core.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.model import Model
+from vinetrack.effects import EffectError, TrialInputs
+
+
+def trial_inputs(trial: Trial) -> TrialInputs:
+    """What the effects see of a trial, in SI."""
+    whole_body = trial.travel_ratio == 1
+    length = trial.length_m if math.isfinite(trial.length_m) else 0.0
+    area = trial.area_m2 if math.isfinite(trial.diameter_m) else 0.0
+    linear_density = trial.linear_density_kg_m
+    pressure = 0.0 if whole_body and not math.isfinite(trial.pressure_Pa) else trial.pressure_Pa
+    yield_pressure = 0.0 if whole_body and not math.isfinite(trial.yield_pressure_Pa) else trial.yield_pressure_Pa
+    gas_density = (pressure + trial.ambient_pressure_Pa) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
+    fold = 0.0 if linear_density == 0 else linear_density * math.pi * trial.thickness_m
+    return TrialInputs(
+        set_pressure=pressure,
+        yield_pressure=yield_pressure,
+        diameter=trial.diameter_m,
+        thickness=trial.thickness_m,
+        length=length,
+        area=area,
+        linear_density=linear_density,
+        mass_loss=trial.mass_loss_kg_m if linear_density else 0.0,
+        payload_mass=trial.payload_kg,
+        cos_angle=math.cos(trial.growth_angle_rad),
+        travel_ratio=trial.travel_ratio,
+        ambient_pressure=trial.ambient_pressure_Pa,
+        chamber_volume=trial.chamber_m3,
+        inlet_area=math.pi * trial.inlet_m**2 / 4,
+        least_mass=fold + gas_density * area * length / trial.travel_ratio**2,
+        has_bends=float(bool(trial.bends)),
+        tail_on_reel=float(trial.tail_store == "reel"),
+        bend_count=float(len(trial.bends)),
+        bend_total=sum(bend.arc_m / bend.radius_m for bend in trial.bends),
+        as_printed=float(trial.mass_loss == "as_printed"),
+        tail_free=float(trial.tail_slack == "free" and not whole_body),
+    )
+
+
+def with_pressures(rigs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
+    """The same rigs, rows of `TrialInputs`, at other pressures, shape (n_rigs,); the gas weighs as much more.
+
+    A yield pressure that is NaN leaves that of the rig.
+    """
+    place = {name: k for k, name in enumerate(TrialInputs._fields)}
+    changed = rigs.copy()
+    denser = (set_pressure_Pa - rigs[:, place["set_pressure"]]) / (GAS_CONSTANT_AIR_J_KG_K * TEMPERATURE_K)
+    volume = rigs[:, place["area"]] * rigs[:, place["length"]] / rigs[:, place["travel_ratio"]] ** 2
+    changed[:, place["set_pressure"]] = set_pressure_Pa
+    changed[:, place["least_mass"]] += denser * volume
+    known = ~np.isnan(yield_pressure_Pa)
+    changed[known, place["yield_pressure"]] = yield_pressure_Pa[known]
+    return changed
+
+
+_COLUMN_OF_FIELD = {
+    "chamber_l": "chamber_m3",
+    "yield_pressure_kPa": "yield_pressure_Pa",
+    "inlet_mm": "inlet_m",
+    "payload_g": "payload_kg",
+    "thickness_um": "thickness_m",
+    "length_mm": "length_m",
+}
+
+
+def stated(column: str, trial: Trial) -> bool:
+    """Whether the sheet gives a trial a number other than zero in this column."""
+    value = getattr(trial, _COLUMN_OF_FIELD.get(column, column), math.nan)
+    return not isinstance(value, float) or (math.isfinite(value) and value != 0)
+
+
+def check_needs(model: Model, *trials: Trial) -> None:
+    """Refuse trials that lack what an effect of the model needs.
+
+    Raises
+    ------
+    EffectError
+        Naming the effect, the column and the trial.
+    """
+    needs = [(effect, column, _COLUMN_OF_FIELD.get(column, column)) for effect in model for column in effect.needs]
+    for trial in trials:
+        for effect, column, attribute in needs:
+            value = getattr(trial, attribute, math.nan)
+            if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
+                raise EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")

@@ -1,0 +1,339 @@
+"""An experiment folder read and checked whole: sheet, settings and, on request, every track.
+
+All problems are collected before anything is raised. A fault of the sheet or the settings stops the experiment; a
+fault confined to one row gives that trial alone `failed`, unless the experiment is `strict`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vinetrack.core.problems import ExperimentError, Problem, format_problems
+from vinetrack.core.records import Trial
+from vinetrack.core.tables import Table, TableError, read_table, safe_join
+from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import COLUMNS, SHARED, oddity
+from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
+from vinetrack.experiment.sheet import (
+    SHEET,
+    Row,
+    find_missing,
+    judge_pressures,
+    judge_row,
+    make_trial,
+    read_row,
+    unknown_columns,
+)
+from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
+
+__all__ = ["Experiment", "ExperimentError", "Problem", "check_experiment", "format_problems", "read_experiment"]
+
+SETTINGS = "experiment.yaml"
+EXPECTED = f"expected a folder with {SHEET} (one row a trial) and, with videos, {SETTINGS}"
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What a folder holds.
+
+    `trials` are those to analyse, in the order of the sheet; `failed` maps the name of every trial with a fault to
+    the reason, `left_out` those that the sheet puts aside (`use: no`) likewise; `names` lists all three in the order
+    of the sheet and `lines` gives their lines in it. `problems` holds everything that was found, warnings too.
+    """
+
+    name: str
+    folder: Path
+    settings: ExperimentSettings
+    trials: tuple[Trial, ...]
+    failed: dict[str, str] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    problems: tuple[Problem, ...] = ()
+    lines: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every trial of the sheet, in its order."""
+        return tuple(self.lines)
+
+    def trial(self, name: str) -> Trial:
+        """The trial of that name among `trials`; KeyError where there is none."""
+        return {trial.name: trial for trial in self.trials}[name]
+
+
+def read_experiment(folder: Path | str, strict: bool | None = None) -> Experiment:
+    """Read the sheet and settings of an experiment; see `Experiment`.
+
+    Tracks are opened only where a pressure must be taken from them, videos never: see `check_experiment`.
+
+    Parameters
+    ----------
+    folder
+        The experiment's folder.
+    strict
+        Whether a fault of one row is a fault of the whole; None leaves it to `strict` in the settings.
+
+    Raises
+    ------
+    ExperimentError
+        With all problems, if the sheet or the settings cannot be read, or if any row has a fault and it is strict.
+    """
+    folder = Path(folder)
+    problems: list[Problem] = []
+    settings = _read_settings(folder, problems)
+    table = _read_sheet(folder, problems)
+    rows = [read_row(table, i, settings or ExperimentSettings()) for i in range(len(table.rows))] if table else []
+    absent: set[str] = set()
+    for row in rows:
+        if row.in_use:
+            judge_row(row, folder)
+            # Without the shared settings nobody knows what is missing.
+            absent |= find_missing(row, folder, table.columns) if table and settings else set()
+    problems += _compare_names(rows)
+    problems += [_absent_column(name) for name in COLUMNS if name in absent]
+    sheet_is_sound = not any(problem.severity == "error" for problem in problems)
+    for row in rows:
+        if sheet_is_sound and row.in_use and not row.failed:
+            _take_pressure_from_recording(row, folder)
+            judge_pressures(row)
+    problems += _merge_warnings(problem for row in rows for problem in row.problems)
+    strict = strict if strict is not None else settings is not None and settings.strict
+    if settings is None or not sheet_is_sound or (strict and any(row.failed and row.in_use for row in rows)):
+        raise ExperimentError(problems)
+    return _assemble(folder, settings, rows, problems)
+
+
+def _assemble(folder: Path, settings: ExperimentSettings, rows: list[Row], problems: list[Problem]) -> Experiment:
+    """Sort the rows into trials to analyse, failed and left out."""
+    good = [row for row in rows if row.in_use and not row.failed]
+    errors = {row.name: [p.reason for p in row.problems if p.severity == "error"] for row in rows if row.in_use}
+    return Experiment(
+        name=Path(os.path.normpath(folder.absolute())).name or "experiment",
+        folder=folder,
+        settings=settings,
+        trials=with_names([make_trial(row, folder, settings) for row in good]),
+        failed={name: "; ".join(reasons) for name, reasons in errors.items() if reasons},
+        left_out={row.name: "left out by the sheet (use: no)" for row in rows if not row.in_use},
+        problems=tuple(problems),
+        lines={row.name: row.line for row in rows},
+    )
+
+
+def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings | None:
+    """Settings, or None if they cannot be read; their paths are checked as well."""
+    try:
+        settings = read_experiment_settings(folder / SETTINGS)
+    except ExperimentError as error:
+        problems += error.problems
+        return None
+    for key, relative in _settings_paths(settings):
+        try:
+            safe_join(folder, relative)
+        except TableError as error:
+            problems.append(_from_table_error(error, SETTINGS, column=key, value=relative))
+    for name in SHARED:
+        value = getattr(settings, name)
+        if COLUMNS[name].kind == "number" and value is not None and (hint := oddity(COLUMNS[name], value)):
+            place: dict[str, Any] = {"file": SETTINGS, "column": name, "value": f"{value:g}"}
+            problems.append(Problem(message=f"is unusual: {hint}", severity="warning", **place))
+    return settings
+
+
+def _settings_paths(settings: ExperimentSettings) -> list[tuple[str, str]]:
+    """Every path in the settings, with its key."""
+    image = getattr(settings.calibration, "image", None)
+    paths = [("effects", path) for path in settings.effects]
+    return [*paths, ("calibration.image", image)] if image is not None else paths
+
+
+def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
+    """The sheet as a table, or None; notes columns that are missing or not known."""
+    if not folder.is_dir():
+        message = "is a file, not a folder" if folder.exists() else "does not exist"
+        problems.append(Problem(message=message, file=str(folder), remedy=EXPECTED))
+        return None
+    if not (folder / SHEET).exists():
+        problems.append(Problem(message="is missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
+        return None
+    try:
+        table = read_table(folder / SHEET)
+    except TableError as error:
+        problems.append(_from_table_error(error, SHEET))
+        return None
+    problems += _judge_columns(table)
+    return table
+
+
+def _missing_sheet_remedy(folder: Path) -> str:
+    """What to do where there is no sheet: a name that comes close, or else what was expected."""
+    try:
+        names = sorted(path.name for path in folder.iterdir())
+    except OSError:
+        return "allow its folder to be read"
+    close = difflib.get_close_matches(SHEET, [name for name in names if "tri" in name.lower()], 1, 0.5)
+    if close and not close[0].endswith(".csv"):
+        return f"save {close[0]} as {SHEET}"
+    if close:
+        return f"rename {close[0]} to {SHEET}"
+    return EXPECTED if names else f"the folder is empty; {EXPECTED}"
+
+
+def _judge_columns(table: Table) -> list[Problem]:
+    """Problems of the header, and a sheet without rows."""
+    problems = unknown_columns(table, SHEET)
+    if table.nameless:
+        problems.append(Problem(message="has a column without a name, ignored", file=SHEET, severity="warning"))
+    if "trial" not in table.columns:
+        problems.append(_absent_column("trial"))
+    if not {"video", "track"} & set(table.columns):
+        message = "has neither a column video nor a column track"
+        problems.append(Problem(message=message, file=SHEET, remedy="add the one that applies"))
+    if not table.rows:
+        problems.append(Problem(message="has no rows", file=SHEET, remedy="write one row a trial below the header"))
+    return problems
+
+
+def _absent_column(name: str) -> Problem:
+    remedy = f"add the column {name}" + ("" if name == "trial" else f", or the key to {SETTINGS}")
+    return Problem(message="is missing", file=SHEET, column=name, remedy=remedy)
+
+
+def _compare_names(rows: list[Row]) -> list[Problem]:
+    """Names used twice (errors) and names that differ in case alone, which some file systems take for one."""
+    problems, seen = [], dict[str, Row]()
+    for row in rows:
+        first = seen.setdefault(row.name.lower(), row)
+        if first is row:
+            continue
+        place: dict[str, Any] = {"file": SHEET, "trial": row.name, "column": "trial", "value": row.name}
+        if first.name == row.name:
+            message = f"is also the name of line {first.line}"
+            problems.append(Problem(message=message, line=row.line, remedy="name every trial once", **place))
+        else:
+            message = f"differs from {first.name!r} of line {first.line} in case alone: some computers mix them up"
+            problems.append(Problem(message=message, line=row.line, severity="warning", **place))
+    return problems
+
+
+def _take_pressure_from_recording(row: Row, folder: Path) -> None:
+    """Fill a blank pressure with the first value of the trace, to three digits: the nominal pressure of the trial."""
+    if "pressure_kPa" in row.values or row.travel_ratio == 1:
+        return
+    column = "pressure_trace" if "pressure_trace" in row.values else "track"
+    path = safe_join(folder, row.values[column])
+    try:
+        pressure = read_pressure_trace(path)[1] if column == "pressure_trace" else read_track(path).pressure_Pa
+    except TrackError as error:
+        message, _, remedy = str(error).partition(": ")
+        row.add(message, column, value=row.values[column], remedy=remedy)
+        return
+    if pressure is None:
+        remedy = "fill it in, or give the track a column pressure_kPa"
+        row.add("is blank, and the track carries no pressure", "pressure_kPa", remedy=remedy)
+        return
+    nominal_kPa = float(f"{float(pressure[0]) / 1000:.3g}")
+    if nominal_kPa < 0:
+        remedy = f"fill it in: the measured pressure starts at {nominal_kPa:g} kPa, which is none"
+        row.add("is blank", "pressure_kPa", value="", remedy=remedy)
+        return
+    row.values["pressure_kPa"] = nominal_kPa
+
+
+def _merge_warnings(problems: Iterable[Problem]) -> list[Problem]:
+    """The same warning about the same value in many rows is said once."""
+    merged: dict[object, list[Problem]] = {}
+    for problem in problems:
+        key = (problem.column, problem.value, problem.message) if problem.severity == "warning" else id(problem)
+        merged.setdefault(key, []).append(problem)
+    return [
+        group[0]
+        if len(group) == 1
+        else replace(group[0], message=f"{group[0].message} [and {len(group) - 1} more rows]")
+        for group in merged.values()
+    ]
+
+
+def _from_table_error(error: Exception, file: str, **details: Any) -> Problem:
+    message, _, remedy = str(error).partition(": ")
+    return Problem(message=message, file=file, remedy=remedy, **details)
+
+
+Survey = Callable[[Experiment, list[Trial]], Iterable[Problem]]
+
+
+def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> list[Problem]:
+    """Every problem of an experiment that can be found in seconds: sheet, settings, tracks, and that videos exist.
+
+    `open_videos` may look into the recordings that are there, and the calibration; see `vinetrack.video.survey`.
+    """
+    try:
+        experiment = read_experiment(folder, strict=False)
+    except ExperimentError as error:
+        return list(error.problems)
+    problems = list(experiment.problems)
+    for key, relative in _settings_paths(experiment.settings):
+        if not safe_join(experiment.folder, relative).exists():
+            message = "does not exist"
+            problems.append(
+                Problem(message=message, file=SETTINGS, column=key, value=relative, remedy="check the path")
+            )
+    found: list[Problem] = []
+    there: list[Trial] = []
+    for trial in experiment.trials:
+        of_trial = _check_track(trial) if trial.track else _check_video(trial)
+        found += [replace(problem, trial=trial.name) for problem in of_trial]
+        if trial.video and not of_trial:
+            there.append(trial)
+    if there and open_videos is not None:
+        found += open_videos(experiment, there)
+    lines = experiment.lines
+    return problems + [
+        replace(problem, file=SHEET, line=lines[problem.trial]) if problem.trial else problem for problem in found
+    ]
+
+
+def _check_track(trial: Trial) -> list[Problem]:
+    """Read the track and its pressure, and hold both against what the sheet says of the trial."""
+    place: dict[str, Any] = {"column": "track", "value": trial.track.name if trial.track else ""}
+    try:
+        track = load_track(trial)
+    except TrackError as error:
+        return [_from_table_error(error, SHEET, **place)]
+    found = []
+    frames = float(np.median(np.diff(track.time_s))) * trial.capture_fps
+    if abs(frames - 1) > 0.02:
+        found.append(f"has points {frames:.4g} frames of capture_fps apart: is capture_fps right?")
+    travel_m = float(np.ptp(track.lead_position_m[track.usable]))
+    # Twice the length leaves room for an axis in the wrong unit of angle or a poor scale, not for mm taken as m.
+    if travel_m > 2 * trial.length_m:
+        found.append(f"travels {travel_m:.4g} m, the vine is {trial.length_m:g} m long: are its positions in metres?")
+    if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
+        found.append("runs backwards: position should grow as the vine does")
+    if track.pressure_Pa is not None and trial.pressure_Pa > 0:
+        highest_kPa = float(np.max(track.pressure_Pa)) / 1000
+        if not 0.5 < highest_kPa / (trial.pressure_Pa / 1000) < 2:
+            found.append(f"has pressures up to {highest_kPa:.4g} kPa, the sheet says {trial.pressure_Pa / 1000:g} kPa")
+    return [Problem(message=message, severity="warning", **place) for message in found]
+
+
+def _check_video(trial: Trial) -> list[Problem]:
+    """Whether there is something to decode at all."""
+    path = trial.video
+    if path is None:
+        return []
+    place: dict[str, Any] = {"column": "video", "value": path.name}
+    try:
+        if path.is_dir():
+            empty = not any(path.iterdir())
+            return [Problem(message="is an empty folder", remedy="put frames in it", **place)] if empty else []
+        if path.stat().st_size == 0:
+            return [Problem(message="is an empty file", remedy="copy it anew", **place)]
+    except (OSError, ValueError):
+        return [Problem(message="does not exist", remedy="check the path and its upper and lower case", **place)]
+    return []

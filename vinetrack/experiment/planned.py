@@ -1,0 +1,186 @@
+"""Trials that nobody has filmed yet: given one by one, or as the rows of a sheet without recordings.
+
+Both are judged cell by cell as a trial sheet is, so that kPa typed as Pa gets the same sentence everywhere.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.records import Trial
+from vinetrack.core.tables import Table, TableError, read_table
+from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.schema import COLUMNS, SHARED
+from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
+from vinetrack.experiment.sheet import SHEET, Row, judge_pressures, judge_wall, make_trial, read_row, unknown_columns
+
+NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
+"""What must be known of a vine before anything can be said of it; its yield pressure can be guessed."""
+
+_RECORDED = ("video", "track", "pressure_trace", "capture_fps", "exposure_us", "mm_per_px", "steady")
+"""Columns about recordings, which a trial that is only planned may lack or have."""
+
+Shown = Callable[[Problem], Problem]
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Trials that are planned, one a condition, with the settings they share; `problems` are warnings."""
+
+    trials: tuple[Trial, ...]
+    settings: ExperimentSettings
+    folder: Path | None
+    problems: tuple[Problem, ...]
+
+
+def option(column: str) -> str:
+    """The command line's option for a column of the sheet.
+
+    >>> option("pressure_kPa")
+    '--pressure-kPa'
+    """
+    return "--" + column.replace("_", "-")
+
+
+def planned_trial(
+    values: Mapping[str, str], settings: ExperimentSettings | None = None, needed: Sequence[str] = NEEDED
+) -> Planned:
+    """A trial from texts by name of column, as they come from the command line.
+
+    A yield pressure that is not given is NaN. What is wrong is said of the option.
+
+    Raises
+    ------
+    ExperimentError
+        With everything that is missing or not allowed.
+    """
+
+    def shown(problem: Problem) -> Problem:
+        return replace(problem, file="", trial="", line=0, column=option(problem.column) if problem.column else "")
+
+    settings = settings or ExperimentSettings()
+    cells = {"trial": "planned", **{name: text.strip() for name, text in values.items()}}
+    table = Table(tuple(cells), (cells,), (0,), ((),), ",", ".")
+    return _assembled(table, settings, None, needed, shown)
+
+
+def planned_sheet(path: Path) -> Planned:
+    """The conditions of an experiment folder, or of a sheet by itself, whether filmed or not.
+
+    Rows of the same nominal settings are one condition, named after the first; rows with `use: no` are passed over.
+
+    Raises
+    ------
+    ExperimentError
+        With everything that is wrong.
+    """
+    file = path / SHEET if path.is_dir() else path
+    if not file.is_file():
+        remedy = _nearest(file) or f"give a folder with {SHEET}, or a sheet"
+        raise ExperimentError([Problem(message="does not exist", file=str(file), remedy=remedy)])
+    try:
+        table = read_table(file)
+    except TableError as error:
+        message, _, remedy = str(error).partition(": ")
+        raise ExperimentError([Problem(message=message, file=file.name, remedy=remedy)]) from None
+    settings = read_experiment_settings(file.parent / "experiment.yaml")
+    if not table.rows:
+        raise ExperimentError([Problem(message="has no rows", file=file.name, remedy="write one row a trial")])
+    header = _judge_header(table, settings, file.name)
+    return _assembled(table, settings, file.parent, NEEDED, lambda problem: replace(problem, file=file.name), header)
+
+
+def _judge_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
+    """Warnings about columns that no sheet has.
+
+    Raises
+    ------
+    ExperimentError
+        If what must be known of every vine is nowhere: said once, not of every row.
+    """
+    unknown = unknown_columns(table, file)
+    absent = [
+        name
+        for name in NEEDED
+        if name not in table.columns and not (name in SHARED and getattr(settings, name) is not None)
+    ]
+    if absent:
+        message = f"has no column {', '.join(absent)}"
+        if len(absent) == len(NEEDED):
+            raise ExperimentError([Problem(message=message, file=file, remedy="give a trial sheet, one row a trial")])
+        raise ExperimentError([Problem(message=message, file=file, remedy="add what is missing"), *unknown])
+    return unknown
+
+
+def _nearest(file: Path) -> str:
+    try:
+        names = [one.name for one in file.parent.iterdir()]
+    except OSError:
+        return ""
+    close = difflib.get_close_matches(file.name, names, 1, 0.6)
+    return f"did you mean {close[0]}?" if close else ""
+
+
+def _assembled(
+    table: Table,
+    settings: ExperimentSettings,
+    folder: Path | None,
+    needed: Sequence[str],
+    shown: Shown,
+    header: Sequence[Problem] = (),
+) -> Planned:
+    """Read, judge and name the rows; refuse them all if one has a fault."""
+    rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
+    for row in rows:
+        _judge(row, needed)
+    of_rows = (shown(problem) for row in rows for problem in row.problems if problem.column not in _RECORDED)
+    problems = [*header, *of_rows]
+    if any(problem.severity == "error" for problem in problems) or not rows:
+        nothing = [] if rows else [shown(Problem(message="has no trial in use", remedy="take `use: no` off one"))]
+        raise ExperimentError([*problems, *nothing])
+    trials = [_trial(row, settings) for row in rows]
+    return Planned(_one_a_condition(with_names(trials)), settings, folder, tuple(_once(problems)))
+
+
+def _judge(row: Row, needed: Sequence[str]) -> None:
+    broken = {problem.column for problem in row.problems}
+    for name in needed:
+        if name not in row.values and name not in broken:
+            row.add(
+                "is missing" if row.line == 0 else "is blank", name, allowed=COLUMNS[name].allowed, remedy="give it"
+            )
+    if row.travel_ratio != 2:
+        row.add("is that of a body that moves as a whole", "travel_ratio", remedy="only everting vines are predicted")
+    judge_wall(row)
+    judge_pressures(row)
+
+
+def _trial(row: Row, settings: ExperimentSettings) -> Trial:
+    """The trial of a row, without its recording; NaN where the yield pressure is not given."""
+    kept = {name: value for name, value in row.values.items() if name not in _RECORDED}
+    trial = make_trial(replace(row, values=kept), Path(), settings)
+    fps = row.values.get("capture_fps", math.nan)
+    trial = replace(trial, capture_fps=float(fps))
+    if "yield_pressure_kPa" not in row.values:
+        return replace(trial, yield_pressure_Pa=math.nan, yield_pressure_sigma_Pa=math.nan)
+    return trial
+
+
+def _one_a_condition(trials: Iterable[Trial]) -> tuple[Trial, ...]:
+    first: dict[str, Trial] = {}
+    for trial in trials:
+        first.setdefault(trial.condition, trial)
+    return tuple(first.values())
+
+
+def _once(problems: Iterable[Problem]) -> list[Problem]:
+    """The same warning about the same value in many rows is said once."""
+    first: dict[object, Problem] = {}
+    for problem in problems:
+        first.setdefault((problem.column, problem.value, problem.message), problem)
+    return list(first.values())

@@ -1,0 +1,384 @@
+"""Settings: what all trials share (`experiment.yaml`) and how the analysis runs (`config/config.yaml`).
+
+The pydantic models below are the one truth about keys, defaults and what is allowed; a test keeps `config/config.yaml`
+in step. An unknown key, a key written twice and a value that is not allowed are all reported at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.records import Bend
+from vinetrack.core.yaml_document import YamlDocument, read_yaml
+from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, Column, read_cell
+
+BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
+"""Eq. (2): the effects in use unless `model` says otherwise, whatever columns the sheet has."""
+
+
+def _no_yes_or_no(value: Any) -> Any:
+    """Refuse what pydantic would take for 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError("is yes or no where a number belongs: write the number")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_no_yes_or_no)]
+Count = Annotated[int, BeforeValidator(_no_yes_or_no)]
+Positive = Annotated[Number, Field(gt=0)]
+Pixel = tuple[Number, Number]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class _Strict(BaseModel):
+    """Unknown keys are refused, instances cannot change, NaN and infinity are no settings."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True)
+
+
+class Axis(_Strict):
+    """The growth axis in the picture, and how wide a strip along it is looked at."""
+
+    from_px: Pixel
+    to_px: Pixel
+    width_mm: Positive | None = None
+
+    @model_validator(mode="after")
+    def _has_a_direction(self) -> Axis:
+        if self.from_px == self.to_px:
+            raise ValueError("from_px and to_px are the same point: name two")
+        return self
+
+
+class MmPerPx(_Strict):
+    """The scale itself."""
+
+    kind: Literal["mm_per_px"]
+    mm_per_px: Positive
+
+
+class TwoPoints(_Strict):
+    """Two points in the picture and the distance between them."""
+
+    kind: Literal["two_points"]
+    from_px: Pixel
+    to_px: Pixel
+    length_mm: Positive
+
+    @model_validator(mode="after")
+    def _has_a_length(self) -> TwoPoints:
+        if self.from_px == self.to_px:
+            raise ValueError("from_px and to_px are the same point: name two")
+        return self
+
+
+class Checkerboard(_Strict):
+    """A checkerboard: `squares` across and down."""
+
+    kind: Literal["checkerboard"]
+    image: str
+    squares: tuple[Annotated[Count, Field(ge=3)], Annotated[Count, Field(ge=3)]]
+    square_mm: Positive
+
+
+class Charuco(_Strict):
+    """A ChArUco board: `squares` across and down, and the name of its marker dictionary as OpenCV has it."""
+
+    kind: Literal["charuco"]
+    image: str
+    squares: tuple[Annotated[Count, Field(ge=2)], Annotated[Count, Field(ge=2)]]
+    square_mm: Positive
+    marker_mm: Positive
+    dictionary: Annotated[str, Field(pattern=r"^DICT_\w+$")]
+
+    @model_validator(mode="after")
+    def _markers_fit(self) -> Charuco:
+        if self.marker_mm >= self.square_mm:
+            raise ValueError("marker_mm is not smaller than square_mm: markers lie inside their squares")
+        return self
+
+
+Calibration = Annotated[Charuco | Checkerboard | TwoPoints | MmPerPx, Field(discriminator="kind")]
+
+
+class Limits(_Strict):
+    """Which further trials could be made, for the next experiment; None where the trials so far are the guide.
+
+    Pressure and payload are ranges (`7:40` or two numbers); the others are what there is to choose from: one value, a
+    list, or a range, of which five values are looked at. `trials` is how many can be afforded, `new_vines` whether a
+    vine can be made for them, `hoop_stress_MPa` what the film is trusted to hold.
+    """
+
+    trials: Annotated[Count, Field(ge=1, le=24)] = 4
+    new_vines: bool = True
+    pressure_kPa: tuple[float, float] | None = None
+    payload_g: tuple[float, float] | None = None
+    diameter_mm: tuple[float, ...] | None = None
+    thickness_um: tuple[float, ...] | None = None
+    length_mm: tuple[float, ...] | None = None
+    chamber_l: tuple[float, ...] | None = None
+    inlet_mm: tuple[float, ...] | None = None
+    growth_angle_deg: tuple[float, ...] | None = None
+    hoop_stress_MPa: Positive = 7.8
+
+    @field_validator("pressure_kPa", "payload_g", mode="before")
+    @classmethod
+    def _range(cls, value: Any, info: Any) -> Any:
+        return value if value is None else _read_range(COLUMNS[info.field_name], value)
+
+    @field_validator(
+        "diameter_mm", "thickness_um", "length_mm", "chamber_l", "inlet_mm", "growth_angle_deg", mode="before"
+    )
+    @classmethod
+    def _values(cls, value: Any, info: Any) -> Any:
+        column = COLUMNS[info.field_name]
+        if isinstance(value, str) and ":" in value:
+            low, high = _read_range(column, value)
+            return tuple(sorted({low, *(float(f"{step:.3g}") for step in _steps(low, high)), high}))
+        if isinstance(value, list | tuple):
+            if not value:
+                raise ValueError("is empty: name at least one value, or remove the key")
+            return tuple(sorted({_read_limit(column, one) for one in value}))
+        return value if value is None else (_read_limit(column, value),)
+
+
+def _read_range(column: Column, value: Any) -> tuple[float, float]:
+    """Lowest and highest from `low:high` or two numbers, judged as cells of the column."""
+    parts = value.split(":") if isinstance(value, str) else value
+    if not isinstance(parts, list | tuple) or len(parts) != 2:
+        raise ValueError("is not a range: write low:high, such as 7:40")
+    low, high = (_read_limit(column, part) for part in parts)
+    if low > high:
+        raise ValueError("ends below where it begins: write the lower value first")
+    return low, high
+
+
+def _steps(low: float, high: float) -> list[float]:
+    """Three values between two others, in equal ratios where both are positive."""
+    parts = (0.25, 0.5, 0.75)
+    return [low ** (1 - part) * high**part if low > 0 else low + (high - low) * part for part in parts]
+
+
+def _read_limit(column: Column, value: Any) -> float:
+    """One value, judged as a cell of the column."""
+    if isinstance(value, bool | list | tuple | dict):
+        raise ValueError("holds something that is not a number: write numbers alone")
+    return float(str(_as_cell(column, value)))
+
+
+def _as_cell(column: Column, value: Any) -> Any:
+    """A value as the sheet's cell would be read.
+
+    Raises
+    ------
+    ValueError
+        If the column does not allow it, with the remedy behind a colon.
+    """
+    try:
+        return read_cell(column, str(value).strip())
+    except CellError as error:
+        remedy = error.remedy or (f"allowed is {error.allowed}" if error.allowed else "")
+        raise ValueError(f"{error.message}: {remedy}") from None
+
+
+class ExperimentSettings(_Strict):
+    """What all trials of an experiment share. Values keep the unit in their name; None where not given.
+
+    Every column but `trial`, `video` and `track` may stand here; a cell of the sheet overrides it.
+    """
+
+    capture_fps: float | None = None
+    exposure_us: float | None = None
+    diameter_mm: float | None = None
+    thickness_um: float | None = None
+    length_mm: float | None = None
+    pressure_kPa: float | None = None
+    pressure_sigma_kPa: float | None = None
+    yield_pressure_kPa: float | None = None
+    yield_pressure_sigma_kPa: float | None = None
+    pressure_trace: str | None = None
+    payload_g: float | None = None
+    growth_angle_deg: float | None = None
+    chamber_l: float | None = None
+    inlet_mm: float | None = None
+    bends: tuple[Bend, ...] | None = None
+    film_density_kg_m3: float | None = None
+    mm_per_px: float | None = None
+    travel_ratio: float | None = None
+    steady: tuple[float, float] | None = None
+    use: bool | None = None
+    ambient_pressure_kPa: Annotated[Number, Field(gt=0, le=1000)] = 101.325
+    tail_slack: Literal["taut", "free"] = "taut"
+    tail_store: Literal["body", "reel"] = "body"
+    mass_loss: Literal["geometric", "as_printed"] = "geometric"
+    model: tuple[str, ...] = BASE_EFFECTS
+    candidates: tuple[str, ...] | None = None
+    effects: tuple[str, ...] = ()
+    strict: bool = False
+    axis: Axis | None = None
+    calibration: Calibration | None = None
+    limits: Limits = Limits()
+    published: Literal["simulated", "measured"] | None = None
+    """Set the paper's numbers beside ours, whose trials were grown from its parameters, or filmed."""
+
+    @field_validator(*SHARED, mode="before")
+    @classmethod
+    def _as_in_the_sheet(cls, value: Any, info: Any) -> Any:
+        """Judge a shared value as the sheet's cell would be."""
+        column = COLUMNS[info.field_name]
+        if value is None or isinstance(value, tuple) or (isinstance(value, bool) and column.kind == "yes_no"):
+            return value
+        if isinstance(value, bool | list | dict):
+            raise ValueError("is not a single value: write one, as in the sheet")
+        return _as_cell(column, value)
+
+    @field_validator("model", "candidates", "effects")
+    @classmethod
+    def _named_once(cls, names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        if names and (twice := sorted({name for name in names if names.count(name) > 1})):
+            raise ValueError(f"names {twice[0]!r} twice: keep one")
+        return names
+
+
+class SteadySettings(_Strict):
+    """When a stretch of motion counts as steady; see `vinetrack.kinematics.steady`."""
+
+    drift_limit: Annotated[Number, Field(gt=0, le=1)] = 0.03
+    start_fraction: Annotated[Number, Field(ge=0, lt=1)] = 0.2
+    start_sigmas: Annotated[Number, Field(ge=0)] = 5.0
+    paper_cv: Annotated[Number, Field(gt=0, le=1)] = 0.03
+    paper_points: Annotated[Count, Field(ge=3)] = 3
+
+
+class VelocitySettings(_Strict):
+    """How positions become velocities; see `vinetrack.kinematics.velocity`."""
+
+    kappa: Positive = 3.0
+    order: Annotated[Count, Field(ge=1, le=5)] = 3
+
+
+class DampingSettings(_Strict):
+    """How the damping law and its intervals are computed; see `vinetrack.kinematics.damping`."""
+
+    resamples: Annotated[Count, Field(ge=100)] = 2000
+    seed: Annotated[Count, Field(ge=0)] = 1
+
+
+class FigureSettings(_Strict):
+    """Files that every figure is saved as."""
+
+    formats: tuple[Literal["png", "svg", "pdf"], ...] = ("png", "svg")
+    dpi: Annotated[Count, Field(ge=50, le=1200)] = 150
+
+    @field_validator("formats")
+    @classmethod
+    def _at_least_one(cls, formats: tuple[str, ...]) -> tuple[str, ...]:
+        if not formats:
+            raise ValueError("is empty: name at least one of png, svg, pdf")
+        return formats
+
+
+class OverlaySettings(_Strict):
+    """Clips of the recordings with the tracked edge and the models' edges; see `vinetrack.figures.overlay`."""
+
+    of: Literal["one_per_condition", "all", "none"] = "one_per_condition"
+    seconds: Positive = 6.0
+    width_px: Annotated[Count, Field(ge=320, le=3840)] = 960
+
+
+class RunSettings(_Strict):
+    """Everything in `config/config.yaml`; any key may be overridden by `--config key=value`."""
+
+    experiment: str = "data/demo"
+    results: str | None = None
+    steady: SteadySettings = SteadySettings()
+    velocity: VelocitySettings = VelocitySettings()
+    damping: DampingSettings = DampingSettings()
+    final_at_fraction: Annotated[Number, Field(gt=0, le=1)] = 0.95
+    efficiency_at_mm: Positive = 150.0
+    figures: FigureSettings = FigureSettings()
+    overlays: OverlaySettings = OverlaySettings()
+
+
+def read_experiment_settings(path: Path) -> ExperimentSettings:
+    """Read `experiment.yaml`; all defaults where there is no such file.
+
+    Raises
+    ------
+    ExperimentError
+        With every problem of the file.
+    """
+    return _validate(ExperimentSettings, read_yaml(path), path.name) if path.exists() else ExperimentSettings()
+
+
+def read_run_settings(path: Path) -> RunSettings:
+    """Read `config/config.yaml`, or a file like it; see `read_experiment_settings`."""
+    return _validate(RunSettings, read_yaml(path), path.name)
+
+
+def run_settings(values: dict[str, Any]) -> RunSettings:
+    """Settings of a run from a mapping, such as Snakemake's `config` after `--config`; see `read_run_settings`.
+
+    >>> run_settings({"damping": {"seed": 7}}).damping.seed
+    7
+    """
+    return _validate(RunSettings, YamlDocument(values, {}), "config.yaml")
+
+
+def _validate(model: type[Model], document: YamlDocument, file: str) -> Model:
+    """The document as a settings object, or every problem it has."""
+    try:
+        return model.model_validate(document.content)
+    except ValidationError as error:
+        raise ExperimentError([_as_problem(model, document, file, detail) for detail in error.errors()]) from None
+
+
+def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detail: Any) -> Problem:
+    """One of pydantic's errors as a problem that names the key, its line and what is allowed."""
+    # Inside a calibration pydantic names the kind between "calibration" and the key; the file does not.
+    location = tuple(part for i, part in enumerate(detail["loc"]) if not (i == 1 and detail["loc"][0] == "calibration"))
+    key = ".".join(str(part) for part in location)
+    line = next(
+        (document.lines[location[:n]] for n in range(len(location), 0, -1) if location[:n] in document.lines), 0
+    )
+    value = detail["input"] if isinstance(detail["input"], str | int | float | bool) else None
+    shown = None if value is None else str(value)
+    if detail["type"] == "extra_forbidden":
+        nearest = difflib.get_close_matches(str(location[-1]), _keys_beside(model, document.content, location), 1, 0.6)
+        remedy = f"did you mean {nearest[0]}?" if nearest else "remove it, or see the documentation for the keys"
+        return Problem(message="is no setting", file=file, line=line, column=key, remedy=remedy)
+    if detail["type"] == "missing":
+        return Problem(message="is missing", file=file, line=line, column=key, remedy="add it")
+    message, _, remedy = detail["msg"].removeprefix("Value error, ").partition(": ")
+    if not detail["msg"].startswith("Value error, "):
+        words = re.sub(r"a valid (tuple|list)", "a list", detail["msg"])
+        words = re.sub(r"a valid dictionary.*", "a group of keys", words)
+        message, remedy = f"is not allowed: {words[:1].lower()}{words[1:]}", ""
+    return Problem(message=message, file=file, line=line, column=key, value=shown, remedy=remedy)
+
+
+def _kind(content: Any) -> Any:
+    calibration = content.get("calibration") if isinstance(content, dict) else None
+    return calibration.get("kind") if isinstance(calibration, dict) else None
+
+
+def _keys_beside(model: type[BaseModel], content: Any, location: tuple[Any, ...]) -> list[str]:
+    """Keys that would have been right where an unknown one stands."""
+    if len(location) == 1:
+        return list(model.model_fields)
+    if location[0] == "calibration":
+        kinds: dict[Any, type[BaseModel]] = {
+            "charuco": Charuco,
+            "checkerboard": Checkerboard,
+            "two_points": TwoPoints,
+            "mm_per_px": MmPerPx,
+        }
+        return list(kinds[_kind(content)].model_fields)
+    inner = type(model.model_fields[location[0]].default) if location[0] != "axis" else Axis
+    return list(getattr(inner, "model_fields", {}))

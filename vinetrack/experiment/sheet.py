@@ -1,0 +1,240 @@
+"""One row of the trial sheet: its cells, what they lack, and the trial they make.
+
+Nothing here opens a recording; `vinetrack.experiment.folder` joins rows, settings and files.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from vinetrack.core.problems import Problem
+from vinetrack.core.records import Trial
+from vinetrack.core.tables import Table, TableError, safe_join
+from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, oddity, read_cell
+from vinetrack.experiment.settings import ExperimentSettings
+
+SHEET = "trials.csv"
+LONGEST_NAME = 100
+"""Longer trial names leave no room for suffixes within the 255 bytes a file name may have."""
+
+NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
+"""What a trial of an everting vine must have; a body that moves as a whole needs its diameter only."""
+
+RATE_REMEDY = "write the rate of capture: the file's own rate is that of playback"
+
+
+@dataclass
+class Row:
+    """A row while it is being judged: values by column, in the column's unit, blank ones left out."""
+
+    name: str
+    line: int
+    values: dict[str, Any] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+
+    @property
+    def failed(self) -> bool:
+        """Whether any of its problems is an error."""
+        return any(problem.severity == "error" for problem in self.problems)
+
+    @property
+    def in_use(self) -> bool:
+        """Whether the person wants this trial analysed."""
+        return bool(self.values.get("use", True))
+
+    @property
+    def travel_ratio(self) -> float:
+        """2 unless the row or the settings say otherwise."""
+        return float(self.values.get("travel_ratio", 2.0))
+
+    def add(self, message: str, column: str = "", severity: str = "error", **details: Any) -> None:
+        """Note a problem of this row."""
+        place: dict[str, Any] = {"file": SHEET, "trial": self.name, "line": self.line}
+        self.problems.append(Problem(message=message, column=column, severity=severity, **place, **details))
+
+
+def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
+    """Read one row of the sheet, shared settings filled in where its cells are blank, and judge every cell."""
+    cells, line = table.rows[index], table.lines[index]
+    row = Row(cells.get("trial", f"line-{line}"), line)
+    _judge_name(row)
+    for name, column in COLUMNS.items():
+        text = cells.get(name, "")
+        if text == "":
+            if name in SHARED and (shared := getattr(settings, name)) is not None:
+                row.values[name] = shared
+            continue
+        try:
+            row.values[name] = read_cell(column, text, table.decimal)
+        except CellError as error:
+            row.add(error.message, name, value=text, allowed=error.allowed, remedy=error.remedy)
+            continue
+        if column.kind == "number" and (hint := oddity(column, row.values[name])):
+            row.add(f"is unusual: {hint}", name, "warning", value=text)
+    if table.extra[index]:
+        remedy = "put decimal commas and text with separators in quotes"
+        row.add(f"has more cells than the header ({table.extra[index][0][:40]!r} …)", remedy=remedy)
+    if not row.in_use:
+        row.problems = [replace(problem, severity="warning") for problem in row.problems]
+    return row
+
+
+def unknown_columns(table: Table, file: str) -> list[Problem]:
+    """A warning for every column that no trial sheet has, with the nearest that it may have meant."""
+    problems = []
+    for name in table.columns:
+        if name not in COLUMNS:
+            nearest = difflib.get_close_matches(name, [c for c in COLUMNS if c not in table.columns], 1, 0.6)
+            remedy = f"did you mean {nearest[0]}?" if nearest else ""
+            message = "is no column of a trial sheet and is ignored"
+            place: dict[str, Any] = {"file": file, "line": 1, "column": name}
+            problems.append(Problem(message=message, severity="warning", remedy=remedy, **place))
+    return problems
+
+
+def _judge_name(row: Row) -> None:
+    """Give a row without a usable name one that can stand in files and messages."""
+    allowed = "letters, digits, _ and -"
+    given = row.name
+    if given and re.fullmatch(r"[A-Za-z0-9_-]+", given, re.ASCII) and len(given) <= LONGEST_NAME:
+        return
+    row.name = f"line-{row.line}"
+    message = "is blank" if not given else "is too long" if len(given) > LONGEST_NAME else "is no name for a trial"
+    remedy = f"at most {LONGEST_NAME} characters, no blanks or dots; it names files"
+    row.add(message, "trial", value=given, allowed=allowed, remedy=remedy)
+
+
+def judge_row(row: Row, folder: Path) -> None:
+    """Judge a row as a whole: paths that lead out, and values that contradict each other."""
+    _judge_paths(row, folder)
+    judge_wall(row)
+    fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
+    # 2 % allows for rounding of both; a shutter that stays open longer than its frame does not exist.
+    if exposure > 1.02e6 / fps:
+        message = f"is longer than a frame at {fps:g} frames a second ({1e6 / fps:.4g} µs)"
+        row.add(message, "exposure_us", "warning", value=f"{exposure:g}")
+
+
+def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
+    """Note required cells that are blank in a row whose shared settings are filled in.
+
+    Returns the required columns that neither sheet nor settings have at all: a fault of the sheet, to be reported
+    once. Where the travel ratio is broken, what the row needs is not known.
+    """
+    broken = {problem.column for problem in row.problems if problem.severity == "error"}
+    absent: set[str] = set()
+    if "travel_ratio" in broken:
+        return absent
+    needed = [name for name in _needed(row, folder) if name not in row.values and name not in broken]
+    for name in needed:
+        if name in columns:
+            remedy = RATE_REMEDY if name == "capture_fps" else "fill it in"
+            row.add("is blank", name, value="", allowed=COLUMNS[name].allowed, remedy=remedy)
+        else:
+            absent.add(name)
+    return absent
+
+
+def _needed(row: Row, folder: Path) -> list[str]:
+    """Columns that a row with this travel ratio and these recordings cannot do without."""
+    needed = list(NEEDED if row.travel_ratio == 2 else NEEDED[:1])
+    if "pressure_kPa" in needed and ("pressure_trace" in row.values or "track" in row.values):
+        needed.remove("pressure_kPa")
+    if "video" in row.values and "track" not in row.values and not _has_dng_frames(folder, row.values["video"]):
+        needed.append("capture_fps")
+    return needed
+
+
+def _judge_paths(row: Row, folder: Path) -> None:
+    """Exactly one recording, and no path that leaves the folder."""
+    for name in ("video", "track", "pressure_trace"):
+        if name in row.values:
+            try:
+                safe_join(folder, row.values[name])
+            except TableError as error:
+                message, _, remedy = str(error).partition(": ")
+                row.add(message, name, value=row.values[name], remedy=remedy)
+    if "video" in row.values and "track" in row.values:
+        row.add("has both a video and a track", "track", value=row.values["track"], remedy="keep one of the two")
+    if "video" not in row.values and "track" not in row.values:
+        row.add("has neither a video nor a track", remedy="name the recording under video, or positions under track")
+
+
+def _has_dng_frames(folder: Path, video: str) -> bool:
+    """Whether a recording is a DNG frame or a folder of them, which carry the rate of capture."""
+    try:
+        path = safe_join(folder, video)
+        return any(file.suffix.lower() == ".dng" for file in ([path] if not path.is_dir() else path.iterdir()))
+    except (TableError, OSError, ValueError):
+        return False
+
+
+def judge_wall(row: Row) -> None:
+    """Refuse a wall that no tube of this diameter can have."""
+    diameter, thickness = row.values.get("diameter_mm", math.nan), row.values.get("thickness_um", math.nan)
+    if thickness / 1000 > diameter / 4:
+        message = f"is a wall above a quarter of the diameter of {diameter:g} mm"
+        allowed, remedy = f"at most {250 * diameter:g} µm", "the wall is in µm, the diameter in mm"
+        row.add(message, "thickness_um", value=f"{thickness:g}", allowed=allowed, remedy=remedy)
+
+
+def judge_pressures(row: Row) -> None:
+    """Warn of pressures that are legal but hardly meant."""
+    pressure = row.values.get("pressure_kPa", math.nan)
+    onset = row.values.get("yield_pressure_kPa", math.nan)
+    if row.travel_ratio == 2 and onset >= pressure:
+        message = f"is not below the pressure of {pressure:g} kPa: nothing would move (psi? 1 psi is 6.895 kPa)"
+        row.add(message, "yield_pressure_kPa", "warning", value=f"{onset:g}")
+    if row.travel_ratio == 1 and pressure > 0:
+        message = "drives a body that moves as a whole (travel_ratio 1): is it a vine?"
+        row.add(message, "pressure_kPa", "warning", value=f"{pressure:g}")
+
+
+def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
+    """The trial of a row that has no errors and a pressure, in SI units, with the defaults of the documentation."""
+    values = row.values
+    everting = row.travel_ratio == 2
+
+    def number(name: str, default: float = math.nan) -> float:
+        return float(values.get(name, default))
+
+    def path(name: str) -> Path | None:
+        return safe_join(folder, values[name]) if name in values else None
+
+    pressure_kPa = number("pressure_kPa", 0.0)
+    trial = Trial(
+        name=row.name,
+        video=path("video"),
+        track=path("track"),
+        pressure_trace=path("pressure_trace"),
+        capture_fps=number("capture_fps"),
+        exposure_s=number("exposure_us") / 1e6,
+        diameter_m=number("diameter_mm") / 1000,
+        thickness_m=number("thickness_um") / 1e6,
+        length_m=number("length_mm") / 1000,
+        pressure_Pa=pressure_kPa * 1000,
+        pressure_sigma_Pa=number("pressure_sigma_kPa", 0.01 * pressure_kPa) * 1000,
+        yield_pressure_Pa=number("yield_pressure_kPa", 0.0) * 1000,
+        yield_pressure_sigma_Pa=number("yield_pressure_sigma_kPa", 0.2 if everting else 0.0) * 1000,
+        payload_kg=number("payload_g", 0.0) / 1000,
+        growth_angle_rad=math.radians(number("growth_angle_deg", 0.0)),
+        chamber_m3=number("chamber_l") / 1000,
+        inlet_m=number("inlet_mm") / 1000,
+        bends=values.get("bends", ()),
+        m_per_px=number("mm_per_px") / 1000,
+        travel_ratio=row.travel_ratio,
+        steady_window_s=values.get("steady"),
+        use=row.in_use,
+        ambient_pressure_Pa=settings.ambient_pressure_kPa * 1000,
+        mass_loss=settings.mass_loss,
+        tail_slack=settings.tail_slack,
+        tail_store=settings.tail_store,
+    )
+    if "film_density_kg_m3" in values:
+        trial = replace(trial, film_density_kg_m3=number("film_density_kg_m3"))
+    return trial

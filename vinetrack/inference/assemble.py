@@ -1,0 +1,241 @@
+"""From the end of the iterations to a `Fit`: values with their errors, each trial's own numbers, words of warning."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.model import Model, Value
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, TrialFit
+from vinetrack.inference.intervals import Precision, near_bound, precision, profile_interval, student
+from vinetrack.inference.mixed_effects import deviance, estimate_spreads, marginal, trial_effect_prior
+from vinetrack.inference.optimiser import Solution, chi2_per_dof
+from vinetrack.inference.parameters import YIELD_PRESSURE, FreeParameter, ParameterMap
+from vinetrack.inference.robust_covariance import widened_covariance
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.whitening import at_correlation, whiten
+
+HARD_TO_TELL_APART = 0.98
+ADDS_NOTHING = 0.95
+MISSES = 2.0
+SPREAD_NAMES = ("pressure", "B")
+
+
+def assemble(
+    predictor: Predictor,
+    solution: Solution,
+    left_out: Mapping[str, str],
+    options: Mapping[str, Any],
+    *,
+    profile: bool,
+) -> Fit:
+    """Everything that is said about a fit."""
+    layout, state = predictor.layout, solution.state
+    by_noise = precision(solution)
+    trials = _trial_fits(predictor, solution, by_noise)
+    known = widened_covariance(predictor, solution, trials, by_noise)
+    numbers = _numbers(predictor, solution, by_noise, known, profile=profile)
+    chi2 = chi2_per_dof(predictor, solution)
+    weights = np.array([item.time_s.size for item in predictor.data], dtype=float)
+    variance = float(np.average(state.variance, weights=weights)) / (1 - state.rho**2)
+    felt = [bool(solution.frame.feels[:, k].any()) for k in range(2)]
+    return Fit(
+        model=fitted_model(layout, numbers),
+        numbers=numbers,
+        covariance=_outside(layout, numbers, known.covariance),
+        spreads={
+            name: BetweenTrialSpread(state.spread[k], solution.estimable[k])
+            for k, name in enumerate(SPREAD_NAMES)
+            if felt[k]
+        },
+        noise_m=math.sqrt(variance),
+        noise_correlation=state.rho,
+        chi2_per_dof=chi2,
+        log_likelihood=log_likelihood(solution),
+        trials=trials,
+        messages=tuple(_messages(layout, solution, numbers, known, chi2)),
+        left_out=dict(left_out),
+        converged=solution.converged,
+        iterations=solution.iterations,
+        predictor=predictor,
+        solution=solution,
+        options=options,
+    )
+
+
+def log_likelihood(solution: Solution) -> float:
+    """Marginal ln L, spreads at their best for it (not the restricted one, which cannot compare models)."""
+    part = marginal(solution.grams, solution.frame, solution.state)
+    spread = estimate_spreads(part, solution.frame, solution.state, solution.estimable, restricted=False)
+    return -0.5 * deviance(part, solution.frame, solution.state, spread, restricted=False)
+
+
+def fitted_model(layout: ParameterMap, numbers: Sequence[Number]) -> Model:
+    """The model with the fitted values; yield pressures belong to the trials and stay in the numbers."""
+    values: dict[str, Value] = {}
+    for number in numbers:
+        if number.key == YIELD_PRESSURE:
+            continue
+        if number.vine:
+            former = values.get(number.key, {})
+            assert isinstance(former, dict)
+            values[number.key] = {**former, number.vine: number.value}
+        else:
+            values[number.key] = number.value
+    return layout.model.with_values(values)
+
+
+def _numbers(
+    predictor: Predictor, solution: Solution, by_noise: Precision, known: Precision, *, profile: bool
+) -> tuple[Number, ...]:
+    layout, frame, theta = predictor.layout, solution.frame, solution.state.theta
+    sigma = np.sqrt(np.diag(known.covariance))
+    dof = known.degrees
+    reach = student(dof)
+    doubtful = near_bound(solution, sigma)
+    numbers = []
+    for k, number in enumerate(layout.free):
+        low, high, method = theta[k] - reach[k] * sigma[k], theta[k] + reach[k] * sigma[k], "linear"
+        if not math.isfinite(sigma[k]):
+            low, high, method = frame.lower[k], frame.upper[k], "none"
+        elif doubtful[k] and profile:
+            # The likelihood knows of the noise alone: it is followed as much further as the error is wider.
+            narrow = math.sqrt(by_noise.covariance[k, k])
+            low, high = profile_interval(predictor, solution, k, narrow, float(reach[k] * sigma[k] / narrow))
+            method = "profile"
+        low, high = max(low, frame.lower[k]), min(high, frame.upper[k])
+        at = [b for b in (frame.lower[k], frame.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]
+        numbers.append(
+            Number(
+                key=number.key,
+                vine=number.vine,
+                symbol=number.symbol,
+                unit=number.unit,
+                value=number.outside(float(theta[k])),
+                sigma=float(sigma[k]) * _slope(number, float(theta[k])),
+                low=_bound_outside(number, low),
+                high=_bound_outside(number, high),
+                dof=float(dof[k]),
+                method=method,
+                bound=_bound_outside(number, at[0]) if at else math.nan,
+            )
+        )
+    return tuple(numbers)
+
+
+def _bound_outside(number: FreeParameter, theta: float) -> float:
+    return number.outside(float(theta)) if math.isfinite(theta) else math.inf * theta
+
+
+def _slope(number: FreeParameter, theta: float) -> float:
+    """∂value/∂(what the fit holds)."""
+    return number.outside(theta) if number.logarithmic else number.scale
+
+
+def _outside(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats) -> Floats:
+    slopes = np.array([_slope(f, f.inside(n.value)) for f, n in zip(layout.free, numbers, strict=True)])
+    return np.asarray(covariance * slopes[:, None] * slopes)
+
+
+def own_sigma(solution: Solution, known: Precision) -> Floats:
+    """Standard errors of each trial's own numbers, shape (n_trials, 4), those of the shared numbers included."""
+    frame, state = solution.frame, solution.state
+    white = at_correlation(solution.grams, state.rho) / state.variance[:, None, None]
+    precision_own = trial_effect_prior(frame, state)[1]
+    square = white[:, :OWN, :OWN] + precision_own[:, :, None] * np.eye(OWN)
+    scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
+    even = square * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(OWN)
+    inverse = np.linalg.inv(even) * scale[:, :, None] * scale[:, None, :]
+    lever = inverse @ white[:, :OWN, OWN:-1]
+    shared = np.zeros((state.theta.size + 1,) * 2)
+    shared[:-1, :-1] = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
+    mine = shared[frame.index[:, :, None], frame.index[:, None, :]]
+    total = inverse + lever @ mine @ np.swapaxes(lever, 1, 2)
+    sigma = np.sqrt(np.maximum(np.einsum("nkk->nk", total), 0.0))
+    for k, column in enumerate((PRESSURE, DAMPING_DEVIATION)):
+        sigma[~frame.feels[:, k], column] = 0.0
+    return np.asarray(sigma)
+
+
+def _trial_fits(predictor: Predictor, solution: Solution, known: Precision) -> tuple[TrialFit, ...]:
+    state, sigma = solution.state, own_sigma(solution, known)
+    moved = predictor.run(predictor.jobs(state.theta, state.own))
+    return tuple(
+        trial_fit(item, state.own[i], sigma[i], moved[i].observed_position_m, moved[i].lead_velocity_m_s, state.rho,
+                  float(state.variance[i]))
+        for i, item in enumerate(predictor.data)
+    )  # fmt: skip
+
+
+def trial_fit(
+    item: FitTrial, own: Floats, sigma: Floats, position_m: Floats, velocity_m_s: Floats, rho: float, variance: float
+) -> TrialFit:
+    """One trial with its own numbers and what the model says of it."""
+    predicted_m = position_m + own[ORIGIN]
+    residual_m = item.lead_position_m - predicted_m
+    return TrialFit(
+        trial=item.trial,
+        time_s=item.time_s,
+        lead_position_m=item.lead_position_m,
+        predicted_position_m=predicted_m,
+        predicted_velocity_m_s=velocity_m_s,
+        residual_m=residual_m,
+        whitened=whiten(residual_m, item.first, rho) / math.sqrt(variance),
+        release_s=float(own[RELEASE]),
+        release_sigma_s=float(sigma[RELEASE]),
+        origin_m=float(own[ORIGIN]),
+        origin_sigma_m=float(sigma[ORIGIN]),
+        pressure_deviation=float(own[PRESSURE]),
+        pressure_deviation_sigma=float(sigma[PRESSURE]),
+        damping_deviation=math.expm1(own[DAMPING_DEVIATION]),
+        damping_deviation_sigma=float(sigma[DAMPING_DEVIATION]),
+        noise_m=math.sqrt(variance / (1 - rho**2)),
+    )
+
+
+def _messages(
+    layout: ParameterMap, solution: Solution, numbers: Sequence[Number], known: Precision, chi2: float
+) -> list[str]:
+    """What to beware of, in words."""
+    found = []
+    if not solution.converged:
+        found.append(f"the fit did not settle in {solution.iterations} iterations: its numbers are not to be trusted")
+    for k, number in enumerate(numbers):
+        free = layout.free[k]
+        if known.silent[k]:
+            found.append(f"{number.title} ({number.key}) never moved the trajectories: it stays at {number.value:.4g}")
+        elif math.isfinite(number.bound):
+            found.append(f"{number.title} ({number.key}) sits at its bound {number.bound:.4g}: the data want it beyond")
+        elif math.isfinite(free.prior_sd) and number.sigma > ADDS_NOTHING * free.prior_sd:
+            found.append(f"{number.title}: the trajectories say no more than the sheet does")
+    if known.tied.any():
+        titles = [f"{n.title} ({n.key})" for n, tied in zip(numbers, known.tied, strict=True) if tied]
+        found.append(f"cannot be told apart at all by these data: {', '.join(titles)}")
+    found += _close_pairs(numbers, known)
+    for k, name in enumerate(SPREAD_NAMES):
+        if solution.frame.feels[:, k].any() and not solution.estimable[k]:
+            found.append(f"the spread of {name} from trial to trial is taken as {100 * solution.state.spread[k]:.2g} %")
+    if chi2 > MISSES:
+        found.append(
+            f"the model leaves {math.sqrt(chi2):.3g} times the noise of the tracks, with B and pressure of every trial"
+            " free to help: something is missing, or tracks err slowly by more than their noise"
+        )
+    return found
+
+
+def _close_pairs(numbers: Sequence[Number], known: Precision) -> list[str]:
+    found = []
+    variance = np.diag(known.covariance)
+    usable = np.flatnonzero(np.isfinite(variance) & (variance > 0))
+    for i, j in itertools.combinations(usable.tolist(), 2):
+        correlation = known.covariance[i, j] / math.sqrt(variance[i] * variance[j])
+        if abs(correlation) > HARD_TO_TELL_APART:
+            one, other = numbers[i].title, numbers[j].title
+            found.append(f"{one} and {other} can hardly be told apart (correlation {correlation:.3f})")
+    return found

@@ -1,0 +1,284 @@
+"""What a fit sees of an experiment: for every trial the measured positions, their instants and the pressure trace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.inference.gauge_noise import noise_of, without_noise
+from vinetrack.tracks.position_noise import position_noise, rest_points, rough_noise
+
+if TYPE_CHECKING:
+    from vinetrack.experiment.folder import Experiment
+
+FEWEST_POINTS = 5
+GAP_FRAMES = 1.5
+"""A point later than this many frames after the one before begins a new stretch of noise, independent of the last."""
+
+MOVES_SIGMAS = 8.0
+
+RISEN = 0.5
+"""A trace that begins below this part of its median while the recording runs has been let in then and there."""
+
+END_FRACTION = 0.95
+"""The last part of the growth is left out: there the mass of a bare vine goes to nothing, its speed diverges, and one
+frame across the end of growth is a corner that no sensitivity describes. What lies behind the end is kept."""
+
+FRAMES_BEHIND_END = 2
+
+VAGUE, FEWEST_CLEAR, MOSTLY = 3.0, 0.3, 0.5
+"""A point is left out whose stated error exceeds that of the better half by this factor, as long as this part stays;
+the whole rest before the motion, where more than the last part of it is left out."""
+
+
+class FitError(ValueError):
+    """A fit cannot be made; the message is one sentence with a remedy."""
+
+
+@dataclass(frozen=True)
+class VagueRest:
+    """A rest before the motion seen only vaguely, such as behind a door: when it ended, where it was, how surely."""
+
+    release_s: float
+    origin_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True)
+class FitTrial:
+    """One trial as a fit sees it; arrays have shape (n_points,).
+
+    `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0
+    where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
+    `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
+    pressure, Pa; `gauge_error` is by what part of it the noise of the gauge leaves it wrong along the whole motion.
+    """
+
+    trial: Trial
+    time_s: Floats
+    lead_position_m: Floats
+    first: NDArray[np.bool_]
+    n_rest: int
+    noise_m: float
+    correlation: float
+    trace: tuple[Floats, Floats] | None = None
+    gauge_error: float = 0.0
+    vague_rest: VagueRest | None = None
+    tracker_sigma_m: float = math.nan  #: median error of a position that was read from a recording
+
+    @cached_property
+    def frame_s(self) -> float:
+        """Spacing of the points, s."""
+        return float(np.median(np.diff(self.time_s)))
+
+    @property
+    def shows_rest(self) -> bool:
+        """Whether anything is seen of the rest before the motion, be it only vaguely."""
+        return self.n_rest > 0 or self.vague_rest is not None
+
+    @property
+    def rest_origin_m(self) -> float:
+        """Where the edge rests before the motion, m; the mean of its points where they are in the fit."""
+        if self.vague_rest is not None:
+            return self.vague_rest.origin_m
+        return float(np.mean(self.lead_position_m[: self.n_rest]))
+
+    @cached_property
+    def let_in(self) -> bool:
+        """Whether the pressure was let in while it was recorded: then the trace says what started the growth, and when.
+
+        Nothing else holds the vine, and a release of its own would pass for a threshold.
+        """
+        return self.trace is not None and bool(self.trace[1][0] < RISEN * np.median(self.trace[1]))
+
+
+Pairs = Iterable[tuple[Trial, Track]]
+
+
+def prepare(pairs: Pairs) -> tuple[list[FitTrial], dict[str, str]]:
+    """Trials that can be fitted, and for the others the reason why not, by name."""
+    data, left_out = [], {}
+    for trial, track in pairs:
+        try:
+            data.append(prepare_trial(trial, track))
+        except FitError as error:
+            left_out[trial.name] = str(error)
+    return data, left_out
+
+
+def prepare_trial(trial: Trial, track: Track) -> FitTrial:
+    """The usable points of a track, rest included, with what they say of their own noise.
+
+    Raises
+    ------
+    FitError
+        Fewer than five usable points, times that do not increase, a leading edge that never moves, or one that moves
+        although its pressure cannot do it.
+    """
+    usable = track.usable & ~_nearing_end(trial, track)
+    vague, vague_rest = _vague(track, usable)
+    usable &= ~vague
+    time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
+    if time_s.size < FEWEST_POINTS:
+        raise FitError(f"{time_s.size} usable points, at least {FEWEST_POINTS} are needed")
+    steps = np.diff(time_s)
+    if np.any(steps <= 0):
+        raise FitError("its times do not increase: sort the rows or drop repeated ones")
+    noise_m, correlation = position_noise(time_s, position_m)
+    if track.pressure_Pa is None and _undriven(trial):
+        raise FitError(
+            f"its pressure, {trial.pressure_Pa / 1e3:g} kPa, lies below the yield pressure,"
+            f" {trial.yield_pressure_Pa / 1e3:g} kPa, yet it moves: correct the sheet"
+        )
+    moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
+    if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
+        raise FitError("its leading edge never moves forward beyond its noise")
+    n_rest = rest_points(position_m)
+    trace, gauge_error = _trace(track, time_s[max(n_rest - 1, 0) :])
+    stated_m = track.lead_position_sigma_m[usable]
+    # Of positions that somebody else measured, an error is that of the point alone; a tracker errs slowly besides.
+    filmed = trial.video is not None
+    return FitTrial(
+        trial=trial,
+        time_s=time_s,
+        lead_position_m=position_m,
+        first=np.concatenate([[True], steps > GAP_FRAMES * np.median(steps)]),
+        n_rest=n_rest if n_rest < position_m.size else 0,
+        noise_m=noise_m,
+        correlation=correlation,
+        trace=trace,
+        gauge_error=gauge_error,
+        vague_rest=vague_rest,
+        tracker_sigma_m=float(np.nanmedian(stated_m)) if filmed and np.isfinite(stated_m).any() else math.nan,
+    )
+
+
+def _trace(track: Track, moving_s: Floats) -> tuple[tuple[Floats, Floats] | None, float]:
+    """Times and pressures of a trace freed of noise, and by what part of the pressure it is wrong all the same."""
+    if track.pressure_Pa is None:
+        return None, 0.0
+    known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
+    if np.count_nonzero(known) < 2:
+        return None, 0.0
+    clock_s, pressure_Pa = (one[known].astype(float) for one in (track.time_s, track.pressure_Pa))
+    told = (clock_s >= moving_s[0]) & (clock_s <= moving_s[-1])
+    typical_Pa = abs(float(np.median(pressure_Pa[told]))) if told.any() else math.nan
+    smooth_Pa = without_noise(pressure_Pa)
+    if not typical_Pa > 0 or smooth_Pa is pressure_Pa:
+        return (clock_s, smooth_Pa), 0.0
+    return (clock_s, smooth_Pa), noise_of(pressure_Pa) / math.sqrt(np.count_nonzero(told)) / typical_Pa
+
+
+def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], VagueRest | None]:
+    """Points whose own stated error is several times that of the others, such as an edge half behind the door.
+
+    And what the rest before the motion still says where it is among them.
+    They would tell a tenth of what another tells, and count as much: one noise holds for all points of a trial.
+    """
+    sigma_m = track.lead_position_sigma_m
+    known = usable & np.isfinite(sigma_m)
+    if not known.any():
+        return np.zeros(usable.size, dtype=bool), None
+    better_m = sigma_m[known & (sigma_m <= np.median(sigma_m[known]))]
+    vague = known & (sigma_m > VAGUE * np.median(better_m))
+    places = np.flatnonzero(usable)
+    at_rest = places[: rest_points(track.lead_position_m[places])]
+    rest = None
+    if 0 < at_rest.size < places.size and np.mean(vague[at_rest]) > MOSTLY:
+        # The few that are left of such a rest would hold the origin alone.
+        vague[at_rest] = True
+        rest = VagueRest(
+            release_s=float(track.time_s[at_rest[-1]]),
+            origin_m=float(np.median(track.lead_position_m[at_rest])),
+            sigma_m=float(np.median(sigma_m[at_rest])),
+        )
+    enough = np.count_nonzero(usable & ~vague) >= max(FEWEST_POINTS, FEWEST_CLEAR * np.count_nonzero(usable))
+    return (vague, rest) if enough else (np.zeros(usable.size, dtype=bool), None)
+
+
+def _undriven(trial: Trial) -> bool:
+    """Whether no error that the sheet admits lets the pressure move a bare vine; gravity alone may move a payload."""
+    room_Pa = 3 * (np.nan_to_num(trial.pressure_sigma_Pa) + np.nan_to_num(trial.yield_pressure_sigma_Pa))
+    return trial.travel_ratio != 1 and trial.payload_kg == 0 and trial.pressure_Pa + room_Pa < trial.yield_pressure_Pa
+
+
+def _nearing_end(trial: Trial, track: Track) -> NDArray[np.bool_]:
+    """Frames on the last twentieth of the growth and the first two behind its end."""
+    near = np.zeros(track.time_s.size, dtype=bool)
+    use = np.flatnonzero(track.usable)
+    if not np.isfinite(trial.length_m) or use.size < FEWEST_POINTS:
+        return near
+    y = track.lead_position_m[use]
+    noise_m = rough_noise(y) + 1e-9
+    n_rest = rest_points(y)
+    n_rest = n_rest if n_rest < y.size else 0
+    begin_m = float(np.mean(y[: max(n_rest, 1)]))
+    # A track that stands still at its end, after a last step far above its noise, has seen the end of growth.
+    still = np.abs(y - np.median(y[-2:])) < 5 * noise_m
+    moving = np.flatnonzero(~still)
+    end = int(moving[-1]) + 1 if moving.size else y.size
+    reached = y.size - end >= 2 and y[end] - y[end - 1] > 5 * noise_m
+    last_m = float(np.median(y[-2:])) - (1 - END_FRACTION) * trial.length_m if reached else np.inf
+    late = y > min(begin_m + END_FRACTION * trial.length_m, last_m)
+    if reached:
+        # Noise hides the end for as long as the last steps are no larger; behind it the model must have stopped too.
+        step_m = max(float(np.median(np.diff(y[max(end - 10, 0) : end]))), 1e-9)
+        late[end + FRAMES_BEHIND_END + math.ceil(min(10 * noise_m / step_m, y.size)) :] = False
+    near[use[late]] = True
+    return near
+
+
+def pairs_of(
+    experiment: Experiment | Path | str | Pairs, tracks: Mapping[str, Track] | None = None
+) -> tuple[list[tuple[Trial, Track]], dict[str, str]]:
+    """Trials and their tracks, and why some trials have none.
+
+    Parameters
+    ----------
+    experiment
+        An experiment, the path of its folder, or pairs of trial and track.
+    tracks
+        Tracks by name of trial, for recordings that were tracked before; else they are read from the experiment.
+
+    Raises
+    ------
+    ExperimentError
+        If the folder is no experiment.
+    """
+    from vinetrack.experiment.folder import Experiment, read_experiment
+
+    if isinstance(experiment, (str, Path)):
+        experiment = read_experiment(experiment)
+    if not isinstance(experiment, Experiment):
+        return list(experiment), {}
+    pairs, left_out = [], {**experiment.failed, **experiment.left_out}
+    for trial in experiment.trials:
+        if tracks is not None and trial.name in tracks:
+            pairs.append((trial, tracks[trial.name]))
+            continue
+        try:
+            pairs.append((trial, _read(trial)))
+        except FitError as error:
+            left_out[trial.name] = str(error)
+    return pairs, left_out
+
+
+def _read(trial: Trial) -> Track:
+    """The track that an experiment brings along, frames that repeat or jump put right."""
+    from vinetrack.tracks.frame_timing import correct_frames
+    from vinetrack.tracks.importers import TrackError, load_track
+
+    if trial.track is None:
+        raise FitError("its recording has not been tracked: run snakemake, or give its track")
+    try:
+        return correct_frames(load_track(trial))
+    except TrackError as error:
+        raise FitError(str(error)) from error

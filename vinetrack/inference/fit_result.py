@@ -1,0 +1,205 @@
+"""What a fit found: numbers with errors and intervals, what each trial has of its own, and what to beware of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.model import Model
+from vinetrack.inference.fit_data import FitError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.inference.optimiser import Solution
+    from vinetrack.inference.sensitivity import Predictor
+
+SHOWN_AS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
+"""Units that read better another way: name and factor."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval.
+
+    `vine` is blank where the number holds for all. `method` tells where the interval comes from: `linear`, `profile`
+    where a bound is near, `none` where the data leave it open. `bound` is the bound it sits at, NaN elsewhere.
+    """
+
+    key: str
+    vine: str
+    symbol: str
+    unit: str
+    value: float
+    sigma: float
+    low: float
+    high: float
+    dof: float
+    method: str
+    bound: float = math.nan
+
+    @property
+    def name(self) -> str:
+        """`effect.parameter`, with the vine in brackets where it has one of its own."""
+        return f"{self.key}[{self.vine}]" if self.vine else self.key
+
+    @property
+    def title(self) -> str:
+        """Symbol, and the vine where it has one of its own."""
+        return f"{self.symbol} ({self.vine})" if self.vine else self.symbol
+
+
+@dataclass(frozen=True)
+class BetweenTrialSpread:
+    """Standard deviation from trial to trial, relative; `estimated` tells whether from these data."""
+
+    value: float
+    estimated: bool
+
+
+@dataclass(frozen=True)
+class TrialFit:
+    """One trial under the model; arrays have shape (n_points,), at the points that were used.
+
+    `whitened` are residuals freed of their correlation, in standard deviations. Deviations are relative, of the set
+    pressure and of the vine's B.
+    """
+
+    trial: Trial
+    time_s: Floats
+    lead_position_m: Floats
+    predicted_position_m: Floats
+    predicted_velocity_m_s: Floats
+    residual_m: Floats
+    whitened: Floats
+    release_s: float
+    release_sigma_s: float
+    origin_m: float
+    origin_sigma_m: float
+    pressure_deviation: float
+    pressure_deviation_sigma: float
+    damping_deviation: float
+    damping_deviation_sigma: float
+    noise_m: float
+
+    @property
+    def name(self) -> str:
+        """The trial's name."""
+        return self.trial.name
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the residuals, m."""
+        return float(np.sqrt(np.mean(self.residual_m**2)))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model fitted to trajectories. Printed, it is a table.
+
+    `model` carries the fitted values. `covariance` is that of `numbers`, SI, in their order. `noise_m` is the standard
+    deviation of a position and `noise_correlation` its lag-one correlation, found with the model;
+    `chi2_per_dof` holds what the model leaves against the noise of the tracks alone: 1 where nothing is missed.
+    `log_likelihood` is the marginal one, every trial's own numbers integrated out, spreads and noise at their best:
+    what hypotheses are compared by. `left_out` gives trials that could not be used, and why.
+    """
+
+    model: Model
+    numbers: tuple[Number, ...]
+    covariance: Floats
+    spreads: Mapping[str, BetweenTrialSpread]
+    noise_m: float
+    noise_correlation: float
+    chi2_per_dof: float
+    log_likelihood: float
+    trials: tuple[TrialFit, ...]
+    messages: tuple[str, ...]
+    left_out: Mapping[str, str]
+    converged: bool
+    iterations: int
+    predictor: Predictor
+    solution: Solution
+    options: Mapping[str, Any]
+
+    def __getitem__(self, name: str) -> Number:
+        """The number of that name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique.
+
+        Raises
+        ------
+        FitError
+            If there is none or several.
+        """
+        fits = [n for n in self.numbers if name in (n.name, n.key, n.key.split(".")[1], n.title)]
+        if len(fits) != 1:
+            known = ", ".join(number.name for number in (fits or self.numbers)) or "none"
+            raise FitError(f"{name!r} is {'no number' if not fits else 'more than one number'} of the fit: {known}.")
+        return fits[0]
+
+    def correlation(self, one: str, other: str) -> float:
+        """Correlation of the errors of two numbers."""
+        i, j = self.numbers.index(self[one]), self.numbers.index(self[other])
+        return float(self.covariance[i, j] / math.sqrt(self.covariance[i, i] * self.covariance[j, j]))
+
+    def trial(self, name: str) -> TrialFit:
+        """The trial of that name; KeyError where there is none."""
+        return {trial.name: trial for trial in self.trials}[name]
+
+    def table(self) -> pd.DataFrame:
+        """A row a number: `parameter, vine, value, sigma, low_95, high_95, unit, interval`."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            [(n.key, n.vine, n.value, n.sigma, n.low, n.high, n.unit, n.method) for n in self.numbers],
+            columns=["parameter", "vine", "value", "sigma", "low_95", "high_95", "unit", "interval"],
+        )
+
+    def __str__(self) -> str:
+        points = sum(trial.time_s.size for trial in self.trials)
+        lines = [f"{' + '.join(self.model.names)}, fitted to {len(self.trials)} trials ({points} positions)"]
+        lines += aligned([("", "value", "error", "95 % interval", "unit"), *map(_row, self.numbers)])
+        lines += [_spread_line(name, spread) for name, spread in self.spreads.items()]
+        lines.append(
+            f"noise {self.noise_m * 1e3:.3g} mm, correlation {self.noise_correlation:.2f};"
+            f" χ² per degree of freedom {self.chi2_per_dof:.3g}; ln L {self.log_likelihood:.1f}"
+        )
+        lines += [f"! {message}" for message in self.messages]
+        if self.left_out:
+            lines.append(f"left out: {'; '.join(f'{name} ({why})' for name, why in self.left_out.items())}")
+        return "\n".join(lines)
+
+
+def _row(number: Number) -> tuple[str, ...]:
+    unit, factor = SHOWN_AS.get(number.unit, (number.unit, 1.0))
+    if not math.isfinite(number.sigma):
+        return number.title, f"{number.value * factor:.4g}", "open", "", unit
+    digits = decimals(number.sigma * factor)
+    value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
+    return number.title, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}", unit
+
+
+def decimals(sigma: float) -> int:
+    """Decimals that show two digits of an error."""
+    return 0 if not sigma > 0 else int(np.clip(1 - math.floor(math.log10(sigma)), 0, 12))
+
+
+def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Rows of (name, value, error, interval, unit) as lines of text in columns; values to the right, the rest left."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.rjust(width) if k == 1 else cell.ljust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append(f"  {'  '.join(cells)}".rstrip())
+    return lines
+
+
+def _spread_line(name: str, spread: BetweenTrialSpread) -> str:
+    how = "" if spread.estimated else " (held: too few trials to estimate it, or told)"
+    return f"spread of {name} from trial to trial {100 * spread.value:.2g} %{how}"

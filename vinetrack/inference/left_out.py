@@ -1,0 +1,189 @@
+"""What a fitted model says of trials it has not seen: their release and origin are found, nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import EffectError
+from vinetrack.inference.assemble import trial_fit
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, prepare_trial
+from vinetrack.inference.parameters import YIELD_PRESSURE, ParameterMap
+from vinetrack.inference.sensitivity import (
+    DAMPING_DEVIATION,
+    ORIGIN,
+    OWN,
+    PRESSURE,
+    RELEASE,
+    RELEASE_STEP_FRAMES,
+    Predictor,
+)
+from vinetrack.inference.starts import align, initial_trial_effects
+from vinetrack.inference.whitening import all_products, at_correlation
+
+if TYPE_CHECKING:
+    from vinetrack.inference.fit_result import Fit, TrialFit
+
+TOLD_APART = 1e-4
+"""Least eigenvalue, of a matrix of unit diagonal, at which release and origin are both found."""
+
+MOST_STEPS = 20
+SETTLED_FRAMES = 1e-3
+FEWEST_AT_REST = 5
+"""Frames before the motion that tell where a vine started, to half the noise of one."""
+
+
+def predict_trials(found: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[TrialFit]:
+    """Trials with their own release and origin, deviations zero; see `vinetrack.inference.fit.predict`.
+
+    With `from_rest` the origin is where a vine is seen at rest before it moves, and release (and the origin where no
+    rest was filmed) are where the root mean square is least. Else both weigh errors with the correlation that the fit
+    found, which where a model fails is nearly 1, and leaves the origin to the misfit.
+    """
+    return predict_prepared(found, [_prepared(trial, track) for trial, track in pairs], from_rest=from_rest)
+
+
+def predict_prepared(found: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
+    """As `predict_trials`, for trials that were laid out for a fit already.
+
+    Raises
+    ------
+    FitError
+        If a vine was not in the fit and B is one per vine, or the model cannot be followed.
+    """
+    rho = 0.0 if from_rest else found.noise_correlation
+    variance = found.noise_m**2 * (1 - rho**2)
+    predictor, own, square = laid_on(found, data, from_rest=from_rest)
+    data = predictor.data
+    try:
+        moved = predictor.run(predictor.jobs(np.empty(0), own))
+    except SimulationError as error:
+        raise FitError(f"The model cannot be followed: {error}") from error
+    sigma = np.zeros((len(data), OWN))
+    sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square / variance, hermitian=True)))
+    return [
+        trial_fit(item, own[i], sigma[i], moved[i].observed_position_m, moved[i].lead_velocity_m_s, rho, variance)
+        for i, item in enumerate(data)
+    ]
+
+
+def laid_on(found: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
+    """The fitted model laid on trials: see `predict_prepared`.
+
+    Returns
+    -------
+    predictor : of these trials with nothing free
+    own : array, shape (n_trials, 4), the release and origin found, deviations 0
+    square : array, shape (n_trials, 2, 2), whitened products of release and origin
+
+    Raises
+    ------
+    FitError
+        As `predict_prepared`.
+    """
+    data = [_known_yield(found, item) for item in data]
+    predictor = Predictor(_nothing_free(found, data), data, found.predictor.host)
+    try:
+        own, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
+        own, square = _settle(predictor, own, 0.0 if from_rest else found.noise_correlation, from_rest)
+    except SimulationError as error:
+        raise FitError(f"The model cannot be followed: {error}") from error
+    return predictor, own, square
+
+
+def told_apart(design: Floats, left: Floats, least: float) -> Floats:
+    """Least squares of columns brought to one length, shape (n_columns,); what is hardly told apart is left alone.
+
+    At constant speed a later release and a higher origin are one. `least` is the least singular value that counts.
+    """
+    length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    return np.asarray(np.linalg.lstsq(design / length, left, rcond=least)[0] / length)
+
+
+def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
+    """Trials filmed long enough at rest to say where they began, shape (n_trials,)."""
+    return np.array([item.n_rest >= FEWEST_AT_REST or item.vague_rest is not None for item in data], dtype=bool)
+
+
+def _prepared(trial: Trial, track: Track) -> FitTrial:
+    try:
+        return prepare_trial(trial, track)
+    except FitError as error:
+        raise FitError(f"Trial {trial.name}: {error}.") from error
+
+
+def _known_yield(found: Fit, item: FitTrial) -> FitTrial:
+    """The trial with the yield pressure that the fit found for its vine, where it found one."""
+    stated = f"{item.trial.vine}, {item.trial.yield_pressure_Pa / 1e3:g} kPa"
+    for number in found.numbers:
+        if number.key == YIELD_PRESSURE and number.vine in (item.trial.vine, stated):
+            return replace(item, trial=replace(item.trial, yield_pressure_Pa=number.value))
+    return item
+
+
+def _nothing_free(found: Fit, data: Sequence[FitTrial]) -> ParameterMap:
+    try:
+        base = np.array([found.model.parameters_for(item.trial.vine) for item in data])
+    except EffectError as error:
+        raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
+    base = base.reshape(len(data), len(found.model.parameter_names))
+    return ParameterMap(found.model, (), (), np.zeros((len(data), 0), dtype=int), base)
+
+
+def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> tuple[Floats, Floats]:
+    """Newton's steps in release and origin, no longer than two frames; the own numbers, and their information.
+
+    A trial that has settled is left alone: it costs as much to simulate as one that has not.
+    """
+    data = predictor.data
+    frames = np.array([item.frame_s for item in data])
+    held = rest_is_seen(data) & from_rest
+    own, square = own.copy(), np.zeros((len(data), 2, 2))
+    own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+    let_in = np.array([item.let_in for item in data], dtype=bool)
+    for i in np.flatnonzero(held).tolist():
+        own[i, ORIGIN] = data[i].rest_origin_m
+    moving = np.arange(len(data))
+    for _ in range(MOST_STEPS):
+        sums = _sums(predictor, own, moving, rho)
+        square[moving] = sums[:, :2, :2]
+        sums[held[moving], ORIGIN, :] = sums[held[moving], :, ORIGIN] = 0.0
+        sums[let_in[moving], RELEASE, :] = sums[let_in[moving], :, RELEASE] = 0.0
+        # At constant speed a later release and a higher origin are one: brought to a unit diagonal that is seen.
+        scale = 1 / np.sqrt(np.maximum(np.einsum("nkk->nk", sums[:, :2, :2]), 1e-300))
+        scale[held[moving], ORIGIN] = scale[let_in[moving], RELEASE] = 0.0
+        even = sums[:, :2, :2] * scale[:, :, None] * scale[:, None, :]
+        inverse = np.linalg.pinv(even, rcond=TOLD_APART, hermitian=True) * scale[:, :, None] * scale[:, None, :]
+        step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])
+        reach = 2 * frames[moving]
+        step[:, RELEASE] = np.clip(step[:, RELEASE], -reach, reach)
+        own[moving, :2] += step
+        moving = moving[np.abs(step[:, RELEASE]) >= SETTLED_FRAMES * frames[moving]]
+        if not moving.size:
+            break
+    return own, square
+
+
+def _sums(predictor: Predictor, own: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
+    """Whitened products of [release, origin, residual] of some trials, shape (n_rows, 3, 3)."""
+    jobs = predictor.jobs(np.empty(0), own)
+    later = [row for row in rows.tolist() if not predictor.plain_release[row]]
+    steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in later}
+    moved = predictor.run(
+        [jobs[row] for row in rows] + [replace(jobs[k], release_s=own[k, RELEASE] + steps[k]) for k in later]
+    )
+    shifted = dict(zip(later, moved[rows.size :], strict=True))
+    columns = []
+    for row, plain in zip(rows.tolist(), moved, strict=False):
+        answer = -plain.lead_velocity_m_s
+        if row in shifted:
+            answer = (shifted[row].observed_position_m - plain.observed_position_m) / steps[row]
+        residual = predictor.data[row].lead_position_m - own[row, ORIGIN] - plain.observed_position_m
+        columns.append(np.column_stack([answer, np.ones_like(answer), residual]))
+    return at_correlation(all_products(columns, [predictor.data[row].first for row in rows]), rho)

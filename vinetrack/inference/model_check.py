@@ -1,0 +1,98 @@
+"""The dynamic model checks the damping fits: B and n from steady windows against B and n from whole trajectories.
+
+Both stand on the same recordings, but not on the same part of them: a steady window says how fast a vine ends up, a
+trajectory also how it gets there. Where they differ by more than their errors, the model lacks something.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.parameters import DAMPING, EXPONENT
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CHECK_COLUMNS = ("vine", "n_steady", "n_trajectory", "B_steady", "B_trajectory", "z")
+
+
+def check_damping(found: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
+    """A row a vine, as `model_check.csv` holds it.
+
+    Parameters
+    ----------
+    found
+        A fit with B and n free.
+    damping
+        One fit of `damping.json`: `both_axes` or `log_log`.
+
+    Returns
+    -------
+    DataFrame
+        `z` is the distance between the two pairs (n, ln B) of a vine, given as the number of standard errors at which
+        a single number would be as unlikely. Errors are added as if the two were independent, though they share their
+        noise: z errs to the small side. NaN where a vine is missing in either.
+
+    Raises
+    ------
+    FitError
+        If the fit has no exponent of its own.
+    """
+    import pandas as pd
+
+    if EXPONENT not in [number.key for number in found.numbers]:
+        raise FitError("The exponent n was held in this fit: there is nothing to check the steady windows against.")
+    n = found[EXPONENT]
+    rows = []
+    for vine in dict.fromkeys(trial.trial.vine for trial in found.trials):
+        steady = (damping.get("vines") or {}).get(vine)
+        B = next((b for b in found.numbers if b.key == DAMPING and b.vine in (vine, "")), None)
+        n_steady = damping.get("n")
+        row: dict[str, object] = {
+            "vine": vine,
+            "n_steady": math.nan if n_steady is None else n_steady,
+            "n_trajectory": n.value,
+            "B_steady": steady["B"] if steady else math.nan,
+            "B_trajectory": B.value if B else math.nan,
+            "z": math.nan,
+        }
+        if steady and B and n_steady is not None:
+            apart = np.array([n_steady - n.value, math.log(steady["B"] / B.value)])
+            row["z"] = _deviate(apart, _steady_covariance(damping, vine) + _trajectory_covariance(found, B.name))
+        rows.append(row)
+    return pd.DataFrame(rows, columns=list(CHECK_COLUMNS))
+
+
+def _steady_covariance(damping: Mapping[str, Any], vine: str) -> Floats:
+    """Covariance of n and ln B of one vine from steady windows."""
+    names = damping["covariance"]["parameters"]
+    k = [names.index("n"), names.index(f"ln B {vine}")]
+    return np.array(damping["covariance"]["matrix"], dtype=float)[np.ix_(k, k)]
+
+
+def _trajectory_covariance(found: Fit, name: str) -> Floats:
+    """Covariance of n and ln B from the trajectories."""
+    k = [found.numbers.index(found[EXPONENT]), found.numbers.index(found[name])]
+    slopes = np.array([1.0, 1 / found[name].value])
+    return np.asarray(found.covariance[np.ix_(k, k)] * slopes[:, None] * slopes)
+
+
+def _deviate(apart: Floats, covariance: Floats) -> float:
+    """The normal deviate as unlikely as this distance of two numbers: χ² with two degrees of freedom."""
+    from scipy.stats import norm
+
+    if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance) < 2:
+        return math.nan
+    square = float(apart @ np.linalg.solve(covariance, apart))
+    # ln P(χ²₂ > s) = −s/2; half of it on each side of the normal, in logarithms so that 40 σ is 40 σ.
+    log_tail = -square / 2 - math.log(2)
+    if log_tail > -700:
+        return float(norm.isf(math.exp(log_tail)))
+    return math.sqrt(square - math.log(square))

@@ -1,0 +1,235 @@
+"""Which numbers of a model a fit may move, and how a vector of them reaches every trial.
+
+A number is named `effect.parameter`; the yield pressure, which the sheet brings along for each vine, is
+`yield_pressure.P_y`. Inside, each is divided by its scale, so that all are of the order of one; but B enters as ln B:
+then what a trial shares with the other trials and what it has of its own add up exactly, and so do ln B and n ln v.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.model import Model
+from vinetrack.effects import Parameter
+from vinetrack.inference.fit_data import FitError, FitTrial
+
+YIELD_PRESSURE = "yield_pressure.P_y"
+DAMPING = "eversion_damping.B"
+EXPONENT = "eversion_damping.n"
+LEAST_DAMPING = 1e-6
+
+
+@dataclass(frozen=True)
+class FreeParameter:
+    """One number that a fit moves, SI. `vine` is blank where it is the same for all trials.
+
+    `prior_sd` is infinite where only the data speak. A prior's mean is `start`.
+    """
+
+    key: str
+    vine: str
+    symbol: str
+    unit: str
+    start: float
+    lower: float
+    upper: float
+    scale: float
+    prior_sd: float = math.inf
+    tries: tuple[float, ...] = ()  #: other values to begin from
+    logarithmic: bool = False
+
+    @property
+    def name(self) -> str:
+        """`effect.parameter`, with the vine in brackets where it has one of its own."""
+        return f"{self.key}[{self.vine}]" if self.vine else self.key
+
+    def inside(self, value: float) -> float:
+        """The value as the fit holds it."""
+        if self.logarithmic:
+            return math.log(max(value, LEAST_DAMPING))
+        return value / self.scale
+
+    def outside(self, theta: float) -> float:
+        """The value, SI, of what the fit holds."""
+        return math.exp(theta) if self.logarithmic else theta * self.scale
+
+
+@dataclass(frozen=True)
+class ParameterMap:
+    """The free numbers in order, and which of them each trial feels.
+
+    `index`, shape (n_trials, n_keys), gives the place among `free` of each key for each trial, -1 where a trial does
+    not feel it. Every trial sees as many columns as there are keys, however many vines there are.
+    """
+
+    model: Model
+    free: tuple[FreeParameter, ...]
+    keys: tuple[str, ...]
+    index: NDArray[np.int_]
+    base: Floats
+
+    @property
+    def start(self) -> Floats:
+        """Starting values, scaled, shape (n_free,)."""
+        return np.array([number.inside(number.start) for number in self.free])
+
+    @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Lower and upper bounds, scaled, shape (n_free,) each."""
+        return (
+            np.array([number.inside(number.lower) for number in self.free]),
+            np.array([number.inside(number.upper) for number in self.free]),
+        )
+
+    @property
+    def prior_precision(self) -> Floats:
+        """1/sd² of the priors in scaled units, shape (n_free,); 0 where there is none."""
+        return np.array([(number.scale / number.prior_sd) ** 2 for number in self.free])
+
+    def values(self, theta: Floats) -> Floats:
+        """Values in SI, shape (n_free,)."""
+        return np.array([number.outside(float(one)) for number, one in zip(self.free, theta, strict=True)])
+
+    def rows(self, theta: Floats) -> tuple[Floats, Floats]:
+        """Model parameters (n_trials, n_parameters) and yield pressures (n_trials,), Pa, for scaled values `theta`."""
+        rows = self.base.copy()
+        values = self.values(theta)
+        yields = np.full(rows.shape[0], math.nan)
+        for column, key in enumerate(self.keys):
+            felt = self.index[:, column] >= 0
+            if key == YIELD_PRESSURE:
+                yields[felt] = values[self.index[felt, column]]
+            else:
+                rows[felt, self.model.parameter_names.index(key)] = values[self.index[felt, column]]
+        return rows, yields
+
+
+def make_layout(
+    model: Model,
+    data: Sequence[FitTrial],
+    *,
+    fixed: Iterable[str] = (),
+    free: Iterable[str] = (),
+    shared: Mapping[str, str] | None = None,
+) -> ParameterMap:
+    """Decide which numbers are free.
+
+    By default every parameter of every effect is, but those that are `held` (g); and the yield pressure of each vine
+    within the error the sheet gives it. Where nothing else is left to find, what is held is found.
+
+    Parameters
+    ----------
+    fixed, free
+        Names to hold at the value of the model, or to find although held. The parameter's own name will do where it is
+        the only one of that name.
+    shared
+        `"all"` or `"vine"` by name, in place of what the effect says.
+
+    Raises
+    ------
+    FitError
+        If a name is not that of any parameter.
+    """
+    known = {f"{effect.name}.{parameter.name}": parameter for effect in model for parameter in effect.parameters}
+    names = [*known, *([YIELD_PRESSURE] if "yield_pressure" in model else [])]
+    held = {find_name(name, names) for name in fixed}
+    wanted = {find_name(name, names) for name in free}
+    sharing = {find_name(name, names): how for name, how in (shared or {}).items()}
+    for name, how in sharing.items():
+        if how not in ("all", "vine"):
+            raise FitError(f"{name} is shared by {how!r}: say 'all' or 'vine'.")
+    chosen = [name for name in known if name not in held and (name in wanted or not known[name].held)]
+    if not chosen and not held:
+        chosen = list(known)
+    vines = [item.trial.vine for item in data]
+    numbers: list[FreeParameter] = []
+    index = np.full((len(data), 0), -1)
+    for name in chosen:
+        how = sharing.get(name, known[name].shared)
+        members = list(dict.fromkeys(vines)) if how == "vine" else [""]
+        places = {vine: len(numbers) + i for i, vine in enumerate(members)}
+        numbers += [_number(model, name, known[name], vine, vines) for vine in members]
+        column = np.array([places[vine if how == "vine" else ""] for vine in vines])
+        index = np.column_stack([index, column])
+    keys = list(chosen)
+    if YIELD_PRESSURE in names and YIELD_PRESSURE not in held:
+        found, column = _yield_pressures(data, len(numbers))
+        if found:
+            numbers, keys, index = [*numbers, *found], [*keys, YIELD_PRESSURE], np.column_stack([index, column])
+    base = np.array([model.parameters_for(vine) for vine in vines]).reshape(len(data), len(model.parameter_names))
+    return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base)
+
+
+def find_name(name: str, names: Sequence[str]) -> str:
+    """The full name among `names` that `name` stands for.
+
+    Raises
+    ------
+    FitError
+        If it stands for none, or for several; the message suggests.
+    """
+    if name in names:
+        return name
+    short = [full for full in names if full.split(".")[1] == name]
+    if len(short) == 1:
+        return short[0]
+    near = short or difflib.get_close_matches(name, names, n=1, cutoff=0.4) or list(names)
+    raise FitError(f"No parameter of the model is named {name!r}: say {' or '.join(near)}.")
+
+
+def _number(model: Model, name: str, parameter: Parameter, vine: str, vines: Sequence[str]) -> FreeParameter:
+    value = model.parameters_for(vine or vines[0])[model.parameter_names.index(name)]
+    low, high = parameter.plausible or parameter.bounds
+    width = high - low if math.isfinite(high - low) else max(abs(parameter.default), 1.0)
+    tries = (low + 0.5 * width,) if math.isfinite(low) and name not in (DAMPING, EXPONENT) else ()
+    return FreeParameter(
+        key=name,
+        vine=vine,
+        symbol=parameter.symbol,
+        unit=parameter.unit,
+        start=float(np.clip(value, *parameter.bounds)),
+        lower=parameter.bounds[0],
+        upper=parameter.bounds[1],
+        scale=max(abs(value), 0.3 * width) or 1.0,
+        tries=tries,
+        logarithmic=name == DAMPING,
+    )
+
+
+def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[FreeParameter], NDArray[np.int_]]:
+    """One yield pressure for each vine and stated value, known to the error of the sheet."""
+    numbers: list[FreeParameter] = []
+    places: dict[tuple[str, float], int] = {}
+    column = np.full(len(data), -1)
+    stated = {(item.trial.vine, round(item.trial.yield_pressure_Pa, 3)) for item in data}
+    several = {vine for vine, _ in stated if sum(vine == other for other, _ in stated) > 1}
+    for i, item in enumerate(data):
+        trial = item.trial
+        sigma_Pa, stated_Pa = trial.yield_pressure_sigma_Pa, trial.yield_pressure_Pa
+        if trial.travel_ratio == 1 or not (math.isfinite(sigma_Pa) and sigma_Pa > 0 and math.isfinite(stated_Pa)):
+            continue
+        place = (trial.vine, round(stated_Pa, 3))
+        if place not in places:
+            places[place] = offset + len(numbers)
+            numbers.append(
+                FreeParameter(
+                    key=YIELD_PRESSURE,
+                    vine=f"{trial.vine}, {stated_Pa / 1e3:g} kPa" if trial.vine in several else trial.vine,
+                    symbol="P_y",
+                    unit="Pa",
+                    start=stated_Pa,
+                    lower=0.0,
+                    upper=math.inf,
+                    scale=max(stated_Pa, 1e3),
+                    prior_sd=sigma_Pa,
+                )
+            )
+        column[i] = places[place]
+    return numbers, column

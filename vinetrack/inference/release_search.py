@@ -1,0 +1,170 @@
+"""Releases of trials looked for, not only improved.
+
+The release, the origin and the deviations of a trial trade against each other, so that its misfit has a minimum in more
+than one place: by far where no frame shows it at rest, and where a vine begins so slowly that its first frames hardly
+differ from rest. A trajectory depends on the time since release alone, so one simulation, shifted, tells the misfit of
+every release.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effect_prior
+from vinetrack.inference.sensitivity import (
+    DAMPING_DEVIATION,
+    ORIGIN,
+    OWN,
+    PRESSURE,
+    RELEASE,
+    Job,
+    Predictor,
+)
+from vinetrack.inference.trial_effects import follow_trial_effects, trial_costs
+from vinetrack.inference.whitening import all_products, at_correlation, whiten
+
+RELEASES = 60
+NEAR_FRAMES = np.concatenate([np.arange(-14.0, 15.0), [-0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6]])
+"""Where else the release of a trial may be that was seen at rest, from where it is held to be. Close by, it may lie on
+the other side of a frame at which the edge jumps."""
+
+GRID_POINTS = 600
+WORTH_MOVING = 0.5
+"""Fall of a trial's −2 ln L for which its release jumps to another minimum."""
+
+HARDLY_MISSED = 30.0
+"""Times the variance of its noise by which a trial may be missed for its release to be looked for."""
+
+IMPROVED = 3
+"""Steps in which a trial settles at another release before it is held against where it was."""
+
+STEPS = np.array([-np.inf, -0.3, -0.3]), np.array([np.inf, 0.3, 0.3])
+"""Least and largest change of origin and deviations."""
+
+DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
+
+
+def search_releases(predictor: Predictor, frame: MixedProblem, state: FitState) -> FitState | None:
+    """The state with likelier releases; None if none is.
+
+    Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than noise:
+    another release would make up for something else.
+    """
+    missed = trial_costs(predictor, frame, state) * state.variance / (1 - state.rho**2) / frame.points
+    places = [
+        i
+        for i, item in enumerate(predictor.data)
+        if item.trace is None and (not item.shows_rest or missed[i] < HARDLY_MISSED * item.noise_m**2)
+    ]
+    if not places:
+        return None
+    plain = predictor.jobs(state.theta, state.own)
+    releases = [_releases(predictor.data[i], float(state.own[i, RELEASE])) for i in places]
+    answers = _answers(predictor, [plain[i] for i in places], releases)
+    own = state.own.copy()
+    claimed = False
+    for i, tried_s, answer in zip(places, releases, answers, strict=True):
+        there, gain = _best(predictor.data[i], i, frame, state, tried_s, *answer)
+        if gain > WORTH_MOVING:
+            own[i], claimed = there, True
+    kept = _borne_out(predictor, frame, state, replace(state, own=own)) if claimed else state
+    return None if np.array_equal(kept.own, state.own) else kept
+
+
+def _borne_out(predictor: Predictor, frame: MixedProblem, state: FitState, tried: FitState) -> FitState:
+    """Of both states the own numbers that fit a trial better, once those tried have settled: lines are not straight."""
+    for _ in range(IMPROVED):
+        tried = follow_trial_effects(predictor, frame, tried)[0]
+    better = _levels(predictor, frame, tried) < _levels(predictor, frame, state) - WORTH_MOVING
+    return replace(state, own=np.where(better[:, None], tried.own, state.own))
+
+
+def _levels(predictor: Predictor, frame: MixedProblem, state: FitState) -> Floats:
+    """−2 ln L of every trial with its own numbers integrated out about where they stand, shape (n_trials,)."""
+    columns = predictor.linearise(state.theta, state.own, own_only=True)
+    white = at_correlation(all_products(columns, [item.first for item in predictor.data]), state.rho)
+    square = white[:, :OWN, :OWN] / state.variance[:, None, None]
+    precision = trial_effect_prior(frame, state)[1]
+    log_volume = np.linalg.slogdet(square + precision[:, :, None] * np.eye(OWN))[1]
+    return np.asarray(trial_costs(predictor, frame, state) + log_volume)
+
+
+def _best(
+    item: FitTrial,
+    i: int,
+    frame: MixedProblem,
+    state: FitState,
+    releases: Floats,
+    times: Floats,
+    plain: Floats,
+    answers: Floats,
+) -> tuple[Floats, float]:
+    """The own numbers of one trial at its likeliest release, and the fall of −2 ln L from the last of the releases."""
+    own = state.own[i]
+    centre, precision = (part[i] for part in trial_effect_prior(frame, state))
+    since = np.clip(item.time_s - releases[:, None], 0.0, times[-1])
+    moved = [np.interp(since, times, one) for one in (*answers, plain)]
+    moved[-1] = item.lead_position_m - own[ORIGIN] - moved[-1]
+    white = whiten(np.stack(moved, axis=-1), item.first, state.rho) / np.sqrt(state.variance[i])
+    tried = np.tile(own, (releases.size, 1))
+    tried[:, RELEASE] = releases
+    square = np.swapaxes(white, 1, 2) @ white
+    inner = square[:, :-1, :-1] + np.diag(precision)
+    slope = (square[:, :-1, -1] - precision * (tried - centre))[:, ORIGIN:]
+    step = np.clip(np.linalg.solve(inner[:, ORIGIN:, ORIGIN:], slope[..., None])[..., 0], *STEPS)
+    tried[:, ORIGIN:] += step
+    left = white[..., -1] - np.einsum("rnk,rk->rn", white[..., 1:-1], step)
+    levels = np.sum(left**2, axis=1) + np.sum(precision * (tried - centre) ** 2, axis=1) + np.linalg.slogdet(inner)[1]
+    k = int(np.argmin(levels))
+    return tried[k], float(levels[-1] - levels[k])
+
+
+def _releases(item: FitTrial, release_s: float) -> Floats:
+    """Where the release of a trial may be, s, shape (n,); the last is where it is held to be."""
+    if item.shows_rest:
+        return np.append(release_s + item.frame_s * NEAR_FRAMES, release_s)
+    duration_s = float(item.time_s[-1] - item.time_s[0])
+    return np.append(item.time_s[0] - np.geomspace(0.1 * item.frame_s, duration_s, RELEASES), release_s)
+
+
+def _answers(
+    predictor: Predictor, plain: Sequence[Job], releases: Sequence[Floats]
+) -> list[tuple[Floats, Floats, Floats]]:
+    """Of every trial other instants since release, shape (n,), positions there, and how they answer to its own numbers.
+
+    Answers have shape (4, n), zero where it does not feel one.
+    """
+    jobs: list[Job] = []
+    moves: list[tuple[int, float]] = []
+    grids: list[Floats] = []
+    for job, tried_s in zip(plain, releases, strict=True):
+        i, released = job.trial, replace(job, release_s=0.0)
+        ways = [((-1, 0.0), released)]
+        if predictor.feels_pressure[i]:
+            deviation = job.pressure_deviation + PRESSURE_STEP
+            ways.append(((PRESSURE, PRESSURE_STEP), replace(released, pressure_deviation=deviation)))
+        if predictor.feels_damping[i]:
+            row = job.row.copy()
+            row[predictor.damping_column] *= np.exp(DAMPING_STEP)
+            ways.append(((DAMPING_DEVIATION, DAMPING_STEP), replace(released, row=row)))
+        longest_s = float(predictor.data[i].time_s[-1] - tried_s.min())
+        for move, varied in ways:
+            moves.append(move)
+            jobs.append(varied)
+            grids.append(longest_s * np.linspace(0.0, 1.0, GRID_POINTS) ** 1.5)
+    found: list[tuple[Floats, Floats, Floats]] = []
+    for (place, step), times, moved in zip(moves, grids, predictor.run(jobs, times_s=grids), strict=True):
+        y = moved.observed_position_m
+        if place < 0:
+            answers = np.zeros((OWN, times.size))
+            answers[RELEASE] = -np.gradient(y, times)
+            answers[ORIGIN] = 1.0
+            found.append((times, y, answers))
+        else:
+            found[-1][2][place] = (y - found[-1][1]) / step
+    return found

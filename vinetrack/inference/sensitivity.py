@@ -1,0 +1,229 @@
+"""How the predicted positions of every trial answer to what a fit may move.
+
+Per trial there are four numbers of its own: the instant of release, the origin of position, the relative deviation of
+its pressure from what was set, and that of its B from its vine's, as a difference of logarithms. Behind them come the
+free numbers of the model.
+All trajectories, moved and unmoved, are simulated in one call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.simulate import Trajectory, bends_of, lay_out, trajectories
+from vinetrack.dynamics.trial_inputs import check_needs, trial_inputs, with_pressures
+from vinetrack.effects import TrialInputs
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, ParameterMap
+
+RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
+OWN = 4
+"""Numbers of a trial's own: release, s; origin, m; relative deviation of pressure; deviation of ln B."""
+
+AIMED_RESPONSE = 2e-3
+"""Differences are taken over steps that move a trajectory by this part of its length: 1000 times the integrator's
+error, and small enough for the curvature not to count."""
+
+SMALLEST_STEP, LARGEST_STEP = 1e-5, 0.1
+RELEASE_STEP_FRAMES = 0.1
+PAYLOAD_COLUMN = TrialInputs._fields.index("payload_mass")
+DAMPING_STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class Job:
+    """One trajectory to simulate: which trial, its parameters, pressures and release, and how wrong its payload is."""
+
+    trial: int
+    row: Floats
+    yield_pressure_Pa: float
+    pressure_deviation: float
+    release_s: float
+    payload_factor: float = 1.0
+
+
+class Predictor:
+    """Simulates the trials of a fit.
+
+    `feels_pressure` and `feels_damping`, shape (n_trials,), tell which trials have a pressure that may deviate (it was
+    set, or measured by a gauge with noise) and a B. `host` is a larger model whose compiled form serves this one.
+    """
+
+    def __init__(self, layout: ParameterMap, data: Sequence[FitTrial], host: Model | None = None) -> None:
+        self.layout, self.data, self.host = layout, data, host
+        model = layout.model
+        self.damping_column = model.parameter_names.index(DAMPING) if DAMPING in model.parameter_names else -1
+        driven = "pressure_drive" in model
+        self.feels_pressure = np.array(
+            [driven and (item.trial.pressure_Pa > 0 if item.trace is None else item.gauge_error > 0) for item in data],
+            dtype=bool,
+        )
+        self.feels_damping = np.array(
+            [self.damping_column >= 0 and item.trial.travel_ratio != 1 for item in data], dtype=bool
+        )
+        check_needs(model, *(item.trial for item in data))
+        self.rigs = np.array([trial_inputs(item.trial) for item in data], dtype=float)
+        self.bends = [bends_of(item.trial) for item in data]
+        measured_otherwise = any({"true_time", "observed_position"} & set(effect.functions) for effect in model)
+        self.plain_release = [item.trace is None and not measured_otherwise for item in data]
+        self.pressure_step = np.full(len(data), 1e-3)
+        self.steps = np.full(len(layout.keys), 1e-3)
+
+    def run(self, jobs: Sequence[Job], times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
+        """Simulate at the instants of each job's trial, or at those of `times_s`, one array a job."""
+        rows = np.array([job.row for job in jobs]).reshape(len(jobs), -1)
+        return self.run_as(self.layout.model, jobs, rows, times_s)
+
+    def run_as(
+        self, model: Model, jobs: Sequence[Job], rows: Floats, times_s: Sequence[Floats] | None = None
+    ) -> list[Trajectory]:
+        """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials."""
+        places = np.array([job.trial for job in jobs], dtype=int)
+        rigs = with_pressures(
+            self.rigs[places],
+            self.rigs[places, 0] * (1 + np.array([job.pressure_deviation for job in jobs])),
+            np.array([job.yield_pressure_Pa for job in jobs]),
+        )
+        rigs[:, PAYLOAD_COLUMN] *= [job.payload_factor for job in jobs]
+        data = [self.data[job.trial] for job in jobs]
+        batch = lay_out(
+            model,
+            rigs,
+            [self.bends[job.trial] for job in jobs],
+            [
+                time_s - job.release_s
+                for time_s, job in zip(times_s or [item.time_s for item in data], jobs, strict=True)
+            ],
+            traces=[
+                None
+                if item.trace is None
+                else (item.trace[0] - job.release_s, item.trace[1] * (1 + job.pressure_deviation))
+                for item, job in zip(data, jobs, strict=True)
+            ],
+            parameters=rows,
+            host=self.host,
+        )
+        return trajectories(batch, [item.trial.travel_ratio for item in data], [item.trial.name for item in data])
+
+    def jobs(self, theta: Floats, own: Floats) -> list[Job]:
+        """The unmoved trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4)."""
+        rows, yields = self.layout.rows(theta)
+        if self.damping_column >= 0:
+            rows[:, self.damping_column] *= np.exp(own[:, DAMPING_DEVIATION])
+        return [
+            Job(i, rows[i], float(yields[i]), float(own[i, PRESSURE]), float(own[i, RELEASE]))
+            for i in range(len(self.data))
+        ]
+
+    def residuals(self, theta: Floats, own: Floats) -> list[Floats]:
+        """Measured minus predicted position of every trial, m."""
+        moved = self.run(self.jobs(theta, own))
+        return [self._residual(i, moved[i], own) for i in range(len(self.data))]
+
+    def _residual(self, i: int, moved: Trajectory, own: Floats) -> Floats:
+        return self.data[i].lead_position_m - own[i, ORIGIN] - moved.observed_position_m
+
+    def linearise(self, theta: Floats, own: Floats, *, own_only: bool = False) -> list[Floats]:
+        """Columns [own numbers, keys of the layout, residual] of every trial, shape (n_points, 4 + n_keys + 1).
+
+        `own_only` leaves the columns of the keys empty, but for B.
+        """
+        plain = self.jobs(theta, own)
+        jobs, moves = list(plain), [(-1, 0.0)] * len(plain)
+        for i, job in enumerate(plain):
+            for place, step, varied in self._variations(i, job, theta, own, own_only):
+                jobs.append(varied)
+                moves.append((place, step))
+        moved = self.run(jobs)
+        columns = [np.zeros((item.time_s.size, OWN + len(self.layout.keys) + 1)) for item in self.data]
+        for i in range(len(plain)):
+            columns[i][:, ORIGIN] = 1.0
+            columns[i][:, RELEASE] = -moved[i].lead_velocity_m_s
+            columns[i][:, -1] = self._residual(i, moved[i], own)
+        for job, (place, step), other in zip(jobs, moves, moved, strict=True):
+            if place >= 0:
+                columns[job.trial][:, place] = _change(moved[job.trial], other) / step
+        self._share_damping(columns)
+        if not own_only:
+            self._adapt(columns)
+        return columns
+
+    def _variations(self, i: int, job: Job, theta: Floats, own: Floats, own_only: bool) -> list[tuple[int, float, Job]]:
+        """What to simulate for the differences of one trial: place of the column, step, and the moved trajectory."""
+        found: list[tuple[int, float, Job]] = []
+        if not self.plain_release[i]:
+            step = RELEASE_STEP_FRAMES * self.data[i].frame_s
+            found.append((RELEASE, step, replace(job, release_s=job.release_s + step)))
+        if self.feels_pressure[i]:
+            step = float(self.pressure_step[i])
+            found.append((PRESSURE, step, replace(job, pressure_deviation=job.pressure_deviation + step)))
+        if self.feels_damping[i] and DAMPING not in self.layout.keys:
+            row = job.row.copy()
+            row[self.damping_column] *= np.exp(DAMPING_STEP)
+            found.append((DAMPING_DEVIATION, DAMPING_STEP, replace(job, row=row)))
+        upper = self.layout.bounds[1]
+        for column, key in enumerate(self.layout.keys):
+            place = self.layout.index[i, column]
+            if place < 0 or (own_only and key != DAMPING):
+                continue
+            step = float(self.steps[column])
+            if theta[place] + step > upper[place]:
+                step = -step
+            number = self.layout.free[place]
+            if key == YIELD_PRESSURE:
+                varied = replace(job, yield_pressure_Pa=number.outside(theta[place] + step))
+            else:
+                row, k = job.row.copy(), self.layout.model.parameter_names.index(key)
+                row[k] += number.outside(theta[place] + step) - number.outside(theta[place])
+                if key == DAMPING:
+                    row[k] = number.outside(theta[place] + step + own[i, DAMPING_DEVIATION])
+                varied = replace(job, row=row)
+            found.append((OWN + column, step, varied))
+        return found
+
+    def _share_damping(self, columns: list[Floats]) -> None:
+        """A trial's deviation of B and ln B itself are one sensitivity."""
+        if DAMPING not in self.layout.keys:
+            return
+        column = self.layout.keys.index(DAMPING)
+        for i in np.flatnonzero(self.feels_damping):
+            columns[i][:, DAMPING_DEVIATION] = columns[i][:, OWN + column]
+
+    def _adapt(self, columns: list[Floats]) -> None:
+        """Steps for the next time, from how far these moved the trajectories."""
+        spans = np.array([np.ptp(item.lead_position_m) for item in self.data])
+        answers = np.array([np.max(np.abs(column), axis=0) for column in columns]) / spans[:, None]
+        for column in range(len(self.layout.keys)):
+            self.steps[column] = _step(float(np.max(answers[:, OWN + column])), float(self.steps[column]))
+        for i in np.flatnonzero(self.feels_pressure):
+            self.pressure_step[i] = _step(float(answers[i, PRESSURE]), float(self.pressure_step[i]))
+
+
+def _change(plain: Trajectory, other: Trajectory) -> Floats:
+    """How far positions moved. Where growth has ended nothing that only delays the end moves them."""
+    change = other.observed_position_m - plain.observed_position_m
+    if plain.status == "ended":
+        over = plain.time_s > plain.end_time_s
+        change[over] = change[-1] if other.status == "ended" else 0.0
+    return change
+
+
+def moved_by(before: Floats, after: Trajectory) -> Floats:
+    """How far the observed positions of a trial moved from those `before`, m, shape (n_points,)."""
+    change = after.observed_position_m - before
+    if after.status == "ended":
+        # Behind the end of growth the film stands still: what delays the end moves nothing there.
+        change[after.time_s > after.end_time_s] = change[-1]
+    return np.asarray(change)
+
+
+def _step(answer: float, before: float) -> float:
+    """Step that moves a trajectory as far as aimed at, given how far a unit step would."""
+    if not answer > 0:
+        return before
+    return float(np.clip(AIMED_RESPONSE / answer, SMALLEST_STEP, LARGEST_STEP))

@@ -1,0 +1,97 @@
+"""What is never known exactly and shared by trials: a payload's mass, a set pressure, the place a camera gives an edge.
+
+Errors of that kind do not average out over trials, so that the scatter of trials does not tell of them; left out, they
+pass for a small effect as soon as pressures and B scatter little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_result import TrialFit
+from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.sensitivity import PRESSURE, Predictor, moved_by
+
+PAYLOAD_ERROR = 0.005
+"""Standard deviation of a payload's mass beside what the sheet states, as part of it: a gram in two hundred."""
+
+PRESSURE_ERROR_PA = 30.0
+"""Standard deviation of a set pressure beside what the sheet states: read to a tenth of a kilopascal."""
+
+PAYLOAD_STEP = 1e-2
+WAVES = 6
+"""Half waves along the growth, at most, in which a tracker may be off by its stated error in all trials alike."""
+
+BEGIN, END, COVERED = 0.015, 0.03, 4.0
+"""Parts of the growth at its begin and end in which it may be off by so many times that: a door hides half of the tip
+there, the last fold pulls it out of shape."""
+
+
+def systematics_of(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> list[Floats]:
+    """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions."""
+    ways = _payloads(predictor, solution, trials), _set_pressures(predictor, solution), _tracker(predictor, trials)
+    parts = zip(*ways, strict=True)
+    return [np.column_stack(one) for one in parts]
+
+
+def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> list[Floats]:
+    """The relative error of each payload of the campaign. Trials with the same payload had the same body."""
+    loaded = [i for i, trial in enumerate(trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
+    payloads = dict.fromkeys(round(trials[i].trial.payload_kg, 9) for i in loaded)
+    places = {payload: k for k, payload in enumerate(payloads)}
+    columns = [np.zeros((trial.time_s.size, len(places))) for trial in trials]
+    if not loaded:
+        return columns
+    jobs = predictor.jobs(solution.state.theta, solution.state.own)
+    try:
+        heavier = predictor.run([replace(jobs[i], payload_factor=1 + PAYLOAD_STEP) for i in loaded])
+    except SimulationError:
+        return [column[:, :0] for column in columns]
+    for i, other in zip(loaded, heavier, strict=True):
+        trial = trials[i]
+        change = moved_by(trial.predicted_position_m - trial.origin_m, other)
+        columns[i][:, places[round(trial.trial.payload_kg, 9)]] = PAYLOAD_ERROR / PAYLOAD_STEP * change
+    return columns
+
+
+def _set_pressures(predictor: Predictor, solution: Solution) -> list[Floats]:
+    """The error of the pressure that was set for a condition; its replicates have it together."""
+    data = [item.trial for item in predictor.data]
+    feels = predictor.feels_pressure & np.array([item.trace is None for item in predictor.data])
+    conditions = dict.fromkeys(trial.condition for trial, felt in zip(data, feels, strict=True) if felt)
+    places = {condition: k for k, condition in enumerate(conditions)}
+    columns = [np.zeros((len(own), len(places))) for own in solution.columns]
+    for column, trial, own, felt in zip(columns, data, solution.columns, feels, strict=True):
+        if felt:
+            column[:, places[trial.condition]] = PRESSURE_ERROR_PA / trial.pressure_Pa * own[:, PRESSURE]
+    return columns
+
+
+def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
+    """Slow errors along the picture, of the size of the error that is stated of positions read from recordings."""
+    stated = np.array([item.tracker_sigma_m for item in predictor.data])
+    if not np.isfinite(stated).any():
+        return [np.zeros((trial.time_s.size, 0)) for trial in trials]
+    sigma_m = float(np.nanmedian(stated))
+    grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
+    reach = max(float(np.max(one)) for one in grown)
+    waves = np.pi * np.arange(1, WAVES + 1)
+    slow = [sigma_m * np.cos(one[:, None] / reach * waves) for one in grown]
+    return [
+        np.column_stack([first, *_ends(one / reach, COVERED * sigma_m)]) for first, one in zip(slow, grown, strict=True)
+    ]
+
+
+def _ends(part: Floats, sigma_m: float) -> list[Floats]:
+    """Errors where the tip leaves what holds it, and where the film runs out and the tip changes its shape."""
+    last = float(np.max(part))
+    return [
+        sigma_m * np.exp(-part / BEGIN),
+        sigma_m * np.exp(-part / (3 * BEGIN)),
+        sigma_m * np.exp((part - last) / END),
+    ]

@@ -1,0 +1,50 @@
+"""Sums of products of a trial's columns under AR(1) noise, as a polynomial of its correlation.
+
+With noise e_k = ρ e_{k−1} + s ε_k, the columns c_k enter every quantity of a fit through
+
+    Σ (c_k − ρ c_{k−1})(c_k − ρ c_{k−1})ᵀ + (1 − ρ²) Σ_first c cᵀ = G₀ − ρ G₁ + ρ² G₂
+
+so three small matrices a trial stand for all its points, whatever ρ turns out to be. `first` are the points that begin
+a stretch without gaps; the noise of stretches is independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+
+
+def products(columns: Floats, first: NDArray[np.bool_]) -> Floats:
+    """G₀, G₁, G₂ of one trial, shape (3, k, k), for columns of shape (n_points, k)."""
+    follows = np.flatnonzero(~first)
+    now, before = columns[follows], columns[follows - 1]
+    begin = columns[first]
+    cross = now.T @ before
+    return np.stack([columns.T @ columns, cross + cross.T, before.T @ before - begin.T @ begin])
+
+
+def all_products(columns: Sequence[Floats], first: Sequence[NDArray[np.bool_]]) -> Floats:
+    """`products` of every trial, shape (n_trials, 3, k, k)."""
+    return np.stack([products(c, f) for c, f in zip(columns, first, strict=True)])
+
+
+def at_correlation(grams: Floats, rho: float) -> Floats:
+    """Sums of whitened products at one correlation, shape (n_trials, k, k), in units of the innovations' variance 1."""
+    return np.asarray(grams[:, 0] - rho * grams[:, 1] + rho**2 * grams[:, 2])
+
+
+def whiten(residual: Floats, first: NDArray[np.bool_], rho: float) -> Floats:
+    """Residuals freed of their correlation, same variance at the first point of a stretch as at the others.
+
+    They have shape (n_points,), (n_points, k) or (m, n_points, k), `first` (n_points,).
+    """
+    white = residual.copy()
+    along, before = (np.swapaxes(one, 0, 1) if one.ndim == 3 else one for one in (white, residual))
+    follows = np.flatnonzero(~first)
+    along[follows] -= rho * before[follows - 1]
+    along[first] *= np.sqrt(1 - rho**2)
+    return white

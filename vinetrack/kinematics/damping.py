@@ -1,0 +1,395 @@
+"""The damping law F = B·x_ssⁿ: one exponent n for all vines, one coefficient B for each.
+
+Two fits of ln F = ln B_v + n ln x_ss. `log_log` is that of the paper: least squares of the force residuals. But the
+experimenter sets the force and the vine answers with a speed: a vine that damps 3 % more goes 8 % slower, and scatter
+on the abscissa flattens such a fit, by σ_B²/var(ln F) of n. `both_axes` puts every error where it arises: that of a
+measured pressure on F; on x_ss that of the measured speed, the vines' scatter, and the scatter of a pressure that was
+set, for there the true force strays about the stated one and takes the speed along (Berkson). York's estimator then
+gives n (D. York et al., Am. J. Phys. 72, 367, 2004). The scatter is whatever the stated errors leave unexplained.
+
+Intervals resample whole trials within each vine, so that nothing is assumed about the scatter. Resampling cannot see
+two things. One is the flattening of `log_log`: its intervals are moved by what its own scatter implies (its estimates
+are not: they are the published method). The other is an error that trials share: the `…_total` intervals add that
+of the yield pressure, common to a vine, and that of the scale, common to all: a scale that is off by ε moves every
+ln x_ss by ε and every ln B by −n·ε, and leaves n alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FEWEST_PER_VINE = 3
+LEAST_FORCE_RATIO = 1.2
+"""Largest over smallest force that a vine must span for its slope to mean anything: below, 1 % of P is 0.1 of n."""
+
+LEAST_STEADY_SHARE = 0.5
+"""Part of a condition's trials that must be steady for any of them to enter a fit."""
+
+FEWEST_FOR_RESAMPLING = 10
+"""Below, resamples repeat so few points that their spread says little: intervals come from Student's t."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """Steady points in logarithms; arrays have shape (n_points,), `vine` counts from 0 in the order of `names`."""
+
+    log_speed: Floats
+    log_force: Floats
+    speed_error: Floats
+    force_error: Floats
+    set_error: Floats
+    yield_error: Floats
+    scale_error: Floats
+    force: Floats
+    vine: np.ndarray
+    names: tuple[str, ...]
+
+    @property
+    def member(self) -> Floats:
+        """Shape (n_points, n_vines): 1 where a point belongs to a vine."""
+        return np.eye(len(self.names))[self.vine]
+
+
+def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
+    """The law from our windows in both ways, and what the published rule gives, to the letter.
+
+    Parameters
+    ----------
+    points
+        A row a trial, as `vinetrack.kinematics.summary` makes them: those with `used` enter `log_log` and `both_axes`;
+        every trial that could, by its payload and travel ratio, and has a window by the published rule enters `paper`
+        with set pressure, without weight and fitted as published.
+
+    Returns
+    -------
+    dict
+        `log_log`, `both_axes`, `paper`, each as `fit_damping` describes.
+    """
+    fits = fit_damping(points[points["used"]], resamples=resamples, seed=seed)
+    literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
+    literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
+    return fits | {"paper": fit_damping(literal, resamples=resamples, seed=seed)["log_log"]}
+
+
+def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
+    """Take out conditions of which less than half of the trials are steady; `used` and `reason` say so.
+
+    At the pressure where a vine only just reaches a steady speed within its length, the slower trials pass and the
+    faster do not: those that pass have too large a B, and so has the top of the fit.
+
+    Parameters
+    ----------
+    points
+        A row a trial, with `condition`, `eligible`, `used` and `reason`.
+    """
+    eligible = points[points["eligible"]]
+    share = eligible.groupby("condition", sort=False)["used"].mean()
+    few = points["condition"].isin(share[(share > 0) & (share < LEAST_STEADY_SHARE)].index) & points["used"]
+    words = [
+        f"only {share[condition]:.0%} of the trials of this condition are steady: the slower ones"
+        for condition in points.loc[few, "condition"]
+    ]
+    marked = points.copy()
+    marked.loc[few, "reason"] = words
+    marked.loc[few, "used"] = False
+    return marked
+
+
+def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> dict[str, Any]:
+    """Fit the law in both ways.
+
+    Parameters
+    ----------
+    points
+        A row a trial: `trial, vine, diameter_mm, thickness_um, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N,
+        yield_force_sigma_N` and, optional, `pressure_source` (`trace` where the force was measured, else `set`) and
+        `scale_rel_sigma` (relative error of the scale, which all trials share).
+        Vines with fewer than three trials, or a span of forces below 1.2, are left out and named.
+    resamples, seed
+        Number of resamples, and the seed that makes them repeatable.
+
+    Returns
+    -------
+    dict
+        `log_log` and `both_axes`, each with `n`, `n_95` (from resampling whole trials), `n_95_total` (with the stated
+        errors of yield pressures and scale too), `vines` (B, B_95, B_95_total, R2 of ln F, diameter, thickness, number
+        of trials), `covariance` of n and ln B, `scatter` (relative, of a single force), `n_trials`, `interval` (how it
+        was found), `left_out`, and `refused`: None, or why there is no fit.
+    """
+    kept, left_out = _admit(points)
+    if kept.empty:
+        reason = (
+            "; ".join(f"{vine}: {why}" for vine, why in left_out.items()) or "there is no trial with a steady window"
+        )
+        refused = f"no vine has enough steady trials for a slope ({reason})"
+        return {method: _refusal(refused, left_out) for method in ("log_log", "both_axes")}
+    data = _logarithms(kept)
+    vines = kept.groupby("vine", sort=False).first()
+    return {
+        "log_log": _fit(data, vines, left_out, resamples, seed, both_axes=False),
+        "both_axes": _fit(data, vines, left_out, resamples, seed, both_axes=True),
+    }
+
+
+def _admit(points: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Points of vines that can carry a slope, and why the others cannot."""
+    usable = points[(points["x_ss_m_s"] > 0) & (points["force_N"] > 0)]
+    left_out = {}
+    for vine in dict.fromkeys(points["vine"]):
+        force = usable.loc[usable["vine"] == vine, "force_N"]
+        if len(force) < FEWEST_PER_VINE:
+            left_out[str(vine)] = f"{len(force)} steady trials, at least {FEWEST_PER_VINE} are needed"
+        elif force.max() < LEAST_FORCE_RATIO * force.min():
+            ratio = force.max() / force.min()
+            left_out[str(vine)] = (
+                f"forces span a factor {ratio:.3g}, at least {LEAST_FORCE_RATIO:g} is needed: vary the pressure"
+            )
+    return usable[~usable["vine"].isin(list(left_out))].sort_values("vine", kind="stable"), left_out
+
+
+def _refusal(reason: str, left_out: dict[str, str]) -> dict[str, Any]:
+    return {
+        "n": None,
+        "n_95": [None, None],
+        "n_95_total": [None, None],
+        "vines": {},
+        "covariance": {"parameters": [], "matrix": []},
+        "scatter": None,
+        "n_trials": 0,
+        "interval": None,
+        "left_out": left_out,
+        "refused": reason,
+    }
+
+
+def _logarithms(points: pd.DataFrame) -> Points:
+    force, speed = points["force_N"].to_numpy(float), points["x_ss_m_s"].to_numpy(float)
+    names = tuple(dict.fromkeys(points["vine"].astype(str)))
+    index = {name: i for i, name in enumerate(names)}
+
+    def relative(column: str, to: Floats) -> Floats:
+        return np.nan_to_num(points[column].to_numpy(float)) / to
+
+    measured = (
+        points["pressure_source"].to_numpy() == "trace" if "pressure_source" in points else np.zeros(len(points), bool)
+    )
+    force_error = relative("force_sigma_N", force)
+    return Points(
+        log_speed=np.log(speed),
+        log_force=np.log(force),
+        speed_error=relative("x_ss_sigma_m_s", speed),
+        force_error=np.where(measured, force_error, 0.0),
+        set_error=np.where(measured, 0.0, force_error),
+        yield_error=np.nan_to_num(points["yield_force_sigma_N"].to_numpy(float)),
+        scale_error=relative("scale_rel_sigma", np.ones(len(points)))
+        if "scale_rel_sigma" in points
+        else np.zeros(len(points)),
+        force=force,
+        vine=np.array([index[name] for name in points["vine"].astype(str)]),
+        names=names,
+    )
+
+
+def slope(
+    log_force: Floats, counts: Floats, data: Points, speed_variance: Floats, force_variance: Floats
+) -> tuple[Floats, Floats]:
+    """York's slope with one intercept a vine, for many resamples at once.
+
+    Parameters
+    ----------
+    log_force : array, shape (n_resamples, n_points) or (1, n_points)
+    counts : array, shape (n_resamples, n_points), how often each point is drawn
+    speed_variance, force_variance : arrays, shape (n_points,), of the logarithms; where the first is 0 this is least
+    squares in F
+
+    Returns
+    -------
+    n : array, shape (n_resamples,)
+    log_B : array, shape (n_resamples, n_vines)
+    """
+    member = data.member
+    n = np.full(counts.shape[0], 0.4)
+    drawn = counts > 0
+    often = np.where(drawn, counts, 1.0)
+    # A resample of one point over and over has no slope: it runs off to infinity here and is dropped by the caller.
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        for _ in range(60):
+            weight = counts / (force_variance + n[:, None] ** 2 * speed_variance)
+            total = weight @ member
+            mean_x = (weight * data.log_speed) @ member / total
+            mean_y = (weight * log_force) @ member / total
+            dx = np.where(drawn, data.log_speed - mean_x[:, data.vine], 0.0)
+            dy = np.where(drawn, log_force - mean_y[:, data.vine], 0.0)
+            lever = weight**2 * (dx * force_variance + n[:, None] * dy * speed_variance) / often
+            update = np.sum(lever * dy, axis=1) / np.sum(lever * dx, axis=1)
+            settled = np.nanmax(np.abs(update - n), initial=0.0) < 1e-10
+            n = update
+            if settled:
+                break
+    return n, mean_y - n[:, None] * mean_x
+
+
+def _fit(
+    data: Points, vines: pd.DataFrame, left_out: dict[str, str], resamples: int, seed: int, *, both_axes: bool
+) -> dict[str, Any]:
+    n_points, n_vines = data.log_force.size, len(data.names)
+    dof = n_points - n_vines - 1
+    speed_variance, force_variance = _variances(data, dof, both_axes)
+    everything = np.ones((1, n_points))
+    found, log_B = slope(data.log_force[None], everything, data, speed_variance, force_variance)
+    n, log_B = float(found[0]), log_B[0]
+    if not (math.isfinite(n) and n > 0):
+        return _refusal("the speeds do not rise with the force, so there is no power law to fit", left_out)
+    residual = data.log_force - log_B[data.vine] - n * data.log_speed
+    scatter = math.sqrt(float(residual @ residual) / dof) if dof > 0 else math.nan
+    covariance = _covariance(data, n, speed_variance, force_variance, scatter, both_axes)
+    draws = _resample(data, speed_variance, force_variance, resamples, seed, with_shared=False)
+    total = _resample(data, speed_variance, force_variance, resamples, seed + 1, with_shared=True)
+    by_resampling = n_points >= FEWEST_FOR_RESAMPLING and dof > 0
+    estimate = np.concatenate([[n], log_B])
+    spread = _widening(data, dof)
+    if by_resampling:
+        low, high = _percentiles(estimate, draws, spread)
+    else:
+        reach = _student(dof) * np.sqrt(np.diag(covariance))
+        low, high = estimate - reach, estimate + reach
+    low_total, high_total = _percentiles(estimate, total, spread)
+    if not both_axes:
+        shift = _flattening(data, estimate)
+        low, high = np.minimum(low + shift, estimate), np.maximum(high + shift, estimate)
+        low_total, high_total = low_total + shift, high_total + shift
+    low_total, high_total = np.minimum(low, low_total), np.maximum(high, high_total)
+    return {
+        "n": n,
+        "n_95": [float(low[0]), float(high[0])],
+        "n_95_total": [float(low_total[0]), float(high_total[0])],
+        "vines": {
+            name: {
+                "B": float(np.exp(log_B[i])),
+                "B_95": [float(np.exp(low[i + 1])), float(np.exp(high[i + 1]))],
+                "B_95_total": [float(np.exp(low_total[i + 1])), float(np.exp(high_total[i + 1]))],
+                "R2": _r_squared(data.log_force[data.vine == i], residual[data.vine == i]),
+                "diameter_mm": float(vines["diameter_mm"][name]),
+                "thickness_um": float(vines["thickness_um"][name]),
+                "n_trials": int(np.sum(data.vine == i)),
+            }
+            for i, name in enumerate(data.names)
+        },
+        "covariance": {"parameters": ["n", *(f"ln B {name}" for name in data.names)], "matrix": covariance.tolist()},
+        "scatter": scatter,
+        "n_trials": n_points,
+        "interval": "resampling whole trials"
+        if by_resampling
+        else "least squares and Student's t: too few trials to resample",
+        "left_out": left_out,
+        "refused": None,
+    }
+
+
+def _flattening(data: Points, estimate: Floats) -> Floats:
+    """How far least squares in F falls short of a fit with all scatter on the speed, shape (1 + n_vines,): n, ln B."""
+    same = np.ones_like(data.log_force)
+    n, log_B = slope(data.log_force[None], same[None], data, same, 1e-14 * same)
+    return np.concatenate([n, log_B[0]]) - estimate
+
+
+def _variances(data: Points, dof: int, both_axes: bool) -> tuple[Floats, Floats]:
+    """Variance of ln x_ss and of ln F for each point, shape (n_points,) each."""
+    if not both_axes:
+        return np.zeros_like(data.log_force), np.ones_like(data.log_force)
+    ones = np.ones((1, data.log_force.size))
+    force_variance = data.force_error**2
+    scatter, n = 1e-3, np.array([0.4])
+    for _ in range(60):
+        speed_variance = data.speed_error**2 + (data.set_error**2 + scatter) / n[0] ** 2
+        n, log_B = slope(data.log_force[None], ones, data, speed_variance, force_variance)
+        if not (math.isfinite(n[0]) and n[0] > 0):
+            break
+        residual = data.log_force - log_B[0][data.vine] - n[0] * data.log_speed
+        # The scatter of ln F, beyond the stated errors, that makes χ² equal its degrees of freedom.
+        known = force_variance + n[0] ** 2 * data.speed_error**2 + data.set_error**2
+        before, scatter = scatter, _unexplained(residual, known, dof)
+        if abs(scatter - before) <= 1e-6 * (scatter + 1e-12):
+            break
+    return speed_variance, np.maximum(force_variance, 1e-14)
+
+
+def _unexplained(residual: Floats, known: Floats, dof: int) -> float:
+    """Variance s with Σ residual²/(known + s) = dof, or 0 where the known variances are enough."""
+    from scipy.optimize import brentq
+
+    def excess(s: float) -> float:
+        return float(np.sum(residual**2 / (known + s))) - max(dof, 1)
+
+    largest = float(residual @ residual) / max(dof, 1) + 1e-12
+    floor = 1e-12
+    return float(brentq(excess, floor, largest)) if excess(floor) > 0 > excess(largest) else floor
+
+
+def _covariance(
+    data: Points, n: float, speed_variance: Floats, force_variance: Floats, scatter: float, both_axes: bool
+) -> Floats:
+    """Of n and the ln B, shape (1 + n_vines,) squared, from the curvature of χ² at its minimum."""
+    design = np.column_stack([data.log_speed, data.member])
+    variance = force_variance + n**2 * speed_variance if both_axes else np.full(data.log_force.size, scatter**2)
+    return np.asarray(np.linalg.pinv(design.T @ (design / variance[:, None])))
+
+
+def _resample(
+    data: Points, speed_variance: Floats, force_variance: Floats, resamples: int, seed: int, *, with_shared: bool
+) -> Floats:
+    """Fits to trials drawn with replacement within each vine, shape (n_kept, 1 + n_vines): columns n, ln B.
+
+    `with_shared` draws the errors that trials share as well: of the yield pressure once a vine, of the scale once.
+    """
+    random = np.random.default_rng(seed)
+    counts = np.zeros((resamples, data.log_force.size))
+    for i in range(len(data.names)):
+        rows = np.flatnonzero(data.vine == i)
+        counts[:, rows] = random.multinomial(rows.size, np.full(rows.size, 1 / rows.size), size=resamples)
+    log_force = data.log_force[None]
+    if with_shared:
+        shift = random.standard_normal((resamples, len(data.names)))[:, data.vine] * data.yield_error
+        log_force = np.log(np.maximum(data.force - shift, 1e-3 * data.force))
+        scale = random.standard_normal((resamples, 1)) * data.scale_error
+        data = replace(data, log_speed=data.log_speed + scale)
+    n, log_B = slope(log_force, counts, data, speed_variance, force_variance)
+    draws = np.column_stack([n, log_B])
+    return draws[np.isfinite(draws).all(axis=1) & (n > 0)]
+
+
+def _widening(data: Points, dof: int) -> Floats:
+    """How much wider than their percentiles intervals must be, shape (1 + n_vines,).
+
+    Resampling N points about p fitted parameters shrinks their variance by (N − p)/N, and a spread that is itself
+    estimated calls for Student's t in place of the normal.
+    """
+    n_points = data.log_force.size
+    sizes = np.array([n_points / (1 + len(data.names)), *np.bincount(data.vine)])
+    student = _student(dof) / 1.959964
+    return np.sqrt(sizes / np.maximum(sizes - 1, 0.5)) * student
+
+
+def _percentiles(estimate: Floats, draws: Floats, spread: Floats) -> tuple[Floats, Floats]:
+    low, high = np.percentile(draws, [2.5, 97.5], axis=0)
+    return estimate - spread * (estimate - low), estimate + spread * (high - estimate)
+
+
+def _student(dof: int) -> float:
+    from scipy.stats import t
+
+    return float(t.ppf(0.975, dof)) if dof > 0 else math.inf
+
+
+def _r_squared(log_force: Floats, residual: Floats) -> float:
+    total = float(np.sum((log_force - log_force.mean()) ** 2))
+    return 1 - float(residual @ residual) / total if total > 0 else math.nan

@@ -1,0 +1,114 @@
+"""Windows in which a vine keeps up with a pressure that changes.
+
+Where the chamber runs down no speed is steady, yet the balance of forces holds at every instant as long as inertia is
+a small part of it. If the pressure along the way is known, measured or from the model in use, such a window gives a
+point of the damping law as good as a steady one. If it is not known, it gives a wrong one: then this rule is never
+asked.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from vinetrack.core.constants import GRAVITY_M_S2
+from vinetrack.core.records import Floats, Kinematics, Track, Trial, Window
+from vinetrack.kinematics.plateau import fit_window, judge
+from vinetrack.kinematics.release import Release
+
+INERTIA_LIMIT = 0.1
+"""Largest part of the force that inertia may take, with its 95 % interval.
+
+It is counted in the force; but the mass of film is known to a few per cent, which leaves 0.3 % of the force at this
+limit.
+"""
+
+LARGEST_CHANGE = 0.3
+"""Largest change of speed across a window.
+
+It puts the mean of ẋⁿ off the power of the mean by n(n−1)/24 of its square, 0.09 %.
+"""
+
+LAST_FRACTION = 0.95
+"""Part of the length up to which the mass of a bare vine is known well enough."""
+
+PARTS = 3
+FEWEST_POINTS = 4 * PARTS
+"""A quadratic in each part, with a point to spare."""
+TRIED = 6
+
+
+def quasi_steady_window(
+    trial: Trial,
+    track: Track,
+    kinematics: Kinematics,
+    release: Release,
+    pressure_Pa: Floats,
+    *,
+    start_fraction: float = 0.2,
+) -> Window:
+    """The longest window, from the highest speed on, in which inertia is a small part of the force.
+
+    Parameters
+    ----------
+    pressure_Pa
+        Known gauge pressure at the points of `kinematics`, shape (n,).
+    start_fraction
+        Slower than this part of the highest speed the window ends.
+
+    Returns
+    -------
+    Window
+        Rule `quasi_steady`; `accepted` is False with the reason where there is none.
+    """
+    usable = track.usable
+    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
+    travel_m = position_m - release.lead_position_m
+    velocity = kinematics.lead_velocity_m_s
+    first = int(np.argmax(velocity))
+    lowest = max(start_fraction, 1 - LARGEST_CHANGE) * velocity[first]
+    beyond = np.flatnonzero((velocity[first:] < lowest) | (travel_m[first:] > LAST_FRACTION * trial.length_m))
+    last = first + int(beyond[0]) - 1 if beyond.size else velocity.size - 1
+    if last - first + 1 < FEWEST_POINTS:
+        points = max(last - first + 1, 0)
+        reason = f"{points} points between the highest speed and the end are too few; {FEWEST_POINTS} are needed"
+        return Window("quasi_steady", False, reason)
+    mass_kg = trial.moving_mass_kg(np.maximum(travel_m, 0.0))
+    weight_N = trial.travel_ratio * mass_kg * GRAVITY_M_S2 * math.cos(trial.growth_angle_rad)
+    force_N = (pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2 + weight_N
+    share_N = trial.travel_ratio**2 * mass_kg
+    ends = np.linspace(first, last, TRIED + 1).round().astype(int)
+    candidates = sorted(itertools.combinations(ends.tolist(), 2), key=lambda ends: ends[0] - ends[1])
+    worst = math.inf
+    for a, b in candidates:
+        if b - a + 1 < FEWEST_POINTS:
+            break
+        inertia = _largest_inertia(time_s, position_m, kinematics, share_N, force_N, a, b)
+        worst = min(worst, inertia)
+        if inertia <= INERTIA_LIMIT:
+            window = judge(time_s, position_m, kinematics, a, b, "quasi_steady")
+            reason = (
+                f"keeps up with a known pressure over {window.n_points} points: speed changes by"
+                f" {100 * window.drift:.2g} %, inertia at most {100 * inertia:.2g} % of the force"
+            )
+            return replace(window, accepted=True, reason=reason)
+    return Window("quasi_steady", False, f"inertia takes at least {100 * worst:.2g} % of the force in every window")
+
+
+def _largest_inertia(
+    time_s: Floats, position_m: Floats, kinematics: Kinematics, share_N: Floats, force_N: Floats, a: int, b: int
+) -> float:
+    """Largest part of the force that inertia may take in any third of a window, at 95 %."""
+    edges = np.linspace(a, b + 1, PARTS + 1).round().astype(int)
+    largest = 0.0
+    for low, high in itertools.pairwise(edges):
+        t = time_s[low:high]
+        fit = fit_window(t, position_m[low:high], kinematics.noise_m, kinematics.noise_correlation)
+        to_force = float(np.mean(share_N[low:high]) / np.mean(force_N[low:high])) * fit.speed_m_s / float(t[-1] - t[0])
+        if not (fit.speed_m_s > 0 and np.all(force_N[low:high] > 0)):
+            return math.inf
+        largest = max(largest, to_force * (abs(fit.drift) + 1.96 * fit.drift_sigma))
+    return largest

@@ -1,0 +1,225 @@
+"""Steady windows: where a trial moves at one speed, by our gated rule, by the paper's literal rule, by hand.
+
+Speeds in a `Window` are **tail** speeds. The gated rule looks for the longest stretch, well above rest, whose change of
+speed is shown to be small (equivalence) rather than merely not shown to be large.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats, Kinematics, Track, Window
+from vinetrack.kinematics.paper_rule import paper_window
+from vinetrack.kinematics.plateau import RangeExtremes, WindowMoments, chord_bounds, judge, trim
+
+__all__ = ["gated_window", "paper_window", "user_window"]
+
+STEPS = 56
+"""Starts and ends tried in the first pass; the best is then moved point by point."""
+
+BAND = 0.5
+"""Half-width of the band that holds every velocity, in drift limits: a drift of the limit is half that each side."""
+
+SHORTEST_SHARE = 0.1
+"""Least part of the motion that counts as steady. What speeds up evenly changes by 3 % within 3–4 % of its run: short
+enough a piece of anything looks steady."""
+
+SHORTEST_FALL, FALLING = 0.02, 1 / 3
+"""Least part where the speed falls by more than a third of the limit: a vine slowing down with its supply or weight is
+in balance all the while, one that speeds up is not."""
+
+TRIM_BAND = 1 / 6
+"""The ends of a window keep to its line of speed within this many drift limits: a start-up of 1.5 % that decays over a
+tenth of the window would put the mean 0.15 % off the line."""
+
+BAND_SIGMAS = 4.0
+"""How many standard errors a single velocity may lie outside the band: 1 in 16 000 by chance."""
+
+
+def gated_window(
+    track: Track,
+    kinematics: Kinematics,
+    *,
+    drift_limit: float = 0.03,
+    start_fraction: float = 0.2,
+    start_sigmas: float = 5.0,
+) -> Window:
+    """The longest window in which the vine provably moves at one speed.
+
+    Parameters
+    ----------
+    track, kinematics
+        The track and the motion made from it.
+    drift_limit
+        Largest change of speed across the window, and of any velocity in it from the mean, as a fraction of the mean.
+    start_fraction, start_sigmas
+        The search begins where the velocity exceeds this fraction of its maximum and this many of its standard errors.
+
+    Returns
+    -------
+    Window
+        Rule `gated`. Where nothing is steady, `accepted` is False and `reason` says what was nearest.
+    """
+    time_s, position_m = _points(track, kinematics)
+    first, last, why = _gate(kinematics, start_fraction, start_sigmas)
+    if why:
+        return Window("gated", False, why)
+    inside = slice(first, last + 1)
+    search = _Search(time_s[inside], position_m[inside], kinematics, inside, drift_limit)
+    found, nearest = search.longest()
+    if found is None:
+        return Window("gated", False, nearest)
+    whole = (first + found[0], first + found[1])
+    kept = trim(time_s, position_m, kinematics, whole, TRIM_BAND * drift_limit, drift_limit)
+    window = judge(time_s, position_m, kinematics, *kept, "gated")
+    moving = last - first + 1
+    reason = (
+        f"steady over {window.n_points} of {moving} moving points: speed changes by {_percent(window)},"
+        f" inside ±{100 * drift_limit:g} %"
+    )
+    return _with(window, True, reason)
+
+
+def user_window(track: Track, kinematics: Kinematics, window_s: tuple[float, float]) -> Window:
+    """The window chosen by hand, always used; `reason` warns where it is not steady.
+
+    Raises
+    ------
+    ValueError
+        Fewer than three usable points between the two times.
+    """
+    time_s, position_m = _points(track, kinematics)
+    inside = np.flatnonzero((time_s >= window_s[0]) & (time_s <= window_s[1]))
+    if inside.size < 3:
+        raise ValueError(
+            f"the chosen window {window_s[0]:g}:{window_s[1]:g} s holds {inside.size} usable points, at least 3 are"
+            f" needed; the track runs from {time_s[0]:g} to {time_s[-1]:g} s"
+        )
+    window = judge(time_s, position_m, kinematics, int(inside[0]), int(inside[-1]), "user")
+    if not window.x_ss_m_s > 0:
+        return _with(window, True, f"chosen by hand; warning: the mean tail speed is {window.x_ss_m_s:.3g} m/s")
+    steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= 0.03
+    verdict = "chosen by hand" if steady else "chosen by hand; warning: not shown to be steady"
+    return _with(window, True, f"{verdict}: speed changes by {_percent(window)} over {window.n_points} points")
+
+
+def _points(track: Track, kinematics: Kinematics) -> tuple[Floats, Floats]:
+    """Times and raw positions at the points of the kinematics."""
+    usable = track.usable
+    time_s, position_m = track.time_s[usable], track.lead_position_m[usable]
+    if not np.array_equal(time_s, kinematics.time_s):
+        raise ValueError("the kinematics were not made from this track; call estimate_kinematics on it again")
+    return time_s, position_m
+
+
+def _gate(kinematics: Kinematics, start_fraction: float, start_sigmas: float) -> tuple[int, int, str]:
+    """First and last point between which a window may lie, or why there is none."""
+    velocity, sigma = kinematics.lead_velocity_m_s, kinematics.lead_velocity_sigma_m_s
+    surely = float(np.max(velocity - 3 * sigma))
+    if velocity.size < 3 or surely <= 0:
+        return 0, 0, "nothing moves faster than three standard errors of its velocity"
+    moving = velocity > np.maximum(start_fraction * surely, start_sigmas * sigma)
+    points = np.flatnonzero(moving)
+    if points.size < 3:
+        return (
+            0,
+            0,
+            (
+                f"only {points.size} points move faster than {start_fraction:g} of the top speed and"
+                f" {start_sigmas:g} standard errors"
+            ),
+        )
+    return int(points[0]), int(points[-1]), ""
+
+
+class _Search:
+    """All windows between two points, judged by cumulative sums."""
+
+    def __init__(
+        self, time_s: Floats, position_m: Floats, kinematics: Kinematics, inside: slice, drift_limit: float
+    ) -> None:
+        self.n = time_s.size
+        self.limit = drift_limit
+        self.moments = WindowMoments(time_s, position_m, kinematics.noise_m, kinematics.noise_correlation)
+        self.width = kinematics.window_points[inside]
+        self.velocity, sigma = kinematics.lead_velocity_m_s[inside], kinematics.lead_velocity_sigma_m_s[inside]
+        velocity = self.velocity
+        self.smooth_low = RangeExtremes(velocity - BAND_SIGMAS * sigma)
+        self.smooth_high = RangeExtremes(-(velocity + BAND_SIGMAS * sigma))
+        self.chords = chord_bounds(time_s, position_m, kinematics.noise_m, kinematics.noise_correlation, BAND_SIGMAS)
+
+    def longest(self) -> tuple[tuple[int, int] | None, str]:
+        """First and last point of the longest steady window, or the reason why there is none."""
+        stride = max(1, math.ceil(self.n / STEPS))
+        edges = np.arange(0, self.n, stride)
+        best, score = self._best(edges, np.union1d(edges, [self.n - 1]))
+        if best is None:
+            return None, score
+        while stride > 1:
+            reach, stride = stride, max(1, stride // 6)
+            near = np.unique(np.append(np.arange(-reach, reach + 1, stride), 0))
+            starts = np.unique(np.clip(best[0] + near, 0, self.n - 1))
+            ends = np.unique(np.clip(best[1] + near, 0, self.n - 1))
+            better, _ = self._best(starts, ends)
+            best = better or best
+        return best, ""
+
+    def _best(self, starts: NDArray[np.int_], ends: NDArray[np.int_]) -> tuple[tuple[int, int] | None, str]:
+        first, last = (grid.ravel() for grid in np.meshgrid(starts, ends, indexing="ij"))
+        long_enough = last - first + 1 >= 3
+        first, last = first[long_enough], last[long_enough]
+        points = last - first + 1
+        keep = points >= np.maximum(3, self.width[(first + last) // 2] / 2 + 2)
+        first, last, points = first[keep], last[keep], points[keep]
+        if first.size == 0:
+            return None, "fewer points move than one smoothing window holds"
+        mean, drift, drift_sigma = self.moments.drift(first, last)
+        worst = np.abs(drift) + 1.96 * drift_sigma
+        share = np.where(drift < -FALLING * self.limit, SHORTEST_FALL, SHORTEST_SHARE)
+        steady = (mean > 0) & (worst <= self.limit) & (points >= share * self.n)
+        for bounds in (self._smooth, *self.chords):
+            index = np.flatnonzero(steady)
+            if index.size == 0:
+                break
+            low, high = bounds(first[index], last[index])
+            inside = (low <= (1 + BAND * self.limit) * mean[index]) & (high >= (1 - BAND * self.limit) * mean[index])
+            steady[index[~inside]] = False
+        if not steady.any():
+            return None, self._nearest(first, last, mean, drift, drift_sigma)
+        index = np.flatnonzero(steady)
+        winner = index[np.lexsort((worst[index], -points[index]))[0]]
+        return (int(first[winner]), int(last[winner])), ""
+
+    def _smooth(self, first: NDArray[np.int_], last: NDArray[np.int_]) -> tuple[Floats, Floats]:
+        return self.smooth_low.maximum(first, last), -self.smooth_high.maximum(first, last)
+
+    def _nearest(
+        self, first: NDArray[np.int_], last: NDArray[np.int_], mean: Floats, drift: Floats, sigma: Floats
+    ) -> str:
+        worst = np.where(mean > 0, np.abs(drift) + 1.96 * sigma, np.inf)
+        near = int(np.argmin(worst))
+        count, change, error = last[near] - first[near] + 1, 100 * drift[near], 196 * sigma[near]
+        if worst[near] > self.limit:
+            why = f"changes by {change:.2g} ± {error:.2g} % across it"
+        elif count < SHORTEST_SHARE * self.n:
+            why = f"is less than {100 * SHORTEST_SHARE:g} % of the motion"
+        else:
+            band = self.velocity[first[near] : last[near] + 1] / mean[near]
+            why = f"holds speeds from {100 * band.min():.0f} to {100 * band.max():.0f} % of its mean"
+        return (
+            f"no window is shown to be steady within ±{100 * self.limit:g} %: the nearest,"
+            f" {count} of {self.n} moving points, {why}"
+        )
+
+
+def _percent(window: Window) -> str:
+    low, high = window.drift_95
+    return f"{100 * window.drift:.2g} % (95 %: {100 * low:.2g} to {100 * high:.2g} %)"
+
+
+def _with(window: Window, accepted: bool, reason: str) -> Window:
+    return replace(window, accepted=accepted, reason=reason)

@@ -1,0 +1,169 @@
+"""Local polynomials: every window of one width along a track, fitted at once.
+
+Even spacing is a convolution (Savitzky and Golay 1964, Anal. Chem. 36:1627); windows that hold a gap or an uneven
+spacing are fitted one by one by least squares of the same order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+
+Indices = NDArray[np.int_]
+Mask = NDArray[np.bool_]
+
+EVEN_TOLERANCE = 0.01
+"""Spacings within this fraction of their median count as even: printed times are rounded."""
+
+MISFIT_TERMS = 4
+"""Further orthogonal polynomials that must be absent from the residuals: what a corner or an unseen wave leaves."""
+
+
+@dataclass(frozen=True)
+class WindowFits:
+    """Polynomials through all m = n − width + 1 windows of `width` points, in powers of u = (t − middle)/half.
+
+    `coefficients` (order + 1, m); `middle_s`, `half_s` (m,); `covariance` of the coefficients for noise of unit
+    standard deviation, `even_covariance` (order + 1, order + 1), or one for each window of uneven spacing in
+    `odd_covariance` (order + 1, order + 1, m); `odd` (m,) tells which those are. `misfit` (m,) is the sum of squares
+    of the next `misfit_terms` orthogonal polynomials, each divided by its variance for noise of unit variance, m².
+    """
+
+    width: int
+    coefficients: Floats
+    middle_s: Floats
+    half_s: Floats
+    even_covariance: Floats
+    odd: Mask
+    odd_covariance: Floats | None
+    misfit: Floats
+    misfit_terms: int
+
+    def at(self, time_s: Floats, window: Indices) -> tuple[Floats, Floats]:
+        """Position, velocity, acceleration (3, k) at times by the given windows, and velocity error of unit noise."""
+        half = self.half_s[window]
+        u = (time_s - self.middle_s[window]) / half
+        value, slope, curve = _rows(u, self.coefficients.shape[0])
+        c = self.coefficients[:, window]
+        values = np.array([(c * value).sum(axis=0), (c * slope).sum(axis=0) / half, (c * curve).sum(axis=0) / half**2])
+        variance = np.einsum("ik,ij,jk->k", slope, self.even_covariance, slope)
+        if self.odd_covariance is not None:
+            own = np.einsum("ik,ijk,jk->k", slope, self.odd_covariance[:, :, window], slope)
+            variance = np.where(self.odd[window], own, variance)
+        return values, np.sqrt(np.maximum(variance, 0.0)) / half
+
+    def velocities(self, time_s: Floats, side: float) -> tuple[Indices, Floats, Floats]:
+        """Window used at every point, its velocity there, and the error of that for unit noise; each (n,).
+
+        The point lies at `side` of its window (−1 beginning, 0 middle, 1 end), or as near as the ends of the track
+        let it.
+        """
+        n, m = time_s.size, self.coefficients.shape[1]
+        reach = window_offset(self.width, side)
+        window = np.clip(np.arange(n) - reach, 0, m - 1)
+        velocity, gain = np.empty(n), np.empty(n)
+        u = 2 * reach / (self.width - 1) - 1
+        slope = _rows(np.array([u]), self.coefficients.shape[0])[1][:, 0]
+        plain = slice(reach, reach + m)
+        velocity[plain] = slope @ self.coefficients / self.half_s
+        gain[plain] = max(float(slope @ self.even_covariance @ slope), 0.0) ** 0.5 / self.half_s
+        special = np.ones(n, dtype=bool)
+        special[plain] = self.odd
+        points = np.flatnonzero(special)
+        values, gain[points] = self.at(time_s[points], window[points])
+        velocity[points] = values[1]
+        return window, velocity, gain
+
+
+def window_offset(width: int, side: float) -> int:
+    """How many points of a window lie before the one at `side`."""
+    return round((1 + side) / 2 * (width - 1))
+
+
+def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, rho: float) -> WindowFits:
+    """Fit a polynomial to every run of `width` neighbouring points.
+
+    Parameters
+    ----------
+    time_s, position_m
+        Arrays, shape (n,), s and m, n ≥ width.
+    width, order
+        Points in a window, and the order of the polynomial, below `width`.
+    rho
+        Lag-one correlation of the noise.
+    """
+    m = time_s.size - width + 1
+    last = np.arange(m) + width - 1
+    middle, half = (time_s[:m] + time_s[last]) / 2, (time_s[last] - time_s[:m]) / 2
+    weights, covariance, terms = _scaled(*_even_design(width, order), order, rho)
+    results = np.array([np.convolve(position_m, row[::-1], mode="valid") for row in weights[0]])
+    odd = _uneven_windows(time_s, width)
+    odd_covariance = None
+    if odd.any():
+        take = np.flatnonzero(odd)[:, None] + np.arange(width)
+        u = (time_s[take] - middle[odd, None]) / half[odd, None]
+        own, own_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
+        results[:, odd] = np.einsum("mkw,mw->km", own, position_m[take])
+        odd_covariance = np.zeros((order + 1, order + 1, m))
+        odd_covariance[:, :, odd] = own_covariance.transpose(1, 2, 0)
+    misfit = np.sum(results[order + 1 :] ** 2, axis=0)
+    return WindowFits(width, results[: order + 1], middle, half, covariance[0], odd, odd_covariance, misfit, terms)
+
+
+def _rows(u: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
+    """Powers of u and their first and second derivatives, each (terms, k)."""
+    k = np.arange(terms)[:, None]
+    value = u**k
+    slope: Floats = np.zeros_like(value)
+    curve: Floats = np.zeros_like(value)
+    slope[1:] = k[1:] * value[:-1]
+    curve[2:] = k[2:] * (k[2:] - 1) * value[:-2]
+    return value, slope, curve
+
+
+def _uneven_windows(time_s: Floats, width: int) -> Mask:
+    """Windows that hold a spacing off the usual one, shape (n − width + 1,)."""
+    spacing = np.diff(time_s)
+    off = np.abs(spacing / np.median(spacing) - 1) > EVEN_TOLERANCE
+    crossed = np.concatenate([[0], np.cumsum(off)])
+    return crossed[width - 1 :] > crossed[: crossed.size - width + 1]
+
+
+def _scaled(weights: Floats, terms: int, order: int, rho: float) -> tuple[Floats, Floats, int]:
+    """Weights with the misfits scaled to unit variance, and the covariance of the coefficients, under AR(1) noise."""
+    coefficients, extra = weights[:, : order + 1], weights[:, order + 1 :]
+    covariance = correlated(coefficients, rho) @ coefficients.transpose(0, 2, 1)
+    spread = np.sqrt(np.sum(correlated(extra, rho) * extra, axis=2, keepdims=True))
+    return np.concatenate([coefficients, extra / np.maximum(spread, 1e-12)], axis=1), covariance, terms
+
+
+@lru_cache(maxsize=64)
+def _even_design(width: int, order: int) -> tuple[Floats, int]:
+    """The one design of all evenly spaced windows of a width."""
+    return _solve_design(np.linspace(-1, 1, width)[None, :], order)
+
+
+def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
+    """Weights of the coefficients and of the next orthonormal polynomials, (s, order + 1 + terms, w), and terms."""
+    terms = min(MISFIT_TERMS, u.shape[1] - order - 1)
+    q, _ = np.linalg.qr(np.polynomial.legendre.legvander(u, order + terms))
+    q = q.transpose(0, 2, 1)
+    inside = q[:, : order + 1]
+    coefficients = np.linalg.solve(inside @ (u[:, :, None] ** np.arange(order + 1)), inside)
+    return np.concatenate([coefficients, q[:, order + 1 :]], axis=1), terms
+
+
+def correlated(weights: Floats, rho: float) -> Floats:
+    """R·w for AR(1) noise, R_ij = ρ^|i − j|, along the last axis: w·(R·w) is the variance of Σ w_i e_i."""
+    from scipy.signal import lfilter
+
+    if rho == 0 or weights.size == 0:
+        return weights
+    before = lfilter([1.0], [1.0, -rho], weights, axis=-1)
+    after = lfilter([1.0], [1.0, -rho], weights[..., ::-1], axis=-1)[..., ::-1]
+    return before + after - weights

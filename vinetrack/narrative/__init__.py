@@ -1,0 +1,1 @@
+"""Results in words: one text for terminal, report and explorer."""

@@ -1,0 +1,205 @@
+"""The command `vinetrack design campaign`: pressures, payloads and replicates that pin n and B, tried before made."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import write_csv
+from vinetrack.narrative.campaign_text import campaign_lines, rehearsal_lines
+from vinetrack.pipeline.prediction_inputs import Asked, as_option, beliefs_of, check_figure, read_ground, write_figure
+from vinetrack.pipeline.vine_stage import read_list, read_range
+from vinetrack.results.folder_layout import ResultsError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from vinetrack.planning.campaign_design import Candidates, Plan, Planned, Scope
+    from vinetrack.planning.campaign_information import FilmingPlan
+    from vinetrack.planning.predictive_inputs import PredictiveInputs
+    from vinetrack.planning.simulated_campaigns import SimulatedCampaigns
+
+_VINE = re.compile(r"\s*([^x×]+)[x×]([^x×]+)[x×]([^x×]+)\s*")
+STAND_IN_KPA = "100"
+"""A vine is believed at some pressure; those of the campaign take its place."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the command asks of a campaign; errors are standard errors, that of B relative."""
+
+    vines: tuple[str, ...]
+    pressure: str | None
+    payloads: str
+    n_error: float
+    B_error: float
+    capture_fps: float
+    noise_mm: float
+    correlation: float
+    longest_s: float
+    pressures: tuple[int, int]
+    replicates: tuple[int, int]
+    most_trials: int
+    burst_share: float
+    check: int
+    seed: int
+
+
+def read_vine(text: str) -> dict[str, str]:
+    """Cells of a vine from `diameter×wall×length` in mm, µm, mm.
+
+    >>> read_vine("24x200x280")
+    {'diameter_mm': '24', 'thickness_um': '200', 'length_mm': '280'}
+
+    Raises
+    ------
+    ExperimentError
+        If it is none.
+    """
+    match = _VINE.fullmatch(text)
+    if match is None:
+        remedy = "write diameter, wall and length in mm, µm, mm, such as 24x200x280"
+        raise ExperimentError([Problem(message="is no vine", column="--vine", value=text, remedy=remedy)])
+    return dict(
+        zip(("diameter_mm", "thickness_um", "length_mm"), (part.strip() for part in match.groups()), strict=True)
+    )
+
+
+def design_campaign(
+    asked: Asked, wanted: Wanted, *, sheet: Path | None = None, figure: Path | None = None
+) -> list[str]:
+    """Lines for the terminal about the campaign; a sheet to film it by and a figure are written where asked for.
+
+    Raises
+    ------
+    ExperimentError, ResultsError, EffectError
+        If something asked for will not do.
+    """
+    from vinetrack.core.terminal import waiting
+    from vinetrack.dynamics.simulate import SimulationError
+    from vinetrack.effects import EffectError
+    from vinetrack.inference.fit_data import FitError
+    from vinetrack.planning.campaign_design import CampaignError, candidates, plan
+    from vinetrack.planning.campaign_information import FilmingPlan
+
+    check_figure(figure)
+    beliefs = _beliefs(asked, wanted)
+    scope = _scope(wanted)
+    camera = FilmingPlan(wanted.capture_fps, wanted.noise_mm / 1e3, wanted.correlation, wanted.longest_s)
+    try:
+        with waiting("weighing conditions"):
+            found = plan(candidates(beliefs, scope, camera), scope, wanted.n_error, wanted.B_error)
+        rehearsal = _rehearsed(found, beliefs, camera, wanted)
+    except EffectError as error:
+        raise as_option(error) from None
+    except (SimulationError, FitError, CampaignError) as error:
+        raise ResultsError(str(error)) from None
+    lines = list(campaign_lines(found, beliefs, camera, wanted.n_error, wanted.B_error, wanted.most_trials))
+    if rehearsal is not None:
+        lines += rehearsal_lines(found, rehearsal)
+    shown = found.best or found.nearest
+    if sheet is not None:
+        write_csv(sheet, film_sheet(found.candidates, shown, wanted))
+        lines.append(f"Sheet, in an order drawn at random: {sheet}")
+    if figure is not None:
+        write_figure(_picture(found.candidates, shown, wanted.longest_s), figure)
+        lines.append(f"Figure: {figure}")
+    return lines
+
+
+def _beliefs(asked: Asked, wanted: Wanted) -> list[PredictiveInputs]:
+    """One for each vine."""
+    if not wanted.vines:
+        raise ExperimentError(
+            [Problem(message="is missing", column="--vine", remedy="name one or more, as 24x200x280")]
+        )
+    beliefs = []
+    for text in dict.fromkeys(wanted.vines):
+        cells = {**asked.cells, **read_vine(text), "pressure_kPa": STAND_IN_KPA}
+        beliefs += beliefs_of(read_ground(replace(asked, cells=cells)))
+    return beliefs
+
+
+def _scope(wanted: Wanted) -> Scope:
+    from vinetrack.planning.campaign_design import Scope
+
+    pressure = (math.nan, math.nan) if wanted.pressure is None else read_range("pressure_kPa", wanted.pressure)
+    return Scope(
+        pressure_Pa=pressure,
+        payloads_kg=read_list("payload_g", wanted.payloads),
+        pressures=wanted.pressures,
+        replicates=wanted.replicates,
+        most_trials=wanted.most_trials,
+        burst_share=wanted.burst_share,
+    )
+
+
+def _rehearsed(
+    found: Planned, beliefs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: Wanted
+) -> SimulatedCampaigns | None:
+    """The campaign made so many times and fitted; None where there is none to make."""
+    from vinetrack.core.terminal import Progress, progress
+    from vinetrack.planning.campaign_design import trials_of
+    from vinetrack.planning.simulated_campaigns import simulate_campaign
+
+    if found.best is None or wanted.check == 0:
+        return None
+    trials = trials_of(found.candidates, found.best)
+    bar: Progress[None]
+    with progress(wanted.check, "rehearsing", unit="campaign") as bar:
+        return simulate_campaign(
+            found.candidates.model,
+            trials,
+            camera,
+            beliefs[0].spreads,
+            campaigns=wanted.check,
+            seed=wanted.seed,
+            watch=bar.advance,
+        )
+
+
+def film_sheet(shown: Candidates, one: Plan, wanted: Wanted) -> pd.DataFrame:
+    """A trial sheet to film the campaign by, in an order drawn at random: what drifts must not look like pressure."""
+    import pandas as pd
+
+    from vinetrack.planning.campaign_design import trials_of
+
+    trials = trials_of(shown, one)
+    order = np.random.default_rng(wanted.seed).permutation(len(trials))
+    rows: list[Mapping[str, object]] = [
+        {
+            "trial": trials[k].name,
+            "video": f"videos/{trials[k].name}.mp4",
+            "capture_fps": wanted.capture_fps,
+            "diameter_mm": float(f"{1e3 * trials[k].diameter_m:.6g}"),
+            "thickness_um": float(f"{1e6 * trials[k].thickness_m:.6g}"),
+            "length_mm": float(f"{1e3 * trials[k].length_m:.6g}"),
+            "pressure_kPa": float(f"{trials[k].pressure_Pa / 1e3:.6g}"),
+            "yield_pressure_kPa": float(f"{trials[k].yield_pressure_Pa / 1e3:.6g}"),
+            "payload_g": float(f"{1e3 * trials[k].payload_kg:.6g}"),
+        }
+        for k in order
+    ]
+    return pd.DataFrame(rows)
+
+
+def _picture(shown: Candidates, one: Plan, longest_s: float) -> Figure:
+    from vinetrack.figures.campaign import draw_campaign
+    from vinetrack.planning.campaign_design import trials_of
+    from vinetrack.planning.campaign_information import final_lead_speeds
+
+    trials = trials_of(shown, one)
+    speeds = final_lead_speeds(shown.model, trials, longest_s)
+    points = [
+        (trial.vine, trial.pressure_Pa / 1e3, trial.payload_kg * 1e3, float(speed))
+        for trial, speed in zip(trials, speeds, strict=True)
+    ]
+    return draw_campaign(points, one.n_error, one.B_errors)

@@ -1,0 +1,38 @@
+"""From the points of the trials to the damping law and how it grows with size."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.core.tables import write_json
+from vinetrack.results.folder_layout import Results, read_result
+
+if TYPE_CHECKING:
+    from vinetrack.experiment.settings import DampingSettings
+
+log = logging.getLogger(__name__)
+
+
+def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
+    """Fit the damping law to `damping_points.csv` and write `damping.json`, and `scaling.json` with `conditions.csv`.
+
+    Returns
+    -------
+    dict
+        `damping.json` as written.
+    """
+    results = Results(folder)
+    points = read_result(results.points)
+
+    from vinetrack.kinematics.damping import fit_laws
+    from vinetrack.kinematics.scaling import fit_scaling
+    from vinetrack.kinematics.trends import fit_trends
+
+    damping = fit_laws(points, resamples=settings.resamples, seed=settings.seed)
+    write_json(results.scaling, fit_scaling(damping) | fit_trends(read_result(results.conditions)))
+    write_json(results.damping, damping)
+    for method, fit in damping.items():
+        log.info("%s: n = %s, refused: %s", method, fit.get("n"), fit.get("refused"))
+    return damping

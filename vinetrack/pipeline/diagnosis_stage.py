@@ -1,0 +1,242 @@
+"""The diagnosis of a results folder: what the model lacks, added while it is one effect, with the errors it saves.
+
+A diagnosis that cannot be made never stops the run: `diagnosis.json` then has no verdict and says why.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.tables import write_csv, write_json
+from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured
+from vinetrack.results.folder_layout import Results, empty_table, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.core.records import Track, Trial
+    from vinetrack.diagnosis.locate import Failure
+    from vinetrack.diagnosis.result import Diagnosis
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import RunSettings
+    from vinetrack.inference.fit_result import Fit
+
+log = logging.getLogger(__name__)
+
+Report = Callable[[str], None]
+FORESEEN = ("FitError", "EffectError", "SimulationError")
+PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
+
+
+def _quiet(_: str) -> None:
+    pass
+
+
+def diagnose_results(
+    experiment: Experiment, folder: Path, report: Report = _quiet, settings: RunSettings | None = None
+) -> dict[str, Any]:
+    """Diagnose what a results folder holds; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`.
+
+    Returns
+    -------
+    dict
+        `diagnosis.json` as written; `refused` is None or the reason why there is no verdict.
+
+    Raises
+    ------
+    ResultsError
+        If a stage before this one has not run.
+    """
+    results = Results(folder)
+    pairs, _ = measured(experiment, results)
+    try:
+        found = diagnose_pairs(experiment, pairs, report)
+    except Exception as error:
+        return _write_refusal(results, experiment, _reason(error))
+    log.info("%s: %s", found.verdict, found.explanation)
+    content = write_diagnosis(results, found)
+    report("the damping law with the pressure of every model")
+    _write_laws(results, found, pairs, settings)
+    return content
+
+
+def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report = _quiet) -> Diagnosis:
+    """Diagnose trials with their tracks by what the experiment says of model, candidates, own effects and limits."""
+    from vinetrack.diagnosis.diagnose import diagnose
+
+    return diagnose(experiment, tracks={trial.name: track for trial, track in pairs}, report=report)
+
+
+def _reason(error: Exception) -> str:
+    """Why there is no verdict, in a sentence; the traceback of what nobody foresaw goes to the log."""
+    if type(error).__name__ in FORESEEN:
+        return str(error)
+    log.exception("no diagnosis could be made")
+    return INTERNAL_FAULT
+
+
+def _write_refusal(results: Results, experiment: Experiment, reason: str) -> dict[str, Any]:
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS
+
+    content: dict[str, Any] = {
+        "verdict": None,
+        "refused": reason,
+        "effects": [],
+        "answer_set": [],
+        "explanation": f"No diagnosis could be made: {reason}",
+        "final_verdict": None,
+        "rounds": [],
+        "parameters": [],
+        "model": list(experiment.settings.model),
+    }
+    _emptied(results)
+    write_csv(results.ladder, empty_table(LADDER_COLUMNS))
+    write_json(results.diagnosis, content)
+    log.info("%s", content["explanation"])
+    return content
+
+
+def _emptied(results: Results) -> Path:
+    folder = results.folder / "diagnosis"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def write_diagnosis(results: Results, found: Diagnosis) -> dict[str, Any]:
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; return the first."""
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
+
+    folder = _emptied(results)
+    for name, table in tables_of(found).items():
+        write_csv(folder / name, table)
+    numbers = moved(found.fits, ("", *found.effects)) if len(found.fits) > 1 else empty_table(MOVED_COLUMNS)
+    write_csv(folder / "moved.csv", numbers)
+    for name, table in predictions(found.fits[0], found.fits[-1]).items():
+        path = results.predictions(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_csv(path, table)
+    write_csv(results.ladder, empty_table(LADDER_COLUMNS) if found.ladder is None else found.ladder)
+    content = {**found.to_json(), "refused": None}
+    write_json(results.diagnosis, content)
+    return content
+
+
+def _write_laws(
+    results: Results, found: Diagnosis, pairs: Sequence[tuple[Trial, Track]], settings: RunSettings | None
+) -> None:
+    """The damping law redone with the pressure that every model of the ladder gives: how n and B come home."""
+    from vinetrack.kinematics.damping_from_model import LAW_COLUMNS, law_table, look_at_motions, redo_damping
+
+    path = results.folder / "diagnosis" / "damping_laws.csv"
+    laws: dict[str, Any] = {}
+    if len(found.fits) > 1:
+        motions = look_at_motions(pairs, settings)
+        for fit in found.fits:
+            try:
+                laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings).laws
+            except ValueError as error:
+                log.info("no damping law with %s: %s", " + ".join(fit.model.names), error)
+    write_csv(path, law_table(laws) if laws else empty_table(LAW_COLUMNS))
+
+
+def tables_of(found: Diagnosis) -> dict[str, pd.DataFrame]:
+    """Tables of where the first model fails, and the force that is missing, by name of file."""
+    tables: dict[str, pd.DataFrame] = {}
+    failure: Failure | None = found.failure
+    if failure is not None:
+        tables |= {
+            "conditions.csv": failure.by_condition,
+            "along_time.csv": failure.along_time,
+            "along_position.csv": failure.along_position,
+            "along_speed.csv": failure.along_speed,
+            "drift_groups.csv": drift_groups(failure, found.fits[-1] if len(found.fits) > 1 else None),
+        }
+    if found.force_table is not None:
+        tables["missing_force.csv"] = found.force_table
+    return tables
+
+
+def drift_groups(failure: Failure, after: Fit | None) -> pd.DataFrame:
+    """What suits every group of trials best under the first model and, where something was added, under the last."""
+    import pandas as pd
+
+    from vinetrack.diagnosis.drift import drift
+
+    parts = [failure.drift.groups.assign(model="before")]
+    if after is not None:
+        try:
+            parts.append(drift(after).groups.assign(model="after"))
+        except Exception as error:
+            log.info("the drift under the last model is not known: %s", _reason(error))
+    return pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
+
+
+def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
+    """What the first and the last model say of every trial, by its name.
+
+    As in `comparison.csv` and the ladder: a release and an origin of the trial's own, and nothing else.
+    `model_after_m` is NaN where nothing was added.
+    """
+    import pandas as pd
+
+    from vinetrack.diagnosis.ladder import in_sample
+
+    first = in_sample(before).trials
+    last = in_sample(after).trials if after is not before else first
+    tables = {}
+    for one, other in zip(first, last, strict=True):
+        later = other.predicted_position_m if after is not before else np.full(one.time_s.size, np.nan)
+        columns = (one.time_s, one.lead_position_m, one.predicted_position_m, later)
+        tables[one.name] = pd.DataFrame(dict(zip(PREDICTION_COLUMNS, columns, strict=True)))
+    return tables
+
+
+def add_effect(experiment: Experiment, folder: Path, name: str, report: Report = _quiet) -> list[str]:
+    """Put an effect in the model, refit, and say what became of errors and numbers; the ladder keeps the history.
+
+    Raises
+    ------
+    ResultsError
+        If a stage before this one has not run.
+    EffectError
+        If there is no such effect, it is in the model already, or a trial lacks what it needs.
+    FitError
+        If the model cannot be followed.
+    """
+    import pandas as pd
+
+    from vinetrack.diagnosis.add import add
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, moved
+    from vinetrack.narrative.verdict_text import added_in_words
+
+    results = Results(folder)
+    pairs, _ = measured(experiment, results)
+    before, after, table = add(experiment, {trial.name: track for trial, track in pairs}, name, report)
+    history = read_result(results.ladder) if results.ladder.exists() else empty_table(LADDER_COLUMNS)
+    rows = table if not len(history) else table.iloc[1:]
+    known = set(zip(history["model"], history["added"].fillna(""), strict=True))
+    new = rows[[(model, added) not in known for model, added in zip(rows["model"], rows["added"], strict=True)]]
+    if len(new):
+        write_csv(results.ladder, pd.concat([history, new], ignore_index=True) if len(history) else new)
+    return added_in_words(before, after, table, moved((before, after), ("", name)))
+
+
+def diagnosis_lines(folder: Path) -> list[str]:
+    """What `diagnosis.json` of a results folder says, in few words.
+
+    Raises
+    ------
+    ResultsError
+        If it has not been diagnosed.
+    """
+    content = read_json(Results(folder).diagnosis)
+    if content["verdict"] is None:
+        return [content["explanation"]]
+    return [f"{content['verdict']}: {content['explanation']}", *(f"! {note}" for note in content.get("notes", ()))]

@@ -1,0 +1,155 @@
+"""Tables of a results folder drawn: one figure a trial in a few processes, and those of the whole experiment."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.core.tables import write_bytes
+from vinetrack.pipeline.pool import map_trials
+from vinetrack.results.folder_layout import Results, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from vinetrack.core.records import Trial
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import FigureSettings
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _TrialPicture:
+    """What one trial's figure needs besides its own files."""
+
+    name: str
+    title: str
+    travel_ratio: float
+    windows: pd.DataFrame
+
+
+def draw_trials(experiment: Experiment, folder: Path, settings: FigureSettings, n_workers: int = 1) -> int:
+    """Draw `figures/trial_<trial>` for every trial that is not left out; return how many."""
+    results = Results(folder)
+    by_trial = dict(iter(read_result(results.steady).groupby("trial", sort=False)))
+    nothing = read_result(results.steady).iloc[:0]
+    known = {trial.name: trial for trial in experiment.trials}
+    pictures = [
+        _TrialPicture(
+            name,
+            describe_trial(known[name]) if name in known else name,
+            known[name].travel_ratio if name in known else 2.0,
+            by_trial.get(name, nothing),
+        )
+        for name in experiment.names
+        if name not in experiment.left_out
+    ]
+    work = partial(_draw_trial, results=results, settings=settings)
+    return sum(1 for _ in map_trials(work, pictures, n_workers, "trial figures"))
+
+
+def _draw_trial(picture: _TrialPicture, results: Results, settings: FigureSettings) -> None:
+    from vinetrack.figures.trial_motion import draw_trial_motion
+
+    track, kinematics = read_result(results.track(picture.name)), read_result(results.kinematics(picture.name))
+    figure = draw_trial_motion(picture.title, track, kinematics, picture.windows, picture.travel_ratio)
+    _write(figure, partial(results.trial_figure, picture.name), settings)
+
+
+def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> None:
+    """Draw the figures of the whole experiment."""
+    from vinetrack.figures.damping_law import draw_damping_law
+    from vinetrack.figures.efficiency import draw_efficiency
+    from vinetrack.figures.exponents import draw_exponents
+    from vinetrack.figures.model_comparison import draw_model_comparison, draw_model_residuals
+    from vinetrack.figures.overview import draw_overview
+    from vinetrack.figures.payload_speed import draw_payload_speed
+    from vinetrack.figures.scaling import draw_scaling
+    from vinetrack.figures.speed_scaling import draw_speed_scaling
+    from vinetrack.figures.style import METHOD_NAMES
+    from vinetrack.results.diagnosis_tables import draw_diagnosed, read_diagnosed, with_after
+
+    results = Results(folder)
+    damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)
+    described = describe_conditions(trials, experiment.trials)
+    moved = {
+        name: read_result(results.kinematics(name))
+        for name in described.loc[described["status"] != "left_out", "trial"]
+    }
+    in_fit = [vine for method in METHOD_NAMES for vine in damping[method]["vines"]]
+    points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
+    compared = label_conditions(read_result(results.comparison), described)
+    trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
+    scaling, diagnosed = read_json(results.scaling), read_diagnosed(results, described)
+    drawings: dict[str, Figure] = {
+        "damping_law": draw_damping_law(points, damping),
+        "exponents": draw_exponents(damping),
+        "scaling": draw_scaling(scaling),
+        "speed_scaling": draw_speed_scaling(scaling),
+        "efficiency": draw_efficiency(scaling),
+        "payload_speed": draw_payload_speed(read_result(results.conditions), read_result(results.payload_model)),
+        "overview": draw_overview(described, moved),
+        "model_comparison": draw_model_comparison(compared, with_after(trajectories, diagnosed)),
+        "model_residuals": draw_model_residuals(compared, trajectories),
+        **draw_diagnosed(diagnosed),
+    }
+    for name, figure in drawings.items():
+        _write(figure, partial(results.figure, name), settings)
+        log.info("drew %s", name)
+
+
+def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings) -> None:
+    from vinetrack.figures.style import render
+
+    for form, data in render(figure, settings.formats, settings.dpi).items():
+        write_bytes(path(f".{form}"), data)
+
+
+def describe_trial(trial: Trial) -> str:
+    """A trial in a line: name, vine, pressure and payload."""
+    return f"{trial.name} · {' · '.join(_features(trial))}"
+
+
+def _features(trial: Trial) -> list[str]:
+    parts = [f"{1e3 * trial.diameter_m:g} mm"]
+    if trial.thickness_m == trial.thickness_m:
+        parts[0] += f" × {1e6 * trial.thickness_m:.4g} µm"
+    if trial.length_m == trial.length_m:
+        parts[0] += f" × {1e3 * trial.length_m:.4g} mm"
+    parts.append(f"{1e-3 * trial.pressure_Pa:.3g} kPa")
+    if trial.payload_kg:
+        parts.append(f"{1e3 * trial.payload_kg:.3g} g")
+    return parts
+
+
+def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
+    """`trials.csv` with the pressure and a short label of each trial's condition, for the panels of the overview."""
+    by_name: dict[str, Any] = {trial.name: trial for trial in known}
+    labels, pressures = [], []
+    for row in trials.itertuples():
+        trial = by_name.get(str(row.trial))
+        if trial is None:
+            labels.append(str(row.condition) or "not readable")
+            pressures.append(float("nan"))
+            continue
+        parts = _features(trial)
+        labels.append(", ".join([f"{1e3 * trial.diameter_m:g} mm", *parts[1:]]))
+        pressures.append(1e-3 * trial.pressure_Pa)
+    return trials.assign(condition_label=labels, pressure_kPa=pressures)
+
+
+def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
+    """`comparison.csv` with the vine and the short label of each condition, vines together, pressure rising."""
+    first = described.drop_duplicates("condition").set_index("condition")
+    vines = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
+    known = comparison[comparison["condition"].isin(first.index)]
+    of = first.loc[known["condition"]]
+    table = known.assign(vine=of["vine"].to_numpy(), condition_label=of["condition_label"].to_numpy())
+    order = sorted(range(len(table)), key=lambda i: (vines[table["vine"].iloc[i]], of["pressure_kPa"].iloc[i]))
+    return table.iloc[order].reset_index(drop=True)

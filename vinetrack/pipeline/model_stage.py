@@ -1,0 +1,279 @@
+"""The model in use fitted to the tracks of a results folder, held against them, and audited for what it leaves out.
+
+Recordings and tracks go one way: both are read back as `tracks/` holds them. A model that cannot be fitted never stops
+the run: its tables have headers alone, and `fit.json` says why.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.records import Kinematics, Track, Trial
+from vinetrack.core.tables import write_csv, write_json
+from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.diagnosis.compare import Comparison
+    from vinetrack.dynamics.audit import Audit
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import RunSettings
+    from vinetrack.inference.fit_result import Fit
+
+log = logging.getLogger(__name__)
+
+INTERNAL_FAULT = "a fault of the program, written down in the log of this stage"
+
+
+def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> dict[str, Any]:
+    """Fit the model in use; write `comparison.csv`, `comparison/`, `model_check.csv`, `audit.csv` and `fit.json`.
+
+    `payload_model.csv` too: final speed against payload as the model has it.
+
+    Returns
+    -------
+    dict
+        `fit.json` as written; `refused` is None or the reason.
+
+    Raises
+    ------
+    ResultsError
+        If a stage before this one has not run.
+    """
+    from vinetrack.diagnosis.compare import COMPARISON_COLUMNS
+    from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, payload_curves
+    from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
+    from vinetrack.inference.model_check import CHECK_COLUMNS
+    from vinetrack.results.folder_layout import empty_table
+
+    results = Results(folder)
+    damping = read_json(results.damping)
+    pairs, kinematics = measured(experiment, results)
+    tables = {results.comparison: COMPARISON_COLUMNS, results.model_check: CHECK_COLUMNS, results.audit: AUDIT_COLUMNS}
+    tables[results.payload_model] = CURVE_COLUMNS
+    found: dict[Path, pd.DataFrame] = {}
+    content: dict[str, Any] = {"model": list(experiment.settings.model), "refused": None}
+    trajectories: dict[str, pd.DataFrame] = {}
+    try:
+        fit, comparison = _fitted(experiment, pairs, kinematics, settings)
+        checked, check_message = _checked(fit, damping)
+        weighed = _audited(fit, comparison, pairs, kinematics)
+        curves = payload_curves(fit, settings.final_at_fraction)
+    except Exception as error:
+        content["refused"] = _reason(error)
+    else:
+        content |= fit_entry(fit, weighed.warnings, check_message)
+        found = {results.comparison: comparison.table, results.model_check: checked, results.audit: weighed.table}
+        found[results.payload_model] = curves
+        trajectories = dict(comparison.trajectories)
+    for path, columns in tables.items():
+        write_csv(path, found.get(path, empty_table(columns)))
+    _write_trajectories(results, trajectories)
+    write_json(results.fit, content)
+    log.info("%s", content["refused"] or f"fitted {len(content['trials'])} trials")
+    return content
+
+
+def measured(experiment: Experiment, results: Results) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
+    """Trials with the tracks and kinematics that the results folder holds; those that failed have none.
+
+    Raises
+    ------
+    ResultsError
+        If a trial has not been analysed.
+    """
+    pairs, kinematics = [], {}
+    for trial in experiment.trials:
+        table = read_result(results.track(trial.name))
+        if len(table):
+            pairs.append((trial, read_back(trial, table)))
+            kinematics[trial.name] = _kinematics(read_result(results.kinematics(trial.name)), trial.travel_ratio)
+    return pairs, kinematics
+
+
+def read_back(trial: Trial, table: pd.DataFrame) -> Track:
+    """A track as `tracks/<trial>.csv` holds it, with the pressure that was measured along with it.
+
+    The pressure stands with what the user brought: in the track itself, or in a trace beside it.
+    """
+    from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
+
+    track = Track(
+        time_s=table["time_s"].to_numpy(dtype=float),
+        lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
+        lead_position_sigma_m=table["lead_position_sigma_m"].to_numpy(dtype=float),
+        flag=table["flag"].to_numpy(dtype=str),
+        edge_px=table["edge_px"].to_numpy(dtype=float),
+    )
+    try:
+        if trial.pressure_trace is not None:
+            return attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+        brought = load_track(trial) if trial.track is not None else None
+    except TrackError as error:
+        raise ResultsError(f"trial {trial.name}: {error}; then run snakemake again") from None
+    if brought is None or brought.pressure_Pa is None:
+        return track
+    return replace(track, pressure_Pa=np.interp(track.time_s, brought.time_s, brought.pressure_Pa))
+
+
+def _kinematics(table: pd.DataFrame, travel_ratio: float) -> Kinematics:
+    """Motion as `kinematics/<trial>.csv` holds it; the file does not keep widths and noise."""
+    names = ("time_s", "lead_position_m", "lead_velocity_m_s", "lead_velocity_sigma_m_s", "lead_acceleration_m_s2")
+    columns = {name: table[name].to_numpy(dtype=float) for name in names}
+    return Kinematics(
+        **columns,
+        window_points=np.zeros(len(table), dtype=int),
+        noise_m=np.nan,
+        noise_correlation=np.nan,
+        travel_ratio=travel_ratio,
+    )
+
+
+def _fitted(
+    experiment: Experiment,
+    pairs: list[tuple[Trial, Track]],
+    kinematics: dict[str, Kinematics],
+    settings: RunSettings,
+) -> tuple[Fit, Comparison]:
+    from vinetrack.diagnosis.compare import compare
+    from vinetrack.inference.fit import fit
+    from vinetrack.pipeline.tracks_stage import model_of
+
+    model = model_of(experiment)
+    # A falling body has nothing else to find: its g tries the whole chain, from the recording to the fit.
+    found = fit(model, pairs, free=("gravity.g",) if model.names == ("gravity",) else ())
+    return found, compare(found, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
+
+
+def _checked(found: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
+    """`model_check.csv`, and why it is empty where it is."""
+    from vinetrack.inference.fit_data import FitError
+    from vinetrack.inference.model_check import CHECK_COLUMNS, check_damping
+    from vinetrack.results.folder_layout import empty_table
+
+    method = "log_log" if damping["both_axes"].get("refused") else "both_axes"
+    try:
+        return check_damping(found, damping[method]), ""
+    except FitError as error:
+        return empty_table(CHECK_COLUMNS), str(error)
+
+
+def _audited(
+    found: Fit, comparison: Comparison, pairs: list[tuple[Trial, Track]], kinematics: dict[str, Kinematics]
+) -> Audit:
+    from vinetrack.dynamics.audit import audit, measured_motion
+
+    tracks = {trial.name: track for trial, track in pairs}
+    motions = []
+    for trial in comparison.trials:
+        track = tracks[trial.name]
+        trace = None if track.pressure_Pa is None else (track.time_s - trial.release_s, track.pressure_Pa)
+        motions.append(measured_motion(trial.trial, kinematics[trial.name], trial.release_s, trace))
+    return audit(found.model, motions)
+
+
+def _reason(error: Exception) -> str:
+    """Why there is no fit, in a sentence; the traceback of what nobody foresaw goes to the log."""
+    if type(error).__name__ in ("FitError", "EffectError", "SimulationError"):
+        return str(error)
+    log.exception("the model could not be fitted")
+    return INTERNAL_FAULT
+
+
+def fit_entry(found: Fit, warnings: tuple[str, ...], check_message: str = "") -> dict[str, Any]:
+    """A fit as `fit.json` holds it: SI units, numbers in the order of `covariance`; deviations are relative."""
+    return {
+        "model": list(found.model.names),
+        "numbers": [
+            {
+                "parameter": number.key,
+                "vine": number.vine,
+                "symbol": number.symbol,
+                "unit": number.unit,
+                "value": number.value,
+                "sigma": number.sigma,
+                "low_95": number.low,
+                "high_95": number.high,
+                "interval": number.method,
+                "bound": number.bound,
+            }
+            for number in found.numbers
+        ],
+        "covariance": found.covariance,
+        "spreads": {
+            name: {"value": spread.value, "estimated": spread.estimated} for name, spread in found.spreads.items()
+        },
+        "noise_m": found.noise_m,
+        "noise_correlation": found.noise_correlation,
+        "chi2_per_dof": found.chi2_per_dof,
+        "log_likelihood": found.log_likelihood,
+        "converged": found.converged,
+        "messages": [*found.messages, *([check_message] if check_message else [])],
+        "warnings": list(warnings),
+        "left_out": dict(found.left_out),
+        "trials": {
+            trial.name: {
+                "release_s": trial.release_s,
+                "release_sigma_s": trial.release_sigma_s,
+                "origin_m": trial.origin_m,
+                "origin_sigma_m": trial.origin_sigma_m,
+                "pressure_deviation": trial.pressure_deviation,
+                "pressure_deviation_sigma": trial.pressure_deviation_sigma,
+                "damping_deviation": trial.damping_deviation,
+                "damping_deviation_sigma": trial.damping_deviation_sigma,
+            }
+            for trial in found.trials
+        },
+    }
+
+
+def _write_trajectories(results: Results, trajectories: dict[str, pd.DataFrame]) -> None:
+    """A file a condition; those of an earlier run go, or a condition that is no more would still be drawn."""
+    folder = results.folder / "comparison"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for condition, table in trajectories.items():
+        write_csv(results.trajectories(condition), table)
+
+
+def comparison_lines(folder: Path) -> list[str]:
+    """`comparison.csv` as lines for the terminal, aligned, with units; or why there is nothing in it.
+
+    Raises
+    ------
+    ResultsError
+        If the model has not been fitted there.
+    """
+    from vinetrack.core.terminal import table as aligned
+    from vinetrack.figures.style import rows
+
+    results = Results(folder)
+    content, table = read_json(results.fit), read_result(results.comparison)
+    if content["refused"]:
+        return [f"{' + '.join(content['model'])} was not fitted: {content['refused']}"]
+    body = [
+        (
+            str(row.condition),
+            _shown(1e3 * row.rms_position_m, 3),
+            _shown(1e3 * row.replicate_floor_m, 3),
+            _shown(row.ratio, 1),
+            _shown(row.rms_final_velocity_m_s, 3),
+            _shown(1e3 * row.worst_at_s, 1),
+            _shown(1e3 * row.worst_at_m, 1),
+        )
+        for row in rows(table)
+    ]
+    head = ("condition", "rms position", "replicates", "ratio", "rms final speed", "worst at", "")
+    lines = aligned(body, head, ("", "mm", "mm", "", "m/s", "ms", "mm"), align="<>>>>>>")
+    return [" + ".join(content["model"]), *lines, *(f"! {message}" for message in content["messages"])]
+
+
+def _shown(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if np.isfinite(value) else "–"

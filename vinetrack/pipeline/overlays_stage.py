@@ -1,0 +1,275 @@
+"""Recordings with the tracked edge and the models' edges drawn, slowed down, as `overlays/<trial>.mp4`."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.pipeline.pool import map_trials
+from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.core.records import Trial
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import OverlaySettings
+    from vinetrack.figures.overlay import Edge
+
+log = logging.getLogger(__name__)
+
+Floats = NDArray[np.float64]
+
+FASTEST_FPS, SLOWEST_FPS = 30.0, 4.0
+"""Pictures a second between which a clip plays: faster is lost on a screen, slower is a slide show."""
+
+REST_FRAMES = 8
+"""Frames of rest before and after the motion that a clip shows."""
+
+FEWEST_PAIRS = 5
+"""Points known in pixels and in metres without which a prediction has no place in the picture."""
+
+
+def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySettings, n_workers: int = 1) -> list[str]:
+    """Write the clips that the settings ask for; return a line for every one that could not be made.
+
+    A recording that cannot be drawn never stops the others. The folder is there afterwards, with or without clips.
+    """
+    results = Results(folder)
+    results.overlays.mkdir(parents=True, exist_ok=True)
+    chosen = chosen_trials(experiment, results, settings.of)
+    work = partial(_try_overlay, results=results, settings=settings)
+    said = map_trials(work, [experiment.trial(name) for name in chosen], n_workers, "overlay clips")
+    return [line for line in said if line]
+
+
+def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float | None = None) -> Path:
+    """Write the clip of one trial of a results folder, as its run was set; return its path.
+
+    Parameters
+    ----------
+    experiment : where the results came from; None for where the folder itself says.
+    seconds : about how long the clip is to play; None for what the run was set to.
+
+    Raises
+    ------
+    ResultsError
+        If there is no such trial, or no clip of it can be made.
+    ExperimentError
+        If the experiment is not where it was.
+    """
+    from vinetrack.experiment.folder import read_experiment
+    from vinetrack.experiment.settings import OverlaySettings
+
+    results = Results(folder)
+    said = read_json(results.provenance)
+    read = read_experiment(experiment or Path(str(said["experiment"])))
+    filmed = [one.name for one in read.trials if one.video is not None]
+    if trial not in filmed:
+        known = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there is none"
+        raise ResultsError(f"{trial!r} is no trial with a recording in {read.folder}: {known}")
+    settings = OverlaySettings(**(said.get("settings") or {}).get("overlays") or {})
+    if seconds is not None:
+        settings = settings.model_copy(update={"seconds": seconds})
+    return write_overlay(read.trial(trial), results, settings)
+
+
+def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str]:
+    """Filmed trials to draw: of every condition the first that was tracked, or all of those, or none."""
+    if of == "none":
+        return []
+    trials = read_result(results.trials)
+    tracked = set(trials.loc[~trials["status"].isin(("failed", "left_out")), "trial"])
+    filmed = [trial for trial in experiment.trials if trial.video is not None and trial.name in tracked]
+    if of == "all":
+        return [trial.name for trial in filmed]
+    first: dict[str, str] = {}
+    for trial in filmed:
+        first.setdefault(trial.condition, trial.name)
+    return list(first.values())
+
+
+def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> str:
+    try:
+        write_overlay(trial, results, settings)
+    except ResultsError as error:
+        log.warning("%s: no clip: %s", trial.name, error)
+        return f"{trial.name}: no clip: {error}"
+    except Exception:
+        log.exception("%s: no clip", trial.name)
+        return f"{trial.name}: no clip: a fault of the program, written down in the log of this stage"
+    return ""
+
+
+def write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
+    """Write the clip of one trial; return its path.
+
+    Raises
+    ------
+    ResultsError
+        If it came without a recording, was not tracked, or its recording cannot be read.
+    """
+    from vinetrack.video.frames import RecordingError
+    from vinetrack.video.write import write_clip
+
+    if trial.video is None:
+        raise ResultsError(f"{trial.name} came without a recording; there is nothing to draw on")
+    track = read_result(results.track(trial.name))
+    shown = frames_to_show(track)
+    rate = 1.0 / float(np.median(np.diff(track["time_s"].to_numpy()))) if len(track) > 1 else math.nan
+    play_fps, stride = pace(shown.stop - shown.start, settings.seconds)
+    path = results.overlay(trial.name)
+    try:
+        pictures = _pictures(trial, results, track, shown, stride, rate / play_fps / stride, settings)
+        write_clip(path, pictures, play_fps)
+    except RecordingError as error:
+        raise ResultsError(str(error)) from None
+    return path
+
+
+def frames_to_show(track: pd.DataFrame) -> range:
+    """Frames from a little before the edge moves until a little after it has stopped.
+
+    Raises
+    ------
+    ResultsError
+        If no edge was found.
+    """
+    edge = track["edge_px"].to_numpy(dtype=float)
+    known = np.flatnonzero(np.isfinite(edge))
+    if known.size < FEWEST_PAIRS:
+        raise ResultsError("its edge was not found, so there is nothing to draw")
+    low, high = float(np.nanmin(edge)), float(np.nanmax(edge))
+    begun = known[edge[known] > low + 0.01 * (high - low)][0]
+    ended = known[edge[known] < high - 0.002 * (high - low)][-1]
+    return range(max(int(begun) - REST_FRAMES, 0), min(int(ended) + REST_FRAMES, int(known[-1])) + 1)
+
+
+def pace(n_frames: int, seconds: float) -> tuple[float, int]:
+    """Pictures a second, and every how many frames one is taken, so that the clip lasts about `seconds`.
+
+    >>> pace(120, 6.0)
+    (20.0, 1)
+    >>> pace(3000, 6.0)
+    (29.41, 17)
+    """
+    stride = max(round(n_frames / seconds / FASTEST_FPS), 1)
+    return float(np.clip(n_frames / stride / seconds, SLOWEST_FPS, FASTEST_FPS)), stride
+
+
+def _pictures(
+    trial: Trial,
+    results: Results,
+    track: pd.DataFrame,
+    shown: range,
+    stride: int,
+    slowed: float,
+    settings: OverlaySettings,
+) -> Iterator[NDArray[np.uint8]]:
+    from vinetrack.figures.overlay import View, compose, levels
+    from vinetrack.video.axis import Axis
+    from vinetrack.video.frames import inspect_recording, iterate_frames
+
+    assert trial.video is not None
+    recording = inspect_recording(trial.video)
+    analysed = read_json(results.analysed(trial.name))
+    line = analysed.get("axis")
+    if line is None:
+        raise ResultsError(f"{results.analysed(trial.name)} does not say where the axis is: run snakemake again")
+    axis = Axis(tuple(line["from_px"]), tuple(line["to_px"]))
+    mm_per_px = float(analysed["row"]["mm_per_px"] or math.nan)
+    tube_px = 1e3 * trial.diameter_m / mm_per_px
+    tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(recording.width, recording.height)
+    view = View(trial.name, axis, tube_px, (recording.width, recording.height), mm_per_px, slowed, settings.width_px)
+    edges, release_s = edges_of(trial.name, results, track)
+    shake_px = shake_along(line, len(track))
+    edges = [replace(edge, along_px=edge.along_px + shake_px) for edge in edges]
+    time_ms = 1e3 * (track["time_s"].to_numpy(dtype=float) - release_s)
+    low = high = 0.0
+    for frame, picture in enumerate(iterate_frames(recording)):
+        if frame >= shown.stop:
+            break
+        if frame < shown.start or (frame - shown.start) % stride:
+            continue
+        if high == low:
+            low, high = (float(value) for value in np.percentile(picture, (0.5, 99.5)))
+        yield compose(view, levels(picture, low, high), frame, float(time_ms[frame]), edges)
+
+
+def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
+    """How far along its axis each picture of a recording was moved by a shaken camera, px, shape (n_frames,).
+
+    Parameters
+    ----------
+    line : `axis` of `analysed/<trial>.json`; it says nothing of a camera that stood still.
+    """
+    shake_px = np.zeros(n_frames)
+    said = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
+    shake_px[: said.size] = said
+    return shake_px
+
+
+def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
+    """The tracked edge, those that were predicted where there are any, and the time of release, s."""
+    from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
+
+    edge_px = track["edge_px"].to_numpy(dtype=float)
+    edges = [Edge("tracked edge", TRACKED, edge_px)]
+    path = results.predictions(trial)
+    if not path.exists():
+        return edges, float(_first_moving_s(track))
+    said = read_result(path)
+    to_px = metres_to_px(track)
+    added = added_effects(results)
+    names = {"model_before_m": "the model you came with", "model_after_m": f"with {added}" if added else ""}
+    time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
+    for column, name in names.items():
+        known = said[["time_s", column]].dropna()
+        if not name or known.empty:
+            continue
+        # The model ends with its last prediction; before its first the vine rests where it begins.
+        position_m = np.interp(time_s, known["time_s"], known[column], right=math.nan)
+        off_mm = 1e3 * (position_m - measured_m)
+        edges.append(Edge(name, BEFORE if column == "model_before_m" else AFTER, to_px(position_m), off_mm))
+    return edges, _release_s(trial, results, track)
+
+
+def metres_to_px(track: pd.DataFrame) -> Any:
+    """A function from metres to pixels along the axis, by what the track holds in both: lens and tilt bend it a little.
+
+    Raises
+    ------
+    ResultsError
+        If too few points are known in both.
+    """
+    both = track[["lead_position_m", "edge_px"]].dropna()
+    metres, px = both["lead_position_m"].to_numpy(dtype=float), both["edge_px"].to_numpy(dtype=float)
+    if len(both) < FEWEST_PAIRS or np.ptp(metres) <= 0:
+        raise ResultsError("too few of its positions are known in pixels and in metres")
+    middle, half = (metres.max() + metres.min()) / 2, np.ptp(metres) / 2
+    bent = np.polynomial.Polynomial.fit(metres, px, 2, domain=[middle - half, middle + half])
+    return bent
+
+
+def added_effects(results: Results) -> str:
+    """The effects that the diagnosis added, in words; blank where there is none."""
+    if not results.diagnosis.exists():
+        return ""
+    return " and ".join(str(name).replace("_", " ") for name in read_json(results.diagnosis).get("effects") or [])
+
+
+def _release_s(trial: str, results: Results, track: pd.DataFrame) -> float:
+    fitted = read_json(results.fit).get("trials") or {} if results.fit.exists() else {}
+    return float(fitted[trial]["release_s"]) if trial in fitted else _first_moving_s(track)
+
+
+def _first_moving_s(track: pd.DataFrame) -> float:
+    return float(track["time_s"].iloc[min(frames_to_show(track).start + REST_FRAMES, len(track) - 1)])

@@ -1,0 +1,176 @@
+"""Published numbers and figures set beside those of a results folder: `paper.csv`, figures, the tables behind them."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.core.tables import write_bytes, write_csv
+from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import FigureSettings
+
+log = logging.getLogger(__name__)
+
+DRAWN_FROM = ("paper", "paper_departures", "paper_motions", "paper_means", "paper_positions", "paper_pressures")
+DRAWN_FROM_SPEEDS = ("paper_speeds", "paper_speed_curves")
+
+FIG5_NOTE = "B of this vine and the payloads other than 35.6 g are not printed; the paper's points are drawn only"
+FIG7_VIRTUAL = (
+    "Of the 12 mm vines only that of 100 µm has a printed B. Virtual vines of other walls were grown with B in "
+    "proportion to the wall: their straight line is what was put in"
+)
+FIG8_NOTE = (
+    "Alvarez et al. (2025): linear, R² = 0.935, from which p = 0.033 (printed: 0.32). The printed B of Fig. 6 do not "
+    "give speeds that rise evenly"
+)
+FIG8_VIRTUAL = ": virtual vines grown with them test neither figure on the other"
+FIG9_NOTE = "Alvarez et al. (2025): higher for thinner walls, no clear trend with diameter; values are drawn only"
+
+
+def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
+    """Write `paper.csv` and the tables behind the figures; return `paper.csv` as written.
+
+    Raises
+    ------
+    ResultsError
+        If the experiment does not ask for it, or a stage before this one has not run.
+    """
+    from vinetrack.paper.arithmetic import computed_rows
+    from vinetrack.paper.foretold import foretold_rows
+    from vinetrack.paper.found import found_rows
+    from vinetrack.paper.protocol import protocol_rows
+    from vinetrack.paper.rows import MARKS, MEASURED, SIMULATED, as_table
+
+    kind = experiment.settings.published
+    if kind is None:
+        raise ResultsError("experiment.yaml has no `published`: write `simulated` or `measured` to ask for it")
+    results = Results(folder)
+    mark = SIMULATED if kind == "simulated" else MEASURED
+    tables = _tables(experiment, results)
+    found = _found(mark, results, tables)
+    rows = [
+        *protocol_rows(experiment.trials, read_result(results.steady), mark),
+        *found_rows(found),
+        *computed_rows(),
+        *foretold_rows(experiment.trials),
+    ]
+    table = as_table(rows)
+    for name, one in tables.items():
+        write_csv(folder / f"{name}.csv", one)
+    write_csv(folder / "paper.csv", table)
+    for mark in MARKS:
+        log.info("%s: %d rows", mark, int((table["mark"] == mark).sum()))
+    return table
+
+
+def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]:
+    """Every table behind a figure, by the name of its file."""
+    from vinetrack.paper import beside
+    from vinetrack.paper.departures import departure_table, motion_table, pressure_table
+    from vinetrack.paper.rows import number
+
+    trials = experiment.trials
+    positions, speeds = beside.position_conditions(trials), beside.speed_conditions(trials)
+    fitted = read_json(results.fit).get("trials") or {}
+    found = {name: beside.Rest(number(one["release_s"]), number(one["origin_m"])) for name, one in fitted.items()}
+    rests = {name: rest for name, rest in found.items() if math.isfinite(rest.release_s + rest.origin_m)}
+    kinematics = {
+        trial.name: read_result(results.kinematics(trial.name))
+        for of_one in (*positions.values(), *speeds.values())
+        for trial in of_one
+        if trial.name in rests
+    }
+    payloads_g = sorted({round(1e3 * of_one[0].payload_kg, 6) for of_one in speeds.values()})
+    return {
+        "paper_departures": departure_table(payloads_g),
+        "paper_motions": motion_table(),
+        "paper_means": beside.mean_motions(positions, kinematics, rests),
+        "paper_positions": beside.position_errors(positions, kinematics, rests),
+        "paper_pressures": pressure_table(),
+        "paper_speeds": beside.final_speeds(speeds, kinematics, rests),
+        "paper_speed_curves": beside.speed_curves(speeds),
+    }
+
+
+def draw_paper(folder: Path, settings: FigureSettings) -> None:
+    """Draw the figures that stand beside the paper's, from the tables of `set_beside_paper`."""
+    from vinetrack.figures.style import render
+
+    for name, figure in _drawings(Results(folder)).items():
+        for form, data in render(figure, settings.formats, settings.dpi).items():
+            write_bytes(Results(folder).figure(name, f".{form}"), data)
+
+
+def _drawings(results: Results) -> dict[str, Figure]:
+    from vinetrack.core import published
+    from vinetrack.figures.efficiency import draw_efficiency
+    from vinetrack.figures.paper_damping import draw_paper_damping
+    from vinetrack.figures.paper_position import draw_paper_position
+    from vinetrack.figures.paper_reservoir import draw_paper_reservoir
+    from vinetrack.figures.paper_rms import draw_paper_rms
+    from vinetrack.figures.payload_speed import draw_payload_speed
+    from vinetrack.figures.scaling import draw_scaling
+    from vinetrack.figures.speed_scaling import draw_speed_scaling
+    from vinetrack.paper.rows import SIMULATED
+
+    tables = {name: read_result(results.folder / f"{name}.csv") for name in (*DRAWN_FROM, *DRAWN_FROM_SPEEDS)}
+    damping, scaling = read_json(results.damping), read_json(results.scaling)
+    virtual = (tables["paper"]["mark"] == SIMULATED).any()
+    fig7, fig8 = (FIG7_VIRTUAL, FIG8_NOTE + FIG8_VIRTUAL) if virtual else ("", FIG8_NOTE)
+    speed = {"steady_speed": _near(scaling["steady_speed"], published.STEADY_SPEED_KPA)}
+    efficiency = {"efficiency": _near(scaling["efficiency"], published.EFFICIENCY_KPA)}
+    return {
+        "paper_fig4": draw_paper_position(
+            tables["paper_motions"], tables["paper_means"], tables["paper_positions"], published.POSITION_RMS_CM
+        ),
+        "paper_fig5": draw_payload_speed(
+            tables["paper_speeds"], tables["paper_speed_curves"], FIG5_NOTE, "Eq. (2), B in proportion to the wall"
+        ),
+        "paper_fig6": draw_paper_damping(read_result(results.points), damping, published.DAMPING_B, published.EXPONENT),
+        "paper_fig7": draw_scaling(scaling, {"B": _printed_B(damping), "source": f"{published.SOURCE}, printed"}, fig7),
+        "paper_fig8": draw_speed_scaling(speed, fig8),
+        "paper_fig9": draw_efficiency(efficiency, FIG9_NOTE),
+        "paper_reservoir": draw_paper_reservoir(tables["paper_pressures"]),
+        "paper_table2": draw_paper_rms(tables["paper"], tables["paper_departures"]),
+    }
+
+
+def _near(families: list[dict[str, Any]], pressure_kPa: float) -> list[dict[str, Any]]:
+    return [family for family in families if abs(family["pressure_kPa"] / pressure_kPa - 1) < 0.02]
+
+
+def _printed_B(damping: dict[str, Any]) -> dict[str, float]:
+    """The printed B of those of our vines that are in Table I, by our names."""
+    from vinetrack.core import published
+
+    printed = {}
+    for law in damping.values():
+        for name, vine in (law.get("vines") or {}).items():
+            scale = published.scale_of(vine["diameter_mm"], vine["thickness_um"])
+            if scale is not None:
+                printed[name] = published.DAMPING_B[scale]
+    return printed
+
+
+def _found(mark: str, results: Results, tables: Mapping[str, pd.DataFrame]) -> Any:
+    from vinetrack.paper.found import Found
+
+    return Found(
+        mark=mark,
+        damping=read_json(results.damping),
+        scaling=read_json(results.scaling),
+        conditions=read_result(results.conditions),
+        fit=read_json(results.fit),
+        positions=tables["paper_positions"],
+        speeds=tables["paper_speeds"],
+        departures=tables["paper_departures"],
+    )

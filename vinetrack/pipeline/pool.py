@@ -1,0 +1,34 @@
+"""The same function over many trials in a few processes, with a bar a person can follow."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import TypeVar
+
+from vinetrack.core.terminal import progress
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+SMALLEST_POOL = 8
+"""Below this many items a second process costs more to start than it saves."""
+
+
+def map_trials(
+    function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int, label: str
+) -> Iterator[Answer]:
+    """Yield `function(item)` for every item, in order; the bar shows on a terminal only.
+
+    `function` and items travel to other processes, so both must be picklable.
+    """
+    if n_workers < 2 or len(items) < SMALLEST_POOL:
+        yield from progress(map(function, items), label, total=len(items))
+        return
+    # Workers that start as copies are ready at once; where the system cannot copy, they import what they need.
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
+    chunk = max(len(items) // (8 * n_workers), 1)
+    with ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context(method)) as pool:
+        yield from progress(pool.map(function, items, chunksize=chunk), label, total=len(items))

@@ -1,0 +1,252 @@
+"""What a person asks about a vine not yet built, read: options or a sheet, a fit, effects; words for the answers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import write_bytes
+from vinetrack.experiment.planned import Planned, option, planned_sheet, planned_trial
+from vinetrack.figures.numbers import number
+from vinetrack.results.folder_layout import Results, ResultsError, read_json
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from vinetrack.core.records import Trial
+    from vinetrack.effects import Effect
+    from vinetrack.planning.fit_inputs import FitNumbers
+    from vinetrack.planning.input_sources import StatedValues
+    from vinetrack.planning.predictive_inputs import Input, PredictiveInputs
+
+FIGURE_FORMATS = (".png", ".svg", ".pdf")
+
+SHOWN_AS = {"Pa": ("kPa", 1e-3), "s": ("ms", 1e3), "1": ("", 1.0), "1/Pa": ("1/kPa", 1e3)}
+"""SI units that read better another way: name and factor."""
+
+NEVER = "never"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What stands on the command line. `cells` are texts by column of the sheet, those that were given.
+
+    `B_error` and `spreads` are relative. NaN and None where nothing is said.
+    """
+
+    cells: Mapping[str, str] = field(default_factory=dict)
+    sheet: Path | None = None
+    results: Path | None = None
+    effects: tuple[str, ...] = ()
+    tail_slack: str | None = None
+    B: float = math.nan
+    B_error: float = 0.0
+    n: float = math.nan
+    n_error: float = 0.0
+    spreads: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What beliefs stand on: trials that are planned, what is said of their numbers, and a fit where there is one."""
+
+    planned: Planned
+    said: StatedValues
+    fit: FitNumbers | None
+
+
+def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
+    """Read the sheet or the options, the fit, and the effects that are asked for.
+
+    Raises
+    ------
+    ExperimentError
+        If the sheet or an option will not do.
+    ResultsError
+        If there is no fit where there should be one.
+    EffectError
+        If an effect is unknown or has no such size.
+    """
+    from vinetrack.experiment.planned import NEEDED
+    from vinetrack.experiment.settings import ExperimentSettings
+    from vinetrack.planning.input_sources import StatedValues
+    from vinetrack.planning.predictive_inputs import read_sizes
+
+    if asked.sheet is not None:
+        planned = planned_sheet(asked.sheet)
+        _refuse_beside_sheet(asked)
+    else:
+        planned = planned_trial(asked.cells, ExperimentSettings(), NEEDED if needed is None else needed)
+    if asked.tail_slack is not None:
+        planned = replace(planned, trials=tuple(replace(one, tail_slack=asked.tail_slack) for one in planned.trials))
+    fit, own = (None, _own(planned)) if asked.results is None else read_fit(asked.results)
+    sizes = [read_sizes(text, own) for text in asked.effects]
+    said = StatedValues(
+        B=asked.B,
+        B_error=asked.B_error,
+        n=asked.n,
+        n_error=asked.n_error,
+        model=planned.settings.model,
+        effects=tuple(name for name, _ in sizes),
+        sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
+        own=own,
+        spreads=asked.spreads,
+    )
+    return Ground(planned, said, fit)
+
+
+def _refuse_beside_sheet(asked: Asked) -> None:
+    problems = [
+        Problem(message="stands beside a sheet", column=option(name), value=text, remedy="write it in the sheet")
+        for name, text in asked.cells.items()
+    ]
+    if problems:
+        raise ExperimentError(problems)
+
+
+def _own(planned: Planned) -> Mapping[str, Effect]:
+    """The user's own effects of the sheet's experiment."""
+    from vinetrack.pipeline.effects_stage import effects_of
+
+    return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
+
+
+def read_fit(results: Path) -> tuple[FitNumbers, Mapping[str, Effect]]:
+    """The fit of a results folder, and the own effects of the experiment that it belongs to.
+
+    Raises
+    ------
+    ResultsError
+        If the folder holds no fit, or an effect of it can no longer be found.
+    """
+    from vinetrack.effects import catalogue
+    from vinetrack.inference.fit_data import FitError
+    from vinetrack.pipeline.effects_stage import effects_of
+    from vinetrack.planning.fit_inputs import fit_numbers
+
+    paths = Results(results)
+    try:
+        fit = fit_numbers(read_json(paths.fit), results.as_posix())
+    except FitError as error:
+        raise ResultsError(str(error)) from None
+    lacking = [name for name in fit.model if name not in catalogue()]
+    if not lacking:
+        return fit, {}
+    experiment = Path(str(read_json(paths.provenance).get("experiment", "")))
+    own = effects_of(experiment) if experiment.is_dir() else {}
+    if not set(lacking) <= set(own):
+        raise ResultsError(
+            f"{results} was fitted with {', '.join(lacking)}, an effect of its experiment's own, which is no longer in "
+            f"{experiment}: put the folder back, or fit again"
+        )
+    return fit, own
+
+
+def beliefs_of(ground: Ground) -> list[PredictiveInputs]:
+    """A belief for every trial.
+
+    Raises
+    ------
+    ResultsError
+        If the fit is not one of everting vines.
+    """
+    from vinetrack.inference.fit_data import FitError
+    from vinetrack.planning.input_sources import predictive_inputs
+
+    try:
+        return [predictive_inputs(trial, ground.said, ground.fit) for trial in ground.planned.trials]
+    except FitError as error:
+        raise ResultsError(str(error)) from None
+
+
+def as_option(error: Exception) -> Exception:
+    """What an effect needs, said of the option or the column that is missing; any other error as it is."""
+    match = re.search(r"the effect (\w+) needs `(\w+)`", str(error))
+    if match is None:
+        return error
+    words = f"is blank, and the effect {match[1]} needs it"
+    return ExperimentError(
+        [Problem(message=words, column=match[2], remedy=f"give it, as {option(match[2])} or in the sheet")]
+    )
+
+
+def warnings_of(ground: Ground) -> list[str]:
+    """What is legal in the sheet or the options, but hardly meant."""
+    return [str(problem) for problem in ground.planned.problems]
+
+
+def litres(volume_m3: float) -> str:
+    """A volume as people say it: litres, or millilitres where they are few.
+
+    >>> litres(3.7e-3), litres(3.534e-6)
+    ('3.7 L', '3.53 mL')
+    """
+    return f"{1e3 * volume_m3:.3g} L" if volume_m3 >= 1e-4 else f"{1e6 * volume_m3:.3g} mL"
+
+
+def trial_words(trial: Trial) -> str:
+    """A trial as a person would write it.
+
+    >>> from vinetrack.core.records import Trial
+    >>> trial_words(Trial(name="a", diameter_m=0.025, thickness_m=1e-4, length_m=0.4, pressure_Pa=62e3))
+    '25 mm × 100 µm × 400 mm at 62 kPa, no payload, growing straight down'
+    """
+    size = f"{1e3 * trial.diameter_m:.4g} mm × {1e6 * trial.thickness_m:.4g} µm × {1e3 * trial.length_m:.4g} mm"
+    payload = f"payload {1e3 * trial.payload_kg:.4g} g" if trial.payload_kg > 0 else "no payload"
+    degrees = math.degrees(trial.growth_angle_rad)
+    named = {0: "straight down", 90: "horizontally", 180: "straight up"}
+    way = named.get(round(degrees, 6), f"{degrees:.4g}° from straight down")  # type: ignore[call-overload]
+    rig = "" if math.isnan(trial.chamber_m3) else f", chamber {litres(trial.chamber_m3)}"
+    rig += "" if math.isnan(trial.inlet_m) else f", inlet {1e3 * trial.inlet_m:.4g} mm"
+    return f"{size} at {trial.pressure_Pa / 1e3:.4g} kPa, {payload}, growing {way}{rig}"
+
+
+def shown(value: float, unit: str, digits: int = 3) -> str:
+    """An SI value in the unit people use, to so many digits; a time that never comes is `never`."""
+    if math.isinf(value):
+        return NEVER
+    return number(value * SHOWN_AS.get(unit, (unit, 1.0))[1], digits)
+
+
+def unit_of(unit: str) -> str:
+    """The unit that `shown` uses."""
+    return SHOWN_AS.get(unit, (unit, 1.0))[0]
+
+
+def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
+    """Rows of a table: symbol, median, 90 % band, unit, where from; constants of nature are left out."""
+    rows = []
+    for one in inputs:
+        if one.origin == "constant":
+            continue
+        exact = one.low == one.high
+        spread = "–" if exact else f"{shown(one.low, one.unit)} to {shown(one.high, one.unit)}"
+        rows.append((one.symbol, shown(one.median, one.unit), spread, unit_of(one.unit), one.origin))
+    return rows
+
+
+def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
+    """Write a figure in the form its ending names.
+
+    Raises
+    ------
+    ExperimentError
+        If it names none.
+    """
+    from vinetrack.figures.style import render
+
+    check_figure(path)
+    form = path.suffix.lower().removeprefix(".")
+    write_bytes(path, render(fig, [form], dpi)[form])
+
+
+def check_figure(path: Path | None) -> None:
+    """Refuse a picture whose ending names no form, before anything is computed."""
+    if path is not None and path.suffix.lower() not in FIGURE_FORMATS:
+        remedy = f"let it end in {', '.join(FIGURE_FORMATS)}"
+        raise ExperimentError([Problem(message="is no picture's name", file=str(path), remedy=remedy)])

@@ -1,0 +1,111 @@
+"""One recording to its track, kinematics, strip figure and row; whatever is wrong with it is its own affair."""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.tables import write_bytes, write_json
+from vinetrack.pipeline.tracks_stage import INTERNAL_FAULT, analyse, failed_row, write_empty
+from vinetrack.results.folder_layout import Results, read_json, read_result
+
+if TYPE_CHECKING:
+    from vinetrack.core.records import Trial
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import RunSettings
+    from vinetrack.video.measure import Measurement
+
+log = logging.getLogger(__name__)
+
+
+def analyse_recording(experiment: Experiment, name: str, folder: Path, settings: RunSettings) -> str:
+    """Track the recording of one trial and analyse its motion; write all files of the trial.
+
+    Returns
+    -------
+    str
+        A line for a person: what was found, or why it failed.
+    """
+    trial = experiment.trial(name)
+    results = Results(folder)
+    reason, fault = _analyse(experiment, trial, results, settings)
+    if fault:
+        log.error("trial %s:\n%s", name, fault)
+    log.info("%s: %s", name, reason or "analysed")
+    return f"{name}: failed: {reason}" if reason else f"{name}: {_counted(results, name)}."
+
+
+def _counted(results: Results, name: str) -> str:
+    """How many frames of a trial show where the edge was, in words."""
+    track = read_result(results.track(name))
+    return f"edge known in {int(track['lead_position_m'].notna().sum())} of {len(track)} frames"
+
+
+def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: RunSettings) -> tuple[str, str]:
+    from vinetrack.tracks.importers import TrackError, attach_pressure, read_pressure_trace
+    from vinetrack.video.frames import RecordingError
+    from vinetrack.video.measure import measure_recording
+
+    measurement = None
+    try:
+        measurement = measure_recording(trial, experiment.settings, experiment.folder)
+        track = measurement.tracking.track
+        if trial.pressure_trace is not None:
+            track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+        reason, fault = analyse(
+            trial,
+            track,
+            results,
+            settings,
+            experiment,
+            mm_per_px=1e3 * measurement.m_per_px,
+            scale_rel_sigma=measurement.scale_rel_sigma,
+        )
+        _add_view(results, trial.name, measurement, getattr(experiment.settings.calibration, "image", None))
+    except (RecordingError, TrackError) as error:
+        reason, fault = str(error), ""
+        write_empty(results, trial.name, failed_row(trial, reason))
+    except Exception:
+        reason, fault = INTERNAL_FAULT, traceback.format_exc()
+        write_empty(results, trial.name, failed_row(trial, reason))
+    _draw(trial, results, measurement, reason, settings)
+    return reason, fault
+
+
+def _add_view(results: Results, name: str, measurement: Measurement, image: str | None) -> None:
+    """Add to the file of a trial what the scale of its recording rests on, and the axis its `edge_px` counts along."""
+    found = measurement.calibration
+    entry: dict[str, Any] = {
+        "kind": "sheet" if found is None else found.kind,
+        "image": image if found is not None else None,
+        "mm_per_px": 1e3 * measurement.m_per_px,
+        "scale_rel_sigma": measurement.scale_rel_sigma,
+        "reprojection_px": None if found is None else found.reprojection_px,
+        "n_corners": 0 if found is None else found.n_corners,
+        "n_pictures": 0 if found is None else found.n_pictures,
+        "notes": [] if found is None else found.notes,
+    }
+    axis = measurement.tracking.axis
+    shake_px = measurement.tracking.shake_px
+    line = {"from_px": axis.from_px, "to_px": axis.to_px, "width_px": axis.width_px}
+    line |= {"shake_px": shake_px.round(2)} if np.any(shake_px) else {}
+    path = results.analysed(name)
+    write_json(path, read_json(path) | {"calibration": entry, "axis": line})
+
+
+def _draw(trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings) -> None:
+    from vinetrack.figures.strip import draw_strip
+    from vinetrack.figures.style import blank, render
+
+    if measurement is None:
+        figure = blank(f"{trial.name}: {reason}")
+    else:
+        figure = draw_strip(trial.name, measurement.tracking, measurement.m_per_px)
+    path = partial(results.strip_figure, trial.name)
+    for form, data in render(figure, settings.figures.formats, settings.figures.dpi).items():
+        write_bytes(path(f".{form}"), data)

@@ -1,0 +1,227 @@
+"""The tables and pictures of a results folder put together as one page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.core.tables import write_json, write_text
+from vinetrack.experiment.provenance import describe_run
+from vinetrack.figures.style import METHOD_NAMES
+from vinetrack.pipeline.figures_stage import describe_conditions
+from vinetrack.results.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
+from vinetrack.results.folder_layout import Results, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
+    from vinetrack.report.recordings import Recording
+    from vinetrack.results.diagnosis_tables import DiagnosisTables
+
+FIGURES = {
+    "ladder": ("The ladder of errors", ""),
+    "before_after": ("The worst condition", ""),
+    "damping_law": ("Steady force and steady speed", "damping_points.csv"),
+    "exponents": ("The exponent and the coefficients, by both methods", "damping.json"),
+    "scaling": ("How damping grows with size", "scaling.json"),
+    "speed_scaling": ("How steady speed goes with size", "conditions.csv"),
+    "efficiency": ("How much of the work becomes motion", "conditions.csv"),
+    "payload_speed": ("Final speed and payload", "conditions.csv"),
+    "overview": ("All trials at a glance", "trials.csv"),
+    "model_comparison": ("Model and measurement", ""),
+    "model_residuals": ("What the model leaves", "comparison.csv"),
+    "where": ("Misfit by condition and position", ""),
+    "missing_force": ("The missing force", ""),
+    "candidates": ("What would explain it", ""),
+    "cosines": ("What can be taken for what", ""),
+    "drift": ("What follows a condition it should not know", ""),
+}
+"""Figures of the page in their order: title, and the file their numbers stand in where it is not one of their own."""
+
+MOST_CURVE_ROWS = 6000
+"""Of the curves of all trials as data to download."""
+
+
+def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> Path:
+    """Write `provenance.json` and `report.html`; return the path of the report.
+
+    Raises
+    ------
+    ResultsError
+        If a stage before this one has not run.
+    """
+    from vinetrack.report.build import build_report
+
+    results = Results(folder)
+    content = report_content(experiment, folder, settings)
+    page = build_report(content)
+    write_json(results.provenance, dict(content.provenance))
+    write_text(results.report, page)
+    return results.report
+
+
+def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
+    """Everything that a results folder has for the page.
+
+    Raises
+    ------
+    ResultsError
+        If a stage has not run.
+    """
+    from vinetrack.report.build import ReportContent
+    from vinetrack.report.model import ModelResult
+
+    results = Results(folder)
+    trials = read_result(results.trials)
+    drawn = [name for name in trials["trial"] if results.kinematics(name).exists()]
+    filmed = [trial.name for trial in experiment.trials if trial.video is not None and trial.name in drawn]
+    diagnosed = read_diagnosed(results, describe_conditions(trials, experiment.trials))
+    own_data = {name: _as_csv(table) for name, table in figure_tables(diagnosed).items()}
+    own_data["model_comparison"] = _as_csv(_curves(results))
+    return ReportContent(
+        name=experiment.name,
+        trials=trials,
+        windows=read_result(results.steady),
+        damping=read_json(results.damping),
+        provenance=_provenance(experiment, settings),
+        kinematics={name: read_result(results.kinematics(name)) for name in drawn},
+        figures=[figure for name in _drawn(results, own_data) if (figure := _figure(results, name, own_data))],
+        trial_figures=_trial_figures(results, drawn),
+        recordings={name: _recording(results, name) for name in filmed},
+        clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
+        clip=_clip(results, diagnosed, trials),
+        model=ModelResult(read_json(results.fit), read_result(results.comparison), read_result(results.model_check)),
+        diagnosis=read_diagnosis(results, experiment),
+        sections=[_paper_section(results)] if experiment.settings.published else [],
+    )
+
+
+def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
+    inputs = [path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace) if path]
+    target = getattr(experiment.settings.calibration, "image", None)
+    inputs += [experiment.folder / target] if target is not None else []
+    inputs += [experiment.folder / path for path in experiment.settings.effects]
+    shared = [path for name in ("trials.csv", "experiment.yaml") if (path := experiment.folder / name).exists()]
+    return describe_run(experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model)
+
+
+def _paper_section(results: Results) -> ReportSection:
+    from vinetrack.report.build import ReportFigure
+    from vinetrack.report.paper import FIGURES as PAPER_FIGURES
+    from vinetrack.report.paper import paper_section
+
+    captions = files("vinetrack.report") / "captions"
+    figures = [
+        ReportFigure(
+            name,
+            title,
+            " ".join((captions / f"{name}.rst").read_text(encoding="utf-8").split()),
+            results.figure(name, ".svg").read_text(encoding="utf-8"),
+            data,
+            (results.folder / data).read_text(encoding="utf-8"),
+        )
+        for name, (title, data) in PAPER_FIGURES.items()
+        if results.figure(name, ".svg").exists()
+    ]
+    table, departures = (read_result(results.folder / f"{name}.csv") for name in ("paper", "paper_departures"))
+    return paper_section(table, departures, figures)
+
+
+def _drawn(results: Results, own_data: Mapping[str, str]) -> list[str]:
+    """Figures with something in them; the others would only repeat why there is no law."""
+    damping, scaling = read_json(results.damping), read_json(results.scaling)
+    empty = set() if any(damping[method]["vines"] for method in METHOD_NAMES) else {"exponents"}
+    empty |= set() if scaling["isometric"] or scaling["thickness"] else {"scaling"}
+    empty |= {key for key, of in (("speed_scaling", "steady_speed"), ("efficiency", "efficiency")) if not scaling[of]}
+    empty |= set() if len(read_result(results.payload_model)) else {"payload_speed"}
+    empty |= {"model_comparison", "model_residuals"} if read_json(results.fit)["refused"] else set()
+    empty |= {name for name, (_, file) in FIGURES.items() if not file and name not in own_data}
+    return [name for name in FIGURES if name not in empty]
+
+
+def _figure(results: Results, name: str, own_data: Mapping[str, str]) -> ReportFigure | None:
+    from vinetrack.report.build import ReportFigure
+
+    path = results.figure(name, ".svg")
+    if not path.exists():
+        return None
+    title, data_name = FIGURES[name]
+    caption = (files("vinetrack.report") / "captions" / f"{name}.rst").read_text(encoding="utf-8")
+    data = (results.folder / data_name).read_text(encoding="utf-8") if data_name else own_data[name]
+    return ReportFigure(
+        name, title, " ".join(caption.split()), path.read_text(encoding="utf-8"), data_name or f"{name}.csv", data
+    )
+
+
+def _as_csv(table: pd.DataFrame) -> str:
+    """A table to download, with five digits, which is finer than any number of a figure is drawn."""
+    return str(table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
+
+
+def _curves(results: Results) -> pd.DataFrame:
+    """Measured and modelled growth of all trials, thinned evenly."""
+    import pandas as pd
+
+    conditions = read_result(results.comparison)["condition"]
+    parts = [read_result(results.trajectories(name)).assign(condition=name) for name in conditions]
+    if not parts:
+        return pd.DataFrame()
+    whole = pd.concat(parts, ignore_index=True)
+    return whole.iloc[:: -(-len(whole) // MOST_CURVE_ROWS)]
+
+
+def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFrame) -> Clip | None:
+    """The clip that plays in the page: of the condition where the model fails most, else the first there is."""
+    from vinetrack.report.build import Clip
+
+    there = trials[[results.overlay(name).exists() for name in trials["trial"]]]
+    if not len(there):
+        return None
+    worst = diagnosed.worst if diagnosed is not None else ""
+    chosen = there[there["condition"] == worst] if (there["condition"] == worst).any() else there
+    name = str(chosen["trial"].iloc[0])
+    where = " The condition is the one where the model fails most." if len(chosen) < len(there) else ""
+    edges = "the tracked edge (yellow)"
+    if diagnosed is not None:
+        edges += ", where the model that you came with has it (vermillion)"
+        edges += f", and where it is with {diagnosed.added} (blue)" if diagnosed.added else ""
+    caption = f"The recording, slowed down, with {edges}.{where}"
+    path = results.overlay(name)
+    return Clip(name, path.read_bytes(), caption, _poster(path))
+
+
+def _poster(path: Path) -> bytes:
+    """A frame two thirds into a clip, where models have come apart, as WebP; nothing of one that cannot be read."""
+    import io
+
+    import av
+
+    try:
+        with av.open(str(path)) as container:
+            frames = list(container.decode(video=0))
+            picture = frames[2 * len(frames) // 3].to_image()
+    except av.error.FFmpegError:
+        return b""
+    file = io.BytesIO()
+    picture.save(file, "WEBP", quality=60)
+    return file.getvalue()
+
+
+def _recording(results: Results, name: str) -> Recording:
+    from vinetrack.report.recordings import Recording
+
+    strip = results.strip_figure(name, ".svg")
+    return Recording(
+        strip=strip.read_text(encoding="utf-8") if strip.exists() else "",
+        flags=read_result(results.track(name))["flag"].tolist(),
+        calibration=read_json(results.analysed(name)).get("calibration"),
+    )
+
+
+def _trial_figures(results: Results, names: list[str]) -> dict[str, str]:
+    paths = {name: results.trial_figure(name, ".svg") for name in names}
+    return {name: path.read_text(encoding="utf-8") for name, path in paths.items() if path.exists()}

@@ -1,0 +1,213 @@
+"""From measured positions to tracks, kinematics and one row a trial.
+
+A bad trial writes its reason and never stops the rest.
+"""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.records import Kinematics, Track, Trial, Window
+from vinetrack.core.tables import write_csv, write_json
+from vinetrack.pipeline.pool import map_trials
+from vinetrack.results.folder_layout import (
+    COUNT_COLUMNS,
+    KINEMATICS_COLUMNS,
+    POINT_COLUMNS,
+    STEADY_COLUMNS,
+    TEXT_COLUMNS,
+    TRACK_COLUMNS,
+    TRIALS_COLUMNS,
+    TRUTH_COLUMNS,
+    Results,
+    empty_table,
+    read_json,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vinetrack.dynamics.model import Model
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.experiment.settings import RunSettings
+
+log = logging.getLogger(__name__)
+
+INTERNAL_FAULT = "could not be analysed: a fault of the program, written down in the log of this stage"
+
+
+def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, n_workers: int = 1) -> list[str]:
+    """Analyse every trial that comes as a track; write `tracks/`, `kinematics/` and `analysed/` of each.
+
+    Trials whose row of the sheet is at fault get empty files here too.
+
+    Returns
+    -------
+    list of str
+        A line for every trial that failed: its name and why.
+    """
+    results = Results(folder)
+    for name, reason in experiment.failed.items():
+        write_empty(results, name, bare_row(name, "failed", reason))
+    model_of(experiment)
+    work = partial(_analyse_track, results=results, settings=settings, experiment=experiment)
+    trials = [trial for trial in experiment.trials if trial.video is None]
+    said = list(map_trials(work, trials, n_workers, "tracks"))
+    for trial, (reason, fault) in zip(trials, said, strict=True):
+        log.info("%s: %s", trial.name, reason or "analysed")
+        if fault:
+            log.error("trial %s:\n%s", trial.name, fault)
+    failed = {trial.name: reason for trial, (reason, _) in zip(trials, said, strict=True) if reason}
+    return [f"{name}: {reason}" for name, reason in (*experiment.failed.items(), *failed.items())]
+
+
+def _analyse_track(trial: Trial, results: Results, settings: RunSettings, experiment: Experiment) -> tuple[str, str]:
+    """Analyse one track, in a worker; return why it failed and the traceback of an unforeseen error, blank if none."""
+    from vinetrack.tracks.importers import TrackError, load_track
+
+    try:
+        track = load_track(trial)
+    except TrackError as error:
+        reason = f"{trial.track.name + ' ' if trial.track else ''}{error}"
+        write_empty(results, trial.name, failed_row(trial, reason))
+        return reason, ""
+    return analyse(trial, track, results, settings, experiment)
+
+
+def analyse(
+    trial: Trial, track: Track, results: Results, settings: RunSettings, experiment: Experiment, **columns: float
+) -> tuple[str, str]:
+    """From a track to the files of one trial; `columns` of `trials.csv` are known to the caller alone.
+
+    Returns
+    -------
+    (reason, fault)
+        Why it failed and the traceback of an unforeseen error, blank if none.
+    """
+    from vinetrack.kinematics.summary import TrialError, summarise_trial
+
+    try:
+        summary = summarise_trial(trial, track, settings, model_of(experiment))
+    except TrialError as error:
+        write_empty(results, trial.name, failed_row(trial, str(error)))
+        return str(error), ""
+    except Exception:
+        write_empty(results, trial.name, failed_row(trial, INTERNAL_FAULT))
+        return INTERNAL_FAULT, traceback.format_exc()
+    write_csv(results.track(trial.name), track_table(summary.track))
+    write_csv(results.kinematics(trial.name), kinematics_table(summary.kinematics))
+    windows = [_window_row(trial.name, window) for window in summary.windows.values()]
+    row = dict(summary.row) | columns
+    point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
+    write_json(results.analysed(trial.name), {"row": row, "windows": windows, "point": point})
+    return "", ""
+
+
+def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
+    """Put what every trial gave into `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`.
+
+    Returns
+    -------
+    DataFrame
+        `trials.csv` as written, in the order of the sheet.
+
+    Raises
+    ------
+    ResultsError
+        If a trial has not been analysed.
+    """
+    from vinetrack.kinematics.conditions import condition_table
+    from vinetrack.kinematics.damping import mark_half_steady
+
+    results = Results(folder)
+    found = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
+    rows = {name: content["row"] for name, content in found.items()}
+    rows |= {name: bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
+    table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
+    write_csv(results.steady, _frame([row for content in found.values() for row in content["windows"]], STEADY_COLUMNS))
+    points = _frame([c["point"] for c in found.values() if c["point"]], POINT_COLUMNS)
+    write_csv(results.points, mark_half_steady(points))
+    places = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
+    write_csv(results.conditions, condition_table(table, experiment.trials, **places))
+    write_csv(results.trials, table)
+    for row in table.itertuples():
+        log.info("%s: %s %s", row.trial, row.status, row.reason)
+    return table
+
+
+def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame:
+    """Rows as a table of these columns, without rows too; a number that JSON could not hold is NaN again."""
+    import pandas as pd
+
+    frame = pd.DataFrame(rows, columns=list(columns))
+    counts = [column for column in columns if column in COUNT_COLUMNS]
+    truths = [column for column in columns if column in TRUTH_COLUMNS]
+    numbers = [column for column in columns if column not in TEXT_COLUMNS | TRUTH_COLUMNS | COUNT_COLUMNS]
+    kinds = dict.fromkeys(numbers, "float") | dict.fromkeys(counts, "Int64") | dict.fromkeys(truths, "bool")
+    return frame.astype(kinds)
+
+
+def model_of(experiment: Experiment) -> Model:
+    """The model in use; every process makes its own, since a user's effects cannot travel between processes."""
+    return _model(experiment.settings.model, tuple(experiment.folder / path for path in experiment.settings.effects))
+
+
+@lru_cache(maxsize=1)
+def _model(names: tuple[str, ...], own: tuple[Path, ...]) -> Model:
+    """The model in use; every process makes its own, since a user's effects cannot travel between processes."""
+    from vinetrack.dynamics.model import make_model
+    from vinetrack.effects import load_effect
+
+    return make_model(names, {effect.name: effect for effect in map(load_effect, own)})
+
+
+def failed_row(trial: Trial, reason: str) -> dict[str, Any]:
+    """The row of `trials.csv` of a trial that could not be analysed."""
+    return bare_row(trial.name, "failed", reason) | {"vine": trial.vine, "condition": trial.condition}
+
+
+def write_empty(results: Results, trial: str, row: dict[str, Any]) -> None:
+    """Files of a trial without results: headers alone, and its row."""
+    write_csv(results.track(trial), empty_table(TRACK_COLUMNS))
+    write_csv(results.kinematics(trial), empty_table(KINEMATICS_COLUMNS))
+    write_json(results.analysed(trial), {"row": row, "windows": [], "point": None})
+
+
+def bare_row(trial: str, status: str, reason: str) -> dict[str, Any]:
+    """A row of `trials.csv` for a trial without results."""
+    blank: dict[str, Any] = dict.fromkeys(TRIALS_COLUMNS, np.nan)
+    return blank | {"trial": trial, "vine": "", "condition": "", "status": status, "reason": reason, "steady_rule": ""}
+
+
+def track_table(track: Track) -> pd.DataFrame:
+    """A track as `tracks/<trial>.csv` holds it: one row a frame, `frame` counted from 0."""
+    import pandas as pd
+
+    columns = (
+        np.arange(len(track.time_s)),
+        track.time_s,
+        track.edge_px,
+        track.lead_position_m,
+        track.lead_position_sigma_m,
+        track.flag,
+    )
+    return pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
+
+
+def kinematics_table(kinematics: Kinematics) -> pd.DataFrame:
+    """Kinematics as `kinematics/<trial>.csv` holds them."""
+    import pandas as pd
+
+    return pd.DataFrame({column: getattr(kinematics, column) for column in KINEMATICS_COLUMNS})
+
+
+def _window_row(trial: str, window: Window) -> dict[str, Any]:
+    low, high = window.drift_95
+    row = {column: getattr(window, column, None) for column in STEADY_COLUMNS}
+    return row | {"trial": trial, "points": window.n_points, "drift_95_low": low, "drift_95_high": high}

@@ -1,0 +1,213 @@
+"""The command `vinetrack design vine`: the fastest vine within what can be built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.experiment.planned import option
+from vinetrack.pipeline.prediction_inputs import (
+    Asked,
+    as_option,
+    check_figure,
+    read_ground,
+    shown,
+    trial_words,
+    write_figure,
+)
+from vinetrack.results.folder_layout import ResultsError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from vinetrack.planning.fastest_vine import Choice, Room
+
+MOST_FILMS = 12
+FILMS = "--films-um"
+
+
+def read_range(column: str, text: str) -> tuple[float, float]:
+    """Two ends of a range, SI, from `low:high` or one number, each judged as a cell of the column.
+
+    >>> read_range("diameter_mm", "5:25")
+    (0.005, 0.025)
+
+    Raises
+    ------
+    ExperimentError
+        If it is none.
+    """
+    values = [_cell(column, part) for part in text.split(":")]
+    if len(values) > 2:
+        raise _refusal(column, text, "is no range", "write low:high, such as 5:25")
+    if values[0] > values[-1]:
+        raise _refusal(column, text, "ends before it begins", "write the lower value first")
+    return values[0], values[-1]
+
+
+def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
+    """Values, SI, from numbers joined by commas; see `read_range`. `name` is the option's, if not the column's."""
+    return tuple(dict.fromkeys(_cell(column, part, name) for part in text.split(",") if part.strip()))
+
+
+SI = {"mm": 1e-3, "um": 1e-6, "kPa": 1e3, "g": 1e-3}
+
+
+def _cell(column: str, text: str, name: str = "") -> float:
+    """One number of a column, in SI; divided, so that 25 mm are 0.025 m and not a digit off."""
+    from vinetrack.experiment.schema import COLUMNS, CellError, read_cell
+
+    try:
+        value = read_cell(COLUMNS[column], text.strip())
+    except CellError as error:
+        raise _refusal(column, text, error.message, error.remedy, error.allowed, name) from None
+    assert isinstance(value, float)
+    factor = SI[column.rsplit("_", 1)[-1]]
+    return value / round(1 / factor) if factor < 1 else value * factor
+
+
+def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "", name: str = "") -> ExperimentError:
+    problem = Problem(message=message, column=name or option(column), value=text, allowed=allowed, remedy=remedy)
+    return ExperimentError([problem])
+
+
+def design_vine(
+    asked: Asked,
+    *,
+    films: str,
+    diameter: str,
+    length: str,
+    burst_share: float,
+    burst_stress_MPa: float,
+    samples: int,
+    seed: int,
+    at_fraction: float,
+    figure: Path | None = None,
+) -> list[str]:
+    """Lines for the terminal about the best vine of every film; its figure is written where asked for.
+
+    Raises
+    ------
+    ExperimentError, ResultsError, EffectError
+        If something asked for will not do.
+    """
+    from vinetrack.core.terminal import waiting
+    from vinetrack.dynamics.simulate import SimulationError
+    from vinetrack.effects import EffectError
+    from vinetrack.inference.fit_data import FitError
+    from vinetrack.planning.fastest_vine import Room, fastest
+
+    check_figure(figure)
+    ground = read_ground(asked, needed=("pressure_kPa",))
+    room = Room(
+        films_m=read_list("thickness_um", films, FILMS),
+        diameter_m=read_range("diameter_mm", diameter),
+        length_m=read_range("length_mm", length),
+        pressure_Pa=ground.planned.trials[0].pressure_Pa,
+        rig=ground.planned.trials[0],
+        burst_share=burst_share,
+        burst_stress_Pa=1e6 * burst_stress_MPa,
+    )
+    _check(room, films, diameter)
+    try:
+        with waiting("looking for the fastest vine"):
+            found = fastest(room, ground.said, ground.fit, samples=samples, seed=seed, at_fraction=at_fraction)
+    except EffectError as error:
+        raise as_option(error) from None
+    except (SimulationError, FitError) as error:
+        raise ResultsError(str(error)) from None
+    _refuse_standstill(room, found)
+    lines = list(_lines(room, found))
+    if figure is not None:
+        write_figure(_picture(found), figure)
+        lines.append(f"Figure: {figure}")
+    return lines
+
+
+def _check(room: Room, films: str, diameter: str) -> None:
+    """Refuse films that no tube of the smallest diameter can have, and none or too many of them."""
+    if not 0 < len(room.films_m) <= MOST_FILMS:
+        words = f"names {len(room.films_m)} films"
+        raise _refusal("thickness_um", films, words, f"name 1 to {MOST_FILMS}", name=FILMS)
+    if max(room.films_m) > room.diameter_m[0] / 4:
+        words = f"begins below four times the thickest film, {1e6 * max(room.films_m):g} µm"
+        raise _refusal("diameter_mm", diameter, words, f"begin at {4e3 * max(room.films_m):g} mm or more")
+
+
+def _refuse_standstill(room: Room, found: Sequence[Choice]) -> None:
+    """There is no fastest of vines that do not move, at the medians of what is believed."""
+    if found[0].sight.final.median > 0:
+        return
+    highest_Pa = max(choice.sight.belief.trial.pressure_Pa for choice in found)
+    yield_kPa = found[0].sight.belief.trial.yield_pressure_Pa / 1e3
+    message = f"moves none of these vines to its end, against a yield pressure of {yield_kPa:.3g} kPa"
+    remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
+    if highest_Pa < 0.995 * room.pressure_Pa:
+        message += f": their walls are trusted with {highest_Pa / 1e3:.3g} kPa at most"
+        remedy = "raise --of-burst, or allow thicker films or smaller diameters"
+    raise _refusal("pressure_kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
+
+
+def _lines(room: Room, found: Sequence[Choice]) -> Iterator[str]:
+    from vinetrack.core.terminal import table
+    from vinetrack.planning.design_checks import design_checks
+    from vinetrack.planning.scaling_priors import hoop_stress_Pa
+
+    best = found[0].sight
+    yield (
+        f"fastest by {best.final.name}"
+        + ("" if best.final.y_over_L == 1 else f" at y/L = {best.final.y_over_L:g}")
+        + f"; hoop stress up to {room.burst_share:.0%} of {room.burst_stress_Pa / 1e6:g} MPa, supply up to "
+        f"{room.pressure_Pa / 1e3:g} kPa"
+    )
+    yield ""
+    rows = []
+    for choice in found:
+        trial, final = choice.sight.belief.trial, choice.sight.final
+        rows.append(
+            (
+                f"{1e6 * trial.thickness_m:g}",
+                f"{1e3 * trial.diameter_m:.3g}",
+                f"{1e3 * trial.length_m:.3g}",
+                f"{trial.pressure_Pa / 1e3:.3g}",
+                f"{hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m) / 1e6:.2f}",
+                shown(final.median, "m/s"),
+                f"{shown(final.low, 'm/s')} to {shown(final.high, 'm/s')}",
+                f"{choice.odds:.0%}",
+                ", ".join(choice.limits),
+            )
+        )
+    head = ("film", "diameter", "length", "pressure", "PD/2t", "speed", "90 % band", "fastest", "held back by")
+    yield from table(rows, head, ("µm", "mm", "mm", "kPa", "MPa", "m/s", "m/s", "of draws", ""), align=">>>>>><><")
+    yield ""
+    if found[0].odds < 0.8 and len(found) > 1:
+        yield (
+            f"the choice of film is open: {1e6 * found[0].thickness_m:g} µm is the fastest in {found[0].odds:.0%} of "
+            "the draws only; measuring B and P_y of the first two would decide it"
+        )
+    yield f"uncertainties of the fastest, {trial_words(best.belief.trial)}: final speed by each alone"
+    rows_of = [
+        (f"  {one.name}", f"{shown(one.low, 'm/s')} to {shown(one.high, 'm/s')} m/s", one.words) for one in best.shares
+    ]
+    yield from table(rows_of)
+    yield "  not included: the burst stress, a guess from one vine, and what the model leaves out (`vinetrack predict`)"
+    yield from (f"! {words}" for words in design_checks(best))
+
+
+def _picture(found: Sequence[Choice]) -> Figure:
+    from vinetrack.figures.vine_choice import Film, draw_choice
+
+    films = [
+        Film(
+            thickness_um=1e6 * choice.thickness_m,
+            diameters_mm=1e3 * choice.others[:, 0],
+            speeds_m_s=choice.others[:, 1],
+            best=(1e3 * choice.sight.belief.trial.diameter_m, choice.sight.final.median),
+            band=(choice.sight.final.low, choice.sight.final.high),
+            odds=choice.odds,
+        )
+        for choice in found
+    ]
+    return draw_choice(films, found[0].sight.final.name, found[0].sight.final.y_over_L)

@@ -1,0 +1,358 @@
+"""What the Snakefile needs to know before anything runs: which experiment, which trials, which files, whose code.
+
+Light on purpose: it is imported every time Snakemake looks at the workflow, before the first job.
+"""
+
+from __future__ import annotations
+
+import atexit
+import difflib
+import hashlib
+import json
+import os
+import shlex
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vinetrack.core.problems import ExperimentError, Problem, format_problems
+
+if TYPE_CHECKING:
+    from vinetrack.experiment.settings import RunSettings
+
+PACKAGE = Path(__file__).parents[1]
+
+CAMPAIGN_FIGURES = {
+    "damping_law": "Force and steady speed",
+    "exponents": "Exponent and coefficients",
+    "scaling": "Coefficient and size",
+    "speed_scaling": "Steady speed and size",
+    "efficiency": "Energy efficiency",
+    "payload_speed": "Final speed and payload",
+    "overview": "All trials",
+    "model_comparison": "Model and measurement",
+    "model_residuals": "What the model leaves",
+    "ladder": "The ladder of errors",
+    "before_after": "The worst condition",
+    "where": "Where it fails",
+    "missing_force": "The missing force",
+    "candidates": "Candidates",
+    "cosines": "What is tied",
+    "drift": "Drift of parameters",
+}
+"""Figures of a whole experiment, by file name, with the label Snakemake's own report gives them."""
+
+DIAGNOSIS_FIGURES = frozenset({"ladder", "before_after", "where", "missing_force", "candidates", "cosines", "drift"})
+"""Those of them that show the diagnosis: they have a folder of their own there."""
+
+PAPER_TABLES = (
+    "paper",
+    "paper_departures",
+    "paper_motions",
+    "paper_means",
+    "paper_positions",
+    "paper_pressures",
+    "paper_speeds",
+    "paper_speed_curves",
+)
+PAPER_FIGURES = {
+    "paper_fig4": "Fig. 4, position",
+    "paper_table2": "Table II, drawn",
+    "paper_fig5": "Fig. 5, final speed",
+    "paper_fig6": "Fig. 6, force and speed",
+    "paper_fig7": "Fig. 7, damping and size",
+    "paper_fig8": "Fig. 8, speed and size",
+    "paper_fig9": "Fig. 9, efficiency",
+    "paper_reservoir": "What a chamber loses",
+}
+"""What an experiment that is set beside the paper gets besides: tables, and figures with their labels."""
+
+SHARED_FILES = ("trials.csv", "experiment.yaml")
+
+_INTAKE = ("core", "experiment")
+_ANALYSIS = (*_INTAKE, "tracks", "pipeline/tracks_stage.py", "results", "video", "kinematics", "effects", "dynamics")
+STAGE_CODE = {
+    "recording": (*_ANALYSIS, "pipeline/recordings_stage.py", "figures/strip.py", "figures/style.py"),
+    "tracks": (*_ANALYSIS, "pipeline/pool.py"),
+    "gather": (*_INTAKE, "pipeline", "results", "kinematics", "tracks"),
+    "damping": (*_INTAKE, "pipeline", "results", "kinematics", "tracks"),
+    "paper": (*_ANALYSIS, "inference", "pipeline", "figures", "planning", "paper"),
+    "model": (*_ANALYSIS, "inference", "planning", "pipeline", "diagnosis", "narrative"),
+    "figures": ("core", "pipeline", "results", "figures", "report/verdict.py"),
+    "overlays": (*_ANALYSIS, "inference", "pipeline", "figures"),
+    "report": (*_INTAKE, "pipeline", "results", "figures", "report", "narrative"),
+    "laboratory": ("core", "effects", "dynamics", "laboratory"),
+}
+"""Files and folders of the package whose change makes the results of a stage stale."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One run of the workflow.
+
+    `trials` are all that get files (those that failed at the sheet too, with empty ones); `filmed` those of them that
+    come as recordings, each with its own inputs; `inputs` what all are read from; `unwatched` a fingerprint of inputs
+    that cannot stand in a rule; `nature` what is true in a shipped virtual experiment, whose measurements are made on
+    first use by the virtual laboratory, and None in anybody's own; `published` whether the paper's numbers are set
+    beside those of this experiment.
+    """
+
+    experiment: Path
+    results: Path
+    trials: tuple[str, ...]
+    filmed: Mapping[str, tuple[str, ...]]
+    inputs: tuple[Path, ...]
+    unwatched: str
+    settings: RunSettings
+    nature: Path | None
+    published: bool
+
+    @property
+    def sheets(self) -> list[str]:
+        """The trial sheet and, where there is one, the settings beside it."""
+        return [path.as_posix() for path in self.inputs if path.name in SHARED_FILES]
+
+    @property
+    def own_effects(self) -> list[str]:
+        """Files of the user's own effects."""
+        return [path.as_posix() for path in self.inputs if path.suffix == ".py"]
+
+    @property
+    def measurements(self) -> list[str]:
+        """What the virtual laboratory makes of a shipped experiment's sheet: recordings and a target, or tracks."""
+        return [path.as_posix() for path in self.inputs if path.name not in SHARED_FILES]
+
+    def result(self, *parts: str) -> str:
+        """Path of a result."""
+        return self.results.joinpath(*parts).as_posix()
+
+    @property
+    def tracked(self) -> tuple[str, ...]:
+        """Trials that do not come as recordings."""
+        return tuple(trial for trial in self.trials if trial not in self.filmed)
+
+    @property
+    def track_inputs(self) -> list[str]:
+        """What trials that do not come as recordings are read from."""
+        own = {path for paths in self.filmed.values() for path in paths} - set(self.sheets)
+        return [path.as_posix() for path in self.inputs if path.as_posix() not in own]
+
+    def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
+        """One result for each of these trials, by default all."""
+        return [self.result(folder, f"{trial}{suffix}") for trial in (self.trials if trials is None else trials)]
+
+    @property
+    def clips(self) -> list[str]:
+        """The folder of clips, where there is anything to make one of and they are wanted."""
+        return [self.result("overlays")] if self.filmed and self.settings.overlays.of != "none" else []
+
+    @staticmethod
+    def one_of(names: Iterable[str]) -> str:
+        """A pattern that these names match and nothing else does."""
+        return "|".join(sorted(names)) or "there-is-none"
+
+    def campaign_figures(self) -> list[tuple[str, str, str]]:
+        """Figures of the whole experiment: name, format and path."""
+        return self._figures(CAMPAIGN_FIGURES, "")
+
+    @property
+    def paper_tables(self) -> list[str]:
+        """Tables that set the paper's numbers beside ours; none where they were not asked for."""
+        return [self.result(f"{name}.csv") for name in PAPER_TABLES] if self.published else []
+
+    def paper_figures(self) -> list[tuple[str, str, str]]:
+        """Figures that stand beside the paper's: name, format and path."""
+        return self._figures(PAPER_FIGURES, "") if self.published else []
+
+    def trial_figures(self) -> list[tuple[str, str, str]]:
+        """Figures of single trials: trial, format and path."""
+        return self._figures(self.trials, "trial_")
+
+    def figure_files(self) -> list[str]:
+        """Paths of all figures."""
+        figures = (*self.campaign_figures(), *self.trial_figures(), *self._figures(self.filmed, "strip_"))
+        return [path for _, _, path in (*figures, *self.paper_figures())]
+
+    def _figures(self, names: Iterable[str], prefix: str) -> list[tuple[str, str, str]]:
+        formats = self.settings.figures.formats
+        return [(name, form, self.result("figures", f"{prefix}{name}.{form}")) for name in names for form in formats]
+
+    def stage_settings(self, *keys: str) -> str:
+        """The settings a stage depends on, or all of them, as JSON: a change of others leaves its results alone.
+
+        Paths are no settings of a stage: the same folder may be written with a slash at its end or without.
+        """
+        chosen = set(keys) or set(type(self.settings).model_fields) - {"experiment", "results"}
+        return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
+
+
+def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
+    """Read the settings and the experiment's sheet.
+
+    Parameters
+    ----------
+    config : Snakemake's `config`, the command line included.
+    base : folder of the Snakefile; the shipped demonstration is found from there, wherever Snakemake is run.
+
+    Raises
+    ------
+    ExperimentError
+        With every problem of the settings, or else of the sheet.
+    """
+    from vinetrack.experiment.folder import read_experiment
+    from vinetrack.experiment.settings import run_settings
+
+    paths = {key: str(config[key]) for key in ("experiment", "results") if config.get(key) is not None}
+    settings = run_settings({**config, **paths})
+    folder = Path(settings.experiment)
+    if not folder.exists() and find_nature(base / folder, base):
+        folder = base / folder
+    nature = find_nature(folder, base)
+    is_virtual = nature is not None
+    experiment = read_experiment(find_experiment(folder))
+    results = Path(settings.results) if settings.results else Path("results") / experiment.name
+    _refuse_braces(folder, results)
+    trials = tuple(name for name in experiment.names if name not in experiment.left_out)
+    files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
+    present = (path for path in files if path is not None and (is_virtual or path.exists()))
+    own = (folder / path for path in experiment.settings.effects)
+    shared = [path for path in (*(folder / name for name in SHARED_FILES), *own) if path.exists()]
+    target = getattr(experiment.settings.calibration, "image", None)
+    targets = [folder / target] if target is not None and (is_virtual or (folder / target).exists()) else []
+    inputs = dict.fromkeys([*shared, *targets, *present])
+    watched = tuple(path for path in inputs if not _has_brace(path))
+    filmed = {
+        trial.name: tuple(
+            path.as_posix()
+            for path in (*shared, *targets, trial.video, trial.pressure_trace)
+            if path is not None and path in watched
+        )
+        for trial in experiment.trials
+        if trial.video is not None
+    }
+    return Plan(
+        experiment=folder,
+        results=results,
+        trials=trials,
+        filmed=filmed,
+        inputs=watched,
+        unwatched=_fingerprint(inputs),
+        settings=settings,
+        nature=nature,
+        published=experiment.settings.published is not None,
+    )
+
+
+def find_nature(folder: Path, base: Path) -> Path | None:
+    """What is true in an experiment that is shipped with a sheet alone; None for a folder of anybody's own.
+
+    The virtual laboratory has a file for each folder of `data/` that it makes, by the same name.
+    """
+    for nature in sorted((PACKAGE / "laboratory").glob("*.yaml")):
+        shipped = base / "data" / nature.stem
+        if folder.exists() and shipped.exists() and folder.samefile(shipped):
+            return nature
+    return None
+
+
+def _has_brace(path: Path) -> bool:
+    """Whether Snakemake would take part of the path for a wildcard; it knows no way to write a brace."""
+    return "{" in str(path) or "}" in str(path)
+
+
+def _refuse_braces(*folders: Path) -> None:
+    for folder in folders:
+        if _has_brace(folder):
+            remedy = "rename the folder, or run the stages one by one with vinetrack"
+            message = "has a brace in its path, which Snakemake cannot read"
+            raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
+
+
+def _fingerprint(inputs: Iterable[Path]) -> str:
+    """Size and time of the inputs that Snakemake cannot watch, so that a change of them is seen all the same."""
+    stats = [(path.name, path.stat()) for path in inputs if _has_brace(path) and path.exists()]
+    return ";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats)
+
+
+def find_experiment(folder: Path) -> Path:
+    """Return `folder` if it exists; else raise an ExperimentError that names the nearest folder that does."""
+    if folder.exists():
+        return folder
+    parent = folder.absolute().parent
+    while not parent.is_dir():
+        parent = parent.parent
+    folders = sorted(path.name for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
+    wanted = folder.absolute().relative_to(parent).parts[0]
+    near = difflib.get_close_matches(wanted, folders, 1, 0.5)
+    sheets = [name for name in folders if (parent / name / "trials.csv").is_file()][:3]
+    if near:
+        remedy = f"did you mean {_shown(parent / near[0])}?"
+    elif sheets:
+        remedy = f"there is {', '.join(_shown(parent / name) for name in sheets)}"
+    else:
+        remedy = f"the nearest that exists is {_shown(parent)}"
+    raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
+
+
+def _shown(path: Path) -> str:
+    return os.path.relpath(path)
+
+
+def plan_or_stop(config: Mapping[str, Any], base: Path) -> Plan:
+    """`make_plan`, but what is wrong is printed in at most 20 lines and the process ends with status 1.
+
+    For the Snakefile: an exception there would be printed with Snakemake's own stack.
+    """
+    try:
+        return make_plan(config, base)
+    except ExperimentError as error:
+        print("\n".join(format_problems(error.problems)), file=sys.stderr)
+        sys.stderr.flush()
+        raise SystemExit(1) from None
+
+
+def say_where_at_exit(plan: Plan, quiet: bool = False) -> None:
+    """Let the last line of this process say where the report is, if it is there and no older than what it is made of.
+
+    Snakemake's own `onsuccess` comes before its closing lines, and not at all where nothing had to be done.
+    """
+    if not quiet:
+        atexit.register(_say_where, plan)
+
+
+def _say_where(plan: Plan) -> None:
+    path = plan.results / "report.html"
+    if not path.exists():
+        return
+    made = path.stat().st_mtime
+    if all(source.stat().st_mtime <= made for source in plan.inputs if source.exists()):
+        print(f"Report: {path}", flush=True)
+
+
+def code_hash(stage: str) -> str:
+    """Hash of the code a stage runs; in `params:` it makes Snakemake rerun what an edit has made stale."""
+    digest = hashlib.sha256()
+    for path in _sources(STAGE_CODE[stage]):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _sources(names: Iterable[str]) -> list[Path]:
+    found: list[Path] = []
+    for name in names:
+        path = PACKAGE / name
+        found += (
+            [file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+            if path.is_dir()
+            else [path]
+        )
+    return sorted(file for file in found if file.exists())
+
+
+def shell_prefix() -> str:
+    """Line before every shell command that puts this Python's programs first: no environment need be activated."""
+    return f'set -euo pipefail; export PATH={shlex.quote(str(Path(sys.executable).parent))}:"$PATH"; '.replace(
+        "{", "{{"
+    ).replace("}", "}}")

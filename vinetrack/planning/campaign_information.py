@@ -1,0 +1,160 @@
+"""How well trials that are not yet made would pin n and B: the information of the linear mixed model about them.
+
+Each condition is simulated once at what is believed, with a camera's frames and noise; what it would say of n, B and
+the yield pressure follows from the sensitivities of its positions, with release, origin and the deviations of pressure
+and B that every trial has of its own integrated out. Information adds up over trials, so any campaign is judged without
+simulating it again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.model import Model, Value
+from vinetrack.dynamics.simulate import simulate_many
+from vinetrack.inference.fit_data import END_FRACTION, FitTrial
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, left_to_keys, marginal
+from vinetrack.inference.optimiser import make_problem
+from vinetrack.inference.parameters import DAMPING, EXPONENT, FreeParameter, ParameterMap, make_layout
+from vinetrack.inference.sensitivity import OWN, Predictor
+from vinetrack.inference.whitening import all_products
+from vinetrack.kinematics.efficiency import lead_velocity_at
+from vinetrack.planning.predictive_inputs import PredictiveInputs
+
+REST_FRAMES = 20
+RELEASE_PART = 0.4
+"""Where between two frames the release falls, in frames: nowhere special."""
+
+FEWEST_MOVING = 12
+"""Frames of growth below which a trial is not worth filming."""
+
+
+@dataclass(frozen=True)
+class FilmingPlan:
+    """What a campaign is filmed with: frames a second, noise of a position, m, and its lag-one correlation."""
+
+    capture_fps: float
+    noise_m: float
+    noise_correlation: float = 0.0
+    longest_s: float = 4.0
+
+
+@dataclass(frozen=True)
+class Information:
+    """What one trial of each condition says; `free` names the numbers; as the fit holds them: ln B, n over its scale.
+
+    `each`, shape (n_conditions, n_free, n_free); `prior`, shape (n_free,), is what is known beforehand: the yield
+    pressures, as precisely as they are stated.
+    """
+
+    free: tuple[FreeParameter, ...]
+    each: Floats
+    prior: Floats
+
+    def covariance(self, counts: Floats) -> Floats:
+        """Covariance of the free numbers after so many trials of every condition, shape (n_free, n_free).
+
+        Infinite on the diagonal where they say nothing of a number.
+        """
+        total = np.tensordot(counts, self.each, axes=1) + np.diag(self.prior)
+        scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-300))
+        even = total * scale[:, None] * scale
+        values, vectors = np.linalg.eigh(even)
+        if values[0] < 1e-12:
+            return np.diag(np.full(len(total), math.inf))
+        return np.asarray((vectors / values) @ vectors.T * scale[:, None] * scale)
+
+    def errors(self, counts: Floats) -> tuple[float, dict[str, float]]:
+        """Standard errors of n (absolute) and of B by vine (relative)."""
+        diagonal = np.sqrt(np.diag(self.covariance(counts)))
+        n = next((one.scale * float(diagonal[k]) for k, one in enumerate(self.free) if one.key == EXPONENT), 0.0)
+        B = {one.vine: float(diagonal[k]) for k, one in enumerate(self.free) if one.key == DAMPING}
+        return n, B
+
+
+def joint_model(beliefs: Sequence[PredictiveInputs]) -> Model:
+    """One model with the medians of all vines: B of each, the rest shared."""
+    first = beliefs[0].model
+    B: Value = {belief.trial.vine: belief.medians[DAMPING] for belief in beliefs}
+    return first.with_values({DAMPING: B})
+
+
+def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[FitTrial | None]:
+    """Each trial as a fit would see it, without noise; None for those too slow or too quick to be filmed."""
+    frame_s = float(1 / camera.capture_fps)
+    ends = simulate_many(model, trials, [np.array([0.0, camera.longest_s])] * len(trials))
+    data: list[FitTrial | None] = []
+    times: list[Floats] = []
+    until = [end.end_time_s if end.status == "ended" else 0.0 for end in ends]
+    for end in until:
+        frames = np.arange(-REST_FRAMES, max(int(end * camera.capture_fps), 1), dtype=float)
+        times.append((frames + 1 - RELEASE_PART) * frame_s)
+    moved = simulate_many(model, trials, times)
+    for trial, one, end in zip(trials, moved, until, strict=True):
+        keep = one.lead_position_m < END_FRACTION * trial.length_m
+        if end == 0.0 or np.count_nonzero(keep & (one.lead_position_m > 0)) < FEWEST_MOVING:
+            data.append(None)
+            continue
+        count = int(np.count_nonzero(keep))
+        data.append(
+            FitTrial(
+                trial=trial,
+                time_s=one.time_s[keep],
+                lead_position_m=one.observed_position_m[keep],
+                first=np.arange(count) == 0,
+                n_rest=REST_FRAMES,
+                noise_m=camera.noise_m,
+                correlation=camera.noise_correlation,
+            )
+        )
+    return data
+
+
+def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -> Floats:
+    """Speed of the leading edge at 0.95 of the length, m/s, shape (n_trials,); 0 where it does not get there."""
+    times = [np.linspace(0.0, 1.0, 4000) ** 2 * longest_s] * len(trials)
+    moved = simulate_many(model, trials, times)
+    return np.array(
+        [
+            np.nan_to_num(lead_velocity_at(one.lead_position_m, one.lead_velocity_m_s, END_FRACTION * trial.length_m))
+            for trial, one in zip(trials, moved, strict=True)
+        ]
+    )
+
+
+def information(
+    model: Model, data: Sequence[FitTrial], camera: FilmingPlan, spreads: tuple[float, float]
+) -> Information:
+    """What one trial of each condition would say.
+
+    Parameters
+    ----------
+    model : at the values believed, B by vine
+    data : see `filmed`
+    spreads : relative, of pressure and B from trial to trial
+    """
+    layout = make_layout(model, data)
+    predictor = Predictor(layout, data)
+    own = np.zeros((len(data), OWN))
+    theta = layout.start
+    predictor.linearise(theta, own)  # its steps are right the second time
+    columns = predictor.linearise(theta, own)
+    grams = all_products(columns, [item.first for item in data])
+    frame = make_problem(predictor, own)
+    variance = np.full(len(data), camera.noise_m**2 * (1 - camera.noise_correlation**2))
+    state = FitState(theta, own, spreads, camera.noise_correlation, variance)
+    return _information(layout, frame, state, grams)
+
+
+def _information(layout: ParameterMap, frame: MixedProblem, state: FitState, grams: Floats) -> Information:
+    left, _ = left_to_keys(marginal(grams, frame, state), frame, state.spread)
+    count = len(layout.free)
+    each = np.zeros((len(left), count + 1, count + 1))
+    for k, block in enumerate(left):
+        each[np.ix_([k], frame.index[k], frame.index[k])] += block[None, :-1, :-1]
+    return Information(layout.free, each[:, :count, :count], layout.prior_precision)

@@ -1,0 +1,186 @@
+"""What speaks against a vine before it is grown: burst, no growth, a slack tail, and what the model leaves out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.audit import AuditedMotion, audit
+from vinetrack.dynamics.model import Model, make_model
+from vinetrack.dynamics.simulate import simulate_many
+from vinetrack.effects import Effect, EffectError, catalogue
+from vinetrack.planning.prediction import EJECTION, LEAST_TENSION, VinePrediction, told_by_payload
+from vinetrack.planning.prediction_runs import LONGEST_S, POINTS, follow
+from vinetrack.planning.predictive_inputs import BAND, YIELD, PredictiveInputs
+from vinetrack.planning.scaling_priors import BURST_STRESS_PA, burst_pressure_Pa, hoop_stress_Pa
+
+CERTAIN = 0.95
+WORTH_A_WORD = 0.05
+"""Share of the draws above which a hazard is named."""
+
+FILM_MODULUS_PA = 25e6
+"""Young's modulus of the film, 10 to 50 MPa."""
+
+INEVITABLE = (
+    "air_drag",
+    "fold_inertia",
+    "gas_inertia",
+    "inlet_loss",
+    "payload_drag",
+    "reservoir_depletion",
+    "tail_friction",
+    "wall_stretch",
+)
+"""Effects that every vine has to some extent; the others of the catalogue may or may not be there."""
+
+
+@dataclass(frozen=True)
+class Neglected:
+    """An effect that the model leaves out, at its typical size, and what it makes of the median final speed, m/s."""
+
+    effect: str
+    size: str
+    final_m_s: float
+    without_m_s: float
+
+    @property
+    def change(self) -> float:
+        """Relative change of the final speed."""
+        return self.final_m_s / self.without_m_s - 1 if self.without_m_s > 0 else math.nan
+
+
+def design_checks(sight: VinePrediction) -> tuple[str, ...]:
+    """Sentences about what a person should know before building this, most serious first."""
+    return (
+        *_burst(sight.belief.trial),
+        *_no_growth(sight),
+        *_slack(sight),
+        *_rules(sight),
+        *sight.belief.notes,
+    )
+
+
+def _burst(trial: Trial) -> Iterator[str]:
+    stress = hoop_stress_Pa(trial.pressure_Pa, trial.diameter_m, trial.thickness_m)
+    highest_kPa = burst_pressure_Pa(trial.diameter_m, trial.thickness_m) / 1e3
+    shown = f"hoop stress PD/2t is {stress / 1e6:.3g} MPa, film is guessed to burst at {BURST_STRESS_PA / 1e6:g} MPa"
+    if stress > BURST_STRESS_PA:
+        yield f"the vine would burst: its {shown}, so at {highest_kPa:.3g} kPa; lower the pressure or thicken the wall"
+    elif stress > 0.9 * BURST_STRESS_PA:
+        yield f"the vine is about to burst: its {shown}, so at {highest_kPa:.3g} kPa (a guess from one vine)"
+
+
+def _no_growth(sight: VinePrediction) -> Iterator[str]:
+    trial = sight.belief.trial
+    low, median, high = np.quantile(sight.belief.draw(2000, 1)[YIELD], BAND) / 1e3
+    if median >= trial.pressure_Pa / 1e3:
+        yield (
+            f"{trial.pressure_Pa / 1e3:g} kPa lies below the yield pressure, {median:.3g} kPa ({low:.2g} to "
+            f"{high:.2g}): nothing would evert; raise the pressure"
+        )
+    elif sight.arrives < CERTAIN:
+        yield (
+            f"in {1 - sight.arrives:.0%} of the draws the vine does not grow to its end; raise the pressure or measure "
+            "its yield pressure"
+        )
+
+
+def _slack(sight: VinePrediction) -> Iterator[str]:
+    trial = sight.belief.trial
+    if sight.slack < WORTH_A_WORD:
+        return
+    often = "in every draw" if sight.slack > 0.995 else f"in {sight.slack:.0%} of the draws"
+    if trial.tail_slack == "free":
+        yield (
+            f"the tail goes slack on the way {often}: speeds of the tail are then those of the film at the tip, and a "
+            "payload falls by itself, at a speed that is not told"
+        )
+        return
+    payload = f" and the {EJECTION} is at least what is stated" if trial.payload_kg > 0 else ""
+    yield (
+        f"the tail would have to push {often} (least tension {_least_tension(sight)}), which "
+        f"it cannot: the payload runs ahead of the film{payload}; `--tail-slack free` lets it"
+    )
+
+
+def _least_tension(sight: VinePrediction) -> str:
+    """The median where that is below 0 itself, else how low it comes in one draw of twenty."""
+    one = sight[LEAST_TENSION]
+    return (
+        f"{one.median:.2g} N" if one.median < 0 else f"{one.median:.2g} N, in one draw of twenty below {one.low:.2g} N"
+    )
+
+
+def _rules(sight: VinePrediction) -> Iterator[str]:
+    """Broken rules of the audit along the median motion, without what has been said of the tail."""
+    belief = sight.belief
+    (moved,), _ = follow(belief, *_medians(belief))
+    keep = moved.lead_position_m <= sight.at_fraction * belief.trial.length_m
+    motion = AuditedMotion(belief.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
+    for sentence in audit(belief.model, [motion]).warnings:
+        words = sentence.partition(": ")[2].rstrip(".")
+        if not words.startswith("the tail would have to push"):
+            yield words
+
+
+def _medians(belief: PredictiveInputs) -> tuple[list[Trial], Floats]:
+    return belief.laid_out(belief.draw(1, 0, only=()))
+
+
+def neglected(belief: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
+    """What each effect that no vine is free of would make of the final speed at the medians, largest change first.
+
+    Each is put in by itself, at its typical size; those whose columns are blank are passed over.
+    """
+    host = whole_model(belief.model)
+    without = final_m_s(belief, belief.model, host, at_fraction)
+    found = []
+    for name in INEVITABLE:
+        effect = catalogue()[name]
+        held = name in belief.model or any(name in other.replaces for other in belief.model)
+        if held or (name == "payload_drag" and belief.trial.payload_kg == 0):
+            continue
+        sizes = typical_sizes(name, belief.trial)
+        model = (belief.model + effect).with_values(sizes)
+        try:
+            final = final_m_s(belief, model, host, at_fraction)
+        except EffectError:
+            continue
+        found.append(Neglected(name, _words(effect, sizes), final, without))
+    return tuple(sorted(found, key=lambda one: -abs(np.nan_to_num(one.change))))
+
+
+def whole_model(model: Model) -> Model:
+    """The catalogue and the model's own effects: its compiled form serves every model that is looked at here."""
+    own = {effect.name: effect for effect in model if effect.name not in catalogue()}
+    return make_model([*catalogue(), *own], own)
+
+
+def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
+    """Parameters of an effect where they follow from the vine: wall stretch, (1 − ν/4) D/(2Et) of soft film, ν = ½."""
+    if name != "wall_stretch":
+        return {}
+    return {"wall_stretch.kappa": (1 - 0.5 / 4) * trial.diameter_m / (2 * FILM_MODULUS_PA * trial.thickness_m)}
+
+
+def _words(effect: Effect, sizes: Mapping[str, float]) -> str:
+    """Its parameters at these sizes, else at their typical ones, such as `C_D = 1`."""
+    values = [(p, sizes.get(f"{effect.name}.{p.name}", p.default)) for p in effect.parameters]
+    return ", ".join(f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in values)
+
+
+def final_m_s(belief: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
+    """The final speed at the medians under this model: a payload's at the end, else the leading edge's."""
+    (trial,), _ = _medians(belief)
+    (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=host)
+    if end.status != "ended":
+        return 0.0
+    times = end.end_time_s * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS)
+    (moved,) = simulate_many(model, [trial], [times], host=host)
+    if told_by_payload(trial):
+        return float(trial.travel_ratio * moved.lead_velocity_m_s[-1])
+    return float(np.interp(at_fraction * trial.length_m, moved.lead_position_m, moved.lead_velocity_m_s))

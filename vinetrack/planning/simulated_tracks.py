@@ -1,0 +1,236 @@
+"""Trials that have not been made, as the camera of the experiment would film them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.dynamics.simulate import SimulationError, Trajectory
+from vinetrack.inference.fit_data import END_FRACTION, FitError, FitTrial, prepare_trial
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.parameters import DAMPING, EXPONENT
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Job, Predictor
+from vinetrack.planning.feasible_trials import Condition
+from vinetrack.planning.hypothesis_predictions import Hypothesis
+
+LONGEST = 1.5
+"""A recording lasts no longer than this many times the longest that was used."""
+
+LEAST_TRAVEL = 0.3
+"""Part of its length that a vine must grow while filmed for a trial to be worth making."""
+
+TIMES_LOOKED_AT = 400
+LEAST_SLACK = 1.05
+"""Tail speed, in steady speeds at the same pressure, beyond which a tail would have to push: there the model is in
+doubt unless it was made for that, or the trials so far were of that kind."""
+
+LINGER_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class TrackSampling:
+    """How the experiment filmed: spacing of frames, frames at rest, frames behind the end of growth, longest motion."""
+
+    frame_s: float
+    rest_frames: int
+    frames_behind_end: int
+    longest_s: float
+
+
+def camera_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
+    """The experiment's camera, at the frame rate of the trial at `like`."""
+    seen = [item for item in data if item.trial.travel_ratio != 1]
+    moving_s = [item.time_s[-1] - item.time_s[max(item.n_rest - 1, 0)] for item in seen]
+    return TrackSampling(
+        frame_s=data[like].frame_s,
+        rest_frames=max(int(np.median([item.n_rest for item in seen])), LINGER_FRAMES),
+        frames_behind_end=int(np.median([_behind_end(item) for item in seen])),
+        longest_s=LONGEST * float(max(moving_s)),
+    )
+
+
+def _behind_end(item: FitTrial) -> int:
+    """Points of a track that show the vine at the end of its growth."""
+    last = int(np.flatnonzero(item.first)[-1])
+    y = item.lead_position_m
+    if last == 0 or not math.isfinite(item.trial.length_m):
+        return 0
+    left_out = y[last] - y[last - 1] > 0.25 * (1 - END_FRACTION) * item.trial.length_m
+    still = float(np.ptp(y[last:])) < 10 * max(item.noise_m, 1e-6)
+    return y.size - last if left_out and still else 0
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a condition runs: when the first hypothesis nears the end of growth, and when the last of them has ended.
+
+    `ends_s` is infinite where one of them does not end in time.
+    """
+
+    near_end_s: float
+    ends_s: float
+
+
+def blank(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_position_m: Floats) -> FitTrial:
+    """A trial as a fit sees it, at these times since release; where the experiment measures pressure it is constant."""
+    like = data[condition.like]
+    trace = None
+    if like.trace is not None:
+        ends = np.array([-1e3, 1e3])
+        trace = (ends, np.full(2, condition.trial.pressure_Pa))
+    return FitTrial(
+        trial=condition.trial,
+        time_s=time_s,
+        lead_position_m=lead_position_m,
+        first=np.arange(time_s.size) == 0,
+        n_rest=int(np.count_nonzero(time_s <= 0)),
+        noise_m=like.noise_m,
+        correlation=like.correlation,
+        trace=trace,
+    )
+
+
+def courses(
+    hypotheses: Sequence[Hypothesis], conditions: Sequence[Condition], cameras: Sequence[TrackSampling]
+) -> list[Course | None]:
+    """How every condition would run; None where it is not worth filming, or where the model is in doubt."""
+    data = hypotheses[0].fit.predictor.data
+    times = [np.linspace(0.0, camera.longest_s, TIMES_LOOKED_AT) for camera in cameras]
+    items = [blank(one, t, data, t) for one, t in zip(conditions, times, strict=True)]
+    every = range(len(conditions))
+    own = np.zeros((len(conditions), OWN))
+    runs: list[list[Trajectory | None]] = []
+    jobs: list[Job] = []
+    for hypothesis in hypotheses:
+        predictor = hypothesis.predictor(every, items)
+        jobs = predictor.jobs(hypothesis.theta, own)
+        runs.append(_followed(predictor, jobs))
+    allowed = max(LEAST_SLACK, _slackest_so_far(hypotheses[-1].fit))
+    found: list[Course | None] = []
+    for i, condition in enumerate(conditions):
+        mine = [one for one in (run[i] for run in runs) if one is not None]
+        if len(mine) < len(runs):
+            found.append(None)
+            continue
+        length_m = condition.trial.length_m
+        near_s = min(_reaches(one, END_FRACTION * length_m, cameras[i].longest_s) for one in mine)
+        grown_m = min(float(np.interp(near_s, one.time_s, one.lead_position_m)) for one in mine)
+        slack = slackness(hypotheses[-1].fit, condition.trial, jobs[i], mine[-1].tail_velocity_m_s)
+        worth = grown_m > LEAST_TRAVEL * (length_m if math.isfinite(length_m) else 0.0)
+        doubtful = condition.trial.tail_slack != "free" and slack > allowed
+        ends = max(one.end_time_s if one.status == "ended" else math.inf for one in mine)
+        found.append(Course(near_s, ends) if worth and not doubtful and near_s > 8 * cameras[i].frame_s else None)
+    return found
+
+
+def _followed(predictor: Predictor, jobs: Sequence[Job]) -> list[Trajectory | None]:
+    """Trajectories of all jobs, None for those that cannot be followed."""
+    try:
+        return list(predictor.run(jobs))
+    except SimulationError:
+        if len(jobs) == 1:
+            return [None]
+    middle = len(jobs) // 2
+    return _followed(predictor, jobs[:middle]) + _followed(predictor, jobs[middle:])
+
+
+def _reaches(moved: Trajectory, position_m: float, otherwise_s: float) -> float:
+    """When a vine is so far, s."""
+    beyond = moved.lead_position_m >= position_m
+    if not beyond.any():
+        return otherwise_s
+    k = int(np.argmax(beyond))
+    return float(np.interp(position_m, moved.lead_position_m[k - 1 : k + 1], moved.time_s[k - 1 : k + 1]))
+
+
+def slackness(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) -> float:
+    """Largest tail speed, in the steady speed of a bare vine there; 0 where the model has no damping."""
+    names = fit.model.parameter_names
+    if DAMPING not in names or EXPONENT not in names:
+        return 0.0
+    B, n = (float(job.row[names.index(key)]) for key in (DAMPING, EXPONENT))
+    yield_Pa = trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
+    drive_N = (trial.pressure_Pa - yield_Pa) * trial.area_m2
+    if not (drive_N > 0 and B > 0 and n > 0.05):
+        return math.inf if not drive_N > 0 else 0.0
+    return float(np.max(tail_velocity_m_s)) / (drive_N / B) ** (1 / n)
+
+
+def _slackest_so_far(fit: Fit) -> float:
+    """Largest slackness among the trials of the experiment."""
+    jobs = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), OWN)))
+    found = [
+        slackness(fit, one.trial, job, one.trial.travel_ratio * one.predicted_velocity_m_s)
+        for one, job in zip(fit.trials, jobs, strict=True)
+        if one.trial.travel_ratio != 1
+    ]
+    return max((one for one in found if math.isfinite(one)), default=0.0)
+
+
+def film(
+    truth: Hypothesis,
+    places: Sequence[int],
+    conditions: Sequence[Condition],
+    cameras: Sequence[TrackSampling],
+    theta: Floats,
+    deviations: Floats,
+    rng: np.random.Generator,
+) -> list[FitTrial | None]:
+    """The conditions at `places` grown as the hypothesis has it and filmed: each as a fit sees it.
+
+    Every trial has a release, an origin and noise of its own. None where the film shows nothing that can be fitted.
+
+    Parameters
+    ----------
+    theta : array, shape (n_free,): the true numbers, scaled
+    deviations : array, shape (n_places, 2): of pressure, relative, and of ln B
+    """
+    chosen, lenses = [conditions[k] for k in places], [cameras[k] for k in places]
+    data = truth.fit.predictor.data
+    times = [
+        lens.frame_s * np.arange(lens.rest_frames + math.ceil(lens.longest_s / lens.frame_s), dtype=float)
+        for lens in lenses
+    ]
+    items = [blank(one, t, data, t) for one, t in zip(chosen, times, strict=True)]
+    predictor = truth.predictor(places, items)
+    own = np.zeros((len(chosen), OWN))
+    own[:, RELEASE] = [(lens.rest_frames - 1 + rng.uniform()) * lens.frame_s for lens in lenses]
+    own[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
+    own[:, PRESSURE] = np.where(predictor.feels_pressure, deviations[:, 0], 0.0)
+    own[:, DAMPING_DEVIATION] = np.where(predictor.feels_damping, deviations[:, 1], 0.0)
+    seen = []
+    for i, moved in enumerate(predictor.run(predictor.jobs(theta, own))):
+        stop = times[i].size
+        if moved.status == "ended":
+            last_s = own[i, RELEASE] + moved.end_time_s
+            stop = min(stop, int(np.searchsorted(times[i], last_s)) + lenses[i].frames_behind_end)
+        noise = _noise(stop, truth.rho, math.sqrt(truth.variance), rng)
+        position_m = own[i, ORIGIN] + moved.observed_position_m[:stop] + noise
+        seen.append(_as_seen(chosen[i], times[i][:stop], position_m, items[i].trace))
+    return seen
+
+
+def _noise(count: int, rho: float, innovation_m: float, draw: np.random.Generator) -> Floats:
+    """Stationary AR(1) noise, shape (count,)."""
+    from scipy.signal import lfilter
+
+    white = innovation_m * draw.standard_normal(count)
+    white[0] /= math.sqrt(1 - rho**2)
+    return np.asarray(lfilter([1.0], [1.0, -rho], white))
+
+
+def _as_seen(
+    condition: Condition, time_s: Floats, position_m: Floats, trace: tuple[Floats, Floats] | None
+) -> FitTrial | None:
+    """The usable points of the film, as a fit would choose them."""
+    unknown = np.full(time_s.size, math.nan)
+    pressure = None if trace is None else np.full(time_s.size, trace[1][0])
+    track = Track(time_s, position_m, unknown, np.full(time_s.size, "", dtype="<U1"), unknown, pressure)
+    try:
+        return prepare_trial(condition.trial, track)
+    except FitError:
+        return None

@@ -1,0 +1,361 @@
+"""What the diagnosis of a results folder left there, as tidy tables for pictures and page.
+
+Every part may be missing: a folder without a diagnosis, one that was refused, a verdict that added nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.figures.style import rows as iter_rows
+from vinetrack.report.verdict import known, listed, sizes
+from vinetrack.results.folder_layout import Results, read_json, read_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from vinetrack.effects import Effect
+    from vinetrack.experiment.folder import Experiment
+    from vinetrack.report.diagnosis import DiagnosisResult
+
+STRETCHES = 8
+"""Parts of the growth in which misfits are averaged where the diagnosis did not say."""
+
+CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
+
+
+@dataclass(frozen=True)
+class DiagnosisTables:
+    """Tables behind the pictures, each empty where there is nothing to draw.
+
+    `rounds` are (question, ranking) pairs, `worst` names the condition that `before_after` shows, `cosines` are names
+    and matrix, `added` the effects that were added, in words.
+    """
+
+    ladder: pd.DataFrame
+    trials: pd.DataFrame
+    before_after: pd.DataFrame
+    where: pd.DataFrame
+    cells: pd.DataFrame
+    drift: pd.DataFrame
+    force: pd.DataFrame
+    rounds: Sequence[tuple[str, pd.DataFrame]] = ()
+    cosines: tuple[Sequence[str], Sequence[Sequence[float]]] = ((), ())
+    worst: str = ""
+    added: str = ""
+    labels: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
+    """Tables of a results folder; None where it has not been diagnosed, or that was refused.
+
+    Parameters
+    ----------
+    conditions : `trial, vine, condition, condition_label` of every trial, vines and pressures in their order.
+    """
+    if not results.diagnosis.exists():
+        return None
+    content = read_json(results.diagnosis)
+    if not content.get("verdict"):
+        return None
+    labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
+    trials = predicted_trials(results, conditions)
+    worst = worst_condition(trials)
+    rounds = list(content.get("rounds") or [])
+    cosines = in_order_of_rank(content.get("cosines") or {}, rounds)
+    return DiagnosisTables(
+        ladder=_table(results.ladder),
+        trials=trials,
+        before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
+        where=where_table(trials, labels, _table(results.diagnosed("along_position.csv"))),
+        cells=cosine_cells(cosines),
+        drift=_table(results.diagnosed("drift_groups.csv")),
+        force=_table(results.diagnosed("missing_force.csv")),
+        rounds=[(question(i, rounds), ranking_table(one)) for i, one in enumerate(rounds)],
+        cosines=(list(cosines["effects"]), list(cosines["matrix"])),
+        worst=worst,
+        added=listed(list(content.get("effects") or [])),
+        labels=labels,
+    )
+
+
+def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult | None:
+    """What the page says of the diagnosis; None where there is none."""
+    from vinetrack.report.diagnosis import DiagnosisResult
+
+    if not results.diagnosis.exists():
+        return None
+    content = read_json(results.diagnosis)
+    paths = (results.ladder, results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
+    ladder, moved, laws = (table if len(table := _table(path)) else None for path in paths)
+    ranked = [str(row["effect"]) for one in content.get("rounds") or [] for row in one.get("ranking") or []]
+    named = [*(content.get("effects") or []), *(content.get("answer_set") or [])]
+    effects = _effects([*named, *ranked], experiment)
+    return DiagnosisResult(
+        content,
+        ladder,
+        moved,
+        laws,
+        {name: effects[name].summary for name in named if name in effects},
+        {f"{name}.{p.name}": (p.symbol, p.unit) for name, effect in effects.items() for p in effect.parameters},
+    )
+
+
+def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
+    """Effects by name; without those whose file has gone."""
+    from vinetrack.effects import EffectError, find_effect, own_effects
+
+    try:
+        own = own_effects([experiment.folder / path for path in experiment.settings.effects])
+    except EffectError:
+        own = {}
+    found = {}
+    for name in dict.fromkeys(names):
+        with contextlib.suppress(EffectError):
+            found[name] = find_effect(name, own)
+    return found
+
+
+def draw_diagnosed(found: DiagnosisTables | None) -> dict[str, Figure]:
+    """All pictures of a diagnosis, by name; those without anything in them say so."""
+    from vinetrack.figures.before_after import draw_before_after
+    from vinetrack.figures.candidates import draw_candidates
+    from vinetrack.figures.cosines import draw_cosines
+    from vinetrack.figures.drift import draw_drift
+    from vinetrack.figures.ladder import draw_ladder
+    from vinetrack.figures.missing_force import draw_missing_force
+    from vinetrack.figures.style import blank
+    from vinetrack.figures.where import draw_where
+
+    if found is None:
+        names = ("ladder", "before_after", "where", "missing_force", "candidates", "cosines", "drift")
+        return {name: blank("There is no diagnosis of this model.") for name in names}
+    return {
+        "ladder": draw_ladder(found.ladder),
+        "before_after": draw_before_after(found.labels.get(found.worst, found.worst), found.before_after, found.added),
+        "where": draw_where(found.where, found.added),
+        "missing_force": draw_missing_force(found.force),
+        "candidates": draw_candidates(found.rounds),
+        "cosines": draw_cosines(*found.cosines),
+        "drift": draw_drift(found.drift, found.added),
+    }
+
+
+def with_after(trajectories: Mapping[str, pd.DataFrame], found: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
+    """Trajectories by condition with what the last model says of them, where effects were added."""
+    if found is None or not found.added or not len(found.trials):
+        return dict(trajectories)
+    later = {str(trial): part["model_after_m"].to_numpy() for trial, part in found.trials.groupby("trial", sort=False)}
+    whole = {}
+    for condition, table in trajectories.items():
+        parts = [later.get(str(trial), np.empty(0)) for trial in dict.fromkeys(table["trial"])]
+        after_m = np.concatenate(parts)
+        whole[condition] = table.assign(model_after_m=after_m) if after_m.size == len(table) else table
+    return whole
+
+
+def figure_tables(found: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
+    """The table behind each picture that has something in it, by name of the picture."""
+    import pandas as pd
+
+    if found is None:
+        return {}
+    parts = [table.assign(round=i + 1) for i, (_, table) in enumerate(found.rounds) if len(table)]
+    tables = {
+        "ladder": found.ladder,
+        "before_after": found.before_after,
+        "where": found.where,
+        "missing_force": found.force,
+        "candidates": pd.concat(parts, ignore_index=True) if parts else found.ladder.iloc[:0],
+        "cosines": found.cells,
+        "drift": found.drift,
+    }
+    return {name: table for name, table in tables.items() if len(table)}
+
+
+def _table(path: Any) -> pd.DataFrame:
+    import pandas as pd
+
+    return read_result(path) if path.exists() else pd.DataFrame()
+
+
+def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
+    """Every trial with predictions, columns `CURVE_COLUMNS`: time since release, positions from the origin."""
+    import pandas as pd
+
+    parts = []
+    compared: dict[str, pd.DataFrame] = {}
+    for trial, condition in zip(conditions["trial"], conditions["condition"], strict=True):
+        path = results.predictions(trial)
+        table = read_result(path) if path.exists() else None
+        if table is None or not len(table):
+            continue
+        if condition not in compared:
+            there = bool(condition) and results.trajectories(condition).exists()
+            compared[condition] = read_result(results.trajectories(condition)) if there else pd.DataFrame()
+        release_s, origin_m = _start(trial, table, compared[condition])
+        positions = {name: table[name] - origin_m for name in CURVE_COLUMNS[3:]}
+        time_s = table["time_s"] - release_s
+        parts.append(pd.DataFrame({"trial": trial, "condition": condition, "time_s": time_s, **positions}))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
+
+
+def _start(trial: str, table: pd.DataFrame, compared: pd.DataFrame) -> tuple[float, float]:
+    """Release and origin of a trial: as the comparison has them, which begins with the same point; else as seen."""
+    same = compared[compared["trial"] == trial] if len(compared) else compared
+    time_s, position_m = float(table["time_s"].iloc[0]), float(table["lead_position_m"].iloc[0])
+    if len(same) == len(table):
+        return time_s - float(same["time_s"].iloc[0]), position_m - float(same["lead_position_m"].iloc[0])
+    origin_m = float(np.nanmin(table["lead_position_m"]))
+    return _first_moving_s(table, origin_m), origin_m
+
+
+def _first_moving_s(table: pd.DataFrame, origin_m: float) -> float:
+    growth = table["lead_position_m"].to_numpy(dtype=float) - origin_m
+    return float(table["time_s"].iloc[int(np.argmax(growth > 0.01 * np.nanmax(growth)))])
+
+
+def worst_condition(trials: pd.DataFrame) -> str:
+    """The condition where the model that the user came with is farthest off; blank without predictions."""
+    from vinetrack.figures.before_after import rms_m
+
+    if not len(trials):
+        return ""
+    off = {name: rms_m(part, "model_before_m") for name, part in trials.groupby("condition", sort=False)}
+    usable = {name: value for name, value in off.items() if math.isfinite(value)}
+    return str(max(usable, key=usable.__getitem__)) if usable else ""
+
+
+def where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
+    """Mean misfit of every condition in stretches of its growth, as `vinetrack.figures.where` draws it.
+
+    Where the diagnosis found the misfit of the first model itself, with its error, that is taken.
+    """
+    import pandas as pd
+
+    rows: list[dict[str, Any]] = []
+    known_rows = located[located["condition"] != ""] if len(located) else located
+    for condition in labels:
+        members = trials[trials["condition"] == condition]
+        if not len(members):
+            continue
+        own = known_rows[known_rows["condition"] == condition] if len(known_rows) else known_rows
+        rows += [
+            {"condition": condition, "condition_label": labels[condition], **row}
+            for row in (_located(own, located, members) if len(own) else _stretched(members))
+        ]
+    return pd.DataFrame(rows)
+
+
+def _located(own: pd.DataFrame, located: pd.DataFrame, members: pd.DataFrame) -> list[dict[str, Any]]:
+    vine = str(own["vine"].iloc[0])
+    whole_m = float(located.loc[located["vine"] == vine, "to_m"].max())
+    rows = []
+    for row in iter_rows(own):
+        after = _means(members, "model_before_m", float(row.from_m), float(row.to_m))["model_after_m"]
+        rows.append(
+            {
+                "n_trials": int(members["trial"].nunique()),
+                "growth_from": float(row.from_m) / whole_m,
+                "growth_to": float(row.to_m) / whole_m,
+                "misfit_before_m": float(row.mean_residual_m),
+                "misfit_after_m": float(np.nanmean(after)) if np.isfinite(after).any() else math.nan,
+                "scatter_m": float(row.sigma_m),
+            }
+        )
+    return rows
+
+
+def _stretched(members: pd.DataFrame) -> list[dict[str, Any]]:
+    """Stretches of what was measured; chance is what trials differ by, less their own mean over the growth."""
+    whole_m = float(members["lead_position_m"].max())
+    edges = np.linspace(0.0, whole_m, STRETCHES + 1)
+    count = int(members["trial"].nunique())
+    rows = []
+    for low, high in itertools.pairwise(edges):
+        means = _means(members, "lead_position_m", low, high if high < whole_m else math.inf)
+        before, after = means["model_before_m"], means["model_after_m"]
+        if not np.isfinite(before).any():
+            continue
+        spread = float(np.nanstd(before, ddof=1)) if np.isfinite(before).sum() > 1 else math.nan
+        rows.append(
+            {
+                "n_trials": count,
+                "growth_from": low / whole_m,
+                "growth_to": high / whole_m,
+                "misfit_before_m": float(np.nanmean(before)),
+                "misfit_after_m": float(np.nanmean(after)) if np.isfinite(after).any() else math.nan,
+                "scatter_m": spread / math.sqrt(count),
+            }
+        )
+    return rows
+
+
+def _means(members: pd.DataFrame, along: str, low: float, high: float) -> dict[str, np.ndarray]:
+    """Mean misfit of each trial, by model, where `along` lies from `low` to `high`; NaN for one that never does."""
+    chosen = members[(members["time_s"] >= 0) & (members[along] >= low) & (members[along] < high)]
+    found: dict[str, list[float]] = {"model_before_m": [], "model_after_m": []}
+    for trial in dict.fromkeys(members["trial"]):
+        part = chosen[chosen["trial"] == trial]
+        for model, values in found.items():
+            misfit = (part["lead_position_m"] - part[model]).to_numpy(dtype=float)
+            misfit = misfit[np.isfinite(misfit)]
+            values.append(float(misfit.mean()) if misfit.size else math.nan)
+    return {model: np.array(values) for model, values in found.items()}
+
+
+def question(index: int, rounds: Sequence[Mapping[str, Any]]) -> str:
+    """What a round asks, in words."""
+    if index == 0:
+        return "What does the model you came with lack?"
+    first = set(rounds[0].get("model") or [])
+    added = [name for name in rounds[index].get("model") or [] if name not in first]
+    return f"And with {listed(added)} added?"
+
+
+def ranking_table(one: Mapping[str, Any]) -> pd.DataFrame:
+    """The ranking of a round as a table; Δχ² of those not testable is NaN."""
+    import pandas as pd
+
+    rows = [
+        {
+            "effect": str(row["effect"]),
+            "kind": str(row.get("kind", "")),
+            "status": str(row.get("status", "")),
+            "delta_chi2": float(row["delta_chi2"]) if known(row.get("delta_chi2")) else math.nan,
+            "sigma": float(row["sigma"]) if known(row.get("sigma")) else math.nan,
+            "in_answer_set": bool(row.get("in_answer_set")),
+            "plausible": bool(row.get("plausible", True)),
+            "size": sizes(row),
+            "reason": str(row.get("reason") or ""),
+        }
+        for row in one.get("ranking") or []
+    ]
+    columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def in_order_of_rank(cosines: Mapping[str, Any], rounds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The matrix of cosines with the answer first, then as the first round ranks its candidates."""
+    names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
+    ranking = list(rounds[0].get("ranking") or []) if rounds else []
+    places = {row["effect"]: (not row.get("in_answer_set"), i) for i, row in enumerate(ranking)}
+    order = sorted(range(len(matrix)), key=lambda i: places.get(names[i], (True, len(ranking))))
+    return {"effects": [names[i] for i in order], "matrix": [[matrix[i][j] for j in order] for i in order]}
+
+
+def cosine_cells(cosines: Mapping[str, Any]) -> pd.DataFrame:
+    """The matrix of cosines as rows of pairs, each once."""
+    import pandas as pd
+
+    names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
+    rows = [(names[i], names[j], matrix[i][j]) for i in range(len(matrix)) for j in range(i)]
+    return pd.DataFrame(rows, columns=["effect", "other", "cosine"])

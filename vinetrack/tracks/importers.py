@@ -1,0 +1,149 @@
+"""Positions measured elsewhere become a track: a CSV, a Physics Tracker project or its text export.
+
+A trial whose sheet names a `track` skips the video stages; what they would have delivered is read here. Stands on
+`records` and `tables` alone, so that the experiment's check can use it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.tables import Table, TableError, parse_table, read_text
+from vinetrack.tracks.physics_tracker import is_export_header, read_export, read_project
+from vinetrack.tracks.track_checks import TrackError, check_pressure, check_times, new_track
+
+__all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
+
+HEADER_WITHIN_LINES = 20
+"""Titles and remarks above the header of a text export end well before this line."""
+
+
+def load_track(trial: Trial) -> Track:
+    """Track of a trial whose positions are already measured, with the pressure of its `pressure_trace` if it has one.
+
+    Raises
+    ------
+    TrackError
+        One sentence with a remedy, if either file cannot be used.
+    """
+    if trial.track is None:
+        raise TrackError("is blank: this trial has a video, not a track")
+    track = read_track(trial.track)
+    if trial.pressure_trace is None:
+        return track
+    try:
+        return attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
+    except TrackError as error:
+        raise TrackError(f"pressure_trace {trial.pressure_trace.name} {error}") from None
+
+
+def read_track(path: Path) -> Track:
+    """Read positions measured elsewhere; the kind of file is found from its content.
+
+    Understood are a CSV with `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and
+    Tracker's text export (columns t, x, y or t and one coordinate, with or without a title above). Points in a plane
+    are projected on the principal axis of their motion. `flag` is blank throughout; `edge_px` NaN except in a project.
+
+    Raises
+    ------
+    TrackError
+        One sentence with a remedy: not readable, fewer than 5 points, time that does not increase, a cell that is not
+        a number, pressure out of range.
+    """
+    if path.suffix.lower() == ".trz":
+        raise TrackError("is a packed Tracker project: unpack it and name the .trk inside")
+    try:
+        text = read_text(path)
+        if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
+            return read_project(text)
+        lines = text.split("\n")[:HEADER_WITHIN_LINES]
+        skip = next((i for i, line in enumerate(lines) if is_export_header(line)), None)
+        table = parse_table(text, skip or 0)
+        if skip is not None and "position_m" not in table.columns:
+            return read_export(table)
+        return _read_positions(table)
+    except TableError as error:
+        raise TrackError(str(error)) from None
+
+
+def _read_positions(table: Table) -> Track:
+    """The project's own table of positions; every row of it is a row of the track."""
+    _require(table, "time_s", "position_m")
+    time_s, position_m = table.numbers("time_s"), table.numbers("position_m")
+    check_times(time_s, table.lines)
+    sigma_m, notes = np.full(len(time_s), np.nan), []
+    if "sigma_m" in table.columns:
+        sigma_m = table.numbers("sigma_m", blank_is_nan=True)
+        if np.any(sigma_m < 0):
+            raise TrackError(f"line {table.lines[int(np.argmax(sigma_m < 0))]}, column sigma_m is negative: mend it")
+        if np.any(sigma_m == 0):
+            notes.append("A sigma_m of 0 is taken as unknown.")
+            sigma_m = np.where(sigma_m == 0, np.nan, sigma_m)
+    pressure_Pa = None
+    if "pressure_kPa" in table.columns and any(row["pressure_kPa"] for row in table.rows):
+        pressure_kPa = table.numbers("pressure_kPa", blank_is_nan=True)
+        check_pressure(pressure_kPa, table.lines)
+        known = np.isfinite(pressure_kPa)
+        pressure_Pa = 1000 * np.interp(time_s, time_s[known], pressure_kPa[known])
+        if not known.all():
+            notes.append(f"Pressure is interpolated at {int(np.sum(~known))} points where its cell is blank.")
+    return new_track(time_s, position_m, sigma_m=sigma_m, pressure_Pa=pressure_Pa, notes=notes)
+
+
+def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
+    """Read a CSV with `time_s, pressure_kPa`: times in s and gauge pressures in Pa, both of shape (n,).
+
+    Raises
+    ------
+    TrackError
+        One sentence with a remedy.
+    """
+    try:
+        table = parse_table(read_text(path))
+        _require(table, "time_s", "pressure_kPa")
+        time_s, pressure_kPa = table.numbers("time_s"), table.numbers("pressure_kPa")
+    except TableError as error:
+        raise TrackError(str(error)) from None
+    if len(time_s) == 0:
+        raise TrackError("has no rows: write time_s and pressure_kPa of at least one reading")
+    check_times(time_s, table.lines)
+    check_pressure(pressure_kPa, table.lines)
+    return time_s, 1000 * pressure_kPa
+
+
+def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
+    """The track with a pressure trace interpolated linearly on its times; trace and track share one clock.
+
+    Beyond the ends of the trace its first and last values are held, which a note says.
+
+    Parameters
+    ----------
+    time_s, pressure_Pa
+        The trace, shape (n,), times increasing.
+
+    Raises
+    ------
+    TrackError
+        If trace and track have no time in common.
+    """
+    start, end = float(np.min(track.time_s)), float(np.max(track.time_s))
+    if len(time_s) > 1 and (time_s[-1] < start or time_s[0] > end):
+        raise TrackError(
+            f"runs from {time_s[0]:g} to {time_s[-1]:g} s, the track from {start:g} to {end:g} s: "
+            "shift one so that both share a clock"
+        )
+    outside = int(np.sum((track.time_s < time_s[0]) | (track.time_s > time_s[-1])))
+    notes = track.notes
+    if outside:
+        notes = (*notes, f"The pressure trace does not cover {outside} of {len(track.time_s)} points: its end is held.")
+    return replace(track, pressure_Pa=np.interp(track.time_s, time_s, pressure_Pa), notes=notes)
+
+
+def _require(table: Table, *columns: str) -> None:
+    if missing := [column for column in columns if column not in table.columns]:
+        found = ", ".join(table.columns[:8]) or "none"
+        raise TrackError(f"lacks the column {missing[0]} (found: {found[:120]}): name its columns {', '.join(columns)}")

@@ -1,0 +1,212 @@
+"""How noisy measured positions are: the standard deviation of one of them and how far the noise remembers itself.
+
+The noise is taken as AR(1): correlation ρ^k between frames k apart. σ and ρ maximise the restricted likelihood
+(Harville 1977, J. Am. Stat. Assoc. 72:320) of short stretches of the track, each free to follow its own polynomial: a
+straight line where the vine is at rest, a cubic where it moves. Stretches that a cubic cannot follow (release, the end
+of growth) are left out.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+
+ENOUGH_REST_FRAMES = 60
+REST_MARGIN = 3  # the corner between rest and motion is found to within about two frames
+LONG_TRACK = 90
+REST_STRETCH, REST_ORDER = 32, 1
+MOVING_STRETCH, MOVING_ORDER = 12, 3
+RHO_GRID = np.linspace(0.0, 0.95, 20)
+PRIOR_RHO_SD = 0.5
+SHORTEST_MOTION = 12
+SUSPECT_RHO, SHORTEST_STRETCH = 0.85, 7
+"""Noise that remembers itself so well may be motion that a cubic does not follow: shorter stretches then decide."""
+
+
+def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
+    """Standard deviation and lag-one correlation of the random error of single positions.
+
+    Parameters
+    ----------
+    time_s, position_m
+        Arrays, shape (n,), s and m, finite, in order of time.
+
+    Returns
+    -------
+    noise_m
+        Standard deviation, m. 0 where the positions are exact or too few (under 5) to tell.
+    correlation
+        Lag-one correlation, 0 to 0.95; pulled to 0 where the track is too short to tell.
+    """
+    if position_m.size < 5:
+        return 0.0, 0.0
+    groups = []
+    n_rest = max(rest_points(position_m) - REST_MARGIN, 0)
+    if n_rest >= 2 * MOVING_STRETCH:
+        groups.append(_stretches(time_s[:n_rest], position_m[:n_rest], REST_STRETCH, REST_ORDER))
+    else:
+        n_rest = 0
+    n_moving = position_m.size - n_rest
+    if n_rest < ENOUGH_REST_FRAMES or n_moving > n_rest:
+        length = MOVING_STRETCH if n_moving < LONG_TRACK else 2 * MOVING_STRETCH
+        groups.append(_stretches(time_s[n_rest:], position_m[n_rest:], length, MOVING_ORDER))
+    noise_m, correlation = _restricted_likelihood(groups)
+    if correlation > SUSPECT_RHO:
+        short = [_stretches(time_s, position_m, SHORTEST_STRETCH, MOVING_ORDER)]
+        noise_m, correlation = min((noise_m, correlation), _restricted_likelihood(short))
+    floor_m = quantum(position_m) / math.sqrt(12)
+    moving_m = position_m[n_rest:] if n_moving >= SHORTEST_MOTION else position_m
+    return (floor_m, 0.0) if noise_m < floor_m and _jagged(moving_m, floor_m) else (noise_m, correlation)
+
+
+def _jagged(position_m: Floats, floor_m: float) -> bool:
+    """Whether positions that are all multiples of a step are so from rounding.
+
+    Exact positions at one speed are multiples of their step too, but smooth: their third differences are zero but for
+    a few at a corner.
+    """
+    uneven = np.count_nonzero(np.abs(np.diff(position_m, 3)) > floor_m)
+    few = 5 if position_m.size >= SHORTEST_MOTION else 0
+    return bool(uneven > max(few, 0.05 * position_m.size))
+
+
+def quantum(position_m: Floats) -> float:
+    """Step of which all positions are multiples (whole pixels, printed decimals), m; 0 where there is none.
+
+    Rounding to a step q adds an error of standard deviation q/√12, which frames at rest cannot show.
+    """
+    values = np.unique(position_m)
+    if values.size < 3:
+        return 0.0
+    steps = np.diff(values)
+    span = float(values[-1] - values[0])
+    resolution = np.finfo(float).eps * float(np.max(np.abs(values)))
+    # Fast motion may skip single steps: the smallest difference is then two or more of them.
+    for count in range(1, 7):
+        step = float(np.min(steps)) / count
+        # A fit is no chance only where the step is coarse beside float resolution, and the span holds several.
+        if step < 1e4 * resolution or span < 3 * step or span / step > 1e7:
+            return 0.0
+        multiples = steps / step
+        if np.all(np.abs(multiples - np.rint(multiples)) < 1e-3 + 8 * resolution / step * multiples):
+            return step
+    return 0.0
+
+
+def rough_noise(position_m: Floats) -> float:
+    """Noise from the median third difference, m, as if white (third differences of white noise have variance 20σ²)."""
+    if position_m.size < 5:
+        return 0.0
+    third = np.diff(position_m, 3)
+    return float(np.median(np.abs(third))) / 0.6745 / math.sqrt(20)
+
+
+def rest_points(position_m: Floats) -> int:
+    """How many points at the start stay at rest, from positions alone; 0 where the track starts in motion.
+
+    The track leaves rest where it goes above the resting level for good; the corner is then that of the best
+    flat-then-straight line through the points up to there.
+    """
+    n = position_m.size
+    if n < 5:
+        return 0
+    noise_m = 2 * rough_noise(position_m) + 1e-12
+    future_low = np.minimum.accumulate(position_m[::-1])[::-1]
+    level, left = float(np.median(position_m[:5])), n
+    for _ in range(4):
+        above = np.flatnonzero(future_low > level + 5 * noise_m)
+        left_now = int(above[0]) if above.size else n
+        if left_now == left:
+            break
+        left = left_now
+        level = float(np.median(position_m[: max(left, 3)]))
+    if left == n:
+        return n
+    return _corner(position_m[: min(n, left + 3)])
+
+
+def _corner(position_m: Floats) -> int:
+    """Number of points before the corner of the best flat-then-straight line through all points given."""
+    n = position_m.size
+    index = np.arange(n, dtype=float)
+    y = position_m - position_m[0]
+    corners = np.arange(0, n - 1) if n <= 400 else np.arange(n - 400, n - 1)
+    best, best_cost = 0, math.inf
+    ramps = np.maximum(index[None, :] - corners[:, None], 0.0)
+    mean_ramp, mean_y = ramps.mean(axis=1), float(y.mean())
+    centred = ramps - mean_ramp[:, None]
+    slope = centred @ (y - mean_y) / np.sum(centred**2, axis=1)
+    cost = np.sum((y - mean_y) ** 2) - slope**2 * np.sum(centred**2, axis=1)
+    where = int(np.argmin(cost))
+    if cost[where] < best_cost:
+        best = int(corners[where])
+    return best + 1 if best > 0 else 0
+
+
+def _stretches(time_s: Floats, position_m: Floats, length: int, order: int) -> tuple[Floats, Floats]:
+    """Positions cut into stretches, shape (s, m), and the polynomial of each stretch's own time, (s, m, order + 1)."""
+    n = position_m.size
+    length = min(length, n)
+    starts = np.unique(np.linspace(0, n - length, max(1, math.ceil(n / length))).astype(int))
+    take = starts[:, None] + np.arange(length)
+    y = position_m[take]
+    t = time_s[take]
+    middle, half = (t[:, :1] + t[:, -1:]) / 2, (t[:, -1:] - t[:, :1]) / 2
+    u = (t - middle) / half
+    order = min(order, length - 2)
+    return y - y.mean(axis=1, keepdims=True), u[:, :, None] ** np.arange(order + 1)
+
+
+def _restricted_likelihood(groups: list[tuple[Floats, Floats]]) -> tuple[float, float]:
+    """σ and ρ that maximise the restricted likelihood of all stretches that follow their polynomial."""
+    tables = [_residuals(y, basis) for y, basis in groups]
+    dof = np.concatenate([np.full(y.shape[0], y.shape[1] - basis.shape[2]) for y, basis in groups])
+    rss = np.concatenate([table[0] for table in tables], axis=1)
+    log_det = np.concatenate([table[1] for table in tables], axis=1)
+    scale = max(float(np.ptp(y)) for y, _ in groups)
+    keep = np.ones(dof.size, dtype=bool)
+    best = 0
+    for _ in range(6):
+        variance = np.median(rss[best] / _chi2_median(dof)) if keep.all() else rss[best, keep].sum() / dof[keep].sum()
+        now = rss[best] <= variance * (dof + 4 * np.sqrt(2 * dof) + 3)
+        keep = now if now.any() else keep
+        pooled, n = rss[:, keep].sum(axis=1), float(dof[keep].sum())
+        if pooled.min() <= n * (1e-13 * scale) ** 2:
+            return 0.0, 0.0
+        score = -0.5 * (n * np.log(pooled) + log_det[:, keep].sum(axis=1)) - 0.5 * (RHO_GRID / PRIOR_RHO_SD) ** 2
+        best = int(np.argmax(score))
+    rho = _vertex(RHO_GRID, score, best)
+    innovation = math.exp(np.interp(rho, RHO_GRID, np.log(pooled / n)))
+    return math.sqrt(innovation / (1 - rho**2)), rho
+
+
+def _chi2_median(dof: Floats) -> Floats:
+    """Median of χ² (Wilson and Hilferty)."""
+    return dof * (1 - 2 / (9 * dof)) ** 3
+
+
+def _residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
+    """For each ρ of the grid and each stretch: whitened residual sum of squares, and the log-determinants of REML."""
+    rss, log_det = [], []
+    for rho in RHO_GRID:
+        root = math.sqrt(1 - rho**2)
+        white_y = np.concatenate([root * y[:, :1], y[:, 1:] - rho * y[:, :-1]], axis=1)
+        white_x = np.concatenate([root * basis[:, :1], basis[:, 1:] - rho * basis[:, :-1]], axis=1)
+        q, r = np.linalg.qr(white_x)
+        inside = np.einsum("smk,sm->sk", q, white_y)
+        residual = white_y - np.einsum("smk,sk->sm", q, inside)
+        rss.append(np.sum(residual**2, axis=1))
+        diagonal = np.abs(np.diagonal(r, axis1=1, axis2=2))
+        log_det.append(2 * np.log(diagonal).sum(axis=1) - math.log(1 - rho**2))
+    return np.array(rss), np.array(log_det)
+
+
+def _vertex(x: Floats, score: Floats, best: int) -> float:
+    """Abscissa of the parabola through the best grid point and its neighbours, inside the grid."""
+    if best == 0 or best == x.size - 1:
+        return float(x[best])
+    left, middle, right = score[best - 1 : best + 2]
+    return float(x[best] + 0.5 * (x[1] - x[0]) * (left - right) / (left - 2 * middle + right))

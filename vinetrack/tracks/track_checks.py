@@ -1,0 +1,81 @@
+"""What every imported track must satisfy, and how one is put together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from vinetrack.core.records import FLAGS, Floats, Track
+
+FEWEST_POINTS = 5
+LARGEST_PRESSURE_KPA = 1000.0
+VACUUM_KPA = -101.4
+"""No gauge reads less; sensors do read a little below zero."""
+LARGEST_NUMBER = 1e9
+"""Seconds or metres; anything larger is no measurement and would overflow when squared and summed."""
+
+
+class TrackError(Exception):
+    """A file that cannot be used as a track or a pressure trace: one sentence, with a remedy."""
+
+
+def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
+    """Refuse times that do not increase from row to row; `lines` gives the line of each row."""
+    wrong = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(wrong):
+        i = int(wrong[0]) + 1
+        place = f"line {lines[i]}, column time_s: " if lines else ""
+        raise TrackError(
+            f"{place}time does not increase ({time_s[i]:g} after {time_s[i - 1]:g} s): sort or mend the rows"
+        )
+
+
+def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
+    """Refuse pressures beyond what the sheet allows; NaN passes."""
+    wrong = np.flatnonzero((pressure_kPa > LARGEST_PRESSURE_KPA) | (pressure_kPa < VACUUM_KPA))
+    if len(wrong):
+        i = int(wrong[0])
+        value = float(pressure_kPa[i])
+        where = f"line {lines[i]}, column pressure_kPa: {value:g}"
+        if value < 0:
+            raise TrackError(f"{where} is below vacuum: gauge pressure in kPa is wanted")
+        hint = f": looks like Pa, {value:g} Pa is {value / 1000:g} kPa" if value < 1000 * LARGEST_PRESSURE_KPA else ""
+        raise TrackError(f"{where} is above {LARGEST_PRESSURE_KPA:g} kPa{hint}")
+
+
+def new_track(
+    time_s: Floats,
+    lead_position_m: Floats,
+    *,
+    sigma_m: Floats | None = None,
+    edge_px: Floats | None = None,
+    pressure_Pa: Floats | None = None,
+    notes: Iterable[str] = (),
+) -> Track:
+    """A track with blank flags, after the checks that all kinds of file share. Arrays have shape (n,).
+
+    Raises
+    ------
+    TrackError
+        If it has fewer than 5 points with a position, times that do not increase, or numbers beyond all measure.
+    """
+    known = np.isfinite(lead_position_m)
+    if np.sum(known) < FEWEST_POINTS:
+        count = int(np.sum(known))
+        raise TrackError(f"has {count} point{'s' * (count != 1)}: at least {FEWEST_POINTS} are needed")
+    if max(np.max(np.abs(time_s)), np.max(np.abs(lead_position_m[known]))) > LARGEST_NUMBER:
+        raise TrackError("holds a time or position too large to be one: mend it")
+    check_times(time_s)
+    unknown = np.full(len(time_s), np.nan)
+    first, last = lead_position_m[known][[0, -1]]
+    backwards = ("Position decreases from first to last point; it should grow along the axis.",) if last < first else ()
+    return Track(
+        time_s=time_s,
+        lead_position_m=lead_position_m,
+        lead_position_sigma_m=unknown if sigma_m is None else sigma_m,
+        flag=np.full(len(time_s), "", dtype=f"<U{len(';'.join(FLAGS))}"),
+        edge_px=unknown.copy() if edge_px is None else edge_px,
+        pressure_Pa=pressure_Pa,
+        notes=(*notes, *backwards),
+    )

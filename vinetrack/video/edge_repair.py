@@ -1,0 +1,114 @@
+"""Edges that break the motion, sought again where the motion leads."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.video.edge_state import EdgeState, core_frames, fit_edges, moving_frames
+from vinetrack.video.strip import Strip
+
+Floats = NDArray[np.float64]
+
+ASTRAY_PX = 3.0
+"""Error stated where nothing like the edge is found where the motion leads."""
+ASTRAY_MISFIT = 1.4
+"""How much worse a fit may be that agrees with its neighbours than one that does not."""
+FAINTEST = 0.5
+"""An edge of less than this much of its contrast is another thing's."""
+LONG_REST = 8
+"""Frames of rest, counted from the motion, in which a bad fit is still sought again from many starts."""
+
+
+def mend_jumps(strip: Strip, state: EdgeState, fit: Floats) -> Floats:
+    """Fits that break the motion, or hardly fit, sought again where the motion leads, shape (n_frames, 6).
+
+    From the middle of the motion backwards and forwards: the edge never retreats, and a step is at most 1.3 times (or
+    1.5 px more than) its neighbour. A fit that breaks that (it caught the far side of a door, a payload) gives way to
+    the best one that does not; only a good fit at two to four whole steps stands, for frames may be missing. A fit
+    half again as bad as most gives way to a better one.
+    """
+    moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
+    if len(moving) < 5:
+        return fit
+    out = fit.copy()
+    bad = 1.5 * float(np.nanmedian(fit[core_frames(state, fit), 2]))
+    central = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
+    anchor = int(moving[np.argmin(central + _rough(fit[moving, 0]) + (fit[moving, 2] > bad))])
+    for sense in (-1, 1):
+        resting = 0
+        for t in range(anchor + sense, -1 if sense < 0 else len(fit), sense):
+            near = out[t - sense, 0]
+            past = out[np.clip([t - sense, t - 2 * sense, t - 3 * sense], 0, len(fit) - 1), 0]
+            step = float(np.nan_to_num(np.abs(np.diff(past))).max())  # of two: a frame may repeat the one before it
+            resting = resting + 1 if step < 0.3 else 0
+            far = max(1.3 * step, step + 1.5)
+            low, high = (near - far, near + 0.8) if sense < 0 else (near - 0.8, near + far)
+            inside, faint = low <= out[t, 0] <= high, out[t, 3] < FAINTEST - 1
+            if not np.isfinite(near) or (inside and (out[t, 2] <= bad or resting > LONG_REST) and not faint):
+                continue
+            better = _best_between(strip, state, t, low, high, 1 if resting > LONG_REST else 9)
+            if inside:
+                if better is not None and (faint or better[2] < out[t, 2]):
+                    out[t] = better
+            elif _may_be_gap(out[t, 0] - near, step) and not faint and _is_better(out[t], better, bad):
+                continue
+            elif better is None:
+                out[t] = (float(np.clip(np.nan_to_num(out[t, 0], nan=near), low, high)), ASTRAY_PX, 4 * bad, 0, 0, 0)
+            else:
+                out[t] = better
+    return _smoothed_out(strip, state, out, moving, bad)
+
+
+def _smoothed_out(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[np.int_], bad: float) -> Floats:
+    """Bad fits that stray from a parabola through two neighbours on each side, sought again where it leads.
+
+    A good fit stays (its frame may repeat another), and so does one that fits much better than what is found there.
+    """
+    out = fit.copy()
+    for t in moving[2:-2]:
+        around = out[[t - 2, t - 1, t + 1, t + 2], 0]
+        expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
+        bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
+        far = abs(out[t, 0] - expected)
+        if not np.isfinite(far) or out[t, 2] <= bad or far < max(1.5, bend):
+            continue
+        reach = max(2.0, 0.3 * far)
+        better = _best_between(strip, state, int(t), expected - reach, expected + reach, 9)
+        if better is not None and better[2] < ASTRAY_MISFIT * out[t, 2]:
+            out[t] = better
+    return out
+
+
+def _is_better(found: Floats, other: Floats | None, bad: float) -> bool:
+    """Whether a fit is good, and better than another."""
+    return bool(found[2] <= bad) and (other is None or bool(other[2] > found[2]))
+
+
+def _may_be_gap(stride: float, step: float) -> bool:
+    """Whether a stride looks like two to four whole steps: frames are missing, and the point is right."""
+    ratio = abs(stride) / max(step, 1e-6)
+    return step > 1.0 and 1.75 < ratio < 4.25 and abs(ratio - round(ratio)) < 0.25
+
+
+def _rough(edge: Floats) -> NDArray[np.bool_]:
+    """Points that stray from the mean of their neighbours by more than a pixel and a tenth of the step, (n,)."""
+    rough = np.ones(len(edge), dtype=bool)
+    step = np.abs(edge[2:] - edge[:-2]) / 2
+    rough[1:-1] = np.abs(edge[1:-1] - 0.5 * (edge[2:] + edge[:-2])) > 1.0 + 0.15 * step
+    return rough
+
+
+def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: float, starts: int) -> Floats | None:
+    """Best fit of frame t that starts and stays between `low` and `high`, shape (6,); None where there is none."""
+    best = None
+    for start in np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]:
+        edge = np.full(len(state.edge), np.nan)
+        edge[t] = start
+        found = fit_edges(strip, replace(state, edge=edge))[t]
+        inside = low - 0.5 <= found[0] <= high + 0.5 and found[3] > FAINTEST - 1
+        if inside and np.isfinite(found[2]) and (best is None or found[2] < best[2]):
+            best = found
+    return best

@@ -1,0 +1,215 @@
+"""What each point of a track is worth: release, end, lost and doubtful points, frames repeated or missing.
+
+Works on positions alone, in pixels by frame; who measured them does not matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import join_flags
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+LOST_SIGMA_PX = 4.0
+"""A point known no better than this is no point."""
+FLOOR_PX = 0.04
+"""Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands: 0.03-0.06 px."""
+STEP_RATIO = 1.6
+"""A step this many times its neighbours is no acceleration: a frame is missing."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Flags (n_frames,), time slots (n_frames,) as mended, and sentences for a person.
+
+    `departure_px`, shape (n_frames,), is how far a point lies off its neighbours' curve where no error explains it.
+    """
+
+    flag: NDArray[np.str_]
+    slot: NDArray[np.int_]
+    notes: tuple[str, ...]
+    first_moving: int
+    last_moving: int
+    departure_px: Floats = field(default_factory=lambda: np.zeros(0))
+
+
+def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: float = 0.5) -> Floats:
+    """Stated errors scaled to the roughness of the track itself, shape (n_frames,).
+
+    Fourth differences cancel any cubic motion and have variance Σ c² σ², c = (1, −4, 6, −4, 1). Their median size in
+    units of the stated errors is the factor, left at 1 where fewer than 8 of them exist; FLOOR_PX is added in square.
+    """
+    weights = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
+    if len(edge_px) < 5:
+        return np.hypot(sigma_px, FLOOR_PX)
+    windows = np.lib.stride_tricks.sliding_window_view
+    difference = windows(edge_px, 5) @ weights
+    expected = np.sqrt(windows(sigma_px**2, 5) @ weights**2)
+    inside = windows(use, 5).all(axis=1) & np.isfinite(difference) & (expected > 0)
+    if inside.sum() < 8:
+        return np.hypot(sigma_px, FLOOR_PX)
+    factor = 1.4826 * float(np.median(np.abs(difference[inside] / expected[inside])))
+    return np.hypot(sigma_px * float(np.clip(factor, smallest, 6.0)), FLOOR_PX)
+
+
+def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
+    """First and last frame in which the edge is on its way; (0, n − 1) if it never rests, (n, −1) if it only rests.
+
+    At rest means: within three sigma, at least 0.4 px (0.25 px at the end, where a creeping stop still tells), of
+    the level that it keeps up to, or from, there.
+    """
+    good = np.flatnonzero(np.isfinite(edge_px))
+    n = len(edge_px)
+    if len(good) < 3:
+        return n, -1
+    y, noise = edge_px[good], float(np.nanmedian(sigma_px[good]))
+    low, high = float(np.median(y[:3])), float(np.median(y[-3:]))
+    if high - low < max(6 * noise, 2.0):
+        return n, -1
+    first = _leaves_level(y, max(3 * noise, 0.4))
+    last = len(y) - 1 - _leaves_level(-y[::-1], max(3 * noise, 0.25))
+    return int(good[first]), int(good[max(last, first)])
+
+
+def _leaves_level(y: Floats, tolerance: float) -> int:
+    """Index of the first point from which on `y` stays above the level of those before it; 0 where none rest."""
+    level = float(y[0])
+    rest = 0
+    for i in range(1, len(y)):
+        if y[i] - level <= tolerance:
+            rest = i
+            level = float(np.median(y[: rest + 1]))
+        elif i + 1 >= len(y) or y[i + 1] - level > tolerance:
+            break
+    # Two frames alike may be a slow start; a rest has three.
+    return rest + 1 if rest >= 2 else 0
+
+
+def judge(
+    edge_px: Floats,
+    sigma_px: Floats,
+    slot: NDArray[np.int_],
+    *,
+    unsure: Bools,
+    damaged: Bools,
+    repeated: Bools,
+    end_px: float,
+    retime: bool = True,
+) -> Judgement:
+    """Flag every frame and mend the times.
+
+    Parameters
+    ----------
+    edge_px, sigma_px
+        Shape (n_frames,), px; NaN where the edge was not found.
+    slot
+        Capture periods from the first frame, shape (n_frames,).
+    unsure, damaged, repeated
+        Masks (n_frames,): a poor fit, a frame the decoder calls corrupt, a picture like the one before it.
+    end_px
+        Where the strip ends: an edge beyond it has left the picture.
+    retime
+        Whether a frame missing by the motion alone shifts the times of those after it.
+    """
+    n = len(edge_px)
+    flags = [""] * n
+    notes: list[str] = []
+    lost = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
+    gone = np.flatnonzero(np.isfinite(edge_px) & (edge_px >= end_px))
+    left = int(gone[0]) if len(gone) else n
+    y = np.where(lost | (np.arange(n) >= left), np.nan, edge_px)
+    first, last = moving_range(y, sigma_px)
+    slot, gaps, found = _mend_times(y, sigma_px, slot, repeated, first, last, retime)
+    notes.extend(found)
+    if left < n:
+        notes.append(f"the leading edge leaves the picture at frame {left}; later frames are not used")
+    copies = repeated & (np.arange(n) > first) & (np.arange(n) <= last)
+    if copies.any():
+        which = int(np.flatnonzero(copies)[0])
+        notes.append(f"{int(copies.sum())} frames repeat the one before them and are dropped, first frame {which}")
+    departure = _departures(y, sigma_px, first, last)
+    outlying = departure > 0
+    for i in range(n):
+        parts = (
+            "before_release" if i < first else "",
+            "after_end" if i > last >= 0 or i >= left else "",
+            "lost" if lost[i] and i < left else "",
+            "duplicate" if copies[i] else "",
+            "gap" if gaps[i] else "",
+            "doubtful" if (unsure[i] or damaged[i] or outlying[i]) and not lost[i] else "",
+        )
+        flags[i] = join_flags(*parts)
+    missing = lost & (np.arange(n) >= first) & (np.arange(n) <= last)
+    if missing.any():
+        notes.append(
+            f"the leading edge is lost in {int(missing.sum())} moving frames, first frame {np.flatnonzero(missing)[0]}"
+        )
+    return Judgement(np.array(flags, dtype=np.str_), slot, tuple(notes), first, last, departure)
+
+
+def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
+    """Distance of moving points from a parabola through their two neighbours on each side, shape (n_frames,), px.
+
+    Zero where it is less than 6 sigma or 1 px. At the start, where a door may hide the tip at rest: by how much the
+    first step is longer than those that follow. At the end, where something may fly on: from the line through the two
+    points before.
+    """
+    out = np.zeros(len(y))
+    for i in range(max(first, 2), min(last, len(y) - 1) - 1):  # a dead stop is no departure
+        around = y[[i - 2, i - 1, i + 1, i + 2]]
+        if not np.all(np.isfinite(around)) or not np.isfinite(y[i]):
+            continue
+        expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
+        bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
+        spread = 1.4 * float(np.max(sigma_px[i - 2 : i + 3]))
+        far = abs(y[i] - expected)
+        out[i] = far if far > max(6 * spread, 1.0, bend) else 0.0
+    for i in range(max(first - 1, 1), min(first + 2, len(y) - 2)):
+        leap, later = y[i] - y[i - 1], 0.5 * (y[i + 2] - y[i])
+        if np.isfinite(leap - later) and leap > 1.2 * later + max(sigma_px[i], 0.5):
+            out[:i] = np.maximum(out[:i], leap - 0.5 * later)
+    for i in range(max(first + 4, last - 2), last + 1):
+        before = y[i - 4 : i]
+        ahead = y[i] - 2 * before[-1] + before[-2]
+        roughness = float(np.max(np.abs(np.diff(before, 2))))
+        if np.isfinite(ahead) and ahead > max(6 * sigma_px[i], 2.0, 0.5 * (before[-1] - before[-2]), 4 * roughness):
+            out[i : last + 1] = np.maximum(out[i : last + 1], ahead)
+    return out
+
+
+def _mend_times(
+    y: Floats, sigma_px: Floats, slot: NDArray[np.int_], repeated: Bools, first: int, last: int, retime: bool
+) -> tuple[NDArray[np.int_], Bools, list[str]]:
+    """Slots with the missing frames counted in, the frames that follow a gap, and what to say of it."""
+    n = len(y)
+    gaps = np.zeros(n, dtype=bool)
+    gaps[1:] = np.diff(slot) > 1
+    mended, notes = slot.copy(), []
+    step = np.full(n, np.nan)
+    step[1:] = np.diff(y) / np.maximum(np.diff(slot), 1)
+    for i in range(max(first, 1) + 2, min(last, n - 1) - 1):
+        around = step[[i - 2, i - 1, i + 1, i + 2]]
+        near = step[[i - 1, i + 1]]
+        if not np.all(np.isfinite(around)) or not np.isfinite(step[i]) or repeated[i - 2 : i + 3].any():
+            continue
+        usual = float(np.median(around))
+        if usual < max(2.0, 8 * float(np.max(sigma_px[i - 1 : i + 1]))) or np.ptp(around) > 0.35 * usual:
+            continue
+        ratio = step[i] / float(near.mean())
+        if ratio > STEP_RATIO:
+            gaps[i] = True
+            whole = round(ratio)
+            if retime and abs(ratio - whole) < 0.2 and whole <= 4:
+                mended[i:] += whole - 1
+                notes.append(
+                    f"{whole - 1} frame(s) missing before frame {i} by the step of the motion; "
+                    "later frames are timed accordingly"
+                )
+            else:
+                notes.append(f"a step of {ratio:.1f} times its neighbours before frame {i}: frames may be missing")
+    return mended, gaps, notes
