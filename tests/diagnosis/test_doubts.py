@@ -51,7 +51,7 @@ def without_doubts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     def none(*about: Any) -> list[Floats]:
         return [np.zeros((trial.time_s.size, 0)) for trial in about[-1]]
 
-    monkeypatch.setattr(questions, "doubts_of", none)
+    monkeypatch.setattr(questions, "systematics_of", none)
     return
 
 

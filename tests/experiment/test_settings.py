@@ -21,7 +21,7 @@ from vinetrack.experiment.settings import (
     run_settings,
 )
 
-CONFIG = Path(__file__).parents[1] / "config" / "config.yaml"
+CONFIG = Path(__file__).parents[2] / "config" / "config.yaml"
 
 
 def read(tmp_path: Path, text: str) -> ExperimentSettings:

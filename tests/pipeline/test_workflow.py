@@ -12,7 +12,7 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.workflow import code_hash, find_experiment, make_plan, shell_prefix
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,use\n"
 
@@ -113,13 +113,13 @@ def test_a_stage_depends_on_its_own_settings_alone(tmp_path: Path) -> None:
 
 
 def test_an_edit_of_a_stage_changes_its_hash_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "motion").mkdir()
+    (tmp_path / "kinematics").mkdir()
     (tmp_path / "figures").mkdir()
-    (tmp_path / "motion" / "a.py").write_text("x = 1\n")
+    (tmp_path / "kinematics" / "a.py").write_text("x = 1\n")
     (tmp_path / "figures" / "b.py").write_text("y = 1\n")
     monkeypatch.setattr(workflow, "PACKAGE", tmp_path)
     motion, figures = code_hash("damping"), code_hash("figures")
-    (tmp_path / "motion" / "a.py").write_text("x = 2\n")
+    (tmp_path / "kinematics" / "a.py").write_text("x = 2\n")
     assert code_hash("damping") != motion
     assert code_hash("figures") == figures
 

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.narrative.law_text import headline, tally, without_law
 from vinetrack.report.build import ReportContent, ReportFigure, ReportSection, ReportTable, build_report
+from vinetrack.report.law_text import headline, tally, without_law
 from vinetrack.report.section import data_uri
 from vinetrack.report.svg import inline_svg, speed_sparkline
 from vinetrack.report.trials import MOST_ROWS

@@ -211,8 +211,8 @@ def gather(
 def damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
     """Steady points to the damping law, damping.json."""
     with _sentences(log):
-        from vinetrack.narrative.law_text import headline
         from vinetrack.pipeline.damping_stage import fit_law
+        from vinetrack.report.law_text import headline
 
         with _busy("fitting the law and resampling its trials", log):
             law = fit_law(results, _run_settings(settings).damping)

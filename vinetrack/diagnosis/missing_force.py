@@ -2,7 +2,8 @@
 
 Nothing is differentiated. What a force would do to the positions is known (`vinetrack.diagnosis.force_sensitivities`);
 the positions then say which force, by least squares with the noise of the tracks, release and origin of every trial
-free, its pressure and B free within what replicates scatter by, and B, n and all other numbers of the model free beside it.
+free, its pressure and B free within what replicates scatter by, and B, n and all other numbers of the model free
+beside it.
 
 Part of any force can be taken over by B and n: between them and a force that is drawn freely the data do not decide.
 Where a simple law explains most of what is missing, B and n are put as this law has them; else where the fit left them.

@@ -1,8 +1,8 @@
 """One step of Radau IIA, order 5, for the speed and position of a tail and the pressure of its chamber.
 
-Text of a compiled kernel, set between the `rates` of one model and `vinetrack.dynamics.integrator`; why it is
-this method is said there. Position follows from the speeds by the same quadrature, so that Newton's system is of the three stage
-speeds alone; the chamber's pressure has one of its own.
+Text of a compiled kernel, set between the `rates` of one model and `vinetrack.dynamics.integrator`; why it is this
+method is said there. Position follows from the speeds by the same quadrature, so that Newton's system is of the three
+stage speeds alone; the chamber's pressure has one of its own.
 
 Source: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.5 and IV.8.
 """

@@ -73,7 +73,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     from vinetrack.figures.scaling import draw_scaling
     from vinetrack.figures.speed_scaling import draw_speed_scaling
     from vinetrack.figures.style import METHOD_NAMES
-    from vinetrack.results.diagnosis_tables import draw_diagnosed, read_diagnosed, with_after
+    from vinetrack.pipeline.diagnosis_tables import draw_diagnosed, read_diagnosed, with_after
 
     results = Results(folder)
     damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)

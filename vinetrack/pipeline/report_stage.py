@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.tables import write_json, write_text
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.figures.style import METHOD_NAMES
+from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
 from vinetrack.pipeline.figures_stage import describe_conditions
-from vinetrack.results.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.experiment.folder import Experiment
+    from vinetrack.pipeline.diagnosis_tables import DiagnosisTables
     from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
     from vinetrack.report.recordings import Recording
-    from vinetrack.results.diagnosis_tables import DiagnosisTables
 
 FIGURES = {
     "ladder": ("The ladder of errors", ""),

@@ -1,8 +1,8 @@
 """What is believed of a vine before it is grown: a model, the median of every number, and what is uncertain about each.
 
-A belief stands on a fit, on what a person says, or on the guesses of `vinetrack.planning.scaling_priors`, whichever
-is first to know a number. Every uncertainty draws from a stream of random numbers of its own name: what vines have in common (an
-exponent, the law of the guess) then moves them together, and what each has of its own does not.
+A belief stands on a fit, on what a person says, or on the guesses of `vinetrack.planning.scaling_priors`, whichever is
+first to know a number. Every uncertainty draws from a stream of random numbers of its own name: what vines have in
+common (an exponent, the law of the guess) then moves them together, and what each has of its own does not.
 """
 
 from __future__ import annotations

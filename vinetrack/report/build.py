@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.page_tokens import page_tokens
-from vinetrack.narrative.law_text import (
+from vinetrack.report.diagnosis import DIAGNOSIS_FIGURES, DiagnosisResult, diagnosis_section
+from vinetrack.report.law_text import (
     DIAGNOSIS_METHODS,
     DIAGNOSIS_REFERENCES,
     REFERENCES,
@@ -19,7 +20,6 @@ from vinetrack.narrative.law_text import (
     vine_table,
     without_law,
 )
-from vinetrack.report.diagnosis import DIAGNOSIS_FIGURES, DiagnosisResult, diagnosis_section
 from vinetrack.report.model import ModelResult, model_section
 from vinetrack.report.recordings import LARGEST_SVG_BYTES, METHODS, SHARED_ERROR, Recording, calibration_table
 from vinetrack.report.section import ReportFigure, ReportSection, ReportTable, figure_entry, section_entry

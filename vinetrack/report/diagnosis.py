@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.numbers import interval, number, with_error
-from vinetrack.narrative.law_text import PREFERRED
+from vinetrack.report.law_text import PREFERRED
 from vinetrack.report.model import READABLE
 from vinetrack.report.section import ReportTable
 from vinetrack.report.verdict import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, moved, one_round, refused
 
 from vinetrack.figures.style import render
-from vinetrack.results.diagnosis_tables import (
+from vinetrack.pipeline.diagnosis_tables import (
     draw_diagnosed,
     figure_tables,
     in_order_of_rank,
@@ -24,7 +24,6 @@ from vinetrack.results.diagnosis_tables import (
     worst_condition,
 )
 from vinetrack.results.folder_layout import Results
-from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, moved, one_round, refused
 
 RELEASE_S, ORIGIN_M = 0.05, 0.2
 TRIALS = {"a": "slow", "b": "slow", "c": "fast"}
