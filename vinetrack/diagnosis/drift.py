@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.numbers import decimals, display_unit
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.constancy_tests import CONDITIONS, Against, ConstancyTest, Sums, as_deviate, constancy, sums_of
 from vinetrack.diagnosis.drift_along import against_the_sheet, along_growth
@@ -29,7 +30,7 @@ from vinetrack.diagnosis.replicate_scatter import LEAST_SPREAD, Scatter
 from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.fit_result import SHOWN_AS, Fit, Number, decimals
+from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.parameters import DAMPING, EXPONENT, YIELD_PRESSURE
 from vinetrack.inference.subset import fit_subset
 
@@ -224,7 +225,7 @@ def _said(own: PerTrialEstimates, against: Against, row: Mapping[str, Any], *, s
 
 def _amount(own: PerTrialEstimates, change: float, error: float) -> str:
     """A change with its error, in per cent or in the unit it reads best in."""
-    unit, factor = ("%", 100.0) if own.logarithmic else SHOWN_AS.get(own.unit, (own.unit, 1.0))
+    unit, factor = ("%", 100.0) if own.logarithmic else display_unit(own.unit)
     digits = max(decimals(error * factor) - 1, 0)
     return f"{change * factor:.{digits}f} ± {error * factor:.{digits}f} {unit}".rstrip()
 
@@ -280,7 +281,7 @@ def _vine_row(
     """A row for values that differ between vines; the change is from the lowest to the highest."""
     ordered = sorted(groups, key=lambda group: float(str(group["value"])))
     low, high = ordered[0], ordered[-1]
-    shown, factor = SHOWN_AS.get(unit, (unit, 1.0))
+    shown, factor = display_unit(unit)
     ends = " and ".join(
         f"{float(str(one['value'])) * factor:.3g} ± {float(str(one['sigma'])) * factor:.1g} {shown}".rstrip()
         + f" ({one['vine']})"

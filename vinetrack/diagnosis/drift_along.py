@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.constancy_tests import FEWEST_DEGREES, ConstancyTest, as_deviate
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of, push_sensitivities
 from vinetrack.diagnosis.per_trial_estimates import AlignedTrial, PerTrialEstimates
 from vinetrack.dynamics.force_terms import evaluate
-from vinetrack.inference.fit_result import Fit, decimals
+from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.left_out import rest_is_seen
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE

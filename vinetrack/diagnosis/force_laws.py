@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
-from vinetrack.inference.fit_result import decimals
 
 PLACES, WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
 PERIODS = 24

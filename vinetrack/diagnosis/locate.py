@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.compare import position_errors
 from vinetrack.diagnosis.drift import Drift, drift
@@ -32,7 +33,7 @@ from vinetrack.diagnosis.stretches import (
     stretches_of,
     variances_of,
 )
-from vinetrack.inference.fit_result import Fit, TrialFit, decimals
+from vinetrack.inference.fit_result import Fit, TrialFit
 
 if TYPE_CHECKING:
     import pandas as pd

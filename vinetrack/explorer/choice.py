@@ -6,14 +6,20 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from vinetrack.core.numbers import display_unit
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.effects import BASE_EFFECTS, Effect, Parameter
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.curves import Sized, yields_of
 from vinetrack.inference.parameters import DAMPING
 
-SHOWN_UNITS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/MPa", 1e6), "m": ("mm", 1e3), "m²": ("cm²", 1e4), "1": ("", 1.0)}
-"""Units that read better another way: name and factor."""
+_SLIDER_UNITS = {"m": ("mm", 1e3), "m²": ("cm²", 1e4)}
+"""Besides `DISPLAY_UNITS`: a slider moves in steps that a hand can see, and lengths of vines are of millimetres."""
+
+
+def slider_unit(unit: str) -> tuple[str, float]:
+    """Return the unit in which the explorer shows an SI unit, and the factor from SI to it."""
+    return _SLIDER_UNITS.get(unit) or display_unit(unit)
 
 
 class ChoiceError(ValueError):
@@ -43,7 +49,7 @@ class Size:
     @property
     def shown(self) -> tuple[str, float]:
         """The unit it is shown in, and the factor to it."""
-        return SHOWN_UNITS.get(self.parameter.unit, (self.parameter.unit, 1.0))
+        return slider_unit(self.parameter.unit)
 
 
 @dataclass(frozen=True)

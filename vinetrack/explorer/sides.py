@@ -7,15 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from vinetrack.core.numbers import decimals
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import SHOWN_UNITS, Choice
+from vinetrack.explorer.choice import Choice, slider_unit
 from vinetrack.explorer.curves import overall_m
 from vinetrack.explorer.export import model_words
 from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
 from vinetrack.explorer.look import command_block, escaped, table
 from vinetrack.explorer.series import vine_colours
 from vinetrack.explorer.story import Story
-from vinetrack.inference.fit_result import Number, decimals
+from vinetrack.inference.fit_result import Number
 
 AT_THE_FLOOR = 1.15
 MOST_PAIRS = 6
@@ -77,7 +78,7 @@ def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[Run
 
 
 def _number_row(number: Number, vine: str) -> tuple[str, ...]:
-    unit, factor = SHOWN_UNITS.get(number.unit, (number.unit, 1.0))
+    unit, factor = slider_unit(number.unit)
     name = f"{number.symbol}, {unit}" if unit else number.symbol
     if not math.isfinite(number.sigma):
         return name, vine, f"{number.value * factor:.4g}", "open", ""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.numbers import number
+from vinetrack.core.numbers import number
 from vinetrack.figures.style import BLUE, INK, MUTED, VERMILLION, blank, look
 
 if TYPE_CHECKING:

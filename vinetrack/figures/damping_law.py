@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.numbers import half_width, number, with_error
+from vinetrack.core.numbers import half_width, number, with_error
 from vinetrack.figures.style import (
     INK,
     METHOD_LINES,

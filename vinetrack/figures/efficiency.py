@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.numbers import interval, number
+from vinetrack.core.numbers import interval, number
 from vinetrack.figures.style import MUTED, VINE_COLOURS, VINE_MARKERS, blank, counted, look, note_below
 
 if TYPE_CHECKING:

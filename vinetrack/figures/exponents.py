@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.figures.numbers import half_width, with_error
+from vinetrack.core.numbers import half_width, with_error
 from vinetrack.figures.style import (
     METHOD_COLOURS,
     METHOD_NAMES,

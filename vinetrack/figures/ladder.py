@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.numbers import number
+from vinetrack.core.numbers import number
 from vinetrack.figures.style import BLUE, GREEN, INK, MUTED, VERMILLION, blank, look, plain_log_ticks
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core import published
-from vinetrack.figures.numbers import half_width, number, with_error
+from vinetrack.core.numbers import half_width, number, with_error
 from vinetrack.figures.style import INK, PAPER, VINE_COLOURS, VINE_MARKERS, blank, look, plain_log_ticks
 
 if TYPE_CHECKING:

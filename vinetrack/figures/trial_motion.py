@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.numbers import with_error
 from vinetrack.core.records import UNUSABLE_FLAGS
-from vinetrack.figures.numbers import with_error
 from vinetrack.figures.style import (
     GRID,
     INK,

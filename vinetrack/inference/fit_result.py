@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.numbers import decimals, display_unit
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitError
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
 
     from vinetrack.inference.optimiser import Solution
     from vinetrack.inference.sensitivity import Predictor
-
-SHOWN_AS = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
-"""Units that read better another way: name and factor."""
 
 
 @dataclass(frozen=True)
@@ -174,17 +172,12 @@ class Fit:
 
 
 def _row(number: Number) -> tuple[str, ...]:
-    unit, factor = SHOWN_AS.get(number.unit, (number.unit, 1.0))
+    unit, factor = display_unit(number.unit)
     if not math.isfinite(number.sigma):
         return number.title, f"{number.value * factor:.4g}", "open", "", unit
     digits = decimals(number.sigma * factor)
     value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))
     return number.title, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}", unit
-
-
-def decimals(sigma: float) -> int:
-    """Decimals that show two digits of an error."""
-    return 0 if not sigma > 0 else int(np.clip(1 - math.floor(math.log10(sigma)), 0, 12))
 
 
 def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.core.numbers import decimals, display_unit
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -17,7 +18,7 @@ from vinetrack.diagnosis.result import (
     Round,
 )
 from vinetrack.dynamics.model import base_model
-from vinetrack.inference.fit_result import SHOWN_AS, Number, decimals
+from vinetrack.inference.fit_result import Number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,7 +38,7 @@ SHOWN_CANDIDATES = 8
 
 def size_in_words(number: Number) -> str:
     """`γ = 1.170 ± 0.004`, in a unit that reads well."""
-    unit, factor = SHOWN_AS.get(number.unit, (number.unit, 1.0))
+    unit, factor = display_unit(number.unit)
     tail = f" {unit}" if unit else ""
     if not (math.isfinite(number.sigma) and number.sigma > 0):
         return f"{number.symbol} = {number.value * factor:.4g}{tail}"
@@ -231,7 +232,7 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
     ]
     changed: dict[tuple[str, str], dict[str, str]] = {}
     for row in _rows(numbers):
-        unit, factor = SHOWN_AS.get(row.unit, (row.unit, 1.0))
+        unit, factor = display_unit(row.unit)
         digits = decimals(row.sigma * factor) if math.isfinite(row.sigma) else 3
         title = f"{row.symbol} ({row.vine})" if row.vine else row.symbol
         place = changed.setdefault((title, unit), {})

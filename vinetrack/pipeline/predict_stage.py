@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.core.numbers import number
 from vinetrack.core.tables import write_csv, write_json
-from vinetrack.figures.numbers import number
 from vinetrack.pipeline.prediction_inputs import (
     Asked,
     Ground,

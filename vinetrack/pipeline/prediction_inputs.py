@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vinetrack.core.numbers import DISPLAY_UNITS, number
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_bytes
 from vinetrack.experiment.planned import Planned, option, planned_sheet, planned_trial
-from vinetrack.figures.numbers import number
 from vinetrack.results.folder_layout import Results, ResultsError, read_json
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 FIGURE_FORMATS = (".png", ".svg", ".pdf")
 
-SHOWN_AS = {"Pa": ("kPa", 1e-3), "s": ("ms", 1e3), "1": ("", 1.0), "1/Pa": ("1/kPa", 1e3)}
+SHOWN_AS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}
 """SI units that read better another way: name and factor."""
 
 NEVER = "never"

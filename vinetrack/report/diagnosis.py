@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.figures.numbers import interval, number, with_error
+from vinetrack.core.numbers import display_unit, interval, number, with_error
 from vinetrack.report.law_text import PREFERRED
-from vinetrack.report.model import READABLE
 from vinetrack.report.section import ReportTable
 from vinetrack.report.verdict import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
 
@@ -160,7 +159,7 @@ def hidden_table(
                 continue
             short = str(name).split(".")[-1]
             symbol, unit = of.get(short) or (units or {}).get(f"{row['effect']}.{short}") or (short, "SI")
-            shown, factor = READABLE.get(unit, (unit, 1.0))
+            shown, factor = display_unit(unit)
             rows.append((plain(row["effect"]), symbol, f"{number(factor * float(largest))} {shown}".strip()))
     if not rows:
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.figures.numbers import half_width, interval, number, with_error
+from vinetrack.core.numbers import half_width, interval, number, with_error
 from vinetrack.figures.style import METHOD_NAMES
 
 if TYPE_CHECKING:

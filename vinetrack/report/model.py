@@ -7,14 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.figures.numbers import number, with_error
+from vinetrack.core.numbers import display_unit, number, with_error
 from vinetrack.figures.style import rows
 
 if TYPE_CHECKING:
     import pandas as pd
-
-READABLE = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
-"""Units that read better another way: name and factor."""
 
 EXPLAINED = (
     "The model in use is fitted to the positions of all trials at once. Each trial is then predicted with a release "
@@ -79,7 +76,7 @@ def _rms(values: pd.Series) -> float:
 
 
 def _number(entry: Mapping[str, Any]) -> dict[str, str]:
-    unit, factor = READABLE.get(entry["unit"], (entry["unit"], 1.0))
+    unit, factor = display_unit(entry["unit"])
     low, high = (None if entry[key] is None else factor * entry[key] for key in ("low_95", "high_95"))
     known = low is not None and high is not None
     return {

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core import published
-from vinetrack.figures.numbers import interval, number
+from vinetrack.core.numbers import interval, number
 from vinetrack.figures.style import rows
 from vinetrack.report.section import ReportFigure, ReportSection, ReportTable
 

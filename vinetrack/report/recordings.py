@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vinetrack.figures.numbers import number
+from vinetrack.core.numbers import number
 
 LARGEST_SVG_BYTES = 1_500_000
 """A larger picture is left as a file beside the report."""

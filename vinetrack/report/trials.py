@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.figures.numbers import number, with_error
+from vinetrack.core.numbers import number, with_error
 from vinetrack.figures.style import RULE_NAMES, rows
 from vinetrack.report.recordings import LARGEST_SVG_BYTES, count_frames
 from vinetrack.report.section import data_uri

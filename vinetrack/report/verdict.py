@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.figures.numbers import number, with_error
-from vinetrack.report.model import READABLE
+from vinetrack.core.numbers import display_unit, number, with_error
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -143,7 +142,7 @@ def _sigmas(row: Mapping[str, Any]) -> str:
 
 def size(entry: Mapping[str, Any]) -> str:
     """A fitted number with its error, in a unit that reads well: `γ = 1.170 ± 0.004`."""
-    unit, factor = READABLE.get(entry["unit"], (entry["unit"], 1.0))
+    unit, factor = display_unit(entry["unit"])
     sigma = factor * float(entry["sigma"]) if known(entry.get("sigma")) else None
     vine = f" ({entry['vine']})" if entry.get("vine") else ""
     return f"{entry['symbol']}{vine} = {with_error(factor * float(entry['value']), sigma)} {unit}".strip()
@@ -167,7 +166,7 @@ def _sizes(diagnosis: Mapping[str, Any]) -> list[Fact]:
 
 
 def _interval(entry: Mapping[str, Any]) -> str:
-    unit, factor = READABLE.get(entry["unit"], (entry["unit"], 1.0))
+    unit, factor = display_unit(entry["unit"])
     if not (known(entry.get("low_95")) and known(entry.get("high_95"))):
         return "95 %: open"
     low, high = (factor * float(entry[key]) for key in ("low_95", "high_95"))

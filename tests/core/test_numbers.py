@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from vinetrack.figures.numbers import half_width, interval, number, with_error
+from vinetrack.core.numbers import decimals, display_unit, half_width, interval, number, with_error
 
 
 @pytest.mark.parametrize(
@@ -55,3 +55,13 @@ def test_an_unknown_interval_is_a_dash(bounds: list | None) -> None:
 def test_half_an_interval() -> None:
     assert half_width([1.0, 4.0]) == 1.5
     assert math.isnan(half_width([None, None]))
+
+
+@pytest.mark.parametrize(("sigma", "count"), [(0.0123, 3), (31.0, 0), (1e-20, 12), (0.0, 0), (math.nan, 0)])
+def test_decimals_show_two_digits_of_an_error(sigma: float, count: int) -> None:
+    assert decimals(sigma) == count
+
+
+def test_a_unit_that_nothing_stands_for_is_shown_as_it_is() -> None:
+    assert display_unit("1/Pa") == ("1/kPa", 1e3)
+    assert display_unit("kg") == ("kg", 1.0)

@@ -1,0 +1,87 @@
+"""Numbers as text: a value to the digit that its error allows, in the unit in which the tables of this field print it.
+
+Used alike by the terminal, the report, the figures and the explorer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+DISPLAY_UNITS: dict[str, tuple[str, float]] = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
+"""Unit shown in place of an SI unit, and the factor from SI: pressures of vines are printed in kPa; "1" has no unit."""
+
+_FIXED_EXPONENTS = (-4, 6)
+"""Decimal exponents written without "e": the range of Python's own `g` format, 0.0001 to 999999."""
+
+_MOST_DECIMALS = 12
+"""Of a value beside its error: an error below 1e-11 is rounding of a double of order 1e5, not knowledge."""
+
+
+def display_unit(unit: str) -> tuple[str, float]:
+    """Return the unit shown in place of an SI unit, and the factor from SI to it.
+
+    Parameters
+    ----------
+    unit : SI unit as parameters of effects state it, such as ``"1/Pa"``.
+
+    Returns
+    -------
+    name, factor
+        The unit itself and 1.0 where nothing else is shown in its place.
+
+    >>> display_unit("Pa"), display_unit("kg")
+    (('kPa', 0.001), ('kg', 1.0))
+    """
+    return DISPLAY_UNITS.get(unit, (unit, 1.0))
+
+
+def decimals(sigma: float) -> int:
+    """Return how many decimals show two digits of an error, at most 12; 0 for an error that is 0 or NaN."""
+    return min(max(1 - math.floor(math.log10(sigma)), 0), _MOST_DECIMALS) if 0 < sigma < math.inf else 0
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return `value` to `digits` significant digits, without exponent from 0.0001 to 999999; "–" for None and NaN."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if not _FIXED_EXPONENTS[0] <= exponent < _FIXED_EXPONENTS[1]:
+        return f"{value:.{digits - 1}e}"
+    return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+
+
+def with_error(value: float | None, sigma: float | None) -> str:
+    """Return `value ± sigma`, the error to two significant digits and the value to the same decimal.
+
+    >>> with_error(0.36981, 0.0123)
+    '0.370 ± 0.012'
+    """
+    if value is None or not math.isfinite(value):
+        return "–"
+    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
+        return number(value)
+    places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 is written 0.010, and counts as that
+    if places > 6:
+        return f"{value:.3e} ± {sigma:.1e}"
+    return f"{value:.{max(places, 0)}f} ± {sigma:.{max(places, 0)}f}"
+
+
+def interval(bounds: Sequence[float | None] | None) -> str:
+    """Return `(low, high)` as "low to high", both to the decimal that its width allows; "–" where unknown."""
+    if bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
+        return "–"
+    low, high = (float(bound) for bound in bounds if bound is not None)
+    width = high - low
+    places = min(max(1 - math.floor(math.log10(width)), 0), 6) if width > 0 else 2
+    return f"{low:.{places}f} to {high:.{places}f}"
+
+
+def half_width(bounds: Sequence[float | None] | None) -> float:
+    """Return half the width of an interval, NaN where it is unknown."""
+    if bounds is None or any(bound is None for bound in bounds):
+        return math.nan
+    low, high = (float(bound) for bound in bounds if bound is not None)
+    return (high - low) / 2
