@@ -30,6 +30,15 @@ AMPLITUDES = (0.03, 0.2, 0.7)
 LADDER = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
 """The same for a threshold: its answer jumps, and a start too far below or above leads nowhere."""
 
+OF_A_TUBE = {
+    "length_mm": "a tube",
+    "thickness_um": "film",
+    "chamber_l": "the gas of a chamber",
+    "inlet_mm": "the gas of a chamber",
+    "yield_pressure_kPa": "a tube under pressure",
+}
+"""Columns that only a tube fills, and what an effect that needs them acts on."""
+
 
 @dataclass(frozen=True)
 class CandidateShape:
@@ -75,7 +84,11 @@ def candidates_of(
 def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
     """Candidates that the sheet lets act, and for the others the reason why not, by name."""
     found, reasons = [], {}
+    no_tube = all(item.trial.travel_ratio == 1 for item in data)
     for effect in candidates:
+        if no_tube and (absent := [column for column in effect.needs if column in OF_A_TUBE]):
+            reasons[effect.name] = f"it acts on {OF_A_TUBE[absent[0]]}, and a body that moves as a whole has none"
+            continue
         if effect.in_trace and all(item.trace is not None for item in data):
             reasons[effect.name] = "the measured pressure already holds it"
             continue

@@ -24,6 +24,7 @@ import numpy as np
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"
+NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("tail_friction",)
 PARAMETERS = (
     Parameter("C", "C", "N", 0.05, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="tension before the bend"),

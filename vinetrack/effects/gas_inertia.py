@@ -22,6 +22,7 @@ from vinetrack.core.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"
+NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("air_drag", "inlet_loss")
 PARAMETERS = (
     Parameter(

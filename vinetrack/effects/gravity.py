@@ -12,7 +12,8 @@ Easily taken for `payload_friction` where cosθ or the payload's mass is wrong.
 
 Reduce it by growing horizontally.
 
-g is known and held; a falling body is the experiment that measures it, and then it is fitted.
+g is known and held, for a falling body too: there it would take up the drag of the air. Where a fall is filmed to
+measure g, free it by name.
 
 Source: Alvarez et al. (2025), Eq. (1).
 """

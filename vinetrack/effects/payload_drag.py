@@ -20,7 +20,7 @@ from vinetrack.core.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"
-NEEDS = ("payload_g",)
+NEEDS = ("payload_g", "length_mm")
 EASILY_TAKEN_FOR = ("air_drag",)
 PARAMETERS = (
     Parameter(

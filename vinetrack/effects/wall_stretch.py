@@ -18,6 +18,7 @@ Source: thin-walled pressure vessels, Timoshenko & Goodier (1970), Theory of Ela
 from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"
+NEEDS = ("thickness_um",)
 EASILY_TAKEN_FOR = ("pressure_gain", "area_scale", "pressure_damping")
 PARAMETERS = (
     Parameter("kappa", "κ", "1/Pa", 2e-6, bounds=(0.0, 1e-4), plausible=(3e-7, 1e-5), meaning="widening of D a pascal"),

@@ -122,7 +122,8 @@ def make_layout(
     """Decide which numbers are free.
 
     By default every parameter of every effect is, but those that are `held` (g); and the yield pressure of each vine
-    within the error the sheet gives it. Where nothing else is left to find, what is held is found.
+    within the error the sheet gives it. A model of gravity alone then has no free number: a g that adapts itself would
+    take up the drag of a falling body.
 
     Parameters
     ----------
@@ -146,8 +147,6 @@ def make_layout(
         if how not in ("all", "vine"):
             raise FitError(f"{name} is shared by {how!r}: say 'all' or 'vine'.")
     chosen = [name for name in known if name not in held and (name in wanted or not known[name].held)]
-    if not chosen and not held:
-        chosen = list(known)
     vines = [item.trial.vine for item in data]
     numbers: list[FreeParameter] = []
     index = np.full((len(data), 0), -1)
