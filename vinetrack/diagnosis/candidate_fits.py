@@ -22,32 +22,45 @@ Report = Callable[[str], None]
 """Told in a few words what is being done."""
 
 WEAK = 100.0
-"""Δχ² up to which what the sensitivities predict is good to a per cent: hypotheses are then fitted without a climb."""
+"""Δχ² up to which what the sensitivities predict is good to a per cent: hypotheses are then fitted without a climb.
+Measured in trials of the method: for weak effects the linear Δχ² predicts the refitted one to 0.1 %, for strong ones
+√LR 22 against 25, 65 against 17."""
 
 PART_KEPT = 0.1
-"""Part of what a climb gained that a fit to all trials must gain, or it is begun again."""
+"""Part of what a climb gained that a fit to all trials must gain, or it is begun again. Chosen: a fit to all trials
+gains a multiple of what a part gains; at half fewer, at twice more fits are begun again (time)."""
 
 WORSE = -1.0
-"""An effect added can do no harm: Δχ² below this is a fit that has lost its way."""
+"""An effect added can do no harm: Δχ² below this is a fit that has lost its way. Derived: nested models cannot be
+worse; 1 is rounding and unsettled iterations."""
 
 WITHIN_REACH = 16.0
+"""Fall of −2 ln L behind the best within which an effect is worth a fit; cosine from which two effects count as alike;
+part of the best promise worth a subset fit. Chosen: √16 is four standard deviations for what the linear prediction may
+err by; 0.95 leaves a tenth of the information (1 − 0.95²)."""
+
 ALIKE = 0.95
 SHARE_WORTH_A_CLIMB = 0.2
 FEWEST_CLIMBED, LOUDEST = 5, 4
-"""The most promising and those with the largest scores: what is left of a fit far off may show in either way alone."""
+"""The most promising and those with the largest scores: what is left of a fit far off may show in either way alone.
+Chosen for time: 5 and 4 of about 20 candidates."""
 
 REACH_OF_CLIMBS, SHARE_OF_REACH, ALIKE_REACH = 40.0, 0.1, 5.0
 """How far behind the best in −2 ln L a climb may end to be worth a fit: this, or this part of what the best gains, and
-so many times further where the two look alike."""
+so many times further where the two look alike. Chosen: the subset holds a third of the trials, so 40 there may be 13
+short of it in all. At half a right answer may be dropped, at twice time grows."""
 
 MOST_FITTED = 7
+"""Full fits at most, and starts of each. Chosen for time."""
+
 STARTS_EACH = 3
 SURELY = 6.0
-"""Standard deviations from nothing beyond which a number is there."""
+"""Standard deviations from nothing beyond which a number is there. Chosen: six standard errors, beyond doubt even with
+errors half as large as they should be."""
 
 FIRSTS, PARTNERS, SHARE_OF_BEST = 3, 4, 0.3
 """Pairs are built on the three best effects alone, if they explain this part of what the best explains, with the four
-that promise most beside each."""
+that promise most beside each. Chosen for time."""
 
 
 @dataclass

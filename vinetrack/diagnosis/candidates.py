@@ -19,16 +19,20 @@ from vinetrack.inference.fit_data import FitTrial
 PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
 
 WIDE_RANGE = 10.0
-"""Plausible values that differ by more than this factor are tried at geometric steps."""
+"""Plausible values that differ by more than this factor are tried at geometric steps. Chosen: within a factor of ten a
+linear scale meets every size within a factor of two."""
 
 NARROW, ROOM_BELOW = 2.0, 3.0
-"""Where plausible values differ by more than the first, an effect may be smaller than them by the second."""
+"""Where plausible values differ by more than the first, an effect may be smaller than them by the second. Chosen: a
+narrow plausible range would else exclude small sizes."""
 
 AMPLITUDES = (0.03, 0.2, 0.7)
-"""Fractions of the plausible range at which an effect is tried whose small sizes do nothing."""
+"""Fractions of the plausible range at which an effect is tried whose small sizes do nothing. Chosen: near nothing,
+small, large."""
 
 LADDER = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
-"""The same for a threshold: its answer jumps, and a start too far below or above leads nowhere."""
+"""The same for a threshold: its answer jumps, and a start too far below or above leads nowhere. Chosen: steps of about
+1.3, less than the width of the jump."""
 
 OF_A_TUBE = {
     "length_mm": "a tube",

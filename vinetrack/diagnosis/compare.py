@@ -55,13 +55,16 @@ TRAJECTORY_COLUMNS = (
 )
 
 FINAL_AT_FRACTION = 0.95
-"""Of the length, or of as much of it as was seen: a bare vine's speed has a meaning only with the place it is taken."""
+"""Of the length, or of as much of it as was seen: a bare vine's speed has a meaning only with the place it is taken.
+Chosen as the fit's END_FRACTION."""
 
 LASTS = 3.0
-"""How many times longer than the recording the model is followed, to get where the measurement got."""
+"""How many times longer than the recording the model is followed, to get where the measurement got. Chosen as a
+safeguard: a model three times slower has failed in any case."""
 
 SMOOTHED_SHARE = 0.05
-"""Of the growth's duration, over which the misfit is averaged to find where it is worst: one frame's noise is not."""
+"""Of the growth's duration, over which the misfit is averaged to find where it is worst: one frame's noise is not.
+Chosen: a twentieth averages 5 to 50 frames."""
 
 
 @dataclass(frozen=True)

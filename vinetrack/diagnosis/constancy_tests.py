@@ -12,11 +12,13 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates
 
 FEWEST_DEGREES = 2
-"""Replicates beyond the first of their condition that can say how values scatter; else the line's own residuals do."""
+"""Replicates beyond the first of their condition that can say how values scatter; else the line's own residuals do.
+Chosen: two degrees of freedom know a scatter to a factor of two, which Student's t allows for."""
 
 
 LEAST_SCATTER = 0.1
-"""Of the likely scatter of pressure and B: that replicates agree better is taken for chance."""
+"""Of the likely scatter of pressure and B: that replicates agree better is taken for chance. Chosen: a tenth of a
+usual scatter; with few replicates chance agreement would make any trend significant."""
 
 
 @dataclass(frozen=True)

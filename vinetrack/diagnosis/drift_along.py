@@ -25,11 +25,14 @@ from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, RELEASE
 
 STEP = 1e-3
+"""Relative step of a difference. Derived: 1000 times the integrator's error."""
+
 LEAST_SCATTER = 2e-3
-"""Of the rise of ln B in a single trial: that replicates agree better is taken for chance."""
+"""Of the rise of ln B in a single trial: that replicates agree better is taken for chance. Chosen: a tenth of the
+usual scatter of B within a batch."""
 
 HALVES = (0.25, 0.75)
-"""Middles of the halves, as parts of the growth."""
+"""Middles of the halves, as parts of the growth. Defined by the halves."""
 
 
 @dataclass(frozen=True)

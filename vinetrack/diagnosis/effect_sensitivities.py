@@ -21,13 +21,16 @@ from vinetrack.inference.sensitivity import moved_by
 
 AIMED_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
 """A step is good that moves a trajectory by this part of its travel, and done again where it moves it by more than the
-second or less than the third: beyond, curvature counts, below the integrator's error does."""
+second or less than the third: beyond, curvature counts, below the integrator's error does. Derived as in
+vinetrack.inference.sensitivity; ten times to both sides."""
 
 STARTS = 0.1
-"""Part of its travel that a vine must still make with a whole effect put in."""
+"""Part of its travel that a vine must still make with a whole effect put in. Chosen: a vine that hardly moves has no
+derivative."""
 
 SILENT_RESPONSE = 3e-6
-"""Part of its travel by which a trajectory must answer to count as answering: the integrator is no better."""
+"""Part of its travel by which a trajectory must answer to count as answering: the integrator is no better. Measured:
+the integrator errs by at most 7e-7 (benchmarks/integrator.py); four times that."""
 
 
 @dataclass(frozen=True)

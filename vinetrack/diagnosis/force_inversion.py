@@ -19,11 +19,15 @@ from vinetrack.inference.sensitivity import OWN
 from vinetrack.inference.whitening import whiten
 
 PER_TRIAL = 10.0
-"""Independent pieces of information that one trial counts for: its frames err together."""
+"""Independent pieces of information that one trial counts for: its frames err together. Chosen: residual correlation
+times of a tenth of a recording; half or twice moves the error of a force by 1.4."""
 
 OWN_ITERATIONS = 8
+"""Iterations of the trial effects at most. Chosen."""
+
 SILENT = 1e-9
-"""Part of the largest information below which a force moves nothing, or only what others move too."""
+"""Part of the largest information below which a force moves nothing, or only what others move too. Chosen far below
+anything of weight."""
 
 SMOOTHNESS = np.geomspace(1e-6, 1e2, 17)
 

@@ -18,21 +18,32 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
 
 PLACES, WIDTHS = 16, (0.06, 0.12, 0.2, 0.33)
+"""Places and widths of a local force, as parts of the growth. Chosen: neighbours overlap by half."""
+
 PERIODS = 24
+"""Periods tried. Chosen: each a tenth shorter than the one before."""
+
 LONGEST_PERIOD, SHORTEST_PERIOD = 0.6, 0.04
-"""Of the growth. Longer ones are slopes; shorter ones leave no trace in positions."""
+"""Of the growth. Longer ones are slopes; shorter ones leave no trace in positions. Derived: two inertial lengths of
+the fastest vine, and 1.5 periods in the growth."""
 
 SCALES = (0.04, 0.1, 0.2, 0.4)
+"""Decay lengths tried, as parts of the growth. Chosen in factors of two."""
+
 LEAST_SPEED = 0.05
-"""Part of the highest speed at which 1/ẋ stops rising: a vine starts from rest."""
+"""Part of the highest speed at which 1/ẋ stops rising: a vine starts from rest. Chosen: below, a frame says nothing of
+the speed."""
 
 EDGE = 0.1
-"""Of a patch's width, over which the force rises at its ends."""
+"""Of a patch's width, over which the force rises at its ends. Chosen: sharp against the patch, smooth against a
+frame."""
 
 START = 0.05
-"""Of the growth, over which a vine gathers speed: a force there is not the largest that is seen."""
+"""Of the growth, over which a vine gathers speed: a force there is not the largest that is seen. Chosen; wording alone
+depends on it."""
 
 SAME_AREA = 1.02
+"""Ratio of areas up to which two vines count as one. Chosen: twice the error of a diameter of 0.5 %."""
 
 
 @dataclass(frozen=True)

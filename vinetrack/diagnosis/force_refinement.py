@@ -34,24 +34,30 @@ from vinetrack.inference.sensitivity import ORIGIN, OWN, RELEASE, Job
 from vinetrack.inference.whitening import whiten
 
 STEPS, ROUNDS = 12, 2
+"""Steps of a refinement and rounds of each motion. Chosen: every round leaves a tenth of the error."""
+
 BARE, SHAPED = 5, 2
 """So many first steps are bare ones of Gauss and Newton, the cost rising or not: pressure and B of a trial do nearly
-the same, a first step along their difference overshoots, and the next ones mend it. Place and scale wait for two."""
+the same, a first step along their difference overshoots, and the next ones mend it. Place and scale wait for two.
+Chosen; the damped steps that follow make up for a bad choice."""
 
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
-"""Of Levenberg and Marquardt, for steps that may only lower the cost: the first where bare ones lead nowhere."""
+"""Of Levenberg and Marquardt, for steps that may only lower the cost: the first where bare ones lead nowhere. Chosen
+as usual for the method; only time depends on it."""
 
 MENDED = 0.5
-"""Part of χ² that the bare steps may leave, to have led anywhere."""
+"""Part of χ² that the bare steps may leave, to have led anywhere. Chosen: half of χ²."""
 
 SMALL = 1e-3
-"""Step of a difference, as the fit holds numbers, and relative for places and scales."""
+"""Step of a difference, as the fit holds numbers, and relative for places and scales. Derived: 1000 times the
+integrator's error."""
 
 END = 0.96
-"""Part of the length up to which points count."""
+"""Part of the length up to which points count. Chosen: a hundredth beyond the fit's END_FRACTION."""
 
 SETTLED = 1e-3
-"""Part of χ² by which a step must lower it for another to follow."""
+"""Part of χ² by which a step must lower it for another to follow. Chosen: a thousandth of χ² moves no law's place in
+the ranking."""
 
 
 @dataclass(frozen=True)

@@ -25,17 +25,20 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import RELEASE, Job
 
 STEPS = 400
-"""Of each motion, closer together at its begin: what is slower than a hundredth of it is followed to 0.1 %."""
+"""Of each motion, closer together at its begin: what is slower than a hundredth of it is followed to 0.1 %. Derived:
+second order with 400 steps errs by 1e-5, by 1e-3 where a hundredth of the motion decides."""
 
 STAGE = 1 - 1 / math.sqrt(2)
 """Of the two-stage method of Alexander, SIAM J. Numer. Anal. 14, 1006 (1977): of second order, and calm where friction
 settles much faster than a step."""
 
 SPARE_FRAMES = 3.0
-"""By which a motion is followed beyond its recording, should its release move."""
+"""By which a motion is followed beyond its recording, should its release move. Chosen: a release moves by less than a
+frame."""
 
 SLOWEST = 1e-3
-"""Part of the highest speed below which a vine stands: no small force moves it."""
+"""Part of the highest speed below which a vine stands: no small force moves it. Chosen: below a thousandth of the top
+speed nothing is seen to move."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ LADDER_COLUMNS = (
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
 MOST_ITERATIONS = 6
-"""A fit without one condition begins beside its end, and settles in two or three."""
+"""A fit without one condition begins beside its end, and settles in two or three. Chosen."""
 
 
 @dataclass(frozen=True)

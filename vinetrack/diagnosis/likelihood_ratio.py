@@ -17,13 +17,16 @@ ANSWER_SET = 9.0
 """Hypotheses whose −2 ln L lies within this of the best cannot be excluded: three standard deviations."""
 
 MOST_INFLATION = 6.0
-"""How many times the variance of the noise model trials may be seen to scatter: beyond, few trials say too little."""
+"""How many times the variance of the noise model trials may be seen to scatter: beyond, few trials say too little.
+Chosen: at half fewer differences count as scatter, at twice weak effects are missed."""
 
 CREDIBLE = 3.0
-"""How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag."""
+"""How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag.
+Chosen: plausible ranges are wide already; at half a true effect just outside is refused, at twice C_D 17 passes."""
 
 LIMIT_DISTANCE = 4.0
-"""Squared distance, in units of the noise, below which what two hypotheses predict is the same curve."""
+"""Squared distance, in units of the noise, below which what two hypotheses predict is the same curve. Derived: two
+standard deviations of one number."""
 
 
 @dataclass(frozen=True)

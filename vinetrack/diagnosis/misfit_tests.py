@@ -31,13 +31,17 @@ from vinetrack.inference.systematics import systematics_of
 
 FIRST_LEVEL, LATER_LEVEL = 3e-3, 1e-4
 """Chance at which nothing missing may be taken for something by the best of all candidates; once an effect was added
-the gate is stricter, for a pair of effects can imitate what no catalogue holds."""
+the gate is stricter, for a pair of effects can imitate what no catalogue holds. Chosen from the bar of 3 % false
+alarms on null campaigns, a tenth of it for each of the tests that may raise one; measured 0 of 42
+(benchmarks/hidden_effects.py, scoring seeds 16000 and 17000)."""
 
 LOUD_PROBE = 3e-4
-"""Chance at which the loudest probe of a fit with nothing missing may stand out."""
+"""Chance at which the loudest probe of a fit with nothing missing may stand out. Chosen: a tenth of FIRST_LEVEL, for
+eight kinds of probes are tried."""
 
 FAR_OFF = 4.0
-"""χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8."""
+"""χ² per degree of freedom, against the noise of the tracks alone, that no noise explains: heavy tails reach 1.8.
+Chosen: twice what heavy tails reach."""
 
 OFF, OFF_OTHERWISE = 6e-4, 1.5e-4
 """Part of its growth by which the median trial is missed beyond any tracker's slow errors: 0.1 mm of 170 mm. Positions
@@ -48,9 +52,11 @@ SUSPECT, SUSPECT_CHANCE, SUSPECT_SIGMAS = 1.5, 1e-2, 6.0
 and what one must then be worth in standard deviations. Heavy tails alone reach 1.5."""
 
 TESTABLE_SIGMAS = 3.0
-"""An effect whose largest plausible size would show by less than this cannot be tested here."""
+"""An effect whose largest plausible size would show by less than this cannot be tested here. Chosen: what would show
+by less than three standard deviations would not pass FIRST_LEVEL."""
 
 ONE_SIDED_95 = 1.645
+"""Derived: quantile of the normal distribution."""
 
 
 @dataclass(frozen=True)

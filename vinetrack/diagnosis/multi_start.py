@@ -31,20 +31,30 @@ Start = tuple[Sequence[Effect], Mapping[str, Value]]
 """Effects to add and values to begin from."""
 
 CLIMB_SPREADS = (0.01, 0.03)
+"""Between-trial standard deviations of pressure and ln B, and iterations, of a subset fit. Chosen as FIRST_SPREADS of
+the optimiser; for time."""
+
 FIRST_ITERATIONS, MORE_ITERATIONS = 4, 10
 MOST_CLIMBED = 14
-"""Trials of a climb: one of every condition, no more than this."""
+"""Trials of a climb: one of every condition, no more than this. Chosen for time."""
 
 FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
+"""Iterations of a full fit at first and in all, and how far behind the best in −2 ln L it is given up. Chosen for
+time."""
+
 SLOW_NOISE = 0.99
+"""Noise correlation above which a fit has taken misfit for noise. Chosen: a correlation time of a hundred frames."""
+
 LOWER, LOWER_PER_POINT = 1.0, 0.02
-"""By how much −2 ln L of a climb must end lower for its start to be worth a fit."""
+"""By how much −2 ln L of a climb must end lower for its start to be worth a fit. Chosen: unsettled iterations differ
+by as much."""
 
 FAR_BEYOND = 6.0
-"""Times its plausible range."""
+"""Times its plausible range. Chosen: twice what CREDIBLE refuses."""
 
 HOPELESS = 0.5
-"""A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far."""
+"""A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far. Chosen
+for time."""
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,8 @@ ENOUGH = 8.0
 """Standard deviations beyond which no more effort, such as a vine that has to be made, is asked for."""
 
 MOST_HYPOTHESES = 5
+"""Hypotheses that a design separates at most. Chosen for time: pairs grow with the square."""
+
 NOTHING = "nothing more"
 """Name of the hypothesis that has no effect which others have not as well."""
 
@@ -50,6 +52,8 @@ PLAIN = 20.0
 """Standard deviations beyond which one draw less will do."""
 
 GAIN = 1.01
+"""Gain in separation for which a trial is exchanged, and new vines tried at most. Chosen for time."""
+
 MOST_VINES_TRIED = 2
 
 

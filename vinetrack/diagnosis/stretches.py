@@ -23,10 +23,12 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 
 STRETCHES = 8
-"""Parts of the growth that a mean is taken over."""
+"""Parts of the growth that a mean is taken over. Chosen: a trial errs in two or three independent ways; more stretches
+share their errors."""
 
 FEWEST_FRAMES = 2
-"""Frames of a stretch, at least: a shorter recording is cut into fewer."""
+"""Frames of a stretch, at least: a shorter recording is cut into fewer. Derived: one frame has no neighbour to average
+with."""
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,18 @@ from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRES
 from vinetrack.inference.whitening import at_correlation, whiten
 
 HARD_TO_TELL_APART = 0.98
+"""Correlation of two fitted numbers from which the fit warns. Chosen: at 0.98 the error of each is five times what it
+would be with the other known (1/√(1 − 0.98²)); it decides a warning alone."""
+
 ADDS_NOTHING = 0.95
+"""Ratio of fitted to stated error of P_y from which the trajectories are said not to constrain it. Chosen: at 0.95
+they add a tenth of the information; wording alone depends on it."""
+
 MISSES = 2.0
+"""χ² per degree of freedom from which the fit warns that it misses the data. Chosen: half of it would warn of every
+sound fit (χ² per degree of freedom is 1 there), twice would keep silent about visible misfit; it decides a warning
+alone."""
+
 SPREAD_NAMES = ("pressure", "B")
 
 

@@ -49,20 +49,31 @@ if TYPE_CHECKING:
 __all__ = ["FitError", "fit", "predict", "refit"]
 
 LOST = 3e-3
-"""Part of its growth by which the median trial is missed where a model is far off."""
+"""Part of its growth by which the median trial is missed where a model is far off. Chosen: several times what a
+tracker errs by slowly along the way; it decides whether further starts are tried, so half costs time and twice may
+keep a local minimum."""
 
 POOR_FIT = 3.0
-"""χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried."""
+"""χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried. Chosen: half would
+try further starts for most fits (time), twice would keep local minima."""
 
 MOST_STARTS = 3
+"""Starts and iterations at most. Chosen for time: fits that need more are taken up again by the search for a better
+minimum."""
+
 ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 40
 BAD_START = 1.5
-"""χ² per point from which a start misses by more than the noise of the fit it came from."""
+"""χ² per point from which a start misses by more than the noise of the fit it came from. Chosen: below it the
+likelihood is nearly quadratic and one descent suffices; it decides time, not results."""
 
 STRICT_ITERATIONS, HOPELESS = 8, 30.0
-"""After so many steps led by the noise of the tracks alone, χ² per degree of freedom above which none will help."""
+"""After so many steps led by the noise of the tracks alone, χ² per degree of freedom above which none will help.
+Chosen for time; a fit given up here is begun from other starts."""
 
 GUIDING_SPREADS, STRICT_SPREADS = (5e-4, 1e-3), (0.01, 0.03)
+"""Between-trial standard deviations of pressure and ln B while a fit is guided, first nearly none, then those of a
+usual batch of vines (about 1 % of pressure, a few per cent of B). Chosen: they only lead the descent and are estimated
+afterwards."""
 
 
 def fit(

@@ -24,10 +24,16 @@ SINGULAR = 1e-10
 """Smallest eigenvalue of an information matrix of unit diagonal at which two numbers can still be told apart."""
 
 SILENT = 1e-6
-"""Information below which a number moves no trajectory: χ² would change by this for the whole scale of the number."""
+"""Information below which a number moves no trajectory: χ² would change by this for the whole scale of the number.
+Chosen far below anything of weight: a Δχ² of 1e-6 is an interval of a thousand scales."""
 
 NEAR_A_BOUND = 3.5
+"""Standard errors within which a bound makes the interval a profile. Derived: beyond 3.5 the normal interval of 95 %
+and the profile agree to a thousandth."""
+
 LOG_STEP = 0.1
+"""Step of a profile in the logarithm of a positive number. Chosen: 10 % a step; only time depends on it, the end of
+the interval is interpolated."""
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,17 @@ from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, RE
 from vinetrack.inference.whitening import at_correlation
 
 LEAST_SPREAD = 1e-5
+"""Least between-trial standard deviation. Chosen far below what any rig repeats, so that its logarithm stays
+finite."""
+
 LARGEST_SPREAD = (0.04, 0.15)
 """Of pressure and B: four times what a batch of vines shows. Beyond, a trial would bend its own pressure and B until
-they pass for whatever the model lacks."""
+they pass for whatever the model lacks. Chosen: a batch of vines scatters by a few per cent of B and one per cent of
+pressure; at half real batches are cut short, at twice spreads soak up missing effects."""
 
 LARGEST_CORRELATION = 0.9998
-"""Nearly 1: what a wrong model leaves is slow and large, and must not count as thousands of independent points."""
+"""Nearly 1: what a wrong model leaves is slow and large, and must not count as thousands of independent points.
+Derived: a correlation time of 5000 frames, longer than any recording."""
 
 CORRELATIONS = np.concatenate(
     [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97, 0.985, 0.993, 0.997, 0.999, LARGEST_CORRELATION]]

@@ -24,6 +24,7 @@ YIELD_PRESSURE = "yield_pressure.P_y"
 DAMPING = "eversion_damping.B"
 EXPONENT = "eversion_damping.n"
 LEAST_DAMPING = 1e-6
+"""Least B, N·(s/m)ⁿ. Chosen: a millionth of the smallest published value."""
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,11 @@ from vinetrack.inference.systematics import systematics_of
 from vinetrack.inference.whitening import products
 
 FEWEST_CLUSTERS = 8
-"""Trials from which their scatter says more than the model of the noise."""
+"""Trials from which their scatter says more than the model of the noise. Chosen: with fewer clusters a sandwich is
+known to worse than 50 %."""
 
 FEWEST_DEGREES = 4
-"""And this many more than there are numbers."""
+"""And this many more than there are numbers. Chosen: with four the variance is known to a factor of about 1.7."""
 
 
 def scatter_of(single: Floats, degrees: float) -> Floats:

@@ -23,16 +23,24 @@ from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, ParameterMap
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 OWN = 4
-"""Numbers of a trial's own: release, s; origin, m; relative deviation of pressure; deviation of ln B."""
+"""Numbers of a trial's own: release, s; origin, m; relative deviation of pressure; deviation of ln B. Defined by the
+model: release, origin, pressure, B."""
 
 AIMED_RESPONSE = 2e-3
 """Differences are taken over steps that move a trajectory by this part of its length: 1000 times the integrator's
-error, and small enough for the curvature not to count."""
+error, and small enough for the curvature not to count. Derived: with the integrator's 1e-6 the optimum of truncation
+against rounding lies between 1e-3 and 1e-2."""
 
 SMALLEST_STEP, LARGEST_STEP = 1e-5, 0.1
+"""Relative steps of a difference, least and largest. Derived: below 1e-5 the integrator's error shows, above 0.1
+curvature."""
+
 RELEASE_STEP_FRAMES = 0.1
+"""Chosen: a tenth of a frame, in which no trajectory bends."""
+
 PAYLOAD_COLUMN = TrialInputs._fields.index("payload_mass")
 DAMPING_STEP = 1e-3
+"""Relative step of B. Derived as AIMED_RESPONSE is: its answer is of the order of the step."""
 
 
 @dataclass(frozen=True)

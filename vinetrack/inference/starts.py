@@ -14,10 +14,14 @@ from vinetrack.inference.parameters import DAMPING, EXPONENT, ParameterMap
 from vinetrack.inference.sensitivity import ORIGIN, OWN, RELEASE, Predictor
 
 EXPONENTS = (0.15, 0.37, 0.65, 1.0)
+"""Exponents tried. Chosen around the published 0.37, from nearly constant friction to linear damping."""
+
 DAMPING_FACTORS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.1)
-"""Tried against the B that would hold the speed reached; a vine that still accelerates has less."""
+"""Tried against the B that would hold the speed reached; a vine that still accelerates has less. Chosen: the coarse
+grid only has to come within a factor of two."""
 
 POINTS_LOOKED_AT = 60
+"""Points of a trial that the coarse search looks at. Chosen for time."""
 
 
 def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:

@@ -12,6 +12,9 @@ from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, RELEASE
 from vinetrack.inference.whitening import all_products, whiten
 
 LARGEST_DEVIATION_STEP = 0.3
+"""Largest step and largest size of a trial's deviation of pressure and ln B, and the largest step of its release,
+frames. Chosen as trust region: beyond, a linear answer says little; spreads above are bounded much earlier."""
+
 LARGEST_DEVIATION = 0.9
 LARGEST_RELEASE_STEP_FRAMES = 2.0
 
