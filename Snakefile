@@ -5,11 +5,11 @@
 
 from pathlib import Path
 
+from vinetrack.pipeline.stage_code import code_hash
 from vinetrack.pipeline.workflow import (
     CAMPAIGN_FIGURES,
     DIAGNOSIS_FIGURES,
     PAPER_FIGURES,
-    code_hash,
     plan_or_stop,
     say_where_at_exit,
     shell_prefix,
@@ -192,7 +192,7 @@ rule diagnosis:
     log:
         plan.result("logs", "diagnosis.log"),
     params:
-        code=code_hash("model"),
+        code=code_hash("diagnosis"),
         unwatched=plan.unwatched,
         experiment=plan.experiment,
         results=plan.results,

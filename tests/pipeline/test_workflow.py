@@ -10,7 +10,7 @@ import pytest
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import workflow
-from vinetrack.pipeline.workflow import code_hash, find_experiment, make_plan, shell_prefix
+from vinetrack.pipeline.workflow import find_experiment, make_plan, shell_prefix
 
 ROOT = Path(__file__).parents[2]
 
@@ -112,18 +112,6 @@ def test_a_stage_depends_on_its_own_settings_alone(tmp_path: Path) -> None:
     assert before.stage_settings("damping") != after.stage_settings("damping")
 
 
-def test_an_edit_of_a_stage_changes_its_hash_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "kinematics").mkdir()
-    (tmp_path / "figures").mkdir()
-    (tmp_path / "kinematics" / "a.py").write_text("x = 1\n")
-    (tmp_path / "figures" / "b.py").write_text("y = 1\n")
-    monkeypatch.setattr(workflow, "PACKAGE", tmp_path)
-    motion, figures = code_hash("damping"), code_hash("figures")
-    (tmp_path / "kinematics" / "a.py").write_text("x = 2\n")
-    assert code_hash("damping") != motion
-    assert code_hash("figures") == figures
-
-
 def test_every_figure_has_a_caption_for_both_reports() -> None:
     captions = workflow.PACKAGE / "report" / "captions"
     figures = {*workflow.CAMPAIGN_FIGURES, *workflow.PAPER_FIGURES, "overlay", "strip", "trial_motion"}
@@ -138,13 +126,6 @@ def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_p
     (folder / "trials.csv").write_text(SHEET.replace("track", "video,capture_fps") + "a,a.mp4,1000,12,100,300,20,3,\n")
     assert make_plan({"experiment": str(folder)}, tmp_path).clips == ["results/v/overlays"]
     assert make_plan({"experiment": str(folder), "overlays": {"of": "none"}}, tmp_path).clips == []
-
-
-def test_every_part_of_a_stages_code_exists() -> None:
-    missing = {
-        name for parts in workflow.STAGE_CODE.values() for name in parts if not (workflow.PACKAGE / name).exists()
-    }
-    assert not missing
 
 
 def test_a_folder_that_snakemake_would_take_for_a_wildcard_is_refused(tmp_path: Path) -> None:
@@ -189,18 +170,6 @@ def test_a_slash_at_the_end_of_the_path_changes_no_stage(tmp_path: Path) -> None
     with_slash, without = (make_plan({"experiment": path}, tmp_path) for path in (folder + "/", folder))
     assert with_slash.stage_settings() == without.stage_settings()
     assert (with_slash.experiment, with_slash.results) == (without.experiment, without.results)
-
-
-def test_a_strip_drawn_otherwise_reruns_recordings_and_no_tracks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "figures").mkdir()
-    (tmp_path / "figures" / "strip.py").write_text("x = 1\n")
-    monkeypatch.setattr(workflow, "PACKAGE", tmp_path)
-    recording, tracks = code_hash("recording"), code_hash("tracks")
-    (tmp_path / "figures" / "strip.py").write_text("x = 2\n")
-    assert code_hash("recording") != recording
-    assert code_hash("tracks") == tracks
 
 
 def test_a_recording_depends_on_its_own_file_the_sheets_and_the_target(tmp_path: Path) -> None:

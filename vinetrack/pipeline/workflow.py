@@ -1,4 +1,4 @@
-"""What the Snakefile needs to know before anything runs: which experiment, which trials, which files, whose code.
+"""What the Snakefile needs to know before anything runs: which experiment, which trials, which files.
 
 Light on purpose: it is imported every time Snakemake looks at the workflow, before the first job.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import atexit
 import difflib
-import hashlib
 import json
 import os
 import shlex
@@ -70,22 +69,6 @@ PAPER_FIGURES = {
 """What an experiment that is set beside the paper gets besides: tables, and figures with their labels."""
 
 SHARED_FILES = ("trials.csv", "experiment.yaml")
-
-_INTAKE = ("core", "experiment")
-_ANALYSIS = (*_INTAKE, "tracks", "pipeline/tracks_stage.py", "results", "video", "kinematics", "effects", "dynamics")
-STAGE_CODE = {
-    "recording": (*_ANALYSIS, "pipeline/recordings_stage.py", "figures/strip.py", "figures/style.py"),
-    "tracks": (*_ANALYSIS, "pipeline/pool.py"),
-    "gather": (*_INTAKE, "pipeline", "results", "kinematics", "tracks"),
-    "damping": (*_INTAKE, "pipeline", "results", "kinematics", "tracks"),
-    "paper": (*_ANALYSIS, "inference", "pipeline", "figures", "planning", "paper"),
-    "model": (*_ANALYSIS, "inference", "planning", "pipeline", "diagnosis", "narrative"),
-    "figures": ("core", "pipeline", "results", "figures", "report/verdict.py"),
-    "overlays": (*_ANALYSIS, "inference", "pipeline", "figures"),
-    "report": (*_INTAKE, "pipeline", "results", "figures", "report", "narrative"),
-    "laboratory": ("core", "effects", "dynamics", "laboratory"),
-}
-"""Files and folders of the package whose change makes the results of a stage stale."""
 
 
 @dataclass(frozen=True)
@@ -329,26 +312,6 @@ def _say_where(plan: Plan) -> None:
     made = path.stat().st_mtime
     if all(source.stat().st_mtime <= made for source in plan.inputs if source.exists()):
         print(f"Report: {path}", flush=True)
-
-
-def code_hash(stage: str) -> str:
-    """Hash of the code a stage runs; in `params:` it makes Snakemake rerun what an edit has made stale."""
-    digest = hashlib.sha256()
-    for path in _sources(STAGE_CODE[stage]):
-        digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def _sources(names: Iterable[str]) -> list[Path]:
-    found: list[Path] = []
-    for name in names:
-        path = PACKAGE / name
-        found += (
-            [file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts]
-            if path.is_dir()
-            else [path]
-        )
-    return sorted(file for file in found if file.exists())
 
 
 def shell_prefix() -> str:
