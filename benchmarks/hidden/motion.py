@@ -173,11 +173,16 @@ def rates(t, y, w, chamber_Pa, tube, f, bends, trace_t, trace_P):
 
 @njit(cache=True, nogil=True)
 def seen(y, w, t, chamber_Pa, tube, f, trace_t, trace_P):
-    """Lead position with the stretch of the tail: y + ½ε L, ε = T₁/(EπDt), and the pressure at the source."""
+    """Lead position with the stretch of tail and wall, and the pressure at the source.
+
+    y + ½ε L + ½y(ε_w − ε), ε = T₁/(EπDt), ε_w = (PA − T₁)/(EπDt).
+    """
     source, P, area = pressures(t, y, w, chamber_Pa, tube, f, trace_t, trace_P)
     pull = 0.5 * ((P - tube.yield_pressure) * area - tip_losses(max(w, 0.0), P, area, f, y))
-    strain = max(pull, 0.0) * f.compliance / (math.pi * tube.diameter * tube.thickness)
-    return y + 0.5 * strain * tube.length, source
+    soft = f.compliance / (math.pi * tube.diameter * tube.thickness)
+    tail = max(pull, 0.0) * soft
+    wall = P * area * soft - tail
+    return y + 0.5 * tail * tube.length + 0.5 * y * (wall - tail), source
 
 
 # Dormand & Prince (1980), J. Comput. Appl. Math. 6, 19–26.

@@ -105,9 +105,11 @@ def _as_it_was(effect: Effect, size: float, m: Motion, base: Model) -> Motion:
     if effect.name == "perspective":
         bent = a * (1 - 2 * size * y) - 2 * size * v * v
         return replace(m, position=y - size * y * y, velocity=v * (1 - 2 * size * y), acceleration=bent)
-    pull = np.maximum(evaluate(base, m.trial, m.time_s, y, v, measured_Pa=m.pressure).tension_N, 0)
+    terms = evaluate(base, m.trial, m.time_s, y, v, measured_Pa=m.pressure)
+    pull = np.maximum(terms.tension_N, 0)
     trial = m.trial
-    stretch = 0.5 * size * trial.length_m * pull / (np.pi * trial.diameter_m * trial.thickness_m)
+    forces = trial.length_m * pull + y * (terms.pressure_Pa * terms.area_m2 - 2 * pull)
+    stretch = 0.5 * size * forces / (np.pi * trial.diameter_m * trial.thickness_m)
     rate = np.gradient(stretch, m.time_s)
     return replace(m, position=y - stretch + stretch[0], velocity=v - rate)
 

@@ -128,7 +128,7 @@ def test_the_docstring_has_a_summary_a_formula_and_a_source(effect: Effect) -> N
 def test_the_kind_agrees_with_the_hooks_and_with_being_base(effect: Effect) -> None:
     assert (effect.kind == "base") == (effect.name in BASE_EFFECTS)
     if effect.kind == "measurement":
-        read_off = {"true_time", "observed_position", "gauge", "yield_gauge", "area", "film_gain"}
+        read_off = {"true_time", "trace_time", "observed_position", "gauge", "yield_gauge", "area", "film_gain"}
         assert set(effect.functions) <= read_off
 
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from by_hand import BARE, LOADED, G, N, Vine, assert_same_motion, simulated
+from by_hand import BARE, LEVEL, LOADED, G, N, Vine, assert_same_motion, followed, simulated
 
 TIMES = np.linspace(0, 0.15, 50)
 
@@ -77,3 +77,43 @@ def test_area_scale_changes_area_and_film(vine: Vine) -> None:
         return (0.5 * (vine.P - vine.P_y) * area + m * G - 0.5 * vine.B * v**N) / m
 
     assert_same_motion(vine, {"area_scale.eps": 0.03}, acceleration)
+
+
+def test_a_lens_bends_about_the_middle_of_the_picture() -> None:
+    plain = simulated(LOADED, {}, TIMES).lead_position_m
+    got = simulated(LOADED, {"lens.k3": -0.7, "lens.y_c": 0.1}, TIMES).observed_position_m
+    np.testing.assert_allclose(got, plain - 0.7 * ((plain - 0.1) ** 3 + 0.1**3), rtol=1e-12)
+
+
+def test_a_rolling_shutter_sees_the_edge_where_it_is_when_its_row_is_read() -> None:
+    delay = 1.5e-3
+    fine = np.linspace(0, 0.25, 20_001)
+    y = simulated(LOADED, {}, fine).lead_position_m
+    stamped = fine - delay * y  # the row at y is read delay · y after the stamp of its picture
+    got = simulated(LOADED, {"rolling_shutter.delay": delay}, TIMES).observed_position_m
+    # Left out is half the acceleration times the square of the delay along the row, and what follows from it.
+    np.testing.assert_allclose(got, np.interp(TIMES, stamped, y), rtol=0, atol=2e-5)
+    assert np.max(np.abs(got - np.interp(TIMES, fine, y))) > 5e-4
+
+
+def test_a_supply_that_rises_starts_the_vine_once_it_overcomes_the_yield_pressure() -> None:
+    vine, tau = LEVEL, 8e-3
+
+    def acceleration(t: float, x: float, v: float) -> float:
+        drive = 0.5 * (vine.P * (1 - math.exp(-t / tau)) - vine.P_y) * vine.A
+        held = drive - 0.5 * vine.B * max(v, 0.0) ** N
+        return held / vine.m(x) if v > 0 or held > 0 else 0.0
+
+    travel = followed(acceleration, 1.8 * vine.L, max_step=1e-4)
+    times = np.linspace(0.0, travel.end, 61)  # type: ignore[attr-defined]
+    got = simulated(vine, {"supply_rise.tau": tau}, times).lead_position_m
+    np.testing.assert_allclose(got, travel(times) / 2, rtol=0, atol=1e-5 * vine.L)
+    assert simulated(vine, {}, times).lead_position_m[20] > got[20] + 5e-3
+
+
+def test_the_clock_of_a_trace_shifts_the_pressure_that_drives() -> None:
+    delay, clock, pressure = 4e-3, np.array([0.0, 5e-3, 0.02, 0.3]), np.array([0.0, 0.0, 28e3, 28e3])
+    late = simulated(LOADED, {}, TIMES, (clock + delay, pressure)).lead_position_m
+    got = simulated(LOADED, {"trace_clock.delta": delay}, TIMES, (clock, pressure)).observed_position_m
+    np.testing.assert_allclose(got, late, rtol=0, atol=1e-12)
+    assert np.max(np.abs(simulated(LOADED, {}, TIMES, (clock, pressure)).lead_position_m - late)) > 1e-3

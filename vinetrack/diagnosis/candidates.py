@@ -96,6 +96,9 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
         if effect.in_trace and all(item.trace is not None for item in data):
             reasons[effect.name] = "the measured pressure already holds it"
             continue
+        if "trace_time" in effect.functions and all(item.trace is None for item in data):
+            reasons[effect.name] = "it needs a pressure measured during growth, and no trial has one"
+            continue
         if absent := [column for column in effect.needs if not any(stated(column, item.trial) for item in data)]:
             reasons[effect.name] = f"it needs `{absent[0]}`, which is blank or zero for every trial"
             continue
@@ -128,7 +131,7 @@ def shapes_of(effect: Effect) -> list[CandidateShape]:
     size, *others = effect.parameters
     combinations = list(itertools.product(*(typical_values(parameter) for parameter in others)))
     shapes = [CandidateShape(effect, rest, first_step(size)) for rest in combinations]
-    if others:
+    if others or effect.finite:
         middle = [rest for k, rest in enumerate(combinations) if k == len(combinations) // 2]
         shapes += whole_shapes(effect, middle)
     return shapes

@@ -36,6 +36,10 @@ SLOW_PRESSURE: Trace = (np.array([0.0, 0.15, 0.3, 0.45, 0.6]), np.array([2e3, 9e
 """A pressure that rises and falls through the threshold, for effects that act on a vine at rest."""
 
 
+OPENED: Trace = (np.array([0.0, 0.02, 0.15]), np.array([0.0, 28e3, 28e3]))
+"""A pressure that is recorded while a valve opens, for what concerns the record of it."""
+
+
 def effect_motion(effect: Effect) -> pd.DataFrame:
     """Motion of the reference vine with an effect at its default size and without it.
 
@@ -51,7 +55,7 @@ def effect_motion(effect: Effect) -> pd.DataFrame:
     trial = replace(REFERENCE, bends=BENDS) if effect.name == "capstan_friction" else REFERENCE
     at_rest = _acts_at_rest(effect)
     trial = replace(trial, growth_angle_rad=math.pi / 2) if at_rest else trial
-    trace = SLOW_PRESSURE if at_rest else None
+    trace = SLOW_PRESSURE if at_rest else OPENED if "trace_time" in effect.functions else None
     until = _end_s(with_it, without, trial, trace)
     times = np.linspace(0.0, until, 400)
     a, b = simulate(without, trial, times, trace=trace), simulate(with_it, trial, times, trace=trace)
@@ -72,6 +76,8 @@ def reference_words(effect: Effect) -> str:
     vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
     if _acts_at_rest(effect):
         return f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
+    if "trace_time" in effect.functions:
+        return f"{vine}, straight down, a pressure recorded while it rises to 28 kPa in 20 ms"
     bends = ", one radian of bend after 100 mm" if effect.name == "capstan_friction" else ""
     return f"{vine}, 28 kPa, straight down, chamber 3.7 L, inlet 6 mm{bends}"
 

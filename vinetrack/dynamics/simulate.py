@@ -255,7 +255,6 @@ def lay_out(
     count = len(rigs)
     traces = traces or [None] * count
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
-    given = [trace for trace in traces if trace is not None]
     if host is not None and host.names != model.names:
         resting = np.array([name not in model for name in host.names])
         model, thetas = host, hosted(host, model, thetas)
@@ -265,6 +264,8 @@ def lay_out(
     kinks, stops = _limits(model, rigs, thetas, on, bends)
     given_times = [np.asarray(t, dtype=float) for t in times_s]
     true_times = _true_times(model, rigs, thetas, on, given_times)
+    traces = _true_traces(model, rigs, thetas, on, traces)
+    given = [trace for trace in traces if trace is not None]
     tail_free = bool(rigs[:, TrialInputs._fields.index("tail_free")].any()) if count else False
     return Batch(
         integrate_many=kernel(model.effects, tail_free).integrate_many,
@@ -335,6 +336,20 @@ def _true_times(
         for i in np.flatnonzero(on[:, effect]):
             state = _NOTHING._replace(time=found[i])  # type: ignore[arg-type]
             found[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float)
+    return found
+
+
+def _true_traces(
+    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], traces: Sequence[Trace | None]
+) -> list[Trace | None]:
+    """Measured pressures at the times at which they were really measured, by trial."""
+    found = list(traces)
+    for effect, function, place in asked(model, "trace_time"):
+        for i in np.flatnonzero(on[:, effect]).tolist():
+            if (trace := found[i]) is None:
+                continue
+            state = _NOTHING._replace(time=trace[0])  # type: ignore[arg-type]
+            found[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float), trace[1]
     return found
 
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 HOOKS = (
     "true_time",
+    "trace_time",
     "film_gain",
     "gauge",
     "yield_gauge",
@@ -132,6 +133,7 @@ class Effect:
     Its functions take `(s: State, rig: Rig, *parameters)` and return, by hook:
 
     true_time           time since release at which what the camera stamps `s.time` really happened, s
+    trace_time          time since release at which what a pressure trace stamps `s.time` really happened, s
     film_gain           factor on the film's mass per metre
     gauge               the gauge pressure that was truly there where the gauge read `s.pressure`, Pa
     yield_gauge         the yield pressure that was truly there, Pa
@@ -163,6 +165,7 @@ class Effect:
     in_trace: bool = False  #: a pressure measured during growth already holds it
     replaces: tuple[str, ...] = ()  #: effects that it contains and that rest while it is in the model
     order: int = 3  #: place among the effects of one hook
+    finite: bool = False  #: small sizes look like something else (a later release): it is tried at finite ones too
     corners: Callable[[TrialInputs], Sequence[float]] | None = None  #: lead positions where its force has a corner, m
 
     @property

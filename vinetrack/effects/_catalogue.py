@@ -78,6 +78,7 @@ def load_effect(path: Path | str) -> Effect:
         in_trace=bool(getattr(module, "IN_TRACE", False)),
         replaces=tuple(getattr(module, "REPLACES", ())),
         order=int(getattr(module, "ORDER", 3)),
+        finite=bool(getattr(module, "FINITE", False)),
         corners=getattr(module, "corners", None),
     )
     faults = list(_faults(effect))

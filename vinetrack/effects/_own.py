@@ -53,6 +53,7 @@ _RIG = TrialInputs(
 
 UNCHANGED = {
     "true_time": _STATE.time,
+    "trace_time": _STATE.time,
     "film_gain": 1.0,
     "gauge": _STATE.pressure,
     "yield_gauge": _STATE.yield_pressure,
