@@ -72,8 +72,8 @@ class CandidateFits:
     climbs: dict[str, SubsetFit] = field(default_factory=dict)
     fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
     silent: set[str] = field(default_factory=set)
-    simplified: set[int] = field(default_factory=set)
-    asked: dict[int, MisfitTests] = field(default_factory=dict)
+    simplified: list[Fit] = field(default_factory=list)
+    tested: list[tuple[Fit, MisfitTests]] = field(default_factory=list)
     most_fitted: int = MOST_FITTED
 
     def __post_init__(self) -> None:
@@ -95,9 +95,12 @@ class CandidateFits:
 
     def after(self, fit: Fit) -> MisfitTests:
         """What one of its fits leaves, asked once."""
-        if id(fit) not in self.asked:
-            self.asked[id(fit)] = misfit_tests(fit, self.questions.effects, LATER_LEVEL)
-        return self.asked[id(fit)]
+        for known, tests in self.tested:
+            if known is fit:
+                return tests
+        tests = misfit_tests(fit, self.questions.effects, LATER_LEVEL)
+        self.tested.append((fit, tests))
+        return tests
 
     def singles(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
         """Fit the hypotheses that may be the best or near it, each effect alone."""
@@ -129,9 +132,9 @@ class CandidateFits:
         for one in list(self.fitted.values()):
             # The simpler is in the larger one, and can be no better.
             behind = 2 * (best - one.fit.log_likelihood) > ANSWER_SET * MOST_INFLATION
-            if behind or id(one.fit) in self.simplified:
+            if behind or any(known is one.fit for known in self.simplified):
                 continue
-            self.simplified.add(id(one.fit))
+            self.simplified.append(one.fit)
             for both, fit in simpler_forms(found, one, self.questions.effects):
                 simpler = likelihood_ratio(found, both, fit)
                 known = self.fitted.get(simpler.label)

@@ -148,7 +148,9 @@ def _with_host(found: Fit, questioned: Sequence[Effect]) -> Fit:
     """A fit whose trajectories come from a kernel that holds all candidates."""
     host = host_for(found.model, questioned)
     predictor = Predictor(found.predictor.layout, found.predictor.data, host)
-    predictor.steps, predictor.pressure_step = found.predictor.steps, found.predictor.pressure_step
+    # Copies: the predictor adapts its steps in place, and the caller's fit must stay as it is.
+    predictor.steps = found.predictor.steps.copy()
+    predictor.pressure_step = found.predictor.pressure_step.copy()
     return replace(found, predictor=predictor)
 
 
