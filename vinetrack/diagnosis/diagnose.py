@@ -40,6 +40,7 @@ from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.narrative.verdict_text import dropped_in_words, explain, listed
+from vinetrack.tracks.wild_points import listed_wild_points
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -99,6 +100,7 @@ def diagnose(
     ExperimentError
         If the experiment cannot be read.
     """
+    wild = ""
     if isinstance(source, Fit):
         questioned = candidates_of(source.model, candidates, own)
         found, dropped = _with_host(source, questioned), _dropped_in_fit(source)
@@ -113,6 +115,7 @@ def diagnose(
         questioned = candidates_of(model, candidates, own)
         pairs, left_out = pairs_of(source, tracks)
         pairs, dropped = _frames_put_right(pairs)
+        wild = listed_wild_points({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
         found = fit_model(model, pairs, host=host_for(model, questioned), profile=False, thorough=False)
         found = replace(found, left_out={**left_out, **found.left_out})
@@ -121,6 +124,8 @@ def diagnose(
     result = _conclude(found, findings, blind)
     if dropped:
         result = _artefact_first(result, dropped)
+    if wild:
+        result = replace(result, notes=(*result.notes, wild))
     if ladder:
         result = _with_ladder(result, report)
     if advice:

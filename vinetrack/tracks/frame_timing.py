@@ -6,9 +6,10 @@ dropped frame shows as one step of double length, and everything after it is one
 
 A jump is judged against the jump that a smooth motion with the track's own noise could show: by least squares of a
 parabola with a step on the nearest points on both sides. Times are moved only where one wild point would not explain
-it as well and points farther away agree: noise may have heavy tails. Nothing is called where the motion is slow beside
-the noise, where it speeds up so fast that a long step may be the motion itself (release), or where the times are
-irregular.
+it as well and points farther away agree: noise may have heavy tails. Points far off the motion around them are rejected
+first (`wild_points`): a dropped frame displaces all later points, a wild point comes back. Nothing is called where the
+motion is slow beside the noise, where it speeds up so fast that a long step may be the motion itself (release), or
+where the times are irregular.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, join_flags
 from vinetrack.tracks.position_noise import position_noise, rough_noise
+from vinetrack.tracks.wild_points import reject_wild_points
 
 CLEAR_STEP_SIGMAS = 8.0
 """Motion is well above noise where one frame's step exceeds this many standard deviations of a position."""
@@ -86,10 +88,11 @@ def correct_frames(track: Track) -> Track:
     Returns
     -------
     Track
-        `duplicate` on repeated frames; `gap` on the first row after a gap in the times; `gap;corrected` on the first
-        row after dropped frames that the times did not show. Each is told in `notes`. A repeated frame that was
-        inserted is set half a frame after the frame it repeats, so that times still increase.
+        `rejected` on wild points; `duplicate` on repeated frames; `gap` on the first row after a gap in the times;
+        `gap;corrected` on the first row after dropped frames that the times did not show. Each is told in `notes`. A
+        repeated frame that was inserted is set half a frame after the frame it repeats, so that times still increase.
     """
+    track = reject_wild_points(track)
     spacing = np.diff(track.time_s)
     if track.time_s.size < 6 or not np.all(spacing > 0):
         return track

@@ -1,0 +1,94 @@
+"""Single points put off by known amounts on motions that are known; seeds 20000 and up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
+
+from vinetrack.core.records import Track
+from vinetrack.tracks.frame_timing import correct_frames
+from vinetrack.tracks.wild_points import reject_wild_points, wild_points
+
+FRAME_S = 1 / CAPTURE_FPS
+VINES = [(Vine(1, 1.0), 3e-5, 0.0), (Vine(2, 5.0), 1e-4, 0.6), (Vine(3, 10.0), 1e-4, 0.6), (Vine(4, 3.0), 1e-4, 0.0)]
+
+
+def steady_track(noise_m: float = 6e-5, n: int = 300, seed: int = 20000) -> Track:
+    time_s = np.arange(n) * FRAME_S
+    y = 0.6 * np.maximum(time_s - time_s[30], 0) + ar1(n, noise_m, 0.0, np.random.default_rng(seed))
+    return make_track(time_s, y)
+
+
+def displaced(track: Track, rows: np.ndarray, by_m: np.ndarray | float) -> Track:
+    y = track.lead_position_m.copy()
+    y[rows] += by_m
+    return replace(track, lead_position_m=y)
+
+
+def test_no_point_of_an_undisturbed_motion_is_wild():
+    """A release, the growth and correlated noise, 24 tracks: 2.4 % chance of a single point by normal noise."""
+    flagged = 0
+    for seed in range(20000, 20006):
+        for vine, noise_m, rho in VINES:
+            end_frames = 5 if seed % 2 else 0
+            draw = np.random.default_rng(seed)
+            track = record(vine, draw, noise_m=noise_m, rho=rho, end_frames=end_frames).track
+            flagged += np.count_nonzero(wild_points(track.time_s, track.lead_position_m))
+    assert flagged == 0
+
+
+def test_one_in_a_hundred_points_is_named_and_no_other():
+    draw = np.random.default_rng(20001)
+    track = steady_track(seed=20001)
+    wild = 20 + 40 * np.arange(7) + draw.integers(-5, 6, 7)
+    out = reject_wild_points(displaced(track, wild, draw.choice([-1, 1], 7) * draw.uniform(1e-3, 1e-2, 7)))
+    assert np.flatnonzero(out.flag == "rejected").tolist() == wild.tolist()
+    assert len(out.notes) == 1
+    assert out.notes[0].startswith("7 points lie far off")
+    assert f"{track.time_s[wild[0]]:.5g} s" in out.notes[0]
+
+
+def test_two_wild_points_beside_each_other_are_both_rejected():
+    out = reject_wild_points(displaced(steady_track(), np.array([150, 151]), np.array([3e-3, -3e-3])))
+    assert np.flatnonzero(out.flag == "rejected").tolist() == [150, 151]
+
+
+@pytest.mark.parametrize("row", [0, 299])
+def test_a_wild_point_at_an_end_is_rejected(row):
+    out = reject_wild_points(displaced(steady_track(), np.array([row]), 5e-3))
+    assert np.flatnonzero(out.flag == "rejected").tolist() == [row]
+
+
+def test_a_wild_point_is_no_dropped_frame():
+    """A point one step ahead, the size of a dropped frame's jump: the times stay as they are."""
+    track = steady_track(noise_m=2e-5)
+    step_m = 0.6 * FRAME_S
+    out = correct_frames(displaced(track, np.array([150]), 1.0 * step_m))
+    np.testing.assert_array_equal(out.time_s, track.time_s)
+    assert not any("gap" in str(flag) for flag in out.flag)
+
+
+def test_points_behind_a_dropped_frame_are_not_wild():
+    track = steady_track(noise_m=2e-5)
+    y = np.delete(track.lead_position_m, [150, 151])
+    out = correct_frames(make_track(track.time_s[:-2], y))
+    assert np.flatnonzero(out.flag != "").tolist() == [150]
+    assert out.flag[150] == "gap;corrected"
+
+
+def test_a_motion_that_starts_at_full_speed_keeps_its_points():
+    """Ten standard deviations a frame from one frame to the next, as a latch lets go."""
+    for seed in range(20010, 20030):
+        track = steady_track(seed=seed)
+        assert not wild_points(track.time_s, track.lead_position_m).any()
+
+
+def test_noise_that_grows_with_speed_is_not_wild():
+    time_s = np.arange(300) * FRAME_S
+    speed = 40.0 * time_s
+    draw = np.random.default_rng(20002)
+    y = 20.0 * time_s**2 + np.hypot(5e-5, 6e-5 * speed) * draw.standard_normal(time_s.size)
+    assert not wild_points(time_s, y).any()

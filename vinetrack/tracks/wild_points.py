@@ -1,0 +1,256 @@
+"""Points far off the motion around them: a reflection, a lost edge, a slip of the hand.
+
+Every point is compared with a cubic through its neighbours, itself left out. The cubic is fitted by iteratively
+reweighted least squares, first for least absolute residuals, then with Tukey's biweight (Beaton & Tukey, Technometrics
+16, 147, 1974), so that a second wild point near by does not bend it. No model of the motion enters: what a model misses
+is no reason to drop a point.
+
+A wild point is alone: the motion goes on through its neighbours as if it were not there. After a dropped frame all
+later points are displaced together, at a corner of the motion one side leaves the cubic; both leave too few neighbours
+on one cubic, and nothing is rejected there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats, Track, join_flags
+from vinetrack.tracks.position_noise import position_noise, rough_noise
+
+HALF_WIDTH = 6
+"""Neighbours on either side. Chosen: twelve leave eight degrees of freedom beside a cubic. With three on either side
+two wild points among them outvote the rest; with twelve on either side a cubic no longer follows a release."""
+
+SCALE_HALF_WIDTH = 20
+"""Points on either side from whose residuals the local noise is taken. Chosen: 41 points tell it to 18 % (the median
+of absolute values has 0.37 of the efficiency of the mean square), and noise that depends on speed changes little over
+them."""
+
+SCALE_FREEDOM = 15.0
+"""Degrees of freedom of that local noise: 0.37 × 41."""
+
+FALSE_ALARM = 1e-3
+"""Chance that normal noise costs a track a single point. Chosen: one campaign of 24 trials in forty loses one, which
+widens no interval; at a hundred times less the limit rises from 7.5 to 10.7 standard deviations for 500
+points."""
+
+LEAST_SHARE = 0.75
+"""Part of the neighbours that must lie on the cubic. Chosen: nine of twelve, so that three of them may be wild too; at
+a corner of the motion more than three lie on the other side of a point that is off the cubic."""
+
+NEAREST, LEAST_NEAR = 4, 3
+"""Of so many nearest neighbours so many must lie on the cubic too: just behind the end of growth nine points of the
+motion can outvote the standstill that the point belongs to (measured: 5 of 160 tracks lost a point without this)."""
+
+BIWEIGHT = 6.0
+"""Residual, in standard deviations of the noise, from which a neighbour has no weight; 4.685 is Tukey's for 95 %
+efficiency, wider since only points far off matter here."""
+
+END_POINTS, END_STEPS = 2, 1.5
+"""Within so many points of an end the motion may have stopped or begun between the frames: so many frames' steps for
+each point from the end are then no sign of a wild one."""
+
+COPY_STEPS = 0.3
+"""A point this close to the one before, in steps of the motion, is a repeated frame, which `frame_timing` judges."""
+
+MOST_ROUNDS = 4
+"""Rounds of rejection. Measured on three campaigns with 2 % of wild points: three rounds leave nothing to reject."""
+
+FEWEST_POINTS = 2 * HALF_WIDTH + 1
+"""The point and its neighbours."""
+
+MOST_NAMED = 8
+"""Points named in the sentence about a campaign; a track's notes name all of its own."""
+
+MOST_REJECTED = 0.1
+"""Where more of the points than this would be rejected the test does not describe the track, and none is. Chosen: five
+times the densest that was tried."""
+
+
+@dataclass(frozen=True)
+class LocalFit:
+    """Every point against the cubic through its neighbours. Arrays have shape (n_points,).
+
+    `residual_m` is the point minus the cubic, `gain` its standard deviation for white noise of standard deviation 1;
+    `spread_m` the root mean square of the neighbours about the cubic, `share` the part of them that lie on it,
+    `near` how many of the nearest four do; `speed_m_s` is its slope.
+    """
+
+    residual_m: Floats
+    gain: Floats
+    spread_m: Floats
+    share: Floats
+    near: NDArray[np.int_]
+    speed_m_s: Floats
+
+
+def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
+    """Compare every point with a robust cubic through its twelve nearest neighbours.
+
+    Parameters
+    ----------
+    time_s, position_m
+        Arrays, shape (n_points,), s and m, finite, in order of time; at least `FEWEST_POINTS`.
+    noise_m
+        Standard deviation of a position; neighbours are never judged more strictly than by this.
+    """
+    n = time_s.size
+    begin = np.clip(np.arange(n) - HALF_WIDTH, 0, n - FEWEST_POINTS)
+    places = begin[:, None] + np.arange(FEWEST_POINTS)
+    # Each row holds the twelve others: the point itself is dropped.
+    places = places[places != np.arange(n)[:, None]].reshape(n, -1)
+    since = time_s[places] - time_s[:, None]
+    width = np.abs(since).max(axis=1)
+    basis = (since / width[:, None])[:, :, None] ** np.arange(4)
+    y = position_m[places] - position_m[:, None]
+    least = np.maximum(noise_m, 1e-9 * np.ptp(position_m))
+    weight = np.ones_like(y)
+    for turn in range(10):
+        coefficients = _weighted(basis, y, weight)
+        left = np.abs(y - np.einsum("npk,nk->np", basis, coefficients))
+        if turn < 6:
+            weight = 1 / np.maximum(left, 0.1 * least)
+        else:
+            # The scale of a window is that of its better half; of 12 residuals about 4 numbers the median is 0.55 sd.
+            scale = np.maximum(np.median(left, axis=1) / 0.55, least)
+            weight = np.maximum(1 - (left / (BIWEIGHT * scale[:, None])) ** 2, 0.0) ** 2 + 1e-9
+    on = weight > 0.1
+    used = np.maximum(on.sum(axis=1), 5)
+    inverse = _inverse(basis, weight)
+    nearest = np.argsort(np.abs(since), axis=1, kind="stable")[:, :NEAREST]
+    levers = np.einsum("nk,npk,np->np", inverse[:, 0], basis, weight)
+    return LocalFit(
+        residual_m=-coefficients[:, 0],
+        gain=np.sqrt(1 + np.sum(levers**2, axis=1)),
+        spread_m=np.sqrt(np.sum(np.where(on, left, 0.0) ** 2, axis=1) / (used - 4)),
+        share=on.mean(axis=1),
+        near=np.take_along_axis(on, nearest, axis=1).sum(axis=1),
+        speed_m_s=coefficients[:, 1] / width,
+    )
+
+
+def local_noise(fit: LocalFit, half_width: int = SCALE_HALF_WIDTH) -> Floats:
+    """Standard deviation of a position around each point, m: the running median of the residuals, shape (n_points,)."""
+    size = np.abs(fit.residual_m) / fit.gain
+    width = min(2 * half_width + 1, size.size)
+    view = np.median(np.lib.stride_tricks.sliding_window_view(size, width), axis=1) / 0.6745
+    middle = np.clip(np.arange(size.size) - width // 2, 0, view.size - 1)
+    return np.asarray(view[middle])
+
+
+def wild_points(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
+    """Which points lie far off the motion around them, shape (n_points,).
+
+    Parameters
+    ----------
+    time_s, position_m
+        Arrays, shape (n_points,), s and m, finite, in order of time.
+
+    Returns
+    -------
+    array
+        The largest deviations first, and others only as they remain without those: a wild point spoils its neighbours.
+    """
+    from scipy.stats import t
+
+    n = time_s.size
+    wild = np.zeros(n, dtype=bool)
+    if n < FEWEST_POINTS + MOST_ROUNDS or not np.all(np.diff(time_s) > 0):
+        return wild
+    limit = float(t.isf(FALSE_ALARM / (2 * n), SCALE_FREEDOM))
+    for _ in range(MOST_ROUNDS):
+        kept = np.flatnonzero(~wild)
+        if kept.size < FEWEST_POINTS:
+            break
+        off = _far_off(time_s[kept], position_m[kept], limit)
+        if not off.any():
+            break
+        wild[kept[off]] = True
+    return wild if np.mean(wild) <= MOST_REJECTED else np.zeros(n, dtype=bool)
+
+
+def reject_wild_points(track: Track) -> Track:
+    """A copy of the track with its wild points flagged `rejected`, and named in its notes.
+
+    Parameters
+    ----------
+    track
+        A row for every frame; positions may be NaN.
+    """
+    rows = np.flatnonzero(track.usable)
+    wild = rows[wild_points(track.time_s[rows], track.lead_position_m[rows])] if rows.size else rows
+    if not wild.size:
+        return track
+    flag = track.flag.astype("<U80")
+    for row in wild:
+        flag[row] = join_flags(str(flag[row]), "rejected")
+    rejected = replace(track, flag=flag)
+    note = f"{_count(wild.size)} far off the motion around and left out: {', '.join(_places(rejected))}"
+    return replace(rejected, notes=(*track.notes, note))
+
+
+def listed_wild_points(tracks: Mapping[str, Track]) -> str:
+    """A sentence that names the rejected points of tracks by trial; blank where there are none.
+
+    Parameters
+    ----------
+    tracks
+        By name of trial, as `reject_wild_points` returns them.
+    """
+    places = [f"{name} at {place}" for name, track in tracks.items() for place in _places(track)]
+    if not places:
+        return ""
+    more = f" and {len(places) - MOST_NAMED} more" if len(places) > MOST_NAMED else ""
+    return f"{_count(len(places))} far off the motion around and left out: {', '.join(places[:MOST_NAMED])}{more}."
+
+
+def _count(points: int) -> str:
+    return "1 point lies" if points == 1 else f"{points} points lie"
+
+
+def _places(track: Track) -> list[str]:
+    """Instant of every rejected point and its distance from the line between its usable neighbours, in words."""
+    wild = np.flatnonzero([("rejected" in str(flag)) for flag in track.flag])
+    others = np.flatnonzero(track.usable)
+    off_m = track.lead_position_m[wild] - np.interp(
+        track.time_s[wild], track.time_s[others], track.lead_position_m[others]
+    )
+    return [
+        f"{track.time_s[row]:.5g} s ({1e3 * off:+.2g} mm)"
+        for row, off in zip(wild, off_m, strict=True)
+        if math.isfinite(off)
+    ]
+
+
+def _far_off(time_s: Floats, position_m: Floats, limit: float) -> NDArray[np.bool_]:
+    """Points beyond the limit that are the worst among their neighbours."""
+    noise_m, _ = position_noise(time_s, position_m)
+    # The likelihood of stretches takes wild points for noise where they are many; the median third difference does not.
+    noise_m = min(noise_m, 1.84 * rough_noise(position_m))
+    fit = local_fit(time_s, position_m, noise_m)
+    sigma_m = np.maximum(np.maximum(local_noise(fit), noise_m), fit.spread_m)
+    size = np.abs(fit.residual_m)
+    step_m = np.abs(fit.speed_m_s) * float(np.median(np.diff(time_s)))
+    from_end = np.minimum(np.arange(size.size), np.arange(size.size)[::-1])
+    room_m = np.where(from_end < END_POINTS, END_STEPS * (from_end + 1) * step_m, 0.0)
+    after = np.concatenate([[math.inf], np.abs(np.diff(position_m))])
+    copy = after < COPY_STEPS * step_m
+    alone = (fit.share >= LEAST_SHARE) & (fit.near >= LEAST_NEAR) & ~copy
+    return np.asarray((size > limit * fit.gain * sigma_m + room_m) & alone & (sigma_m > 0))
+
+
+def _inverse(basis: Floats, weight: Floats) -> Floats:
+    square = np.einsum("npk,np,npl->nkl", basis, weight, basis)
+    scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
+    even = square * scale[:, :, None] * scale[:, None, :] + 1e-10 * np.eye(square.shape[1])
+    return np.asarray(np.linalg.inv(even) * scale[:, :, None] * scale[:, None, :])
+
+
+def _weighted(basis: Floats, y: Floats, weight: Floats) -> Floats:
+    """Coefficients of the weighted least-squares fits, shape (n_windows, 4)."""
+    return np.einsum("nkl,npl,np,np->nk", _inverse(basis, weight), basis, weight, y)
