@@ -1,6 +1,6 @@
 # What each target does: `make help`. Everything happens in .venv; nothing else on the machine is touched.
 .DEFAULT_GOAL := help
-.PHONY: help venv demo guide test lint
+.PHONY: help venv demo guide test lint docs
 
 BIN := .venv/bin
 STAMP := .venv/installed
@@ -25,6 +25,10 @@ lint: $(STAMP)  ## style, types and the workflow's formatting
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/snakefmt --check Snakefile
+
+docs: $(STAMP)  ## the documentation with the Python interface as a site, build/site/tutorial.html
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock
+	@$(BIN)/mkdocs build --quiet --strict
 
 # The stamp is written last: an installation that was broken off starts again.
 $(STAMP): requirements.lock pyproject.toml

@@ -12,6 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+DOCS_LOCK = (ROOT / "requirements-docs.lock").read_text(encoding="utf-8")
 MAKE = shutil.which("make")
 
 needs_make = pytest.mark.skipif(MAKE is None, reason="needs make")
@@ -29,7 +30,8 @@ def make(folder: Path, *arguments: str, path: str | None = None) -> subprocess.C
 def test_help_is_the_default_and_lists_every_target(arguments: tuple[str, ...]) -> None:
     done = make(ROOT, *arguments)
     assert done.returncode == 0
-    assert {line.split()[1] for line in done.stdout.splitlines()} == {"help", "venv", "demo", "guide", "test", "lint"}
+    targets = {"help", "venv", "demo", "guide", "test", "lint", "docs"}
+    assert {line.split()[1] for line in done.stdout.splitlines()} == targets
 
 
 @needs_make
@@ -72,8 +74,8 @@ def test_an_installation_that_is_up_to_date_is_left_alone(tmp_path: Path) -> Non
     assert make(tmp_path, "--question", "venv").returncode == 1
 
 
-def locked() -> dict[str, str]:
-    return dict(re.findall(r"^([a-z0-9][a-z0-9._-]*)==([^ ;\\]+)", LOCK, flags=re.MULTILINE))
+def locked(lock: str = LOCK) -> dict[str, str]:
+    return dict(re.findall(r"^([a-z0-9][a-z0-9._-]*)==([^ ;\\]+)", lock, flags=re.MULTILINE))
 
 
 def test_everything_the_project_asks_for_is_locked() -> None:
@@ -83,7 +85,12 @@ def test_everything_the_project_asks_for_is_locked() -> None:
         *(name for extra in project["optional-dependencies"].values() for name in extra),
     ]
     names = {re.split(r"[<>=!~\[; ]", requirement)[0].lower().replace("_", "-") for requirement in wanted}
-    assert names - set(locked()) == set()
+    assert names - set(locked()) - set(locked(DOCS_LOCK)) == set()
+
+
+def test_the_site_is_built_with_the_versions_that_the_package_has() -> None:
+    site = locked(DOCS_LOCK)
+    assert {name: version for name, version in locked().items() if name in site and site[name] != version} == {}
 
 
 def test_every_locked_version_has_hashes() -> None:
