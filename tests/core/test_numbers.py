@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from vinetrack.core.numbers import decimals, display_unit, half_width, interval, number, with_error
+from vinetrack.core.numbers import decimals, half_width, interval, number, with_error
+from vinetrack.core.units import display_unit
 
 
 @pytest.mark.parametrize(

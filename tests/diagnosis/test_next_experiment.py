@@ -122,7 +122,7 @@ def test_another_connector_tells_drag_from_inlet_loss_and_no_vine_has_to_be_made
     assert {trial["inlet_mm"] for trial in advised.trials} - {8.0}
     assert sum(trial["replicates"] for trial in advised.trials) == 4
     assert advised.separation_sigma["air_drag | inlet_loss"] > 8
-    assert "a connector of" in advised.text
+    assert "an inlet of" in advised.text
 
 
 def test_what_is_foretold_is_what_the_simulation_shows(advised: NextExperiment) -> None:

@@ -1,4 +1,4 @@
-"""Numbers as text: a value to the digit that its error allows, in the unit in which the tables of this field print it.
+"""Numbers as text: a value to the digit that its error allows.
 
 Used alike by the terminal, the report, the figures and the explorer.
 """
@@ -8,32 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-DISPLAY_UNITS: dict[str, tuple[str, float]] = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
-"""Unit shown in place of an SI unit, and the factor from SI: pressures of vines are printed in kPa; "1" has no unit."""
-
 _FIXED_EXPONENTS = (-4, 6)
 """Decimal exponents written without "e": the range of Python's own `g` format, 0.0001 to 999999."""
 
 _MOST_DECIMALS = 12
 """Of a value beside its error: an error below 1e-11 is rounding of a double of order 1e5, not knowledge."""
-
-
-def display_unit(unit: str) -> tuple[str, float]:
-    """Return the unit shown in place of an SI unit, and the factor from SI to it.
-
-    Parameters
-    ----------
-    unit : SI unit as parameters of effects state it, such as ``"1/Pa"``.
-
-    Returns
-    -------
-    name, factor
-        The unit itself and 1.0 where nothing else is shown in its place.
-
-    >>> display_unit("Pa"), display_unit("kg")
-    (('kPa', 0.001), ('kg', 1.0))
-    """
-    return DISPLAY_UNITS.get(unit, (unit, 1.0))
 
 
 def decimals(sigma: float) -> int:

@@ -21,8 +21,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.numbers import decimals, display_unit
+from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats
+from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.constancy_tests import CONDITIONS, Against, ConstancyTest, Sums, as_deviate, constancy, sums_of
 from vinetrack.diagnosis.drift_along import against_the_sheet, along_growth
 from vinetrack.diagnosis.per_trial_estimates import PerTrialEstimates, lay, per_trial_estimates

@@ -61,9 +61,9 @@ MOST_VINES_TRIED = 2
 class NextExperiment:
     """What to do next.
 
-    `trials` has an entry a condition: `pressure_kPa, payload_g, diameter_mm, thickness_um, length_mm, chamber_l,
-    inlet_mm, growth_angle_deg` (NaN where the sheet is blank), `replicates`, `vine`, `new_vine` and `changed`, the
-    names of what differs from the rig so far. Empty where no trials are recommended.
+    `trials` has an entry a condition: the columns of the sheet that may be chosen (`schema.LIMITED`; NaN where the
+    sheet is blank), `replicates`, `vine`, `new_vine` and `changed`, the names of what differs from the rig so far.
+    Empty where no trials are recommended.
 
     `separation_sigma` holds, by pair (`"a | b"`), the separation to expect once the trials are made and all are fitted
     together, in standard deviations: the smaller of what it is if a is true and if b is true, which `if_true_sigma`

@@ -10,6 +10,7 @@ from vinetrack.core.constants import GAS_CONSTANT_AIR_J_KG_K, TEMPERATURE_K
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import EffectError, TrialInputs
+from vinetrack.experiment.schema import COLUMNS
 
 
 def trial_inputs(trial: Trial) -> TrialInputs:
@@ -63,19 +64,14 @@ def with_pressures(rigs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Flo
     return changed
 
 
-_COLUMN_OF_FIELD = {
-    "chamber_l": "chamber_m3",
-    "yield_pressure_kPa": "yield_pressure_Pa",
-    "inlet_mm": "inlet_m",
-    "payload_g": "payload_kg",
-    "thickness_um": "thickness_m",
-    "length_mm": "length_m",
-}
+def _of_trial(column: str, trial: Trial) -> object:
+    """What a trial has in a column of the sheet, SI; NaN for a column that no sheet has."""
+    return getattr(trial, COLUMNS[column].field, math.nan) if column in COLUMNS else math.nan
 
 
 def stated(column: str, trial: Trial) -> bool:
     """Whether the sheet gives a trial a number other than zero in this column."""
-    value = getattr(trial, _COLUMN_OF_FIELD.get(column, column), math.nan)
+    value = _of_trial(column, trial)
     return not isinstance(value, float) or (math.isfinite(value) and value != 0)
 
 
@@ -87,9 +83,9 @@ def check_needs(model: Model, *trials: Trial) -> None:
     EffectError
         Naming the effect, the column and the trial.
     """
-    needs = [(effect, column, _COLUMN_OF_FIELD.get(column, column)) for effect in model for column in effect.needs]
+    needs = [(effect, column) for effect in model for column in effect.needs]
     for trial in trials:
-        for effect, column, attribute in needs:
-            value = getattr(trial, attribute, math.nan)
+        for effect, column in needs:
+            value = _of_trial(column, trial)
             if isinstance(value, float) and not math.isfinite(value) and trial.travel_ratio != 1:
                 raise EffectError(f"Trial {trial.name}: the effect {effect.name} needs `{column}`, which is blank.")

@@ -1,7 +1,11 @@
-"""What each column of a trial sheet, and the setting of the same name, may hold.
+"""Every column of a trial sheet, declared once: its name, unit, bounds, meaning, and what it becomes in a trial.
 
-One specification serves both: a cell of `trials.csv` and a value of `experiment.yaml` pass the same checks and get
-the same remedies. Values stay in the column's own unit here.
+From these declarations derive the reading of `trials.csv` (`vinetrack.experiment.sheet`), the settings of the same
+name in `experiment.yaml` and its `limits` (`settings`), the options of `vinetrack predict` and `design`
+(`vinetrack.cli.design_options`), what an effect may need (`vinetrack.dynamics.trial_inputs`), and `vinetrack settings`.
+
+A cell of the sheet and a value of `experiment.yaml` pass the same checks and get the same remedies. Values stay in the
+column's own unit until a trial is made of them.
 """
 
 from __future__ import annotations
@@ -9,8 +13,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from vinetrack.core.records import Bend
+from vinetrack.core.records import Bend, Trial
 from vinetrack.core.tables import TableError, parse_number
+from vinetrack.core.units import UNITS, Unit, convert, split_unit
 
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...]
 
@@ -25,23 +30,42 @@ class CellError(ValueError):
         self.message, self.allowed, self.remedy = message, allowed, remedy
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Column:
     """A column of the sheet.
 
-    `low` and `high` bound the value (`low` itself is refused where `above_low`). `slips` are units people write by
-    mistake, each with the factor that turns it into the column's own. A legal value outside `usual` gets a warning.
+    `field` is the field of a `Trial` that holds it, in SI where it is a number; `meaning` what it is, `measured` how to
+    come by it, `default` what a blank cell stands for. `low` and `high` bound the value (`low` itself is refused where
+    `above_low`). `slips` are units people write by mistake. A legal value outside `usual` gets a warning. `unit_key` is
+    given where the name does not end in the unit. `shared` columns may stand in `experiment.yaml` for all trials;
+    `limit` says how those that the next experiment may choose stand in its `limits`: as a `range`, or as a `choice`.
     """
 
     name: str
+    field: str
+    meaning: str
+    measured: str = ""
+    default: str = ""
     kind: str = "number"
     low: float = -math.inf
     high: float = math.inf
     above_low: bool = False
-    unit: str = ""
-    slips: tuple[tuple[str, float], ...] = ()
+    unit_key: str = ""
+    slips: tuple[str, ...] = ()
     usual: tuple[float, float] = (-math.inf, math.inf)
     unusual_hint: str = ""
+    shared: bool = True
+    limit: str = ""
+
+    @property
+    def scale(self) -> Unit | None:
+        """The unit of a number; None for text and for plain numbers."""
+        return UNITS.get(self.unit_key or split_unit(self.name)[1])
+
+    @property
+    def unit(self) -> str:
+        """The unit as it is printed; blank where there is none."""
+        return self.scale.text if self.scale else ""
 
     @property
     def allowed(self) -> str:
@@ -51,84 +75,278 @@ class Column:
             return ("above " if self.above_low else "at least ") + f"{self.low:g}{unit}"
         return f"{'above ' if self.above_low else ''}{self.low:g} to {self.high:g}{unit}"
 
+    def in_words(self, value: float) -> str:
+        """A number of this column for a sentence: `a chamber of 3.7 litres`."""
+        quantity = split_unit(self.name)[0].replace("_", " ")
+        article = "an" if quantity[0] in "aeiou" else "a"
+        return f"{article} {quantity} of {value:.3g} {self.unit}".rstrip()
 
-_PRESSURE_SLIPS = (("Pa", 1e-3), ("mbar", 0.1))
+    def to_si(self, value: float) -> float:
+        """A number of this column in SI."""
+        return self.scale.to_si(value) if self.scale else value
+
+    def of_trial(self, trial: Trial) -> float:
+        """The number that a trial has here, in the unit of the column; NaN where it has none."""
+        value = float(getattr(trial, self.field))
+        return self.scale.from_si(value) if self.scale else value
+
+
 _BAR = "looks like bar: 1 bar is 100 kPa"
 
 COLUMNS: dict[str, Column] = {
     column.name: column
     for column in (
-        Column("trial", "text"),
-        Column("video", "path"),
-        Column("track", "path"),
-        Column("pressure_trace", "path"),
         Column(
-            "capture_fps",
+            name="trial",
+            field="name",
+            kind="text",
+            shared=False,
+            meaning="Name of the trial, unique in the sheet; it names files.",
+            default="required",
+        ),
+        Column(
+            name="video",
+            field="video",
+            kind="path",
+            shared=False,
+            meaning="The recording: mp4, mov, avi, mkv, or a folder or stack of pictures.",
+        ),
+        Column(
+            name="track",
+            field="track",
+            kind="path",
+            shared=False,
+            meaning="Positions measured already: a CSV with time_s, position_m, or a file of Physics Tracker.",
+        ),
+        Column(
+            name="pressure_trace",
+            field="pressure_trace",
+            kind="path",
+            meaning="A CSV with time_s, pressure_kPa: the gauge pressure measured during the trial.",
+        ),
+        Column(
+            name="capture_fps",
+            field="capture_fps",
             low=0,
             above_low=True,
             high=1e7,
-            unit="frames a second",
             usual=(60, math.inf),
             unusual_hint="write the rate of capture, not that of playback",
+            meaning="Frames a second at capture.",
+            measured="The camera's setting; the file's own rate is that of playback.",
+            default="required with a video, but for DNG frames",
         ),
-        Column("exposure_us", low=0, above_low=True, high=1e6, unit="µs", slips=(("ns", 1e-3),)),
-        Column("diameter_mm", low=0.5, high=300, unit="mm", slips=(("metres", 1e3), ("µm", 1e-3))),
         Column(
-            "thickness_um",
+            name="exposure_us",
+            field="exposure_s",
+            low=0,
+            above_low=True,
+            high=1e6,
+            slips=("ns",),
+            meaning="Exposure of one frame.",
+            measured="The camera's setting.",
+        ),
+        Column(
+            name="diameter_mm",
+            field="diameter_m",
+            low=0.5,
+            high=300,
+            slips=("m", "um"),
+            limit="choice",
+            meaning="Diameter of the inflated vine.",
+            measured="Calliper on the inflated tube, or lay-flat width times 2/π.",
+            default="required",
+        ),
+        Column(
+            name="thickness_um",
+            field="thickness_m",
             low=0,
             above_low=True,
             high=75_000,
-            unit="µm",
-            slips=(("nm", 1e-3),),
+            slips=("nm",),
             usual=(2, math.inf),
             unusual_hint="looks like millimetres: 0.2 mm is 200 µm",
+            limit="choice",
+            meaning="Thickness of the wall.",
+            measured="Micrometer over ten layers, divided by ten.",
+            default="required",
         ),
         Column(
-            "length_mm",
+            name="length_mm",
+            field="length_m",
             low=0,
             above_low=True,
             high=100_000,
-            unit="mm",
-            slips=(("µm", 1e-3),),
+            slips=("um",),
             usual=(5, math.inf),
             unusual_hint="looks like metres: 0.28 m is 280 mm",
+            limit="choice",
+            meaning="Length of the grown vine.",
+            measured="Ruler along the everted tube.",
+            default="required",
         ),
         Column(
-            "pressure_kPa",
+            name="pressure_kPa",
+            field="pressure_Pa",
             low=0,
             high=1000,
-            unit="kPa",
-            slips=_PRESSURE_SLIPS,
+            slips=("Pa", "mbar"),
             usual=(1, math.inf),
             unusual_hint=_BAR,
+            limit="range",
+            meaning="Gauge pressure.",
+            measured="Gauge at the chamber, before the release.",
+            default="required without a trace",
         ),
-        Column("pressure_sigma_kPa", low=0, high=1000, unit="kPa", slips=_PRESSURE_SLIPS),
-        Column("yield_pressure_kPa", low=0, high=1000, unit="kPa", slips=_PRESSURE_SLIPS),
-        Column("yield_pressure_sigma_kPa", low=0, high=1000, unit="kPa", slips=_PRESSURE_SLIPS),
         Column(
-            "payload_g",
+            name="pressure_sigma_kPa",
+            field="pressure_sigma_Pa",
+            low=0,
+            high=1000,
+            slips=("Pa", "mbar"),
+            meaning="Scatter of the gauge pressure from trial to trial.",
+            measured="Standard deviation of the gauge over repeated fillings.",
+            default="1 % of the pressure",
+        ),
+        Column(
+            name="yield_pressure_kPa",
+            field="yield_pressure_Pa",
+            low=0,
+            high=1000,
+            slips=("Pa", "mbar"),
+            meaning="Yield pressure: the least gauge pressure at which the vine grows.",
+            measured="Pressure raised slowly until the tip starts to move.",
+            default="required",
+        ),
+        Column(
+            name="yield_pressure_sigma_kPa",
+            field="yield_pressure_sigma_Pa",
+            low=0,
+            high=1000,
+            slips=("Pa", "mbar"),
+            meaning="Standard error of the yield pressure.",
+            measured="Standard deviation over repeated starts.",
+            default="0.2 kPa",
+        ),
+        Column(
+            name="payload_g",
+            field="payload_kg",
             low=0,
             high=100_000,
-            unit="g",
-            slips=(("mg", 1e-3),),
+            slips=("mg",),
             usual=(0.1, math.inf),
             unusual_hint="looks like kilograms: 0.0356 kg is 35.6 g",
+            limit="range",
+            meaning="Mass that rides on the tail.",
+            measured="Balance.",
+            default="0",
         ),
-        Column("growth_angle_deg", low=-180, high=180, unit="degrees"),
-        Column("chamber_l", low=0, above_low=True, high=10_000, unit="litres", slips=(("cm³", 1e-3),)),
-        Column("inlet_mm", low=0, above_low=True, high=300, unit="mm", slips=(("µm", 1e-3),)),
-        Column("bends", "bends"),
-        Column("film_density_kg_m3", low=100, high=25_000, unit="kg/m³", slips=(("g/cm³", 1e3),)),
-        Column("mm_per_px", low=0, above_low=True, high=1000, unit="mm"),
-        Column("travel_ratio", "choice", low=1, high=2),
-        Column("steady", "window"),
-        Column("use", "yes_no"),
+        Column(
+            name="growth_angle_deg",
+            field="growth_angle_rad",
+            low=-180,
+            high=180,
+            limit="choice",
+            meaning="Direction of growth: 0 down, 90 level, 180 up.",
+            default="0",
+        ),
+        Column(
+            name="chamber_l",
+            field="chamber_m3",
+            low=0,
+            above_low=True,
+            high=10_000,
+            slips=("cm3",),
+            limit="choice",
+            meaning="Volume of the pressure chamber.",
+            measured="Mass of the water that fills it.",
+            default="unknown",
+        ),
+        Column(
+            name="inlet_mm",
+            field="inlet_m",
+            low=0,
+            above_low=True,
+            high=300,
+            slips=("um",),
+            limit="choice",
+            meaning="Diameter of the inlet between chamber and vine.",
+            measured="Drawing of the connector, or calliper.",
+            default="unknown",
+        ),
+        Column(
+            name="bends",
+            field="bends",
+            kind="bends",
+            meaning="Bends of the path: start_mm:arc_mm:radius_mm, several joined by ;.",
+            default="none",
+        ),
+        Column(
+            name="film_density_kg_m3",
+            field="film_density_kg_m3",
+            low=100,
+            high=25_000,
+            slips=("g_cm3",),
+            meaning="Density of the film.",
+            measured="Data sheet, or the mass of a piece over its volume.",
+            default="1200 kg/m³",
+        ),
+        Column(
+            name="mm_per_px",
+            field="m_per_px",
+            low=0,
+            above_low=True,
+            high=1000,
+            unit_key="mm",
+            meaning="Scale of the picture; overrides the calibration.",
+        ),
+        Column(
+            name="travel_ratio",
+            field="travel_ratio",
+            kind="choice",
+            low=1,
+            high=2,
+            meaning="Travel of the tail over that of the lead: 2 for eversion, 1 for a body that moves as a whole.",
+            default="2",
+        ),
+        Column(
+            name="steady",
+            field="steady_window_s",
+            kind="window",
+            meaning="A steady window chosen by hand: from_s:to_s.",
+            default="found by rules",
+        ),
+        Column(
+            name="use",
+            field="use",
+            kind="yes_no",
+            meaning="no: the trial stays in the sheet and is left out of the analysis.",
+            default="yes",
+        ),
     )
 }
 """Every column of `trials.csv`, in the order of the documentation."""
 
-SHARED = tuple(name for name in COLUMNS if name not in ("trial", "video", "track"))
+SHARED = tuple(name for name, column in COLUMNS.items() if column.shared)
 """Columns that `experiment.yaml` may set for all trials."""
+
+LIMITED = {kind: tuple(name for name in COLUMNS if COLUMNS[name].limit == kind) for kind in ("range", "choice")}
+"""Columns that the next experiment may choose, by how `limits` of `experiment.yaml` states them."""
+
+
+def column_in_other_unit(name: str) -> tuple[Column, str] | None:
+    """The column that a name in another unit stands for, and that unit; None where it stands for none.
+
+    >>> column, unit = column_in_other_unit("pressure_psi")
+    >>> column.name, unit
+    ('pressure_kPa', 'psi')
+    """
+    quantity, unit = split_unit(name)
+    for column in COLUMNS.values():
+        same = split_unit(column.name)[0] == quantity and column.scale is not None and unit in UNITS
+        if same and column.name != name and column.scale is not None and UNITS[unit].si == column.scale.si:
+            return column, unit
+    return None
 
 
 def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
@@ -182,7 +400,9 @@ def oddity(column: Column, value: float) -> str:
 
 def _slip(column: Column, value: float) -> str:
     """The unit that was probably meant, where the value is allowed in it."""
-    for unit, factor in column.slips:
+    own = column.unit_key or split_unit(column.name)[1]
+    for key in column.slips:
+        unit, factor = UNITS[key].text, convert(1.0, key, own)
         meant = value * factor
         # A slip enlarges numbers that are too small and shrinks those that are too large, never the other way round.
         if (factor > 1) == (value < column.high) and max(column.low, 1e-9) <= meant <= column.high:

@@ -11,12 +11,21 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Bend
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
-from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, Column, read_cell
+from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, CellError, Column, read_cell
 
 BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
 """Eq. (2): the effects in use unless `model` says otherwise, whatever columns the sheet has."""
@@ -40,6 +49,12 @@ class _Strict(BaseModel):
     """Unknown keys are refused, instances cannot change, NaN and infinity are no settings."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, coerce_numbers_to_str=True)
+
+
+def _optional_fields(types: dict[str, Any]) -> Any:
+    """A base class with a field of each name and type, None where it is not given."""
+    fields: dict[str, Any] = {name: (kind | None, None) for name, kind in types.items()}
+    return create_model("Columns", __base__=_Strict, **fields)
 
 
 class Axis(_Strict):
@@ -107,7 +122,12 @@ class Charuco(_Strict):
 Calibration = Annotated[Charuco | Checkerboard | TwoPoints | MmPerPx, Field(discriminator="kind")]
 
 
-class Limits(_Strict):
+_LimitedColumns: Any = _optional_fields(
+    dict.fromkeys(LIMITED["range"], tuple[float, float]) | dict.fromkeys(LIMITED["choice"], tuple[float, ...])
+)
+
+
+class Limits(_LimitedColumns):
     """Which further trials could be made, for the next experiment; None where the trials so far are the guide.
 
     Pressure and payload are ranges (`7:40` or two numbers); the others are what there is to choose from: one value, a
@@ -117,24 +137,14 @@ class Limits(_Strict):
 
     trials: Annotated[Count, Field(ge=1, le=24)] = 4
     new_vines: bool = True
-    pressure_kPa: tuple[float, float] | None = None
-    payload_g: tuple[float, float] | None = None
-    diameter_mm: tuple[float, ...] | None = None
-    thickness_um: tuple[float, ...] | None = None
-    length_mm: tuple[float, ...] | None = None
-    chamber_l: tuple[float, ...] | None = None
-    inlet_mm: tuple[float, ...] | None = None
-    growth_angle_deg: tuple[float, ...] | None = None
     hoop_stress_MPa: Positive = 7.8
 
-    @field_validator("pressure_kPa", "payload_g", mode="before")
+    @field_validator(*LIMITED["range"], mode="before")
     @classmethod
     def _range(cls, value: Any, info: Any) -> Any:
         return value if value is None else _read_range(COLUMNS[info.field_name], value)
 
-    @field_validator(
-        "diameter_mm", "thickness_um", "length_mm", "chamber_l", "inlet_mm", "growth_angle_deg", mode="before"
-    )
+    @field_validator(*LIMITED["choice"], mode="before")
     @classmethod
     def _values(cls, value: Any, info: Any) -> Any:
         column = COLUMNS[info.field_name]
@@ -187,32 +197,26 @@ def _as_cell(column: Column, value: Any) -> Any:
         raise ValueError(f"{error.message}: {remedy}") from None
 
 
-class ExperimentSettings(_Strict):
+_TYPES: dict[str, Any] = {
+    "number": float,
+    "choice": float,
+    "text": str,
+    "path": str,
+    "bends": tuple[Bend, ...],
+    "window": tuple[float, float],
+    "yes_no": bool,
+}
+"""What a value of each kind of column becomes."""
+
+_SharedColumns: Any = _optional_fields({name: _TYPES[COLUMNS[name].kind] for name in SHARED})
+
+
+class ExperimentSettings(_SharedColumns):
     """What all trials of an experiment share. Values keep the unit in their name; None where not given.
 
     Every column but `trial`, `video` and `track` may stand here; a cell of the sheet overrides it.
     """
 
-    capture_fps: float | None = None
-    exposure_us: float | None = None
-    diameter_mm: float | None = None
-    thickness_um: float | None = None
-    length_mm: float | None = None
-    pressure_kPa: float | None = None
-    pressure_sigma_kPa: float | None = None
-    yield_pressure_kPa: float | None = None
-    yield_pressure_sigma_kPa: float | None = None
-    pressure_trace: str | None = None
-    payload_g: float | None = None
-    growth_angle_deg: float | None = None
-    chamber_l: float | None = None
-    inlet_mm: float | None = None
-    bends: tuple[Bend, ...] | None = None
-    film_density_kg_m3: float | None = None
-    mm_per_px: float | None = None
-    travel_ratio: float | None = None
-    steady: tuple[float, float] | None = None
-    use: bool | None = None
     ambient_pressure_kPa: Annotated[Number, Field(gt=0, le=1000)] = 101.325
     tail_slack: Literal["taut", "free"] = "taut"
     tail_store: Literal["body", "reel"] = "body"

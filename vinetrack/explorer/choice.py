@@ -6,20 +6,12 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from vinetrack.core.numbers import display_unit
+from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.effects import BASE_EFFECTS, Effect, Parameter
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.curves import Sized, yields_of
 from vinetrack.inference.parameters import DAMPING
-
-_SLIDER_UNITS = {"m": ("mm", 1e3), "m²": ("cm²", 1e4)}
-"""Besides `DISPLAY_UNITS`: a slider moves in steps that a hand can see, and lengths of vines are of millimetres."""
-
-
-def slider_unit(unit: str) -> tuple[str, float]:
-    """Return the unit in which the explorer shows an SI unit, and the factor from SI to it."""
-    return _SLIDER_UNITS.get(unit) or display_unit(unit)
 
 
 class ChoiceError(ValueError):
@@ -49,7 +41,7 @@ class Size:
     @property
     def shown(self) -> tuple[str, float]:
         """The unit it is shown in, and the factor to it."""
-        return slider_unit(self.parameter.unit)
+        return display_unit(self.parameter.unit, SLIDER_UNITS)
 
 
 @dataclass(frozen=True)

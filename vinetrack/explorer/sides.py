@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from vinetrack.core.numbers import decimals
+from vinetrack.core.units import SLIDER_UNITS, display_unit
+from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import Choice, slider_unit
+from vinetrack.explorer.choice import Choice
 from vinetrack.explorer.curves import overall_m
 from vinetrack.explorer.export import model_words
 from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
@@ -78,7 +80,7 @@ def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[Run
 
 
 def _number_row(number: Number, vine: str) -> tuple[str, ...]:
-    unit, factor = slider_unit(number.unit)
+    unit, factor = display_unit(number.unit, SLIDER_UNITS)
     name = f"{number.symbol}, {unit}" if unit else number.symbol
     if not math.isfinite(number.sigma):
         return name, vine, f"{number.value * factor:.4g}", "open", ""
@@ -185,14 +187,11 @@ def next_panel(campaign: Campaign, story: Story | None) -> str:
     return "".join(parts)
 
 
-OTHER_SETTINGS = {"chamber_l": "chamber {:.3g} L", "inlet_mm": "inlet {:.3g} mm", "growth_angle_deg": "angle {:.3g}°"}
-
-
 def _trial_row(trial: Mapping[str, Any]) -> tuple[str, ...]:
     """One condition to make, in the units of the sheet; what differs from the rig so far is said."""
     size = f"{_cell(trial.get('diameter_mm'))} mm × {_cell(trial.get('thickness_um'))} µm"
     changed = trial.get("changed") or ()
-    other = [words.format(trial[key]) for key, words in OTHER_SETTINGS.items() if key in changed and trial.get(key)]
+    other = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in changed and trial.get(key)]
     return (
         f"{size}{' (new)' if trial.get('new_vine') else ''}",
         f"{_cell(trial.get('pressure_kPa'))} kPa",

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.numbers import decimals, display_unit
+from vinetrack.core.numbers import decimals
 from vinetrack.core.records import Floats, Trial
+from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitError
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from vinetrack.effects import Effect
 from vinetrack.effects._words import remedy, told_apart
+from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.inference.fit_result import Fit
 from vinetrack.planning.feasible_trials import NEW_VINE, Condition
 
@@ -66,15 +67,7 @@ def _trial_in_words(trial: Mapping[str, Any]) -> str:
         words += f" with {trial['payload_g']:.3g} g"
     size = f"{trial['diameter_mm']:.3g} mm × {trial['thickness_um']:.3g} µm × {trial['length_mm']:.3g} mm"
     words += f" with {'a new' if trial['new_vine'] else 'the'} vine of {size}"
-    changed = [
-        text.format(trial[key])
-        for key, text in (
-            ("chamber_l", "a chamber of {:.3g} l"),
-            ("inlet_mm", "a connector of {:.3g} mm"),
-            ("growth_angle_deg", "grown {:.3g}° from straight down"),
-        )
-        if key in trial["changed"]
-    ]
+    changed = [COLUMNS[key].in_words(trial[key]) for key in LIMITED["choice"] if key in trial["changed"]]
     return f"{words}, {' and '.join(changed)}" if changed else words
 
 
@@ -109,16 +102,7 @@ def entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str
 
 def _entry(condition: Condition, replicates: int) -> dict[str, Any]:
     trial = condition.trial
-    settings = {
-        "pressure_kPa": trial.pressure_Pa / 1e3,
-        "payload_g": trial.payload_kg * 1e3,
-        "diameter_mm": trial.diameter_m * 1e3,
-        "thickness_um": trial.thickness_m * 1e6,
-        "length_mm": trial.length_m * 1e3,
-        "chamber_l": trial.chamber_m3 * 1e3,
-        "inlet_mm": trial.inlet_m * 1e3,
-        "growth_angle_deg": math.degrees(trial.growth_angle_rad),
-    }
+    settings = {name: COLUMNS[name].of_trial(trial) for name in (*LIMITED["range"], *LIMITED["choice"])}
     return {
         **{name: float(f"{value:.6g}") for name, value in settings.items()},
         "replicates": replicates,

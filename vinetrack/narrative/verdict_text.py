@@ -6,7 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.numbers import decimals, display_unit
+from vinetrack.core.numbers import decimals
+from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,

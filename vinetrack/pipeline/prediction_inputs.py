@@ -9,9 +9,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vinetrack.core.numbers import DISPLAY_UNITS, number
+from vinetrack.core.numbers import number
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_bytes
+from vinetrack.core.units import PREDICTION_UNITS, display_unit
 from vinetrack.experiment.planned import Planned, option, planned_sheet, planned_trial
 from vinetrack.results.folder_layout import Results, ResultsError, read_json
 
@@ -25,9 +26,6 @@ if TYPE_CHECKING:
     from vinetrack.planning.predictive_inputs import Input, PredictiveInputs
 
 FIGURE_FORMATS = (".png", ".svg", ".pdf")
-
-SHOWN_AS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}
-"""SI units that read better another way: name and factor."""
 
 NEVER = "never"
 
@@ -210,12 +208,12 @@ def shown(value: float, unit: str, digits: int = 3) -> str:
     """An SI value in the unit people use, to so many digits; a time that never comes is `never`."""
     if math.isinf(value):
         return NEVER
-    return number(value * SHOWN_AS.get(unit, (unit, 1.0))[1], digits)
+    return number(value * display_unit(unit, PREDICTION_UNITS)[1], digits)
 
 
 def unit_of(unit: str) -> str:
     """The unit that `shown` uses."""
-    return SHOWN_AS.get(unit, (unit, 1.0))[0]
+    return display_unit(unit, PREDICTION_UNITS)[0]
 
 
 def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.numbers import display_unit, interval, number, with_error
+from vinetrack.core.numbers import interval, number, with_error
+from vinetrack.core.units import display_unit
+from vinetrack.experiment.schema import LIMITED
 from vinetrack.report.law_text import PREFERRED
 from vinetrack.report.section import ReportTable
 from vinetrack.report.verdict import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
@@ -193,16 +195,7 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
     if not content:
         return None
     trials = [dict(trial) for trial in content.get("trials") or []]
-    keys = (
-        "replicates",
-        "pressure_kPa",
-        "payload_g",
-        "diameter_mm",
-        "thickness_um",
-        "length_mm",
-        "chamber_l",
-        "inlet_mm",
-    )
+    keys = ("replicates", *LIMITED["range"], *(name for name in LIMITED["choice"] if name != "growth_angle_deg"))
     shown = [key for key in keys if any(known(trial.get(key)) for trial in trials)]
     head = [{"replicates": "trials"}.get(key, key.rpartition("_")[0] + f" ({key.rpartition('_')[2]})") for key in shown]
     rows = [

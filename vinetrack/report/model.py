@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.numbers import display_unit, number, with_error
+from vinetrack.core.numbers import number, with_error
+from vinetrack.core.units import display_unit
 from vinetrack.figures.style import rows
 
 if TYPE_CHECKING:

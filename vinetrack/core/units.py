@@ -1,0 +1,131 @@
+"""The one table of units: those of columns and options, those people write by mistake, and those tables print.
+
+Inside the program all is SI. A name that carries a unit ends in it: `pressure_kPa`, `film_density_kg_m3`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit and its size: value in SI = value · `multiply` / `divide`.
+
+    Two numbers in place of one factor, so that both are exact: 28.7 mm / 1000 is the double next to 0.0287, while
+    28.7 · 0.001 may miss it by one in the last place. `text` is how it is printed, `metavar` how the help of a command
+    names a value in it.
+    """
+
+    si: str
+    text: str
+    multiply: float = 1.0
+    divide: float = 1.0
+    metavar: str = "NUMBER"
+
+    def to_si(self, value: float) -> float:
+        """The value in SI."""
+        return value * self.multiply / self.divide
+
+    def from_si(self, value: float) -> float:
+        """A value in SI, in this unit."""
+        return value * self.divide / self.multiply
+
+
+UNITS: dict[str, Unit] = {
+    "Pa": Unit("Pa", "Pa"),
+    "mbar": Unit("Pa", "mbar", multiply=100.0),
+    "kPa": Unit("Pa", "kPa", multiply=1000.0, metavar="KPA"),
+    "psi": Unit("Pa", "psi", multiply=6894.757293168361),
+    "bar": Unit("Pa", "bar", multiply=1e5),
+    "MPa": Unit("Pa", "MPa", multiply=1e6, metavar="MPA"),
+    "nm": Unit("m", "nm", divide=1e9),
+    "um": Unit("m", "µm", divide=1e6, metavar="UM"),
+    "mm": Unit("m", "mm", divide=1000.0, metavar="MM"),
+    "cm": Unit("m", "cm", divide=100.0),
+    "in": Unit("m", "in", multiply=25.4, divide=1000.0),
+    "ft": Unit("m", "ft", multiply=304.8, divide=1000.0),
+    "m": Unit("m", "metres"),
+    "mg": Unit("kg", "mg", divide=1e6),
+    "g": Unit("kg", "g", divide=1000.0, metavar="GRAMS"),
+    "oz": Unit("kg", "oz", multiply=28.349523125, divide=1000.0),
+    "lb": Unit("kg", "lb", multiply=453.59237, divide=1000.0),
+    "kg": Unit("kg", "kg"),
+    "ns": Unit("s", "ns", divide=1e9),
+    "us": Unit("s", "µs", divide=1e6),
+    "ms": Unit("s", "ms", divide=1000.0),
+    "s": Unit("s", "s"),
+    "ml": Unit("m3", "ml", divide=1e6),
+    "cm3": Unit("m3", "cm³", divide=1e6),
+    "l": Unit("m3", "litres", divide=1000.0, metavar="LITRES"),
+    "m3": Unit("m3", "m³"),
+    "deg": Unit("rad", "degrees", multiply=math.pi / 180, metavar="DEGREES"),
+    "rad": Unit("rad", "radians"),
+    "g_cm3": Unit("kg_m3", "g/cm³", multiply=1000.0),
+    "kg_m3": Unit("kg_m3", "kg/m³"),
+    "fps": Unit("fps", "frames a second"),
+}
+"""Units by the ending of a name. An inch is 25.4 mm, a foot 304.8 mm, a pound 453.59237 g and an ounce a sixteenth of
+it, all by definition (international yard and pound agreement, 1959); a psi is the weight of a pound (g = 9.80665 m/s²)
+on a square inch: 0.45359237 · 9.80665 / 0.0254² Pa."""
+
+DISPLAY_UNITS: dict[str, tuple[str, float]] = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
+"""Unit shown in place of an SI unit, and the factor from SI: pressures of vines are printed in kPa; "1" has no unit."""
+
+SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}
+"""The same for a slider, which moves in steps that a hand can see; lengths of vines are of millimetres."""
+
+PREDICTION_UNITS = {**DISPLAY_UNITS, "s": ("ms", 1e3)}
+"""The same for a prediction: a vine grows in a tenth of a second."""
+
+
+def display_unit(unit: str, table: Mapping[str, tuple[str, float]] = DISPLAY_UNITS) -> tuple[str, float]:
+    """Return the unit shown in place of an SI unit, and the factor from SI to it.
+
+    Parameters
+    ----------
+    unit : SI unit as parameters of effects state it, such as ``"1/Pa"``.
+    table : what is shown in place of what, for a slider or a prediction.
+
+    Returns
+    -------
+    name, factor
+        The unit itself and 1.0 where nothing else is shown in its place.
+
+    >>> display_unit("Pa"), display_unit("kg")
+    (('kPa', 0.001), ('kg', 1.0))
+    """
+    return table.get(unit, (unit, 1.0))
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Split a name into what it names and the key of its unit, which is blank where it ends in none.
+
+    >>> split_unit("yield_pressure_kPa"), split_unit("film_density_kg_m3"), split_unit("bends")
+    (('yield_pressure', 'kPa'), ('film_density', 'kg_m3'), ('bends', ''))
+    """
+    parts = name.split("_")
+    for start in range(1, len(parts)):
+        if (ending := "_".join(parts[start:])) in UNITS:
+            return "_".join(parts[:start]), ending
+    return name, ""
+
+
+def convert(value: float, unit: str, to: str) -> float:
+    """Return a value in another unit of the same quantity.
+
+    Raises
+    ------
+    ValueError
+        If the two measure different quantities.
+
+    >>> convert(4, "psi", "kPa"), convert(1, "in", "mm")
+    (27.579029172673444, 25.4)
+    """
+    given, wanted = UNITS[unit], UNITS[to]
+    if given.si != wanted.si:
+        raise ValueError(f"{given.text} cannot be turned into {wanted.text}")
+    # Both factors in one product: 1 in is 25.4 mm, not 25.4 · 1000 / 1000 with the rounding of each step.
+    return value * (given.multiply * wanted.divide) / (given.divide * wanted.multiply)
