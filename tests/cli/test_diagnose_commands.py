@@ -15,7 +15,7 @@ from vinetrack.laboratory.campaign import damping_values
 from vinetrack.laboratory.ground_truth import BASE, Nature
 from vinetrack.laboratory.tracks import grow, write_experiment
 
-LADDER = "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m"
+LADDER = "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m"
 
 
 def run(*arguments: str | Path) -> tuple[int, str]:

@@ -98,7 +98,7 @@ def test_in_sample_error_and_floor_are_those_of_the_comparison(fits: tuple[Fit, 
     table = compare(fits[0], pairs).table
     errors = in_sample(fits[0])
     assert errors.rms_m == pytest.approx(np.sqrt(np.mean(table["rms_position_m"] ** 2)))
-    assert errors.floor_m == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
+    assert errors.floor[0] == pytest.approx(np.sqrt(np.mean(table["replicate_floor_m"] ** 2)))
 
 
 def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vine(fits: tuple[Fit, Fit]) -> None:
@@ -131,7 +131,7 @@ def test_of_a_single_condition_nothing_can_be_left_out(pairs: Pairs) -> None:
 
 def test_without_replicates_there_is_no_floor(pairs: Pairs) -> None:
     found = vt.fit(vt.base_model(), pairs[::3], profile=False)
-    assert math.isnan(in_sample(found).floor_m)
+    assert math.isnan(in_sample(found).floor[0])
     assert math.isnan(ladder([found], [""])["excess_left_out_m"].iloc[0])
 
 

@@ -23,7 +23,8 @@ from vinetrack.pipeline.model_stage import fit_model, measured, read_back
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
 COMPARISON_HEADER = (
-    "model,condition,rms_position_m,rms_final_velocity_m_s,replicate_floor_m,ratio,worst_at_s,worst_at_m"
+    "model,condition,rms_position_m,rms_final_velocity_m_s,replicate_floor_m,ratio,worst_at_s,worst_at_m,"
+    "replicate_floor_sigma_m"
 )
 CHECK_HEADER = "vine,n_steady,n_trajectory,B_steady,B_trajectory,z"
 AUDIT_HEADER = (

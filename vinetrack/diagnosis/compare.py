@@ -2,8 +2,8 @@
 
 A trial's prediction has a release and an origin of its own and nothing else: its pressure and B deviate by nothing, as
 for a trial that was left out of the fit. The origin is where the vine is seen at rest; the release, and the origin
-where no rest was filmed, are where the root mean square is least. Replicates are laid on their mean in the same way: so
-a model that lacks nothing comes out at the floor, at a ratio of 1.
+where no rest was filmed, are where the root mean square is least. Replicates are laid on their mean in the same way,
+without any model: so one that lacks nothing comes out at the floor, at a ratio of 1.
 
 The two errors are those of the paper's Table II (Alvarez et al., 2025): of the position over the whole growth, and of
 the final speed of the leading edge. A model whose vines stop and start again is followed through every stop, but the
@@ -44,6 +44,7 @@ COMPARISON_COLUMNS = (
     "ratio",
     "worst_at_s",
     "worst_at_m",
+    "replicate_floor_sigma_m",
 )
 TRAJECTORY_COLUMNS = (
     "trial",
@@ -135,7 +136,7 @@ def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[st
     """Errors of position of one condition while it moves: every trial counts alike, however many frames it has."""
     squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
     rms_m = math.sqrt(float(np.mean(squares)))
-    floor_m = together.floor_m
+    floor_m = together.alignment.floor_m
     worst_at_s, worst_at_m = _worst(together)
     return {
         "rms_position_m": rms_m,
@@ -143,6 +144,7 @@ def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[st
         "ratio": rms_m / floor_m if floor_m > 0 else math.nan,
         "worst_at_s": worst_at_s,
         "worst_at_m": worst_at_m,
+        "replicate_floor_sigma_m": together.alignment.floor_sigma_m,
     }
 
 

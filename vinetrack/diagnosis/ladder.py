@@ -12,11 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.diagnosis.replicates import first_that_counts, replicates_of
+from vinetrack.diagnosis.replicate_alignment import align_replicates
+from vinetrack.diagnosis.replicates import first_that_counts
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_prepared
@@ -33,6 +35,7 @@ LADDER_COLUMNS = (
     "rms_highest_pressure_m",
     "floor_m",
     "excess_left_out_m",
+    "floor_sigma_m",
 )
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
@@ -53,18 +56,28 @@ class Errors:
         squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in self.trials]
         return math.sqrt(float(np.mean(squares))) if squares else math.nan
 
-    @property
-    def floor_m(self) -> float:
-        """What replicates differ by, over all conditions that have any; NaN where none has."""
+    @cached_property
+    def floor(self) -> tuple[float, float]:
+        """What replicates differ by, over all conditions that have any, and its standard error, m; NaN where none has.
+
+        Mean of the conditions' variances weighted by their numbers of trials; the error of a variance s² of ν degrees
+        of freedom is s²√(2/ν).
+        """
         conditions = dict.fromkeys(trial.trial.condition for trial in self.trials)
-        squares, counts = [], []
+        squares, counts, degrees = [], [], []
         for condition in conditions:
             members = [trial for trial in self.trials if trial.trial.condition == condition]
-            floor_m = replicates_of(members).floor_m
-            if math.isfinite(floor_m):
-                squares.append(floor_m**2)
+            alignment = align_replicates(members)
+            if math.isfinite(alignment.floor_m):
+                squares.append(alignment.floor_m**2)
                 counts.append(len(members))
-        return math.sqrt(float(np.average(squares, weights=counts))) if squares else math.nan
+                degrees.append(alignment.degrees)
+        if not squares:
+            return math.nan, math.nan
+        share = np.array(counts) / np.sum(counts)
+        floor_m = math.sqrt(float(np.sum(share * squares)))
+        error_m2 = math.sqrt(float(np.sum((share * squares) ** 2 * 2 / np.array(degrees))))
+        return floor_m, error_m2 / (2 * floor_m) if floor_m > 0 else 0.0
 
 
 def ladder(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
@@ -102,7 +115,7 @@ def ladder(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
 def ladder_row(found: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
     """The row of one model, and sentences about what could not be predicted."""
     inside, outside, highest = in_sample(found), left_out(found), highest_pressure(found)
-    floor_m = inside.floor_m
+    floor_m, floor_sigma_m = inside.floor
     row: dict[str, object] = {
         "model": "+".join(found.model.names),
         "added": added,
@@ -111,6 +124,7 @@ def ladder_row(found: Fit, added: str = "") -> tuple[dict[str, object], list[str
         "rms_highest_pressure_m": highest.rms_m,
         "floor_m": floor_m,
         "excess_left_out_m": excess(outside.rms_m, floor_m),
+        "floor_sigma_m": floor_sigma_m,
     }
     return row, [*_notes("left-out conditions", outside), *_notes("the left-out highest pressure", highest)]
 
