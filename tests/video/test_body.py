@@ -60,6 +60,17 @@ def test_falling_disc(body, back):
     assert 2 * fall[0] == pytest.approx(9.81, rel=0.01)
 
 
+def test_a_neighbour_in_a_wide_strip_is_not_followed():
+    """Another disc, 60 px beside, that falls later: the wide axis drawn by hand along the first holds both."""
+    frames, row = falling_disc(305)
+    other, _ = falling_disc(306, rest=40)
+    both = np.concatenate([frames[:, :, 30:130], other[:, :, 50:110]], axis=2)
+    track = track_frames(in_memory(both), BALL, RATE, Axis((54.0, 0.0), (50.0, 419.0), 120.0)).track
+    used = track.usable & (row > 90) & (row < 340)
+    assert used.sum() > 70
+    assert (track.edge_px[used] - row[used]).std() < 0.15
+
+
 def test_body_strip_directly_along_a_given_axis():
     frames, row = falling_disc(302)
     strip = cut_strip(frames, Axis((80.0, 0.0), (80.0, 419.0), 48.0), 40)

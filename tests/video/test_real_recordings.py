@@ -22,12 +22,22 @@ REAL = Path(FOLDER)
 RULER_M_PER_PX = 0.27307e-3
 
 
-def test_free_fall_gives_g():
+GIVEN = {
+    "axis found": None,
+    "axis given": Axis((161.0, 40.0), (151.0, 799.0)),
+    "axis given, narrow": Axis((161.0, 40.0), (151.0, 799.0), 30.0),
+    "axis given, wide": Axis((161.0, 40.0), (151.0, 799.0), 160.0),
+    "axis 3 degrees off": Axis((176.0, 20.0), (136.0, 790.0), 60.0),
+}
+
+
+@pytest.mark.parametrize("axis", GIVEN.values(), ids=GIVEN)
+def test_free_fall_gives_g(axis):
     trial = Trial(
         name="ball", video=REAL / "freefall_1000fps" / "freefall.mp4", capture_fps=1000.0, m_per_px=RULER_M_PER_PX,
         travel_ratio=1,
     )  # fmt: skip
-    track = track_recording(trial).track
+    track = track_recording(trial, axis).track
     falling = track.usable & np.array(["before_release" not in flag for flag in track.flag])
     assert falling.sum() > 150
     time, position = track.time_s[falling], track.lead_position_m[falling]

@@ -21,6 +21,9 @@ SMALL_PX = 240
 """Longest side of the pictures in which the axis is sought."""
 ORDERLY = 0.45
 """Share of all change that one front explains where nothing else of weight goes on; a swinging door takes a fifth."""
+MOST_TURN_DEG = 8.0
+"""Chosen: how far a given axis is turned onto the motion. One drawn by hand over some hundred pixels errs by a degree
+or two; with half of it an axis 5 degrees off stays off, with twice of it a wide strip lets in what crosses it."""
 PREFIXES = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 MAX_FRAMES = 150
 """Frames, spread evenly over the changes, in which it is sought."""
@@ -108,6 +111,47 @@ def is_orderly(luma: NDArray[Any], axis: Axis) -> bool:
     return bool(line[3][agree].sum() >= ORDERLY * line[3].sum())
 
 
+def centred_on_motion(luma: NDArray[Any], given: Axis) -> Axis:
+    """A given axis moved and turned onto the line of what moves within its width, and as wide as that.
+
+    It keeps its ends' places along itself: only what lies across is corrected, by up to half of `given.width_px` and
+    MOST_TURN_DEG. Of several bodies within the width the one that collects more change, and lies nearer, is taken.
+
+    Parameters
+    ----------
+    luma : array, shape (n_frames, height, width), brightness
+    given : axis in the picture, its width that of the strip to look in, px
+
+    Raises
+    ------
+    RecordingError
+        Where nothing moves within the width.
+    """
+    small, factor = _small_frames(luma)
+    scaled = Axis(_shrunk(given.from_px, factor), _shrunk(given.to_px, factor), given.width_px / factor)
+    x, y, time, weight, n_times = _changed_pixels(small, len(small))
+    reach = max(0.5 * scaled.width_px, 3.0)
+    offset = np.column_stack([x, y]) - scaled.from_px
+    across = offset @ scaled.normal
+    near = (np.abs(across) < reach) & (
+        np.abs(offset @ scaled.direction - scaled.length_px / 2) < 0.6 * scaled.length_px
+    )
+    if near.sum() < 12:
+        raise RecordingError("nothing moves along the axis")
+    pixels = x[near], y[near], time[near], weight[near], n_times
+    line = _line_near(*pixels, scaled, reach)
+    if line is None:
+        return given
+    turned = np.array([np.cos(line.angle), np.sin(line.angle)])
+    slope = float(turned @ scaled.normal) / max(float(turned @ scaled.direction), 0.5)
+    middle = line.middle - scaled.from_px
+    shift = float(middle @ scaled.normal - slope * (middle @ scaled.direction)) * factor
+    start = given.points(np.array(0.0), shift)
+    stop = given.points(np.array(given.length_px), shift + slope * given.length_px)
+    ends = (float(start[0]), float(start[1])), (float(stop[0]), float(stop[1]))
+    return Axis(*ends, 2 * line.half * factor)
+
+
 @dataclass(frozen=True)
 class _Line:
     """A line in the small pictures and how much change it collects: `order` is its share of all change."""
@@ -153,6 +197,45 @@ def _find_line(small: NDArray[np.float32], count: int, patient: bool = False) ->
             return nothing
         raise
     return _Line(angle, middle, half, ends, collected, collected / float(weight.sum()))
+
+
+def _line_near(
+    x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, given: Axis, reach: float
+) -> _Line | None:
+    """The line near a given one along which most change is collected in order, refined; None where none is.
+
+    All in the small pictures. Lines that leave the middle of the given width count less, to a half at its border.
+    """
+    from vinetrack.video.axis_kernels import fan
+
+    band = float(np.clip(0.25 * reach, 2.0, 6.0))
+    start = float(np.arctan2(given.direction[1], given.direction[0]))
+    middle = np.asarray(given.points(np.array(given.length_px / 2)))
+    length = int(2 * given.length_px) + 4
+    bins = int(np.ceil(2 * reach / band)) + 3
+    best, angle, point = 0.0, start, middle
+    for turn in np.radians(np.arange(-MOST_TURN_DEG, MOST_TURN_DEG + 0.5, 2.0)):
+        unit = np.array([np.cos(start + turn), np.sin(start + turn)])
+        side = np.array([-unit[1], unit[0]])
+        place = np.column_stack([x, y]) - middle
+        along, across = place @ unit + length / 2, (place @ side + reach) / band
+        inside = (across >= 0) & (across < bins) & (along >= 0) & (along < length)
+        gathered = fan(along[inside], across[inside], time[inside], weight[inside], bins, length, n_times)
+        away = (np.arange(gathered.size) + 1) * band - reach
+        worth = gathered * (1 - 0.5 * np.clip(away / reach, -1, 1) ** 2)
+        i = int(np.argmax(worth))
+        if worth[i] > best:
+            best, angle, point = float(worth[i]), start + float(turn), middle + away[i] * side
+    if best <= 0:
+        return None
+    band, half, ends, collected = 2 * band, band, (0.0, 0.0), best
+    try:
+        for _ in range(3):
+            angle, point, half, ends, collected = _refine(x, y, time, weight, n_times, angle, point, band)
+            band = float(np.clip(1.2 * half, 2.0, reach))
+    except RecordingError:
+        return None
+    return _Line(angle, point, half, ends, collected, collected / float(weight.sum()))
 
 
 def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:

@@ -27,6 +27,18 @@ MISPLACED_PX = 0.5
 """Misplacement that the weights of the template forgive."""
 POOR_MATCH = 0.6
 """Correlation with the template under which a point is doubtful."""
+LOST_MATCH = 0.4
+"""Chosen: correlation under which what was found is not the body. A body cut in half by the picture's edge keeps about
+0.5; with 0.2 textures of the background pass for a body, with 0.6 nothing is ever doubtful."""
+ABSENT = 0.7
+"""Chosen: where the background leaves less than this part of what the template leaves, the body is not there. At 1 noise
+decides where body and background are alike; at half of it a body that left counts until its place is quiet."""
+BACK_PX, BACK_SIGMA = 3.0, 6.0
+"""Chosen: a body this far behind where it was has turned back. A registration errs by 0.1 px; twice of it lets a bounce
+run on for some frames, half of it makes an end of one bad frame."""
+BACK_COST = 0.05
+"""Chosen: a step back on the coarse way costs this a pixel, in units of the score of a frame in which the body is seen:
+a bounce of 100 px pays within five frames, a hop back to a hand that let go does not."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +47,8 @@ class BodyFit:
 
     `position_px` is the column of the template's middle at mid-exposure, `across_px` its place across, `sigma_px` the
     random error along, `match` the correlation with the template, `unsure` where that is poor or the body is cut by
-    the strip's end. `half_px` is half the length of the template.
+    the strip's end. `lost` marks frames in which the body is not seen, or that come after the end of its motion along
+    the strip, which `notes` say. `half_px` is half the length of the template.
     """
 
     position_px: Floats
@@ -44,6 +57,8 @@ class BodyFit:
     match: Floats
     unsure: NDArray[np.bool_]
     half_px: float
+    lost: NDArray[np.bool_]
+    notes: tuple[str, ...] = ()
 
 
 def track_body(strip: Strip) -> BodyFit:
@@ -58,7 +73,7 @@ def track_body(strip: Strip) -> BodyFit:
 
     pictures = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
     pictures += strip.offset[:, None, None].astype(np.float32)
-    path, half = _coarse_path(pictures, strip.noise)
+    path, half, background = _coarse_path(pictures, strip.noise)
     if np.isfinite(strip.axis.width_px):
         # A body is about as long as it is wide, a glint on it is not.
         half = max(half, round(0.75 * strip.axis.width_px))
@@ -73,11 +88,58 @@ def track_body(strip: Strip) -> BodyFit:
         template, weight = _mean_template(pictures, place, match, half, strip.noise)
     place, error, match = _find_all(pictures, template, weight, place, half, first=False)
     inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
-    return BodyFit(place[:, 0], place[:, 1], error, match, ~inside | (match < POOR_MATCH), float(half))
+    astray = np.abs(place[:, 1]) > SEARCH_ROWS - 0.5
+    lost = (match < LOST_MATCH) | astray | _is_absent(pictures, background, template, weight, place, half)
+    last, notes = _end_of_motion(place[:, 0], error, match, lost)
+    lost |= np.arange(len(lost)) > last
+    unsure = ~inside | (match < POOR_MATCH)
+    return BodyFit(place[:, 0], place[:, 1], error, match, unsure, float(half), lost, notes)
 
 
-def _coarse_path(pictures: NDArray[np.float32], noise: float) -> tuple[Floats, int]:
-    """Middle of the body by frame, to a few pixels, and half its length along the axis.
+def _is_absent(
+    pictures: NDArray[np.float32], background: NDArray[np.float32], template: NDArray[np.float32],
+    weight: NDArray[np.float32], place: Floats, half: int,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Frames in which the background alone explains better than the body what is where the body was found."""
+    absent = np.zeros(len(pictures), dtype=bool)
+    share = weight / float(weight.sum())
+    inner = template - float(np.sum(share * template))
+    power = float(np.sum(share * inner**2)) + 1e-9
+    for t, picture in enumerate(pictures):
+        patch = _cut(picture, place[t, 0], place[t, 1], half)
+        patch = patch - float(np.sum(share * patch))
+        bare = patch - _cut(background, place[t, 0], place[t, 1], half)
+        bare -= float(np.sum(share * bare))
+        gain = float(np.clip(np.sum(share * patch * inner) / power, 0.3, 3.0))
+        body = patch - gain * inner
+        absent[t] = np.sum(share * bare**2) < ABSENT * np.sum(share * body**2)
+    return absent
+
+
+def _end_of_motion(along: Floats, sigma: Floats, match: Floats, lost: NDArray[np.bool_]) -> tuple[int, tuple[str, ...]]:
+    """Last frame of the body's way along the strip, and what ends it where the recording does not.
+
+    It ends where the body turns back (a bounce), and where it is not recognised again (it tips over, or is gone).
+    """
+    known = np.flatnonzero(~lost & (match >= POOR_MATCH))
+    if len(known) < 3:
+        return len(along) - 1, ()
+    y = along[known]
+    behind = np.maximum.accumulate(y) - y
+    back = behind > np.maximum(BACK_PX, BACK_SIGMA * np.nan_to_num(sigma[known], nan=0.0))
+    turned = np.flatnonzero(back[:-1] & back[1:])
+    if len(turned):
+        last = int(known[int(np.argmax(y[: turned[0]]))])
+        why = f"the body turns back after frame {last}: a bounce, or the end of its way; later frames are not used"
+        return last, (why,)
+    last = int(known[-1])
+    if last >= len(along) - 2:
+        return len(along) - 1, ()
+    return last, (f"the body is not recognised after frame {last}: it is gone, hidden or turned over",)
+
+
+def _coarse_path(pictures: NDArray[np.float32], noise: float) -> tuple[Floats, int, NDArray[np.float32]]:
+    """Middle of the body by frame, to a few pixels, half its length along the axis, and the strip without it.
 
     Background is the median over frames spread evenly over the changes: a body that rests for long does not become
     part of it.
@@ -92,7 +154,7 @@ def _coarse_path(pictures: NDArray[np.float32], noise: float) -> tuple[Floats, i
     half = _half_length(strange)
     box = np.ones(2 * half + 1)
     score = np.stack([np.convolve(row, box, mode="same") for row in strange])
-    return _forward_path(score / (float(np.quantile(score, 0.98)) + 1e-9)), half
+    return _onward_path(score / (float(np.quantile(score, 0.98)) + 1e-9)), half, background
 
 
 def _half_length(strange: NDArray[np.float32]) -> int:
@@ -106,23 +168,32 @@ def _half_length(strange: NDArray[np.float32]) -> int:
     return int(np.clip(0.8 * width, 6, rows.shape[1] // 5))
 
 
-def _forward_path(score: Floats) -> Floats:
-    """Place by frame, shape (n_frames,), that never goes back and collects most score."""
+def _onward_path(score: Floats) -> Floats:
+    """Place by frame, shape (n_frames,), that collects most score; steps back cost BACK_COST a pixel."""
     n, columns = score.shape
     best = np.zeros_like(score)
     came = np.zeros(score.shape, dtype=int)
     best[0] = score[0]
+    cost = BACK_COST * np.arange(columns)
     for t in range(1, n):
-        running = np.maximum.accumulate(best[t - 1])
-        new = np.concatenate([[True], best[t - 1][1:] > running[:-1]])
-        came[t] = np.maximum.accumulate(np.where(new, np.arange(columns), 0))
-        best[t] = running + score[t]
+        ahead, ahead_from = _running_best(best[t - 1])
+        behind, behind_from = _running_best((best[t - 1] - cost)[::-1])
+        behind, behind_from = behind[::-1] + cost, columns - 1 - behind_from[::-1]
+        came[t] = np.where(ahead >= behind, ahead_from, behind_from)
+        best[t] = np.maximum(ahead, behind) + score[t]
     path = np.zeros(n)
     place = int(np.argmax(best[-1]))
     for t in range(n - 1, -1, -1):
         path[t] = place
         place = came[t, place]
     return path
+
+
+def _running_best(values: Floats) -> tuple[Floats, NDArray[np.int_]]:
+    """Largest value up to each place, and where it stands."""
+    running = np.maximum.accumulate(values)
+    new = np.concatenate([[True], values[1:] > running[:-1]])
+    return running, np.maximum.accumulate(np.where(new, np.arange(values.size), 0))
 
 
 def _best_seen(path: Floats, half: int, columns: int) -> int:

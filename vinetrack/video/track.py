@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.video.axis import Axis, find_axis, is_orderly
+from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
@@ -66,6 +66,7 @@ class _Edge:
     exposure_frames: float
     reach_px: float
     apart_sigma_px: Floats | float = 0.0
+    notes: tuple[str, ...] = ()
 
 
 def track_recording(
@@ -143,8 +144,8 @@ def track_frames(
             )
         raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
     scale = trial.m_per_px if m_per_px is None else m_per_px
-    notes = [*frames.notes, *verdict.notes]
-    if not _is_grown(found.edge_px, verdict, trial.length_m / scale):
+    notes = [*frames.notes, *verdict.notes, *(f"{name}: {note}" for note in found.notes)]
+    if not found.notes and not _is_grown(found.edge_px, verdict, trial.length_m / scale):
         notes += _ending(luma, verdict, found.edge_px, name)
     if not orderly:
         notes.append(
@@ -183,8 +184,10 @@ def _whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: 
     axis = axis if axis is not None else find_axis(luma)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
     if given:
-        # Room for an axis that is a few degrees off; `_follow` centres it.
+        # Room for an axis that is a few degrees off; it is centred on what moves, here or in `_follow`.
         axis = replace(axis, width_px=axis.width_px + 0.08 * axis.length_px)
+        if trial.travel_ratio == 1:
+            axis = centred_on_motion(luma, axis)
     return axis, trial.travel_ratio == 1 or is_orderly(luma, axis)
 
 
@@ -196,7 +199,8 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
 
         strip = cut_strip(luma, axis, 1.5 * half + 12)
         fit = track_body(strip)
-        return strip, _Edge(fit.position_px, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px)
+        place = np.where(fit.lost, np.nan, fit.position_px)
+        return strip, _Edge(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, notes=fit.notes)
     from vinetrack.video.edge import outline, track_edge
 
     try:
