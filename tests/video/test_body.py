@@ -71,6 +71,30 @@ def test_a_neighbour_in_a_wide_strip_is_not_followed():
     assert (track.edge_px[used] - row[used]).std() < 0.15
 
 
+def test_a_bounce_ends_the_track():
+    frames, row = falling_disc(307, n=185)
+    impact = int(np.argmax(row > 340))
+    there_and_back = np.concatenate([frames[: impact + 1], frames[impact - 1 : 90 : -1]])
+    track = track_frames(in_memory(there_and_back), BALL, RATE).track
+    assert not track.usable[impact + 2 :].any()
+    assert all("after_end" in flag for flag in track.flag[impact + 2 :])
+    assert not any("gap" in flag for flag in track.flag)
+    assert any("turns back" in note for note in track.notes)
+    used = np.flatnonzero(track.usable & (np.arange(len(track.flag)) > 60))
+    assert np.abs(track.edge_px[used] - row[used]).max() < 1
+
+
+def test_a_body_that_is_gone_is_lost():
+    """Taken away in mid-fall: nothing that stays behind is followed in its place."""
+    frames, _ = falling_disc(308, n=185)
+    empty = np.concatenate([frames[:60, 210:], frames[:60, 210:]], axis=1)[:, : SHAPE[0]]
+    gone = np.concatenate([frames[:150], empty, empty])
+    track = track_frames(in_memory(gone), BALL, RATE).track
+    assert track.usable[60:145].all()
+    assert not track.usable[151:].any()
+    assert any("not recognised after frame" in note for note in track.notes)
+
+
 def test_body_strip_directly_along_a_given_axis():
     frames, row = falling_disc(302)
     strip = cut_strip(frames, Axis((80.0, 0.0), (80.0, 419.0), 48.0), 40)

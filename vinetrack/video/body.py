@@ -31,8 +31,8 @@ LOST_MATCH = 0.4
 """Chosen: correlation under which what was found is not the body. A body cut in half by the picture's edge keeps about
 0.5; with 0.2 textures of the background pass for a body, with 0.6 nothing is ever doubtful."""
 ABSENT = 0.7
-"""Chosen: where the background leaves less than this part of what the template leaves, the body is not there. At 1 noise
-decides where body and background are alike; at half of it a body that left counts until its place is quiet."""
+"""Chosen: where the background leaves less than this part of what the template leaves, the body is not there. At 1
+noise decides where body and background are alike; at half of it a body that left counts until its place is quiet."""
 BACK_PX, BACK_SIGMA = 3.0, 6.0
 """Chosen: a body this far behind where it was has turned back. A registration errs by 0.1 px; twice of it lets a bounce
 run on for some frames, half of it makes an end of one bad frame."""
