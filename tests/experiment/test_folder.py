@@ -32,6 +32,7 @@ def test_a_row_becomes_a_trial_in_si_units(folder: Path) -> None:
         yield_pressure_Pa=3e3,
         yield_pressure_sigma_Pa=200.0,
         payload_kg=0.0356,
+        position_systematic_m=1e-4,
     )
     assert known(experiment.trials[0]) == known(expected)
     assert experiment.trials[1].payload_kg == 0.0
@@ -323,3 +324,13 @@ def test_a_sheet_from_a_german_spreadsheet(folder: Path) -> None:
     sheet = GOOD.replace(",", ";").replace("35.6", "35,6").replace("\n", "\r\n")
     (folder / "trials.csv").write_bytes(sheet.encode("utf-8-sig"))
     assert read_experiment(folder).trials[0].payload_kg == pytest.approx(0.0356)
+
+
+@pytest.mark.parametrize(
+    ("setting", "expected_m"), [("", 1e-4), ("position_systematic_mm: 0.25", 2.5e-4), ("position_systematic_mm: 0", 0)]
+)
+def test_positions_from_elsewhere_have_a_smooth_error_unless_it_is_stated(
+    folder: Path, setting: str, expected_m: float
+) -> None:
+    (folder / "experiment.yaml").write_text(setting + "\n")
+    assert read_experiment(folder).trials[0].position_systematic_m == pytest.approx(expected_m)

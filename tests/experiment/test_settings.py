@@ -162,6 +162,7 @@ def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
         ("steady: 0.2:0.1", "ends before it starts"),
         ("bends: 1:2", "three numbers"),
         ("tail_slack: loose", "taut"),
+        ("position_systematic_mm: -1", "0"),
         ("mass_loss: none", "as_printed"),
         ("model: [gravity, gravity]", "names 'gravity' twice"),
         ("ambient_pressure_kPa: 101325", "less than or equal to 1000"),

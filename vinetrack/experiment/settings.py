@@ -221,6 +221,9 @@ class ExperimentSettings(_SharedColumns):
     tail_slack: Literal["taut", "free"] = "taut"
     tail_store: Literal["body", "reel"] = "body"
     mass_loss: Literal["geometric", "as_printed"] = "geometric"
+    position_systematic_mm: Annotated[Number, Field(ge=0, le=100)] | None = None
+    """Standard deviation of smooth errors of position that all trials share, such as a lens makes; by default 0.1 for
+    positions from elsewhere and for calibrations by two points or a scale, 0 for those by a target."""
     model: tuple[str, ...] = BASE_EFFECTS
     candidates: tuple[str, ...] | None = None
     effects: tuple[str, ...] = ()

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from vinetrack.core.problems import Problem
-from vinetrack.core.records import Trial
+from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
 from vinetrack.core.tables import Table, TableError, safe_join
 from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, Column, oddity, read_cell
-from vinetrack.experiment.settings import ExperimentSettings
+from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSettings
 
 SHEET = "trials.csv"
 LONGEST_NAME = 100
@@ -213,6 +213,7 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
         mass_loss=settings.mass_loss,
         tail_slack=settings.tail_slack,
         tail_store=settings.tail_store,
+        position_systematic_m=_position_systematic_m(settings, measured="track" in values or "mm_per_px" in values),
     )
 
 
@@ -221,3 +222,15 @@ def _in_si(column: Column, value: Any, folder: Path) -> Any:
     if column.kind == "path":
         return safe_join(folder, value)
     return column.to_si(float(value)) if column.kind in ("number", "choice") else value
+
+
+def _position_systematic_m(settings: ExperimentSettings, *, measured: bool) -> float:
+    """Smooth error of positions, standard deviation, m: as stated, else by what is known of the lens.
+
+    A target of many corners shows the distortion of the lens; two points or a scale do not, nor do positions that
+    somebody else measured say whether it was corrected (`measured`, which a scale of the trial's own counts as).
+    """
+    if settings.position_systematic_mm is not None:
+        return settings.position_systematic_mm / 1e3
+    knows_lens = isinstance(settings.calibration, (Charuco, Checkerboard)) and not measured
+    return 0.0 if knows_lens else POSITION_SYSTEMATIC_M

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, TrialFit
-from vinetrack.inference.intervals import Precision, near_bound, precision, profile_interval, student
+from vinetrack.inference.intervals import Precision, among_first, near_bound, precision, profile_interval, student
 from vinetrack.inference.mixed_effects import deviance, estimate_spreads, marginal, trial_effect_prior
 from vinetrack.inference.optimiser import Solution, chi2_per_dof
 from vinetrack.inference.parameters import YIELD_PRESSURE, FreeParameter, ParameterMap
+from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.inference.robust_covariance import widened_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.whitening import at_correlation, whiten
@@ -47,10 +49,15 @@ def assemble(
 ) -> Fit:
     """Everything that is said about a fit."""
     layout, state = predictor.layout, solution.state
-    by_noise = precision(solution)
-    trials = _trial_fits(predictor, solution, by_noise)
-    known = widened_covariance(predictor, solution, trials, by_noise)
-    numbers = _numbers(predictor, solution, by_noise, known, profile=profile)
+    smooth = smooth_errors(predictor, solution, options.get("held"))
+    wide = smooth.solution if smooth else solution
+    by_noise = precision(wide)
+    trials = _trial_fits(predictor, solution, among_first(by_noise, len(layout.free)))
+    if smooth is not None:
+        trials = tuple(replace(one, whitened=white) for one, white in zip(trials, smooth.whitened, strict=True))
+    known = widened_covariance(predictor, solution, trials, by_noise, wide if smooth else None)
+    by_noise, known = (among_first(one, len(layout.free)) for one in (by_noise, known))
+    numbers = _numbers(predictor, solution, wide.state.theta, by_noise, known, profile=profile)
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([item.time_s.size for item in predictor.data], dtype=float)
     variance = float(np.average(state.variance, weights=weights)) / (1 - state.rho**2)
@@ -67,7 +74,7 @@ def assemble(
         noise_m=math.sqrt(variance),
         noise_correlation=state.rho,
         chi2_per_dof=chi2,
-        log_likelihood=log_likelihood(solution),
+        log_likelihood=smooth.log_likelihood if smooth else log_likelihood(solution),
         trials=trials,
         messages=tuple(_messages(layout, solution, numbers, known, chi2)),
         left_out=dict(left_out),
@@ -102,9 +109,16 @@ def fitted_model(layout: ParameterMap, numbers: Sequence[Number]) -> Model:
 
 
 def _numbers(
-    predictor: Predictor, solution: Solution, by_noise: Precision, known: Precision, *, profile: bool
+    predictor: Predictor,
+    solution: Solution,
+    theta: Floats,
+    by_noise: Precision,
+    known: Precision,
+    *,
+    profile: bool,
 ) -> tuple[Number, ...]:
-    layout, frame, theta = predictor.layout, solution.frame, solution.state.theta
+    """The free numbers at `theta`, which holds them first, with their errors and intervals."""
+    layout, frame = predictor.layout, solution.frame
     sigma = np.sqrt(np.diag(known.covariance))
     dof = known.degrees
     reach = student(dof)

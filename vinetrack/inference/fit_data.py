@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
 from vinetrack.inference.gauge_noise import noise_of, without_noise
 from vinetrack.tracks.position_noise import position_noise, rest_points, rough_noise
 
@@ -89,6 +89,7 @@ class FitTrial:
     gauge_error: float = 0.0
     vague_rest: VagueRest | None = None
     tracker_sigma_m: float = math.nan  #: median error of a position that was read from a recording
+    position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
 
     @cached_property
     def frame_s(self) -> float:
@@ -174,7 +175,15 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         gauge_error=gauge_error,
         vague_rest=vague_rest,
         tracker_sigma_m=float(np.nanmedian(stated_m)) if filmed and np.isfinite(stated_m).any() else math.nan,
+        position_systematic_m=_position_systematic_m(trial),
     )
+
+
+def _position_systematic_m(trial: Trial) -> float:
+    """Smooth error of the positions of a trial, standard deviation, m: as stated, else that of imported tracks."""
+    if math.isfinite(trial.position_systematic_m):
+        return trial.position_systematic_m
+    return POSITION_SYSTEMATIC_M if trial.video is None else 0.0
 
 
 def _trace(track: Track, moving_s: Floats) -> tuple[tuple[Floats, Floats] | None, float]:

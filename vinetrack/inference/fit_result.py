@@ -65,8 +65,8 @@ class BetweenTrialSpread:
 class TrialFit:
     """One trial under the model; arrays have shape (n_points,), at the points that were used.
 
-    `whitened` are residuals freed of their correlation, in standard deviations. Deviations are relative, of the set
-    pressure and of the vine's B.
+    `whitened` are residuals freed of their correlation and of smooth errors of position, in standard deviations.
+    Deviations are relative, of the set pressure and of the vine's B.
     """
 
     trial: Trial

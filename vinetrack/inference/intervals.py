@@ -50,6 +50,11 @@ class Precision:
     tied: np.ndarray
 
 
+def among_first(known: Precision, count: int) -> Precision:
+    """What is known of the first `count` numbers, the others being integrated out."""
+    return Precision(known.covariance[:count, :count], known.degrees[:count], known.silent[:count], known.tied[:count])
+
+
 def precision(solution: Solution) -> Precision:
     """Covariance at the end of a fit, by the model of the noise and the scatter."""
     part = marginal(solution.grams, solution.frame, solution.state)

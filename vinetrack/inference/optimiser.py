@@ -213,7 +213,7 @@ def solve(
         early = early and not search
         before = state
         state = _update_variances(predictor, frame, grams, state, can, held, early=early, search=search)
-        moved = _variances_moved(before, state)
+        moved = variances_moved(before, state)
         step, own_change, promised = newton_step(grams, frame, state, damping)
         if watch is not None:
             watch(_step_report(predictor, state, iteration, promised))
@@ -294,7 +294,7 @@ def _update_variances(
     return state
 
 
-def _variances_moved(before: FitState, after: FitState) -> float:
+def variances_moved(before: FitState, after: FitState) -> float:
     """Largest relative change among spreads and noise; spreads below a thousandth count as none."""
     spreads = [abs(np.log((b + 1e-3) / (a + 1e-3))) for a, b in zip(before.spread, after.spread, strict=True)]
     noise = np.max(np.abs(np.log(after.variance / before.variance)))

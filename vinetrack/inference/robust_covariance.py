@@ -41,11 +41,18 @@ def scatter_of(single: Floats, degrees: float) -> Floats:
 
 
 def widened_covariance(
-    predictor: Predictor, solution: Solution, trials: Sequence[TrialFit], known: Precision
+    predictor: Predictor,
+    solution: Solution,
+    trials: Sequence[TrialFit],
+    known: Precision,
+    wide: Solution | None = None,
 ) -> Precision:
-    """Covariance and degrees of freedom at the end of a fit, widened where trials say that they should be."""
-    doubts = systematics_of(predictor, solution, trials)
-    plain, robust, shared = _sandwich(predictor, solution, doubts)
+    """Covariance and degrees of freedom at the end of a fit, widened where trials say that they should be.
+
+    `wide` is the fit with smooth errors of position among its numbers, to which `known` then belongs.
+    """
+    doubts = systematics_of(predictor, solution, trials, positions=wide is None)
+    plain, robust, shared = _sandwich(predictor, wide or solution, doubts)
     diagonal = np.diag(plain)
     live = diagonal > 0
     ratio = np.ones(diagonal.size)

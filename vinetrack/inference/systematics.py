@@ -15,6 +15,7 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.position_errors import position_shapes
 from vinetrack.inference.sensitivity import PRESSURE, Predictor, moved_by
 
 PAYLOAD_ERROR = 0.005
@@ -36,10 +37,20 @@ there, the last fold pulls it out of shape. Chosen after rendered recordings, in
 end of growth were off by several stated errors."""
 
 
-def systematics_of(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> list[Floats]:
-    """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions."""
-    ways = _payloads(predictor, solution, trials), _set_pressures(predictor, solution), _tracker(predictor, trials)
-    parts = zip(*ways, strict=True)
+def systematics_of(
+    predictor: Predictor, solution: Solution, trials: Sequence[TrialFit], *, positions: bool = True
+) -> list[Floats]:
+    """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions.
+
+    `positions` tells whether smooth errors of position are among them; a fit estimates those along with its numbers.
+    """
+    grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
+    ways = (
+        _payloads(predictor, solution, trials),
+        _set_pressures(predictor, solution),
+        _tracker(predictor, trials),
+    )
+    parts = zip(*ways, position_shapes(predictor, grown), strict=True) if positions else zip(*ways, strict=True)
     return [np.column_stack(one) for one in parts]
 
 

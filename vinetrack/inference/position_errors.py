@@ -1,0 +1,179 @@
+"""Smooth errors of position that all trials of a camera share, fitted along with a model.
+
+An uncalibrated lens displaces the leading edge by a smooth function of where it is. That function is the same in every
+trial, so that neither replicates nor the scatter of trials show it, and whatever effect resembles it would take it up.
+So it is a nuisance: Legendre polynomials of order 1 to 4 over the growth, each less its value where the edge rests and
+with a normal prior of standard deviation σ_s (`position_systematic_mm`).
+
+About a fit, r_i = X_i Δθ + Z_i u_i + D_i s + e_i with s ~ N(0, 1) and D_i the shapes times σ_s. With s among the free
+numbers this is the linear mixed model of `vinetrack.inference.mixed_effects` again, with four more columns and four
+priors: its likelihood is that of hypotheses of which none is credited with what a lens could do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.inference.mixed_effects import (
+    FitState,
+    MixedProblem,
+    deviance,
+    estimate_noise,
+    estimate_spreads,
+    marginal,
+    newton_step,
+)
+from vinetrack.inference.optimiser import SETTLED_SPREAD, FixedTerms, Solution, floor, variances_moved
+from vinetrack.inference.sensitivity import ORIGIN, Predictor
+from vinetrack.inference.whitening import products, whiten
+
+ORDERS = (1, 2, 3, 4)
+"""Legendre orders of the shapes. Order 0 is the origin, which is free in every trial; a lens to lowest order is orders
+1 to 3 (`effects/lens.py`); chosen: 4 leaves room for what is not quite cubic. With 2 fewer a lens off the middle of the
+growth is not covered; with 2 more, errors grow further for shapes that no lens makes."""
+
+SETTLED, MOST_STEPS = 1e-2, 15
+"""Decrease of −2 ln L of a step at which the linear iteration ends: a hundredth of what matters in a comparison, where
+differences count from 1; and the most steps. Measured on campaigns of 20 trials: 2 to 4 steps."""
+
+
+@dataclass(frozen=True)
+class SmoothErrors:
+    """A fit with smooth errors of position beside it.
+
+    `solution` holds the free numbers of the fit and behind them the sizes of the errors in standard deviations of their
+    priors. `log_likelihood` is ln L with those priors, `whitened`, arrays of shape (n_points,), what is left of each
+    trial, freed of its correlation, in standard deviations; `displacement_m`, arrays of shape (n_points,), the smooth
+    error itself.
+    """
+
+    solution: Solution
+    log_likelihood: float
+    whitened: tuple[Floats, ...]
+    displacement_m: tuple[Floats, ...]
+
+
+def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Floats]:
+    """What one standard deviation of each shape does to positions, m, arrays of shape (n_points, n_shapes).
+
+    `grown_m` is the growth at each point; a trial whose positions have no systematic error has zeros. The interval of
+    the polynomials is that of all growth, for one camera sees all trials. No shapes where no trial has such an error.
+    """
+    sigma_m = np.array([item.position_systematic_m for item in predictor.data])
+    if not (sigma_m > 0).any():
+        return [np.zeros((one.size, 0)) for one in grown_m]
+    reach = max(float(np.max(one)) for one in grown_m)
+    select = np.eye(max(ORDERS) + 1)[list(ORDERS)].T
+    # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
+    at_rest = (-1.0) ** np.array(ORDERS)
+    return [
+        sigma * (np.polynomial.legendre.legval(2 * np.clip(one / reach, 0, 1) - 1, select).T - at_rest)
+        for one, sigma in zip(grown_m, sigma_m.tolist(), strict=True)
+    ]
+
+
+def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> SmoothErrors | None:
+    """Fit the smooth errors of position beside the numbers of a fit, to first order; None where there are none.
+
+    Parameters
+    ----------
+    held : spreads and noise that the fit was told instead of estimating them
+
+    Returns
+    -------
+    SmoothErrors or None
+
+    Notes
+    -----
+    Trajectories are not followed anew: positions move by tenths of a millimetre, over which they are straight.
+    """
+    grown = [
+        item.lead_position_m - own[ORIGIN] - columns[:, -1]
+        for item, own, columns in zip(predictor.data, solution.state.own, solution.columns, strict=True)
+    ]
+    shapes = position_shapes(predictor, grown)
+    count = shapes[0].shape[1]
+    if not count:
+        return None
+    wide = [
+        np.column_stack([columns[:, :-1], shape, columns[:, -1]])
+        for columns, shape in zip(solution.columns, shapes, strict=True)
+    ]
+    grams = np.stack([products(one, item.first) for one, item in zip(wide, predictor.data, strict=True)])
+    problem = _with_shapes(solution.frame, count)
+    state = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
+    held = held or FixedTerms()
+    moved = np.zeros((len(grown), grams.shape[-1] - 1))
+    state = _variances(predictor, problem, grams, state, solution.estimable, held)
+    for _ in range(MOST_STEPS):
+        step, own_step, promised = newton_step(grams, problem, state, 0.0)
+        theta = np.clip(state.theta + step, problem.lower, problem.upper)
+        change = np.column_stack([own_step, np.append(theta - state.theta, 0.0)[problem.index]])
+        grams, moved = _moved(grams, change), moved + change
+        state = replace(state, theta=theta, own=state.own + own_step)
+        before, state = state, _variances(predictor, problem, grams, state, solution.estimable, held)
+        if promised < SETTLED and variances_moved(before, state) < SETTLED_SPREAD:
+            break
+    part = marginal(grams, problem, state)
+    spread = estimate_spreads(part, problem, state, solution.estimable, restricted=False)
+    left = [one[:, -1] - one[:, :-1] @ change for one, change in zip(wide, moved, strict=True)]
+    return SmoothErrors(
+        solution=replace(solution, state=state, frame=problem, grams=grams, columns=tuple(_with_residual(wide, left))),
+        log_likelihood=-0.5 * deviance(part, problem, state, spread, restricted=False),
+        whitened=tuple(
+            whiten(one, item.first, state.rho) / np.sqrt(variance)
+            for one, item, variance in zip(left, predictor.data, state.variance, strict=True)
+        ),
+        displacement_m=tuple(shape @ state.theta[-count:] for shape in shapes),
+    )
+
+
+def _with_residual(columns: Sequence[Floats], residual: Sequence[Floats]) -> list[Floats]:
+    return [np.column_stack([one[:, :-1], left]) for one, left in zip(columns, residual, strict=True)]
+
+
+def _with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
+    """The problem with the sizes of the shapes as further free numbers, each with a normal prior of mean 0 and sd 1."""
+    places = problem.prior_mean.size + np.arange(count)
+    # A trial's column that belongs to no free number has the place −1: the last of an appended zero.
+    index = np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))])
+    return replace(
+        problem,
+        index=index,
+        prior_mean=np.append(problem.prior_mean, np.zeros(count)),
+        prior_precision=np.append(problem.prior_precision, np.ones(count)),
+        lower=np.append(problem.lower, np.full(count, -np.inf)),
+        upper=np.append(problem.upper, np.full(count, np.inf)),
+        free=np.append(problem.free, np.ones(count, dtype=bool)),
+    )
+
+
+def _variances(
+    predictor: Predictor,
+    problem: MixedProblem,
+    grams: Floats,
+    state: FitState,
+    estimable: tuple[bool, bool],
+    held: FixedTerms,
+) -> FitState:
+    """Noise and spreads anew, where the fit was not told them."""
+    if held.noise is None:
+        rho, variance = estimate_noise(grams, problem, state, held.correlation)
+        state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
+    if any(estimable):
+        state = replace(state, spread=estimate_spreads(marginal(grams, problem, state), problem, state, estimable))
+    return state
+
+
+def _moved(grams: Floats, change: Floats) -> Floats:
+    """Products of the columns once the unknowns of each trial, shape (n_trials, n_columns − 1), have moved by so much.
+
+    The residual becomes r − C·change, the other columns stay.
+    """
+    turn = np.broadcast_to(np.eye(grams.shape[-1]), (len(grams), *grams.shape[-2:])).copy()
+    turn[:, :-1, -1] = -change
+    return np.asarray(np.swapaxes(turn, 1, 2)[:, None] @ grams @ turn[:, None])
