@@ -9,6 +9,7 @@ import pytest
 from by_hand import BARE, LOADED, Vine, simulated, whole_catalogue
 
 from vinetrack.core.records import Bend, Trial
+from vinetrack.dynamics.equations import TrialArrays
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, base_model, effects_on
@@ -30,9 +31,9 @@ def accelerations(
     theta = model.parameters_for(trial.vine)
     on, rig = effects_on(model, theta[None])[0], np.array(trial_inputs(trial))
     bends = np.array([(b.start_m, b.arc_m, b.radius_m) for b in trial.bends]).reshape(-1, 3)
-    pressures = np.full(time.size, compiled.first_chamber(on, rig, theta)) if chamber is None else chamber
-    common = (on, rig, theta, np.empty(0), np.empty(0), bends)
-    return [compiled.rates(t, 2 * a, 2 * b, p, *common)[0] for t, a, b, p in zip(time, y, v, pressures, strict=True)]
+    arrays = TrialArrays(on, rig, theta, np.empty(0), np.empty(0), bends)
+    pressures = np.full(time.size, compiled.first_chamber(arrays)) if chamber is None else chamber
+    return [compiled.rates(t, 2 * a, 2 * b, p, arrays)[0] for t, a, b, p in zip(time, y, v, pressures, strict=True)]
 
 
 @pytest.mark.parametrize("vine", [BARE, LOADED], ids=["bare", "loaded"])

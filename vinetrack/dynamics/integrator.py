@@ -6,196 +6,73 @@ the end of a bare vine the mass goes to nothing; and a vine may stall, after whi
 exceeds what holds it. An implicit method that is stable at any step, with the step chosen from its own error, does
 all four.
 
-This file is the text of a compiled kernel: `vinetrack.dynamics.kernel` sets what follows the marked line behind the
-`rates` of one model and `vinetrack.dynamics.radau`, so that the compiler sees all. Only numbers and arrays, nothing of
-Python's.
+`_integrate` follows one trajectory. A vine is at rest (`_wait_for_drive`, `_set_off`), moving (`_limited_step`,
+`radau_step`, `_judge_step`, `_next_step_size`) or has a slack tail (`vinetrack.dynamics.slack_tail`). Only numbers,
+tuples and arrays here, nothing that numba could not compile. The first argument of most functions, `equations`, holds
+the compiled functions of one model, and `trial` the arrays of one trial: see `vinetrack.dynamics.equations`.
 
-Source of the method: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.5 and IV.8.
+Source of the method: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1996), sections
+IV.5 and IV.8.
 """
 
 import numpy as np
-from numba import njit
 
-from vinetrack.dynamics.breakpoints import next_corner
-from vinetrack.dynamics.radau import C1, C2, carry_on, quintic, radau_step
-from vinetrack.dynamics.slack_tail import TAUT, follow_slack
-
-
-@njit(nogil=True)
-def rates(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends):
-    """Acceleration of the tail and rate of change of the chamber's pressure: here stand those of one model."""
-    raise NotImplementedError
-
-
-@njit(nogil=True)
-def rest_acceleration(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends):
-    """Acceleration with which a vine at rest would set off, what holds it at rest included."""
-    raise NotImplementedError
-
-
-@njit(nogil=True)
-def observed(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends):
-    """Position of the leading edge that the camera reports."""
-    raise NotImplementedError
-
-
-@njit(nogil=True)
-def first_chamber(on, rig, theta):
-    """Pressure of the chamber at release."""
-    raise NotImplementedError
-
-
-@njit(nogil=True)
-def tip_tension(time, x, v, chamber, resting, on, rig, theta, trace_time, trace_pressure, bends):
-    """Tension that the tip leaves for the tail, and rate of change of the chamber's pressure."""
-    raise NotImplementedError
-
-
-TAIL_FREE = (
-    False  #: whether `vinetrack.dynamics.slack_tail` is set behind; `rig[FREE]` and `rig[RATIO]` are then looked at
+from vinetrack.dynamics.equations import (
+    ENDED,
+    RUNNING,
+    STALLED,
+    TAUT,
+    TOO_HARD,
+    Point,
+    TrialArrays,
+    compiled,
+    next_slope_change,
 )
-FREE = RATIO = 0
+from vinetrack.dynamics.radau import NO_STAGES, first_stages, quintic, radau_step
 
-# ---- what follows is set behind the rates of one model ----
-RUNNING, ENDED, STALLED, TOO_HARD = 0, 1, 2, 3
 MOST_STEPS = 20_000
-EASY = 0.1  # error, in tolerances, of a step cut short that leaves its length before the cut to be believed
+"""Steps before a trajectory is given up, chosen: trajectories of the catalogue take 20 to 600. At half and at twice
+nothing changes but how long a hopeless one takes, about 20 ms at 1 µs a step."""
+
+EASY = 0.1
+"""Error, in tolerances, of a shortened step below which the next takes up the length wished before; chosen: an error
+grows with the fourth power of the step, so that at 0.1 a step 1.8 times as long would just do. At half it is taken up
+less often, at twice more of such steps are refused."""
+
+BATCH = (
+    "starts", "times", "on", "inputs", "thetas", "trace_starts", "trace_time", "trace_pressure", "bend_starts", "bends",
+    "breakpoints", "stops", "rtol", "out", "ends", "work",
+)  # fmt: skip
+"""Arguments of `integrate_trials` behind the equations, in their order."""
+
+MOVING, AT_REST, SLACK = 0, 1, 2
+"""Phases of a trajectory; a convention of this file."""
+
+ACCEPTED, REFUSED, STANDSTILL = 0, 1, 2
+"""What becomes of a step (`_judge_step`); a convention of this file."""
 
 
-@njit(nogil=True)
-def typical_speed(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends, start_acceleration, room):
-    """Speed that the motion will reach, within a factor of two: ballistic over `room`, or where the forces balance."""
-    ballistic = (2 * start_acceleration * room) ** 0.5
-    speed = ballistic
-    for _ in range(60):
-        acceleration, _rate = rates(time, x, speed, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-        if acceleration > 0:
-            return min(2 * speed, ballistic)
-        speed *= 0.5
-    return speed
-
-
-@njit(nogil=True)
-def time_of_end(stop, h, x0, v0, a0, x1, v1, a1):
-    """Fraction of a step at which x reaches `stop`, by bisection."""
-    low, high = 0.0, 1.0
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        x, _v, _a = quintic(middle, h, x0, v0, a0, x1, v1, a1)
-        if x < stop:
-            low = middle
-        else:
-            high = middle
-    return 0.5 * (low + high)
-
-
-@njit(nogil=True)
-def time_of_slack(
-    time, h, x0, v0, a0, x1, v1, a1, chamber, chamber_end, on, rig, theta, trace_time, trace_pressure, bends
-):
-    """Fraction of a step at which the tail's tension comes to nothing, by bisection; 2 where it is taut at the end."""
-    tension, _rate = tip_tension(
-        time + h, x1, v1, chamber_end, False, on, rig, theta, trace_time, trace_pressure, bends
-    )
-    if tension >= 0:
-        return 2.0
-    low, high = 0.0, 1.0
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        x, v, _a = quintic(middle, h, x0, v0, a0, x1, v1, a1)
-        pressure = chamber + middle * (chamber_end - chamber)
-        tension, _rate = tip_tension(
-            time + middle * h, x, v, pressure, False, on, rig, theta, trace_time, trace_pressure, bends
-        )
-        if tension < 0:
-            high = middle
-        else:
-            low = middle
-    return high
-
-
-@njit(nogil=True)
-def filled(time, x, chamber, step, on, rig, theta, trace_time, trace_pressure, bends):
-    """Pressure of the chamber of a vine at rest after `step`; exact for a supply in proportion to what is lacking."""
-    _a, rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-    if rate == 0:
-        return chamber
-    delta = 1e-6 * (abs(chamber) + 1e3)
-    _a, other = rates(time, x, 0.0, chamber + delta, on, rig, theta, trace_time, trace_pressure, bends)
-    decay = step * (other - rate) / delta
-    return chamber + step * rate * (np.expm1(decay) / decay if abs(decay) > 1e-12 else 1.0)
-
-
-@njit(nogil=True)
-def once_it_shows(time, until, x, chamber, delay, on, rig, theta, trace_time, trace_pressure, bends):
-    """When a drive that rises from nothing at `time` has moved a vine by 10⁻⁹ of its way, and the chamber's pressure.
-
-    Before, the drive is a small difference of large forces, no more than rounding, and the vine as good as at rest.
-    """
-    start, pressure = time, chamber
-    while time + delay < until:
-        after = filled(time, x, chamber, delay, on, rig, theta, trace_time, trace_pressure, bends)
-        if rest_acceleration(time + delay, x, after, on, rig, theta, trace_time, trace_pressure, bends) <= 0:
-            break
-        slope, _rate = rates(time + delay, x, 0.0, after, on, rig, theta, trace_time, trace_pressure, bends)
-        room = 0.5 * slope * delay**2
-        speed = typical_speed(time + delay, x, after, on, rig, theta, trace_time, trace_pressure, bends, slope, room)
-        if delay * speed > 1e-9 * (x + 1e-3):
-            break
-        start, pressure = time + delay, after
-        delay *= 2
-    return start, pressure
-
-
-@njit(nogil=True)
-def wait_for_drive(time, until, x, chamber, on, rig, theta, trace_time, trace_pressure, bends):
-    """First instant after `time` at which the drive moves a vine at rest, and the chamber's pressure then.
-
-    The instant is past `until` where none does. The chamber goes on filling meanwhile.
-    """
-    steps = max(256, 2 * trace_time.size)
-    step = (until - time) / steps
-    for _step in range(steps):
-        after = filled(time, x, chamber, step, on, rig, theta, trace_time, trace_pressure, bends)
-        if rest_acceleration(time + step, x, after, on, rig, theta, trace_time, trace_pressure, bends) > 0:
-            low, high = 0.0, step
-            for _ in range(24):
-                middle = 0.5 * (low + high)
-                pressure = filled(time, x, chamber, middle, on, rig, theta, trace_time, trace_pressure, bends)
-                if rest_acceleration(time + middle, x, pressure, on, rig, theta, trace_time, trace_pressure, bends) > 0:
-                    high = middle
-                else:
-                    low = middle
-            pressure = filled(time, x, chamber, high, on, rig, theta, trace_time, trace_pressure, bends)
-            return once_it_shows(
-                time + high, until, x, pressure, 1e-7 * step, on, rig, theta, trace_time, trace_pressure, bends
-            )
-        time += step
-        chamber = after
-    return until + 1.0, chamber
-
-
-@njit(nogil=True)
-def rest_from(times, k, x, chamber, on, rig, theta, trace_time, trace_pressure, bends, out):
-    """Fill the rows of `out` from k with a vine at rest at x."""
-    for i in range(k, times.size):
-        out[i, 3] = observed(times[i], x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-        out[i, 0] = x
-        out[i, 1] = 0.0
-        out[i, 2] = 0.0
-
-
-@njit(nogil=True)
-def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, stop, rtol, out):
+@compiled
+def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
     """Follow one trajectory from rest at time 0.
 
-    Fills `out` (n_times, 4) with x, v, a of the tail and the position of the leading edge that the camera reports, at
-    `times`; while a tail is slack, with r times those of the leading edge.
-
-    `kinks`, rising, is where along x the forces have corners, such as where the film's mass reaches its floor: a step
-    ends at each, for none is good across it. `times` must increase; before 0 the vine is at rest, after the end of
-    growth (x = `stop`; infinite for a body that moves as a whole) it stays there with its last speed and acceleration
-    given as 0.
+    Parameters
+    ----------
+    times
+        Array (n_times,), s since release, increasing. Before 0 the vine is at rest; after the end of growth it stays at
+        `stop`, speed and acceleration 0.
+    breakpoints
+        Array, rising, padded with infinity: where along x the forces have corners, such as where the film's mass
+        reaches its floor, m. A step ends at each, for none is accurate across it.
+    stop
+        Tail travel at the end of growth, m; infinite for a body that moves as a whole.
+    rtol
+        Local tolerance on the speed, relative.
+    out
+        Array (n_times, 4) to be filled: x, v, a of the tail and the position of the leading edge that the camera
+        reports; while a tail is slack, r times those of the leading edge.
+    work
+        Array (7, 4) for `follow_slack`.
 
     Returns
     -------
@@ -204,236 +81,323 @@ def integrate(times, on, rig, theta, trace_time, trace_pressure, bends, kinks, s
         the tail first went slack, NaN where it did not or may not.
     """
     count = times.size
-    k = 0
-    chamber = first_chamber(on, rig, theta)
-    while k < count and times[k] <= 0:
-        out[k, 3] = observed(0.0, 0.0, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-        out[k, 0] = 0.0
-        out[k, 1] = 0.0
-        out[k, 2] = 0.0
-        k += 1
-    if k == count:
-        return RUNNING, float("nan"), 0.0, 0, float("nan")
+    point = Point(0.0, 0.0, 0.0, 0.0, equations.first_chamber(trial))
+    row = _write_at_rest(equations, trial, times, 0, 0.0, point, out)
+    end_time = slack_time = np.nan
+    if row == count:
+        return RUNNING, end_time, 0.0, 0, slack_time
     until = times[count - 1]
-    time, x, v = 0.0, 0.0, 0.0
-    n_steps = 0
-    end_time = float("nan")
-    at_rest = True
-    loose = closed_in = False
-    slack_time = float("nan")
-    h = 0.0
-    slope = 0.0
-    scale = 0.0
-    z1 = z2 = z3 = 0.0
-    have_guess = False
-    h_before = 1.0
-    passed = corner = 0
+    phase, closed_in = AT_REST, False
+    before, h, scale = NO_STAGES, 0.0, 0.0
+    passed = sample = n_steps = 0
     while True:
-        if TAIL_FREE and loose:
-            if slack_time != slack_time:
-                slack_time = time
-            status, k, time, x, v, chamber, end_speed = follow_slack(
-                times,
-                k,
-                time,
-                x,
-                v,
-                chamber,
-                on,
-                rig,
-                theta,
-                trace_time,
-                trace_pressure,
-                bends,
-                rig[RATIO],
-                stop,
-                rtol,
-                out,
+        if phase == SLACK:
+            slack_time = point.time if np.isnan(slack_time) else slack_time
+            status, row, point, end_speed = equations.follow_slack(
+                equations, trial, times, row, point, stop, rtol, out, work
             )
+            if status == ENDED:
+                end_time = point.time
+                _write_at_rest(equations, trial, times, row, np.inf, _at(point, stop), out)
             if status != TAUT:
-                end_time = time if status == ENDED else end_time
-                if status == ENDED:
-                    rest_from(times, k, stop, chamber, on, rig, theta, trace_time, trace_pressure, bends, out)
                 return status, end_time, end_speed, n_steps, slack_time
-            loose, at_rest, have_guess = False, v <= 0, False
-            slope, _rate = rates(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-            scale = max(scale, v)
-            h = 1e-2 * max(v, 1e-3 * scale) / max(abs(slope), 1e-9)
-        if at_rest:
-            if rest_acceleration(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends) <= 0:
-                start, chamber = wait_for_drive(
-                    time, until, x, chamber, on, rig, theta, trace_time, trace_pressure, bends
-                )
-                while k < count and times[k] <= start:
-                    out[k, 3] = observed(times[k], x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-                    out[k, 0] = x
-                    out[k, 1] = 0.0
-                    out[k, 2] = 0.0
-                    k += 1
-                if k == count:
-                    return STALLED, time, 0.0, n_steps, slack_time
-                time = start
-            if TAIL_FREE and rig[FREE] > 0:
-                tension, _rate = tip_tension(
-                    time, x, 0.0, chamber, True, on, rig, theta, trace_time, trace_pressure, bends
-                )
-                if tension < 0:
-                    at_rest, loose, v = False, True, 0.0
-                    continue
-            slope, _rate = rates(time, x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-            at_rest = False
-            room = min(stop - x, 0.5 * slope * (until - time) ** 2 + 1e-9)
-            scale = typical_speed(time, x, chamber, on, rig, theta, trace_time, trace_pressure, bends, slope, room)
-            h = 1e-4 * scale / slope
-            v = 0.0
-            have_guess = False
-        while passed < kinks.size and x >= kinks[passed]:
+            phase = AT_REST if point.v <= 0 else MOVING
+            point, scale, h = _pulled_taut(equations, trial, point, scale)
+            before = NO_STAGES
+        if phase == AT_REST:
+            if equations.rest_acceleration(point.time, point.x, point.chamber, trial) <= 0:
+                start, chamber = _wait_for_drive(equations, trial, point, until)
+                resting = Point(point.time, point.x, 0.0, 0.0, chamber)
+                row = _write_at_rest(equations, trial, times, row, start, resting, out)
+                if row == count:
+                    return STALLED, point.time, 0.0, n_steps, slack_time
+                point = Point(start, point.x, 0.0, 0.0, chamber)
+            if equations.slack_at_rest(equations, trial, point.time, point.x, point.chamber):
+                point = Point(point.time, point.x, 0.0, 0.0, point.chamber)
+                phase = SLACK
+                continue
+            point, scale, h = _set_off(equations, trial, point, until, stop)
+            phase, before = MOVING, NO_STAGES
+        while passed < breakpoints.size and point.x >= breakpoints[passed]:
             passed += 1
-        kink = kinks[passed] if passed < kinks.size else stop
-        ahead = min(kink, stop) - x
-        if v > 0 and h * v > 1.05 * ahead:
-            h = 1.02 * ahead / v
-        wished = h
-        if trace_time.size > 0:
-            # Between its samples a trace is straight; a step across a corner of it would be refused again and again.
-            corner = next_corner(corner, time, trace_time, trace_pressure)
-            if corner < trace_time.size and time + h > trace_time[corner]:
-                h = trace_time[corner] - time
-        if have_guess:
-            # The last step's polynomial, carried on into this one, relative to where this one starts.
-            r = h / h_before
-            p1, p2, p3 = carry_on(1 + C1 * r, z1, z2, z3), carry_on(1 + C2 * r, z1, z2, z3), carry_on(1 + r, z1, z2, z3)
-            w1, w2, w3 = p1 - z3, p2 - z3, p3 - z3
-            w1, w2, w3 = max(w1, -0.9 * v), max(w2, -0.9 * v), max(w3, -0.9 * v)
-        else:
-            w1, w2, w3 = C1 * h * slope, C2 * h * slope, h * slope
-            w1, w2, w3 = max(w1, -0.9 * v), max(w2, -0.9 * v), max(w3, -0.9 * v)
-        ok, error, x_end, v_end, slope_end, chamber_end, w1, w2, w3 = radau_step(
-            time, x, v, chamber, slope, h, w1, w2, w3, scale, rtol, on, rig, theta, trace_time, trace_pressure, bends
-        )
+        breakpoint_x = breakpoints[passed] if passed < breakpoints.size else stop
+        wished = _limited_step(h, point, min(breakpoint_x, stop))
+        sample = next_slope_change(sample, point.time, trial)
+        h = _up_to_sample(wished, point.time, sample, trial)
+        converged, error, end, stages = radau_step(equations, trial, point, first_stages(point, h, before), scale, rtol)
         n_steps += 1
         if n_steps > MOST_STEPS:
-            return TOO_HARD, time, v, n_steps, slack_time
-        if not ok:
-            h *= 0.25
-            have_guess = False
+            return TOO_HARD, point.time, point.v, n_steps, slack_time
+        verdict, factor = _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale)
+        if verdict == STANDSTILL:
+            point = Point(point.time + h, point.x + 0.5 * h * max(point.v, 0.0), point.v, point.slope, end.chamber)
+            phase, end_time = AT_REST, point.time
+            row = _write_at_rest(equations, trial, times, row, point.time, point, out)
+            if row == count:
+                return STALLED, end_time, 0.0, n_steps, slack_time
             continue
-        if v_end <= 0 or v + w1 <= 0 or v + w2 <= 0:
-            # It stops within this step. Close in on the moment, then let it rest.
-            if h * v <= 1e-9 * max(x, 1e-6) or v <= 1e-7 * scale:
-                at_rest = True
-                x += 0.5 * h * max(v, 0.0)
-                time += h
-                chamber = chamber_end
-                end_time = time
-                while k < count and times[k] <= time:
-                    out[k, 3] = observed(times[k], x, 0.0, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-                    out[k, 0] = x
-                    out[k, 1] = 0.0
-                    out[k, 2] = 0.0
-                    k += 1
-                if k == count:
-                    return STALLED, end_time, 0.0, n_steps, slack_time
+        if verdict == REFUSED:
+            h *= factor
+            before = NO_STAGES
+            continue
+        ended = end.x >= stop
+        fraction = _fraction_at(stop, h, point, end) if ended else 1.0
+        slack = equations.slack_fraction(equations, trial, h, point, end)
+        if slack < 2 and (slack < fraction or not ended):
+            if not closed_in:
+                # Within a step the chamber's pressure is known less well than at its ends: end one here.
+                closed_in, before = True, NO_STAGES
+                h *= slack
                 continue
-            h *= 0.3
-            have_guess = False
-            continue
-        if error > 1:
-            h *= max(0.2, 0.9 * error**-0.25)
-            have_guess = False
-            continue
-        if kink < stop and x_end > kink + 1e-7 * stop:
-            h *= time_of_end(kink + 5e-8 * stop, h, x, v, slope, x_end, v_end, slope_end)
-            have_guess = False
-            continue
-        last = time + h
-        ended = x_end >= stop
-        fraction = time_of_end(stop, h, x, v, slope, x_end, v_end, slope_end) if ended else 1.0
-        if TAIL_FREE and rig[FREE] > 0:
-            slack = time_of_slack(
-                time, h, x, v, slope, x_end, v_end, slope_end, chamber, chamber_end,
-                on, rig, theta, trace_time, trace_pressure, bends,
-            )  # fmt: skip
-            if slack < 2 and (slack < fraction or not ended):
-                if not closed_in:
-                    # Within a step the chamber's pressure is known less well than at its ends: end one here.
-                    closed_in, have_guess = True, False
-                    h *= slack
-                    continue
-                ended, loose, closed_in, fraction = False, True, False, slack
-        while k < count and times[k] <= time + fraction * h:
-            part = (times[k] - time) / h
-            now_x, now_v, now_a = quintic(part, h, x, v, slope, x_end, v_end, slope_end)
-            now_chamber = chamber + part * (chamber_end - chamber)
-            out[k, 0] = now_x
-            out[k, 1] = now_v
-            out[k, 2] = now_a
-            out[k, 3] = observed(times[k], now_x, now_v, now_chamber, on, rig, theta, trace_time, trace_pressure, bends)
-            k += 1
-        if ended and time + fraction * h <= until:
-            end_time = time + fraction * h
-            _x, end_speed, _a = quintic(fraction, h, x, v, slope, x_end, v_end, slope_end)
-            rest_from(times, k, stop, chamber_end, on, rig, theta, trace_time, trace_pressure, bends, out)
+            ended, phase, closed_in, fraction = False, SLACK, False, slack
+        row = _write_moving(equations, trial, times, row, fraction, h, point, end, out)
+        if ended and point.time + fraction * h <= until:
+            end_time = point.time + fraction * h
+            _x, end_speed, _a = quintic(fraction, h, point, end)
+            _write_at_rest(equations, trial, times, row, np.inf, _at(end, stop), out)
             return ENDED, end_time, end_speed, n_steps, slack_time
-        if k == count:
-            return RUNNING, end_time, v_end, n_steps, slack_time
-        if loose:
-            chamber += fraction * (chamber_end - chamber)
-            x, v, _a = quintic(fraction, h, x, v, slope, x_end, v_end, slope_end)
-            time += fraction * h
+        if row == count:
+            return RUNNING, end_time, end.v, n_steps, slack_time
+        if phase == SLACK:
+            point = _within_step(fraction, h, point, end)
             continue
-        time, x, v, slope, chamber = last, x_end, v_end, slope_end, chamber_end
         # A drive that rises from nothing takes the speed far beyond what the start let expect.
-        scale = max(scale, v)
-        z1, z2, z3 = w1, w2, w3
-        have_guess = True
-        h_before = h
-        further = h * min(6.0, 0.9 * max(error, 1e-8) ** -0.25)
-        h = max(further, wished) if wished > h and error < EASY else further
+        point, before, scale = end, stages, max(scale, end.v)
+        h = _next_step_size(h, wished, error)
 
 
-@njit(nogil=True)
-def integrate_many(
+@compiled
+def integrate_trials(
+    equations,
     starts,
     times,
     on,
-    rigs,
+    inputs,
     thetas,
     trace_starts,
     trace_time,
     trace_pressure,
     bend_starts,
     bends,
-    kinks,
+    breakpoints,
     stops,
     rtol,
     out,
     ends,
+    work,
 ):
-    """`integrate` for many trials.
+    """`_integrate` for many trials.
 
-    Trial i has times[starts[i]:starts[i+1]], on[i], rigs[i], thetas[i], kinks[i] (padded with infinity), and the trace
-    and the bends between its own starts. Fills `out` (n_times, 4) and `ends` (n_trials, 5): status, end time, end
-    speed, number of steps, time of slack.
+    Trial i has times[starts[i]:starts[i+1]], on[i], inputs[i], thetas[i], breakpoints[i] (padded with infinity), and
+    the trace and the bends between its own starts. Fills `out` (n_times, 4) and `ends` (n_trials, 5): status, end time,
+    end speed, number of steps, time of slack.
     """
     for i in range(starts.size - 1):
-        low, high = starts[i], starts[i + 1]
         trace = slice(trace_starts[i], trace_starts[i + 1])
-        status, end_time, end_speed, n_steps, slack_time = integrate(
-            times[low:high],
+        trial = TrialArrays(
             on[i],
-            rigs[i],
+            inputs[i],
             thetas[i],
             trace_time[trace],
             trace_pressure[trace],
             bends[bend_starts[i] : bend_starts[i + 1]],
-            kinks[i],
-            stops[i],
-            rtol,
-            out[low:high],
+        )
+        rows = slice(starts[i], starts[i + 1])
+        status, end_time, end_speed, n_steps, slack_time = _integrate(
+            equations, trial, times[rows], breakpoints[i], stops[i], rtol, out[rows], work
         )
         ends[i, 0] = status
         ends[i, 1] = end_time
         ends[i, 2] = end_speed
         ends[i, 3] = n_steps
         ends[i, 4] = slack_time
+
+
+@compiled
+def _at(point, x):
+    """The same point at another position."""
+    return Point(point.time, x, point.v, point.slope, point.chamber)
+
+
+@compiled
+def _write_at_rest(equations, trial, times, row, until, point, out):
+    """Fill the rows of `out` from `row` up to the time `until` with a vine at rest; returns the next row."""
+    while row < times.size and times[row] <= until:
+        # Before release the camera sees the vine as it stood at release.
+        out[row, 3] = equations.observed(max(times[row], 0.0), point.x, 0.0, point.chamber, trial)
+        out[row, 0] = point.x
+        out[row, 1] = 0.0
+        out[row, 2] = 0.0
+        row += 1
+    return row
+
+
+@compiled
+def _write_moving(equations, trial, times, row, fraction, h, start, end, out):
+    """Fill the rows of `out` from `row` up to a fraction of a step; returns the next row."""
+    while row < times.size and times[row] <= start.time + fraction * h:
+        part = (times[row] - start.time) / h
+        x, v, a = quintic(part, h, start, end)
+        chamber = start.chamber + part * (end.chamber - start.chamber)
+        out[row, 0] = x
+        out[row, 1] = v
+        out[row, 2] = a
+        out[row, 3] = equations.observed(times[row], x, v, chamber, trial)
+        row += 1
+    return row
+
+
+@compiled
+def _within_step(fraction, h, start, end):
+    """The vine at a fraction of a step."""
+    x, v, a = quintic(fraction, h, start, end)
+    return Point(start.time + fraction * h, x, v, a, start.chamber + fraction * (end.chamber - start.chamber))
+
+
+@compiled
+def _fraction_at(x_wanted, h, start, end):
+    """Fraction of a step at which x reaches a position, by bisection."""
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        x, _v, _a = quintic(middle, h, start, end)
+        if x < x_wanted:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+@compiled
+def _limited_step(h, point, x_limit):
+    """The step size, cut so that the step ends just behind the next breakpoint or the end of growth."""
+    ahead = x_limit - point.x
+    if point.v > 0 and h * point.v > 1.05 * ahead:
+        return 1.02 * ahead / point.v
+    return h
+
+
+@compiled
+def _up_to_sample(h, time, sample, trial):
+    """The step size, cut at the next sample of a measured pressure: a step across it would be refused repeatedly."""
+    if sample < trial.trace_time.size and time + h > trial.trace_time[sample]:
+        return trial.trace_time[sample] - time
+    return h
+
+
+@compiled
+def _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale):
+    """Whether a step counts, and otherwise the factor on its size for the next attempt.
+
+    STANDSTILL: the vine stops within the step, which is by now so short that the moment is known.
+    """
+    h = stages.h
+    if not converged:
+        return REFUSED, 0.25
+    if end.v <= 0 or point.v + stages.z1 <= 0 or point.v + stages.z2 <= 0:
+        if h * point.v <= 1e-9 * max(point.x, 1e-6) or point.v <= 1e-7 * scale:
+            return STANDSTILL, 1.0
+        return REFUSED, 0.3
+    if error > 1:
+        return REFUSED, max(0.2, 0.9 * error**-0.25)
+    if breakpoint_x < stop and end.x > breakpoint_x + 1e-7 * stop:
+        return REFUSED, _fraction_at(breakpoint_x + 5e-8 * stop, h, point, end)
+    return ACCEPTED, 1.0
+
+
+@compiled
+def _next_step_size(h, wished, error):
+    """Size of the step after an accepted one, from its error: Hairer & Wanner IV.8, an estimate of order 3."""
+    longer = h * min(6.0, 0.9 * max(error, 1e-8) ** -0.25)
+    return max(longer, wished) if wished > h and error < EASY else longer
+
+
+@compiled
+def _set_off(equations, trial, point, until, stop):
+    """From rest: the point with its acceleration, the speed that the motion will reach, and the first step."""
+    slope, _rate = equations.rates(point.time, point.x, 0.0, point.chamber, trial)
+    room = min(stop - point.x, 0.5 * slope * (until - point.time) ** 2 + 1e-9)
+    scale = _typical_speed(equations, trial, point.time, point.x, point.chamber, slope, room)
+    return Point(point.time, point.x, 0.0, slope, point.chamber), scale, 1e-4 * scale / slope
+
+
+@compiled
+def _pulled_taut(equations, trial, point, scale):
+    """After a slack phase: the point with its acceleration, the speed to be expected, and the first step."""
+    time, x, v, _slope, chamber = point
+    slope, _rate = equations.rates(time, x, v, chamber, trial)
+    scale = max(scale, v)
+    return Point(time, x, v, slope, chamber), scale, 1e-2 * max(v, 1e-3 * scale) / max(abs(slope), 1e-9)
+
+
+@compiled
+def _typical_speed(equations, trial, time, x, chamber, start_acceleration, room):
+    """Speed that the motion will reach, within a factor of two: ballistic over `room`, or where the forces balance."""
+    ballistic = (2 * start_acceleration * room) ** 0.5
+    speed = ballistic
+    for _ in range(60):
+        acceleration, _rate = equations.rates(time, x, speed, chamber, trial)
+        if acceleration > 0:
+            return min(2 * speed, ballistic)
+        speed *= 0.5
+    return speed
+
+
+@compiled
+def _filled(equations, trial, time, x, chamber, step):
+    """Pressure of the chamber of a vine at rest after `step`; exact for a supply in proportion to what is lacking."""
+    _a, rate = equations.rates(time, x, 0.0, chamber, trial)
+    if rate == 0:
+        return chamber
+    delta = 1e-6 * (abs(chamber) + 1e3)
+    _a, higher = equations.rates(time, x, 0.0, chamber + delta, trial)
+    decay = step * (higher - rate) / delta
+    return chamber + step * rate * (np.expm1(decay) / decay if abs(decay) > 1e-12 else 1.0)
+
+
+@compiled
+def _wait_for_drive(equations, trial, point, until):
+    """First instant at which the drive moves a vine that rests at `point`, and the chamber's pressure then.
+
+    The instant is past `until` where none does. The chamber goes on filling meanwhile.
+    """
+    time, x, _v, _slope, chamber = point
+    steps = max(256, 2 * trial.trace_time.size)
+    step = (until - time) / steps
+    for _step in range(steps):
+        after = _filled(equations, trial, time, x, chamber, step)
+        if equations.rest_acceleration(time + step, x, after, trial) > 0:
+            low, high = 0.0, step
+            for _ in range(24):
+                middle = 0.5 * (low + high)
+                pressure = _filled(equations, trial, time, x, chamber, middle)
+                if equations.rest_acceleration(time + middle, x, pressure, trial) > 0:
+                    high = middle
+                else:
+                    low = middle
+            pressure = _filled(equations, trial, time, x, chamber, high)
+            return _visible_start(equations, trial, time + high, until, x, pressure, 1e-7 * step)
+        time += step
+        chamber = after
+    return until + 1.0, chamber
+
+
+@compiled
+def _visible_start(equations, trial, time, until, x, chamber, delay):
+    """When a drive that rises from nothing at `time` has moved a vine by 10⁻⁹ of its way, and the chamber's pressure.
+
+    Before, the drive is a small difference of large forces, no more than rounding, and the vine as good as at rest.
+    """
+    start, pressure = time, chamber
+    while time + delay < until:
+        after = _filled(equations, trial, time, x, chamber, delay)
+        if equations.rest_acceleration(time + delay, x, after, trial) <= 0:
+            break
+        slope, _rate = equations.rates(time + delay, x, 0.0, after, trial)
+        room = 0.5 * slope * delay**2
+        speed = _typical_speed(equations, trial, time + delay, x, after, slope, room)
+        if delay * speed > 1e-9 * (x + 1e-3):
+            break
+        start, pressure = time + delay, after
+        delay *= 2
+    return start, pressure

@@ -1,8 +1,8 @@
 """The sum of effects as one compiled function.
 
-The effects of a model are plain Python functions in separate files. Here a small module is written out that calls
-them in the order of the physics, sets the integrator behind them, and is compiled once; the compiled form is kept in
-the user's cache under a name made of everything it depends on, so that it is found again by the next process.
+The effects of a model are plain Python functions in separate files. Here a small module is written that calls them in
+the order of the physics and hands the result, an `Equations`, to the integrator. It is compiled once; the compiled form
+is kept in the user's cache under a name made of everything it depends on, so that the next process finds it again.
 """
 
 from __future__ import annotations
@@ -20,57 +20,42 @@ from pathlib import Path
 from types import ModuleType
 
 from vinetrack.core import constants
+from vinetrack.dynamics.integrator import BATCH
 from vinetrack.effects import Effect, TrialInputs
-from vinetrack.effects import _base as effects_base
-from vinetrack.effects._catalogue import load_module
 
-TEXTS = tuple(
-    Path(__file__).with_name(name) for name in ("radau.py", "breakpoints.py", "slack_tail.py", "integrator.py")
-)
-"""What is set behind the rates, in this order; `slack` only where a tail may go slack."""
+PARTS = ("equations.py", "radau.py", "slack_tail.py", "integrator.py")
+"""Files of the integrator, which the compiled form of a model holds too: an edit of one must compile anew."""
 
-MARK = "# ---- what follows is set behind the rates of one model ----\n"
-
-_HEAD = '''"""Machine-made: the effects {names} summed, and the integrator behind them."""
+_HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
 
 from pathlib import Path
 
-import numpy as np
 from numba import njit
 
-from vinetrack.effects._base import State, TrialInputs
-from vinetrack.effects._catalogue import load_module
+from vinetrack.dynamics.equations import (
+    Equations, angle_passed, compiled, never_slack, no, no_free_fall, no_slack_phase, no_tip_tension, not_slack_at_rest,
+    trace_at, yes,
+)
+from vinetrack.dynamics.integrator import integrate_trials
+from vinetrack.dynamics.slack_tail import follow_slack, slack_at_rest, slack_fraction
+from vinetrack.effects import State, TrialInputs, load_effect
 
 '''
 
-_TABLES = '''
-
-@njit(nogil=True)
-def trace_at(time, trace_time, trace_pressure):
-    """The measured pressure, linear between its samples, constant beyond them."""
-    last = trace_time.size - 1
-    if time <= trace_time[0]:
-        return trace_pressure[0]
-    if time >= trace_time[last]:
-        return trace_pressure[last]
-    k = np.searchsorted(trace_time, time)
-    part = (time - trace_time[k - 1]) / (trace_time[k] - trace_time[k - 1])
-    return trace_pressure[k - 1] + part * (trace_pressure[k] - trace_pressure[k - 1])
+_FOOT = """
+EQUATIONS = Equations(__name__, {fields})
 
 
-@njit(nogil=True)
-def angle_passed(y, bends):
-    """Angle of the bends (rows: start, arc, radius) that the tip has passed at y."""
-    angle = 0.0
-    for k in range(bends.shape[0]):
-        angle += min(max(y - bends[k, 0], 0.0), bends[k, 1]) / bends[k, 2]
-    return angle
-
-'''
+# Only the outermost function is called from Python; what it calls is compiled into it, and kept with it.
+@njit(nogil=True, error_model="numpy", _nrt=False, cache=True)
+def integrate_many({batch}):
+    integrate_trials(EQUATIONS, {batch})
+"""
 
 _SUM = """
-@njit(nogil=True)
+@compiled
 def {name}({arguments}):
+    on, theta = trial.on, trial.theta
     rig = TrialInputs({rig_fields})
     film = 1.0
     {motion}
@@ -87,12 +72,12 @@ _STATE = (
     "State(time, y, ydot, x, v, set_pressure, pressure, yield_pressure, area, density, mass, gain, bend_angle, "
     "tension, seen)"
 )
-_INDICES = {"FREE": "tail_free", "RATIO": "travel_ratio"}
-_COMMON = "on, rig_row, theta, trace_time, trace_pressure, bends"
-_MOTION = f"time, x, v, chamber, {_COMMON}"
+_MOTION = "time, x, v, chamber, trial"
 _MOVING = """x, v = max(x, 0.0), max(v, 0.0)
     y, ydot = x / rig.travel_ratio, v / rig.travel_ratio"""
 _AT_REST = "v, ydot = 0.0, 0.0\n    x = max(x, 0.0)\n    y = x / rig.travel_ratio"
+_TAIL_FREE = ("tip_tension", "free_fall", "slack_fraction", "slack_at_rest", "follow_slack")
+_TAIL_TAUT = ("no_tip_tension", "no_free_fall", "never_slack", "not_slack_at_rest", "no_slack_phase")
 _AT_RELEASE = "x, v, y, ydot, time = 0.0, 0.0, 0.0, 0.0, 0.0"
 
 
@@ -114,7 +99,7 @@ class _Writer:
                 continue
             arguments = "".join(f", theta[{offsets[i] + j}]" for j in range(len(effect.parameters)))
             name = f"{effect.name}__{hook}"
-            self.loads[name] = f"{name} = njit(nogil=True)(load_module(Path({str(effect.path)!r})).{hook})"
+            self.loads[name] = f"{name} = compiled(load_effect(Path({str(effect.path)!r})).functions[{hook!r}])"
             # A measured trace already holds what happens in the chamber.
             condition = f"on[{i}] and not measured" if effect.in_trace else f"on[{i}]"
             lines += [f"if {condition}:", f"    {target.format(call=f'{name}({state}, rig{arguments})')}"]
@@ -124,7 +109,7 @@ class _Writer:
         """Gauge → what the chamber does → area and losses; where the area yields to pressure, until both agree."""
         gauge = self.calls("gauge", "pressure = {call}")
         lines = [*gauge, "set_pressure = pressure"]
-        lines += ["if measured:", "    pressure = trace_at(time, trace_time, trace_pressure)"]
+        lines += ["if measured:", "    pressure = trace_at(time, trial)"]
         lines += [f"    {line}" for line in gauge]
         if self.has("chamber_rate"):
             lines += ["else:", "    pressure = chamber"]
@@ -141,8 +126,8 @@ class _Writer:
 
     def mass(self) -> list[str]:
         lines = [*self.calls("film_gain", "film *= {call}"), "density = rig.linear_density * film"]
-        lost = "rig.mass_loss * film * rig.travel_ratio * y"
-        lines += [f"film_mass = density * rig.length - {lost}"]
+        everted = "rig.mass_loss * film * rig.travel_ratio * y"
+        lines += [f"film_mass = density * rig.length - {everted}"]
         lines += ["mass = max(film_mass, rig.least_mass) + rig.payload_mass"]
         return lines
 
@@ -168,15 +153,15 @@ class _Writer:
             name=name,
             arguments=arguments,
             motion=motion,
-            rig_fields=", ".join(f"rig_row[{i}]" for i in range(len(TrialInputs._fields))),
-            angle="0.0" if at_release else "angle_passed(y, bends)",
-            measured="False" if at_release else "trace_time.size > 0",
+            rig_fields=", ".join(f"trial.inputs[{i}]" for i in range(len(TrialInputs._fields))),
+            angle="0.0" if at_release else "angle_passed(y, trial)",
+            measured="False" if at_release else "trial.trace_time.size > 0",
             body="\n".join(f"    {line}" for line in lines),
         )
 
 
 def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
-    """Python text of the functions that `vinetrack.dynamics.integrator` calls, for this sum of effects.
+    """Python text of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects.
 
     Mass that effects add moves like the tail but has no weight of its own: it is counted after the forces.
     """
@@ -184,7 +169,7 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     both = [*write.mass(), *write.pressure(), *write.forces()]
     added = write.inertia()
     seen = write.calls("observed_position", "seen = {call}")
-    rest = write.calls("rest_force", "tip += {call}")
+    holding = write.calls("rest_force", "tip += {call}")
     # The chamber knows its own pressure, not what is left of it at the tip.
     filling = write.calls("chamber_rate", "chamber_rate += {call}", _STATE.replace(" pressure,", " chamber,"))
     per_mass = "return (tip / rig.travel_ratio + tail) / mass"
@@ -194,18 +179,18 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     functions = [
         write.function("rates", _MOTION, _MOVING, [*both, *filling, *added, f"{per_mass}, chamber_rate"]),
         write.function(
-            "rest_acceleration", _MOTION.replace("v, ", ""), _AT_REST, [*both, *rest, *pushed, *added, per_mass]
+            "rest_acceleration", _MOTION.replace("v, ", ""), _AT_REST, [*both, *holding, *pushed, *added, per_mass]
         ),
         write.function("observed", _MOTION, _MOVING, [*(looked if seen else []), "return seen"]),
         write.function(
             "first_chamber",
-            "on, rig_row, theta",
+            "trial",
             _AT_RELEASE,
             [*write.calls("gauge", "pressure = {call}"), "return pressure"],
         ),
     ]
     if tail_free:
-        resting = ["if resting:", *[f"    {line}" for line in rest or ["pass"]]]
+        resting = ["if resting:", *[f"    {line}" for line in holding or ["pass"]]]
         functions += [
             write.function(
                 "tip_tension",
@@ -216,25 +201,10 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
             write.function("free_fall", _MOTION.replace("x, v,", "y, ydot, x, v,"), "", [*both, "return tail / mass"]),
         ]
     names = ", ".join(effect.name for effect in effects)
-    constants = [f"HAS_CHAMBER, TAIL_FREE = {write.has('chamber_rate')}, {tail_free}"]
-    constants += [f"{name} = {TrialInputs._fields.index(field)}" for name, field in _INDICES.items()]
-    return "".join(
-        f"{part}\n"
-        for part in (_HEAD.format(names=names), *write.loads.values(), _TABLES, *functions, *constants, "", "")
-    )
-
-
-def _module_source(effects: Sequence[Effect], tail_free: bool) -> str:
-    text = sum_source(effects, tail_free)
-    for path in TEXTS:
-        if tail_free or path.stem != "slack_tail":
-            text += path.read_text(encoding="utf-8").split(MARK)[1]
-    # Only the outermost function is called from Python; what it calls is compiled into it. Nothing but a slack tail
-    # makes an array: not to count references to those passed along, nor to look for division by zero, is three times
-    # as fast.
-    text = text.replace("@njit(nogil=True)\ndef integrate_many", "@njit(nogil=True, cache=True)\ndef integrate_many")
-    counting = "" if tail_free else ", _nrt=False"
-    return text.replace("njit(nogil=True", f"njit(nogil=True, error_model='numpy'{counting}")
+    fields = ["rates", "rest_acceleration", "observed", "first_chamber", "yes" if write.has("chamber_rate") else "no"]
+    fields += _TAIL_FREE if tail_free else _TAIL_TAUT
+    foot = _FOOT.format(fields=", ".join(fields), batch=", ".join(BATCH))
+    return "\n".join((_HEAD.format(names=names), *write.loads.values(), *functions, foot))
 
 
 def _cache_folder() -> Path:
@@ -260,12 +230,13 @@ def _cache_folder() -> Path:
 def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     """The compiled module for these effects; its `integrate_many` is described in `vinetrack.dynamics.integrator`.
 
-    Only one for tails that may go slack holds `vinetrack.dynamics.slack_tail`: it takes longer to compile.
+    Only one for tails that may go slack (`tail_free`) compiles `vinetrack.dynamics.slack_tail`: it takes longer.
     """
     import numba
 
-    source = _module_source(effects, tail_free)
-    parts = [source, *(inspect.getsource(part) for part in (effects_base, load_module, constants))]
+    source = sum_source(effects, tail_free)
+    parts = [source, *(Path(__file__).with_name(name).read_text(encoding="utf-8") for name in PARTS)]
+    parts += [inspect.getsource(part) for part in (sys.modules[Effect.__module__], constants)]
     parts += [numba.__version__, sys.version]
     parts += [effect.path.read_text() for effect in effects]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]

@@ -1,43 +1,63 @@
 """One step of Radau IIA, order 5, for the speed and position of a tail and the pressure of its chamber.
 
-Text of a compiled kernel, set between the `rates` of one model and `vinetrack.dynamics.integrator`; why it is this
-method is said there. Position follows from the speeds by the same quadrature, so that Newton's system is of the three
-stage speeds alone; the chamber's pressure has one of its own.
+Position follows from the speeds by the same quadrature, so that Newton's system is of the three stage speeds alone; the
+chamber's pressure has one of its own. Why it is this method is stated in `vinetrack.dynamics.integrator`.
 
-Source: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.5 and IV.8.
+Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (Springer, 1996), sections IV.5 (the method,
+table 5.6) and IV.8 (its implementation in RADAU5: simplified Newton iterations, starting values, error estimate).
 """
 
-from numba import njit
+from typing import NamedTuple
 
-HAS_CHAMBER = True  #: whether an effect of the model gives the chamber an equation of its own
+from vinetrack.dynamics.equations import Point, compiled
 
-
-@njit(nogil=True)
-def rates(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends):
-    """Acceleration of the tail and rate of change of the chamber's pressure: here stand those of one model."""
-    raise NotImplementedError
-
-
-# ---- what follows is set behind the rates of one model ----
 SQRT6 = 6.0**0.5
 C1, C2 = (4 - SQRT6) / 10, (4 + SQRT6) / 10
 A11, A12, A13 = (88 - 7 * SQRT6) / 360, (296 - 169 * SQRT6) / 1800, (-2 + 3 * SQRT6) / 225
 A21, A22, A23 = (296 + 169 * SQRT6) / 1800, (88 + 7 * SQRT6) / 360, (-2 - 3 * SQRT6) / 225
 A31, A32, A33 = (16 - SQRT6) / 36, (16 + SQRT6) / 36, 1 / 9
-# Slope of the collocation polynomial at the end of a step: free of the cancellation that f(v) suffers when stiff.
+"""Nodes c and matrix A of the method; the third node is 1. Source: Hairer & Wanner, table IV.5.6."""
+
 S1 = (1 - C2) / (C1 * (C1 - C2) * (C1 - 1))
 S2 = (1 - C1) / (C2 * (C2 - C1) * (C2 - 1))
 S3 = 1 + 1 / (1 - C1) + 1 / (1 - C2)
-# The real eigenvalue of A⁻¹ and the weights of Hairer's estimate of the local error.
+"""Slope at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2), (1, z3): derived, the derivatives of its
+Lagrange polynomials at 1. It is free of the cancellation that f(v) suffers when stiff."""
+
 MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)
 E1, E2, E3 = (-13 - 7 * SQRT6) / 3, (-13 + 7 * SQRT6) / 3, -1 / 3
+"""The real eigenvalue of A⁻¹ and the weights of the estimate of the local error. Source: Hairer & Wanner, IV.8."""
 
 MOST_NEWTON = 9
+"""Newton iterations before a step is given up; chosen near the 7 of RADAU5. At half, more steps are cut to a quarter
+and repeated; at twice, hopeless steps cost twice as much. The result depends on neither: a step counts only once it has
+converged."""
+
+NEWTON_TOLERANCE = 1e-2
+"""Change of the speeds at which the iterations stop, over the tolerance of a step; chosen as RADAU5 does (κ between
+10⁻¹ and 10⁻²), so that what the iterations leave is small beside the error of the method."""
+
+FAST_CONTRACTION = 0.1
+"""Ratio of two successive changes below which the Jacobian is kept for the next iteration, chosen; RADAU5 keeps it from
+step to step below 10⁻³. At half it is evaluated more often, at twice the iterations are slower."""
 
 
-@njit(nogil=True)
-def solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
-    """Cramer's rule for the Newton step of the three stages."""
+class Stages(NamedTuple):
+    """Speeds gained at the three stages of a step of size h, s and m/s; h is 0 where there is no earlier step."""
+
+    h: float
+    z1: float
+    z2: float
+    z3: float
+
+
+NO_STAGES = Stages(0.0, 0.0, 0.0, 0.0)
+"""For a step that no other precedes: after a start and after a step was refused."""
+
+
+@compiled
+def _solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
+    """Solution of three linear equations by Cramer's rule: the Newton step of the three stages."""
     k1 = m22 * m33 - m23 * m32
     k2 = m23 * m31 - m21 * m33
     k3 = m21 * m32 - m22 * m31
@@ -48,28 +68,83 @@ def solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
     return z1, z2, z3
 
 
-@njit(nogil=True)
-def slope_in_speed(time, x, v, chamber, acceleration, scale, on, rig, theta, trace_time, trace_pressure, bends):
-    """∂a/∂v by a one-sided difference, upwards: below rest the law is another."""
+@compiled
+def _slope_in_speed(equations, trial, time, x, v, chamber, acceleration, scale):
+    """∂a/∂v, 1/s, by a one-sided difference, upwards: below rest the law is another."""
     delta = 1e-6 * max(abs(v), 1e-4 * scale)
-    other, _rate = rates(time, x, v + delta, chamber, on, rig, theta, trace_time, trace_pressure, bends)
-    return (other - acceleration) / delta
+    higher, _rate = equations.rates(time, x, v + delta, chamber, trial)
+    return (higher - acceleration) / delta
 
 
-@njit(nogil=True)
-def radau_step(
-    time, x, v, chamber, slope, h, z1, z2, z3, scale, rtol, on, rig, theta, trace_time, trace_pressure, bends
-):
-    """One step of size h from (x, v, chamber); z1…z3 are first guesses of the speeds gained at the stages.
+@compiled
+def first_stages(point, h, before):
+    """Starting values of the Newton iterations: the last step's cubic, continued beyond its end.
+
+    Without an earlier step, the acceleration at the start. No stage is let below a tenth of the speed at the start.
+    """
+    lowest = -0.9 * point.v
+    if before.h > 0:
+        r = h / before.h
+        p1, p2, p3 = _continued(1 + C1 * r, before), _continued(1 + C2 * r, before), _continued(1 + r, before)
+        w1, w2, w3 = p1 - before.z3, p2 - before.z3, p3 - before.z3
+    else:
+        w1, w2, w3 = C1 * h * point.slope, C2 * h * point.slope, h * point.slope
+    return Stages(h, max(w1, lowest), max(w2, lowest), max(w3, lowest))
+
+
+@compiled
+def _continued(s, stages):
+    """The cubic through (0, 0), (C1, z1), (C2, z2), (1, z3), at s."""
+    l1 = s * (s - C2) * (s - 1) / (C1 * (C1 - C2) * (C1 - 1))
+    l2 = s * (s - C1) * (s - 1) / (C2 * (C2 - C1) * (C2 - 1))
+    l3 = s * (s - C1) * (s - C2) / ((1 - C1) * (1 - C2))
+    return l1 * stages.z1 + l2 * stages.z2 + l3 * stages.z3
+
+
+@compiled
+def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
+    """Newton's change of the stage speeds: (I − h A J) d = h A f − z, J the slopes of the acceleration in speed."""
+    return _solve3(
+        1 - h * A11 * j1, -h * A12 * j2, -h * A13 * j3,
+        -h * A21 * j1, 1 - h * A22 * j2, -h * A23 * j3,
+        -h * A31 * j1, -h * A32 * j2, 1 - h * A33 * j3,
+        h * (A11 * f1 + A12 * f2 + A13 * f3) - z1,
+        h * (A21 * f1 + A22 * f2 + A23 * f3) - z2,
+        h * (A31 * f1 + A32 * f2 + A33 * f3) - z3,
+    )  # fmt: skip
+
+
+@compiled
+def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
+    """Newton's change of the chamber's pressures at the stages; jc is h times the slope of its rate in pressure."""
+    return _solve3(
+        1 - A11 * jc, -A12 * jc, -A13 * jc,
+        -A21 * jc, 1 - A22 * jc, -A23 * jc,
+        -A31 * jc, -A32 * jc, 1 - A33 * jc,
+        h * (A11 * g1 + A12 * g2 + A13 * g3) - (q1 - chamber),
+        h * (A21 * g1 + A22 * g2 + A23 * g3) - (q2 - chamber),
+        h * (A31 * g1 + A32 * g2 + A33 * g3) - (q3 - chamber),
+    )  # fmt: skip
+
+
+@compiled
+def radau_step(equations, trial, point, stages, scale, rtol):
+    """One step from `point`, of the size and with the starting values that `first_stages` gave.
+
+    Parameters
+    ----------
+    scale : speed that the motion reaches, m/s; with `rtol` it sets the tolerance
 
     Returns
     -------
-    (converged, error, x, v, slope, chamber, z1, z2, z3)
-        The error is in units of the tolerance; `slope` the acceleration at the end.
+    (converged, error, end, stages)
+        `error` in units of the tolerance, `end` the `Point` at the end of the step, `stages` the speeds gained.
     """
+    time, x, v, _slope, chamber = point
+    h, z1, z2, z3 = stages
     j1 = j2 = j3 = 0.0
     g1 = g2 = g3 = 0.0
-    small = 1e-2 * rtol * max(scale, abs(v))
+    small = NEWTON_TOLERANCE * rtol * max(scale, abs(v))
     before = 1e300
     q1 = q2 = q3 = chamber
     jc = 0.0
@@ -82,85 +157,79 @@ def radau_step(
         x2 = x + h * (C2 * v + A21 * z1 + A22 * z2 + A23 * z3)
         x3 = x + h * (v + A31 * z1 + A32 * z2 + A33 * z3)
         t1, t2, t3 = time + C1 * h, time + C2 * h, time + h
-        f1, g1 = rates(t1, x1, v1, q1, on, rig, theta, trace_time, trace_pressure, bends)
-        f2, g2 = rates(t2, x2, v2, q2, on, rig, theta, trace_time, trace_pressure, bends)
-        f3, g3 = rates(t3, x3, v3, q3, on, rig, theta, trace_time, trace_pressure, bends)
+        f1, g1 = equations.rates(t1, x1, v1, q1, trial)
+        f2, g2 = equations.rates(t2, x2, v2, q2, trial)
+        f3, g3 = equations.rates(t3, x3, v3, q3, trial)
         if not fresh:
-            j1 = slope_in_speed(t1, x1, v1, q1, f1, scale, on, rig, theta, trace_time, trace_pressure, bends)
-            j2 = slope_in_speed(t2, x2, v2, q2, f2, scale, on, rig, theta, trace_time, trace_pressure, bends)
-            j3 = slope_in_speed(t3, x3, v3, q3, f3, scale, on, rig, theta, trace_time, trace_pressure, bends)
+            j1 = _slope_in_speed(equations, trial, t1, x1, v1, q1, f1, scale)
+            j2 = _slope_in_speed(equations, trial, t2, x2, v2, q2, f2, scale)
+            j3 = _slope_in_speed(equations, trial, t3, x3, v3, q3, f3, scale)
             fresh = True
-            # A chamber of its own is as stiff as its supply is quick.
-            filling = HAS_CHAMBER and (g1 != 0 or g2 != 0 or g3 != 0)
+            # A chamber with an equation of its own is as stiff as its supply is quick.
+            filling = equations.has_chamber() and (g1 != 0 or g2 != 0 or g3 != 0)
             if filling:
                 dq = 1e-6 * (abs(q3) + 1e3)
-                _f, other = rates(t3, x3, v3, q3 + dq, on, rig, theta, trace_time, trace_pressure, bends)
-                jc = h * (other - g3) / dq
+                _f, higher = equations.rates(t3, x3, v3, q3 + dq, trial)
+                jc = h * (higher - g3) / dq
         change = 0.0
         if filling:
-            c1, c2, c3 = solve3(
-                1 - A11 * jc, -A12 * jc, -A13 * jc,
-                -A21 * jc, 1 - A22 * jc, -A23 * jc,
-                -A31 * jc, -A32 * jc, 1 - A33 * jc,
-                h * (A11 * g1 + A12 * g2 + A13 * g3) - (q1 - chamber),
-                h * (A21 * g1 + A22 * g2 + A23 * g3) - (q2 - chamber),
-                h * (A31 * g1 + A32 * g2 + A33 * g3) - (q3 - chamber),
-            )  # fmt: skip
+            c1, c2, c3 = _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber)
             q1, q2, q3 = q1 + c1, q2 + c2, q3 + c3
             change = max(abs(c1), abs(c2), abs(c3)) / (abs(q3) + 1e3)
-        d1, d2, d3 = solve3(
-            1 - h * A11 * j1, -h * A12 * j2, -h * A13 * j3,
-            -h * A21 * j1, 1 - h * A22 * j2, -h * A23 * j3,
-            -h * A31 * j1, -h * A32 * j2, 1 - h * A33 * j3,
-            h * (A11 * f1 + A12 * f2 + A13 * f3) - z1,
-            h * (A21 * f1 + A22 * f2 + A23 * f3) - z2,
-            h * (A31 * f1 + A32 * f2 + A33 * f3) - z3,
-        )  # fmt: skip
+        d1, d2, d3 = _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3)
         z1, z2, z3 = z1 + d1, z2 + d2, z3 + d3
         size = max(abs(d1), abs(d2), abs(d3), change * scale)
         if not size < 1e300:
-            return False, 1e300, x, v, slope, chamber, z1, z2, z3
+            break
         ratio = size / before
         # The next iteration would change about ratio · size more.
-        if size <= small or (iteration > 0 and ratio < 0.1 and ratio * size <= 0.1 * small):
+        if size <= small or (iteration > 0 and ratio < FAST_CONTRACTION and ratio * size <= 0.1 * small):
             converged = True
             break
-        if ratio > 0.1:
+        if ratio > FAST_CONTRACTION:
             fresh = False
         if iteration > 3 and size > before:
             break
         before = size
+    gained = Stages(h, z1, z2, z3)
     if not converged:
-        return False, 1e300, x, v, slope, chamber, z1, z2, z3
-    # Hairer filters this with (μ/h − J)⁻¹. Not here: it hides what a long stiff step does wrong at its far end.
-    raw = (h * slope + E1 * z1 + E2 * z2 + E3 * z3) / MU
+        return False, 1e300, point, gained
+    return True, _local_error(point, gained, scale, rtol), _end_of_step(point, gained, q3), gained
+
+
+@compiled
+def _local_error(point, stages, scale, rtol):
+    """Hairer's estimate of the error of the speed, in units of the tolerance.
+
+    Hairer filters it with (μ/h − J)⁻¹. Not here: that hides what a long stiff step does wrong at its far end.
+    """
+    h, z1, z2, z3 = stages
+    raw = (h * point.slope + E1 * z1 + E2 * z2 + E3 * z3) / MU
     # A tenth of the final speed: what goes wrong at the start is carried through the whole growth.
-    weight = rtol * max(0.1 * scale, abs(v), abs(v + z3))
-    x_end = x + h * (v + A31 * z1 + A32 * z2 + A33 * z3)
+    weight = rtol * max(0.1 * scale, abs(point.v), abs(point.v + z3))
+    return abs(raw) / weight
+
+
+@compiled
+def _end_of_step(point, stages, chamber):
+    """The vine at the end of a step; `chamber` is the pressure at its last stage."""
+    h, z1, z2, z3 = stages
+    x_end = point.x + h * (point.v + A31 * z1 + A32 * z2 + A33 * z3)
     slope_end = (S1 * z1 + S2 * z2 + S3 * z3) / h
-    return True, abs(raw) / weight, x_end, v + z3, slope_end, q3, z1, z2, z3
+    return Point(point.time + h, x_end, point.v + z3, slope_end, chamber)
 
 
-@njit(nogil=True)
-def quintic(s, h, x0, v0, a0, x1, v1, a1):
-    """Position, speed and acceleration at the fraction s of a step, from those at its ends (Hermite, order 6)."""
-    d = x1 - x0 - h * v0 - 0.5 * h * h * a0
-    e = h * (v1 - v0 - h * a0)
-    f = h * h * (a1 - a0)
+@compiled
+def quintic(s, h, start, end):
+    """Position, speed and acceleration at the fraction s of a step h, from those at its ends (Hermite, order 6)."""
+    d = end.x - start.x - h * start.v - 0.5 * h * h * start.slope
+    e = h * (end.v - start.v - h * start.slope)
+    f = h * h * (end.slope - start.slope)
     c3 = 10 * d - 4 * e + 0.5 * f
     c4 = -15 * d + 7 * e - f
     c5 = 6 * d - 3 * e + 0.5 * f
     s2 = s * s
-    x = x0 + h * s * v0 + 0.5 * h * h * s2 * a0 + s2 * s * (c3 + s * (c4 + s * c5))
-    v = v0 + h * s * a0 + s2 * (3 * c3 + s * (4 * c4 + s * 5 * c5)) / h
-    a = a0 + s * (6 * c3 + s * (12 * c4 + s * 20 * c5)) / (h * h)
+    x = start.x + h * s * start.v + 0.5 * h * h * s2 * start.slope + s2 * s * (c3 + s * (c4 + s * c5))
+    v = start.v + h * s * start.slope + s2 * (3 * c3 + s * (4 * c4 + s * 5 * c5)) / h
+    a = start.slope + s * (6 * c3 + s * (12 * c4 + s * 20 * c5)) / (h * h)
     return x, v, a
-
-
-@njit(nogil=True)
-def carry_on(s, z1, z2, z3):
-    """The cubic through (0, 0), (C1, z1), (C2, z2), (1, z3), at s."""
-    l1 = s * (s - C2) * (s - 1) / (C1 * (C1 - C2) * (C1 - 1))
-    l2 = s * (s - C1) * (s - 1) / (C2 * (C2 - C1) * (C2 - 1))
-    l3 = s * (s - C1) * (s - C2) / ((1 - C1) * (1 - C2))
-    return l1 * z1 + l2 * z2 + l3 * z3

@@ -5,57 +5,96 @@ its own forces balance, Σ tip forces = 0 at the tail speed r·ẏ of the film t
 the tip has taken up its slack, x − r·y = 0. A payload that has fallen as far as the tip rests there: its push on the
 tip is left out, so that growth is too slow from then on.
 
-Like `vinetrack.dynamics.integrator` this is the text of a compiled kernel, and follows it. The method is that of
-Dormand & Prince with its continuous extension: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I,
-section II.6.
+The method is that of Dormand & Prince with its continuous extension: E. Hairer, S. P. Nørsett and G. Wanner, Solving
+Ordinary Differential Equations I (Springer, 1993), section II.5, table 5.2, and section II.6, equation (6.12).
 """
 
-import numpy as np
-from numba import njit
+from typing import NamedTuple
 
-RUNNING, ENDED, TOO_HARD = 0, 1, 3
+from vinetrack.dynamics.equations import ENDED, RUNNING, TAUT, TOO_HARD, Point, compiled
+from vinetrack.dynamics.radau import quintic
+from vinetrack.effects import TrialInputs
+
 MOST_STEPS = 20_000
+"""Steps before a slack phase is given up, chosen as in `vinetrack.dynamics.integrator`; at half and at twice only what
+a hopeless one costs changes."""
+
+FREE, RATIO = TrialInputs._fields.index("tail_free"), TrialInputs._fields.index("travel_ratio")
+"""Places in the inputs of a trial: derived from the order of the fields."""
+
+NODES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
+WEIGHTS = (
+    (1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0),
+    (3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0),
+    (44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0),
+    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0),
+    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0),
+    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
+)
+ERROR_WEIGHTS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+DENSE_WEIGHTS = (
+    -12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072,
+    701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423,
+)  # fmt: skip
+"""The method of Dormand & Prince. Source: as above; the dense output is that of the program DOPRI5 given there."""
 
 
-@njit(nogil=True)
-def tip_tension(time, x, v, chamber, resting, on, rig, theta, trace_time, trace_pressure, bends):
-    """Tension the tip leaves for a tail passing it at v, and rate of the chamber: here stand those of one model."""
-    raise NotImplementedError
+class SlackState(NamedTuple):
+    """A vine with a slack tail: position and speed of the tail, position of the tip, pressure of the chamber, SI."""
+
+    x: float
+    v: float
+    y: float
+    chamber: float
 
 
-@njit(nogil=True)
-def free_fall(time, y, ydot, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends):
-    """Acceleration of a slack tail."""
-    raise NotImplementedError
+@compiled
+def slack_at_rest(equations, trial, time, x, chamber):
+    """Whether the tail of a vine at rest would have to push."""
+    if trial.inputs[FREE] <= 0:
+        return False
+    tension, _rate = equations.tip_tension(time, x, 0.0, chamber, True, trial)
+    return tension < 0
 
 
-@njit(nogil=True)
-def observed(time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends):
-    """Position of the leading edge that the camera reports."""
-    raise NotImplementedError
+@compiled
+def slack_fraction(equations, trial, h, start, end):
+    """Fraction of a step at which the tail's tension comes to nothing, by bisection; 2 where it is taut at the end."""
+    if trial.inputs[FREE] <= 0:
+        return 2.0
+    tension, _rate = equations.tip_tension(end.time, end.x, end.v, end.chamber, False, trial)
+    if tension >= 0:
+        return 2.0
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        x, v, _a = quintic(middle, h, start, end)
+        pressure = start.chamber + middle * (end.chamber - start.chamber)
+        tension, _rate = equations.tip_tension(start.time + middle * h, x, v, pressure, False, trial)
+        if tension < 0:
+            high = middle
+        else:
+            low = middle
+    return high
 
 
-# ---- what follows is set behind the rates of one model ----
-TAUT = 4
-
-
-@njit(nogil=True)
-def free_tip_speed(time, x, chamber, guess, moving, on, rig, theta, trace_time, trace_pressure, bends):
+@compiled
+def _free_tip_speed(equations, trial, time, x, chamber, guess, moving):
     """Tail speed of the film at a tip with nothing to pull: where its forces balance, by the Illinois rule; x = r·y."""
-    f_low, _r = tip_tension(time, x, 0.0, chamber, not moving, on, rig, theta, trace_time, trace_pressure, bends)
+    f_low, _r = equations.tip_tension(time, x, 0.0, chamber, not moving, trial)
     if f_low <= 0:
         return 0.0
     low, high = 0.0, max(guess, 1e-6)
-    f_high, _r = tip_tension(time, x, high, chamber, False, on, rig, theta, trace_time, trace_pressure, bends)
+    f_high, _r = equations.tip_tension(time, x, high, chamber, False, trial)
     factor = 1.01
     while f_high > 0 and high < 1e6:
         low, f_low = high, f_high
         high *= factor
         factor = min(factor * factor, 10.0)
-        f_high, _r = tip_tension(time, x, high, chamber, False, on, rig, theta, trace_time, trace_pressure, bends)
+        f_high, _r = equations.tip_tension(time, x, high, chamber, False, trial)
     if low == 0.0 and guess > 0:
         near = 0.99 * guess
-        f_near, _r = tip_tension(time, x, near, chamber, False, on, rig, theta, trace_time, trace_pressure, bends)
+        f_near, _r = equations.tip_tension(time, x, near, chamber, False, trial)
         if f_near > 0:
             low, f_low = near, f_near
         else:
@@ -66,7 +105,7 @@ def free_tip_speed(time, x, chamber, guess, moving, on, rig, theta, trace_time, 
         middle = high - f_high * (high - low) / (f_high - f_low)
         if not low < middle < high:
             middle = 0.5 * (low + high)
-        f, _r = tip_tension(time, x, middle, chamber, False, on, rig, theta, trace_time, trace_pressure, bends)
+        f, _r = equations.tip_tension(time, x, middle, chamber, False, trial)
         if f * f_high < 0:
             low, f_low = high, f_high
         else:
@@ -77,72 +116,79 @@ def free_tip_speed(time, x, chamber, guess, moving, on, rig, theta, trace_time, 
     return high
 
 
-@njit(nogil=True)
-def slack_rates(time, s, tip_speed, moving, r, out, on, rig, theta, trace_time, trace_pressure, bends):
-    """Rates of (x, v, y, chamber) while the tail is slack, into `out`; returns the tail speed of film at the tip."""
-    u = free_tip_speed(time, r * s[2], s[3], tip_speed, moving, on, rig, theta, trace_time, trace_pressure, bends)
-    _t, rate = tip_tension(time, r * s[2], u, s[3], False, on, rig, theta, trace_time, trace_pressure, bends)
-    fall = free_fall(time, s[2], u / r, s[0], s[1], s[3], on, rig, theta, trace_time, trace_pressure, bends)
-    out[0] = s[1]
-    out[1] = 0.0 if s[1] <= 0 and fall < 0 else fall
-    out[2] = u / r
-    out[3] = rate
+@compiled
+def _slack_rates(equations, trial, time, s, tip_speed, moving, rates):
+    """Rates of a `SlackState` into `rates`, shape (4,); returns the tail speed of the film at the tip, m/s."""
+    r = trial.inputs[RATIO]
+    u = _free_tip_speed(equations, trial, time, r * s.y, s.chamber, tip_speed, moving)
+    _tension, chamber_rate = equations.tip_tension(time, r * s.y, u, s.chamber, False, trial)
+    fall = equations.free_fall(time, s.y, u / r, s.x, s.v, s.chamber, trial)
+    rates[0] = s.v
+    rates[1] = 0.0 if s.v <= 0 and fall < 0 else fall
+    rates[2] = u / r
+    rates[3] = chamber_rate
     return u
 
 
-@njit(nogil=True)
-def dormand_prince(time, s, h, tip_speed, moving, r, k, on, rig, theta, trace_time, trace_pressure, bends):
+@compiled
+def _stage_state(s, h, weights, k, n):
+    """The state s plus h times the weighted sum of the first n rows of k."""
+    x, v, y, chamber = s
+    for j in range(n):
+        x += h * weights[j] * k[j, 0]
+        v += h * weights[j] * k[j, 1]
+        y += h * weights[j] * k[j, 2]
+        chamber += h * weights[j] * k[j, 3]
+    return SlackState(x, v, y, chamber)
+
+
+@compiled
+def _dormand_prince(equations, trial, time, s, h, tip_speed, k):
     """One step: k (7, 4), its first row given, gets the others. Returns the end, its error and the tip's speed."""
-    a = (
-        (1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0),
-        (3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0),
-        (44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0),
-        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0),
-        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0),
-        (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-    )
-    c = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
-    e = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
-    end = s.copy()
+    moving = tip_speed > 0
+    end = s
     u = tip_speed
     for i in range(6):
-        for m in range(4):
-            end[m] = s[m]
-            for j in range(i + 1):
-                end[m] += h * a[i][j] * k[j, m]
-        u = slack_rates(time + c[i] * h, end, u, moving, r, k[i + 1], on, rig, theta, trace_time, trace_pressure, bends)
+        end = _stage_state(s, h, WEIGHTS[i], k, i + 1)
+        u = _slack_rates(equations, trial, time + NODES[i] * h, end, u, moving, k[i + 1])
     error_x, error_y = 0.0, 0.0
     for i in range(7):
-        error_x += h * e[i] * k[i, 0]
-        error_y += h * e[i] * k[i, 2]
-    return end, max(abs(error_x), r * abs(error_y)), u
+        error_x += h * ERROR_WEIGHTS[i] * k[i, 0]
+        error_y += h * ERROR_WEIGHTS[i] * k[i, 2]
+    return end, max(abs(error_x), trial.inputs[RATIO] * abs(error_y)), u
 
 
-@njit(nogil=True)
-def slack_at(part, h, s, end, k):
-    """State (x, v, y, chamber) at the fraction `part` of a step."""
-    d = (-12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072,
-         701980252875 / 199316789632, -1453857185 / 822651844, 69997945 / 29380423)  # fmt: skip
-    found = np.empty(4)
-    for m in range(4):
-        change = end[m] - s[m]
-        bend = h * k[0, m] - change
-        last = 0.0
-        for i in range(7):
-            last += h * d[i] * k[i, m]
-        rest = change - h * k[6, m] - bend
-        found[m] = s[m] + part * (change + (1 - part) * (bend + part * (rest + (1 - part) * last)))
-    return found
+@compiled
+def _slack_at(part, h, s, end, k):
+    """The state at the fraction `part` of a step."""
+    return SlackState(
+        _dense(part, h, s.x, end.x, k, 0),
+        _dense(part, h, s.v, end.v, k, 1),
+        _dense(part, h, s.y, end.y, k, 2),
+        _dense(part, h, s.chamber, end.chamber, k, 3),
+    )
 
 
-@njit(nogil=True)
-def slack_event(kind, stop, r, h, s, end, k):
-    """Fraction of a step at which growth ends (`kind` 0) or the tail is taut again (1), by bisection."""
+@compiled
+def _dense(part, h, start, end, k, column):
+    """The continuous extension of one component, of order 4."""
+    change = end - start
+    bend = h * k[0, column] - change
+    last = 0.0
+    for i in range(7):
+        last += h * DENSE_WEIGHTS[i] * k[i, column]
+    remainder = change - h * k[6, column] - bend
+    return start + part * (change + (1 - part) * (bend + part * (remainder + (1 - part) * last)))
+
+
+@compiled
+def _event_fraction(kind, stop, r, h, s, end, k):
+    """Fraction of a step at which growth ends (`kind` ENDED) or the tail is taut again (TAUT), by bisection."""
     low, high = 0.0, 1.0
     for _ in range(50):
         middle = 0.5 * (low + high)
-        state = slack_at(middle, h, s, end, k)
-        before = r * state[2] < stop if kind == 0 else state[0] > r * state[2]
+        state = _slack_at(middle, h, s, end, k)
+        before = r * state.y < stop if kind == ENDED else state.x > r * state.y
         if before:
             low = middle
         else:
@@ -150,58 +196,65 @@ def slack_event(kind, stop, r, h, s, end, k):
     return high
 
 
-@njit(nogil=True)
-def follow_slack(times, n, time, x, v, chamber, on, rig, theta, trace_time, trace_pressure, bends, r, stop, rtol, out):
+@compiled
+def _write_slack(equations, trial, times, row, time, fraction, h, s, end, k, u, u_end, out):
+    """Fill the rows of `out` from `row` up to a fraction of a step with r·y, r·ẏ, r·ÿ of the tip; the next row."""
+    r = trial.inputs[RATIO]
+    while row < times.size and times[row] <= time + fraction * h:
+        now = _slack_at((times[row] - time) / h, h, s, end, k)
+        speed = _free_tip_speed(equations, trial, times[row], r * now.y, now.chamber, u, u > 0)
+        out[row, 0] = r * now.y
+        out[row, 1] = speed
+        out[row, 2] = (u_end - u) / h
+        out[row, 3] = equations.observed(times[row], r * now.y, speed, now.chamber, trial)
+        row += 1
+    return row
+
+
+@compiled
+def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
     """From the moment the tail goes slack until it is taut again, growth ends or the last time is filled in.
 
-    Fills rows n… of `out` as `integrate` does, with r·y, r·ẏ and r·ÿ of the tip. `r` is the travel ratio, `stop` r·L.
+    Fills rows of `out` from `row` on as the integrator does, with r·y, r·ẏ and r·ÿ of the tip. `stop` is r·L; k is an
+    array (7, 4) for the rates at the stages of a step.
 
     Returns
     -------
-    (status, n, time, x, v, chamber, tip_speed)
-        `status` TAUT, RUNNING (all filled in), ENDED or TOO_HARD; `tip_speed` is r·ẏ there.
+    (status, row, point, tip_speed)
+        `status` TAUT, RUNNING (all filled in), ENDED or TOO_HARD; `tip_speed` is r·ẏ there, m/s.
     """
-    until = times[times.size - 1]
-    s = np.array([x, v, x / r, chamber])
-    k = np.zeros((7, 4))
-    u = slack_rates(time, s, v, v > 0, r, k[0], on, rig, theta, trace_time, trace_pressure, bends)
+    time, until = start.time, times[times.size - 1]
+    r = trial.inputs[RATIO]
+    s = SlackState(start.x, start.v, start.x / r, start.chamber)
+    u = _slack_rates(equations, trial, time, s, start.v, start.v > 0, k[0])
     h = 1e-3 * (until - time)
     allowed = 1e-3 * rtol * stop
     for _ in range(MOST_STEPS):
-        end, error, u_end = dormand_prince(
-            time, s, h, u, u > 0, r, k, on, rig, theta, trace_time, trace_pressure, bends
-        )
+        end, error, u_end = _dormand_prince(equations, trial, time, s, h, u, k)
         if not error <= allowed:
             h *= max(0.2, 0.9 * (allowed / error) ** 0.2) if error < 1e300 else 0.1
             continue
-        status, part = RUNNING, 1.0
-        if r * end[2] >= stop:
-            status, part = ENDED, slack_event(0, stop, r, h, s, end, k)
-        elif end[0] <= r * end[2] and end[1] < u_end:
-            status, part = TAUT, slack_event(1, stop, r, h, s, end, k)
-        while n < times.size and times[n] <= time + part * h:
-            fraction = (times[n] - time) / h
-            now = slack_at(fraction, h, s, end, k)
-            speed = free_tip_speed(
-                times[n], r * now[2], now[3], u, u > 0, on, rig, theta, trace_time, trace_pressure, bends
-            )
-            out[n, 0] = r * now[2]
-            out[n, 1] = speed
-            out[n, 2] = (u_end - u) / h
-            out[n, 3] = observed(times[n], r * now[2], speed, now[3], on, rig, theta, trace_time, trace_pressure, bends)
-            n += 1
-        if n == times.size and time + part * h > until:
-            return RUNNING, n, until, end[0], end[1], end[3], u_end
+        status, fraction = RUNNING, 1.0
+        if r * end.y >= stop:
+            status, fraction = ENDED, _event_fraction(ENDED, stop, r, h, s, end, k)
+        elif end.x <= r * end.y and end.v < u_end:
+            status, fraction = TAUT, _event_fraction(TAUT, stop, r, h, s, end, k)
+        row = _write_slack(equations, trial, times, row, time, fraction, h, s, end, k, u, u_end, out)
+        if row == times.size and time + fraction * h > until:
+            return RUNNING, row, Point(until, end.x, end.v, 0.0, end.chamber), u_end
         if status != RUNNING:
-            now = slack_at(part, h, s, end, k)
-            return status, n, time + part * h, r * now[2], max(now[1], 0.0), now[3], u_end
+            now = _slack_at(fraction, h, s, end, k)
+            return status, row, Point(time + fraction * h, r * now.y, max(now.v, 0.0), 0.0, now.chamber), u_end
         time += h
-        s[:] = end
-        # Where the payload has come to the tip it rests there.
-        tip = stop / r + s[2]
-        if s[0] > tip:
-            s[0] = tip
-            s[1] = min(s[1], u_end / r)
-        u = slack_rates(time, s, u_end, u_end > 0, r, k[0], on, rig, theta, trace_time, trace_pressure, bends)
+        s = _resting_on_tip(end, stop / r + end.y, u_end / r)
+        u = _slack_rates(equations, trial, time, s, u_end, u_end > 0, k[0])
         h *= min(5.0, 0.9 * (allowed / max(error, 1e-6 * allowed)) ** 0.2)
-    return TOO_HARD, n, time, s[0], s[1], s[3], u
+    return TOO_HARD, row, Point(time, s.x, s.v, 0.0, s.chamber), u
+
+
+@compiled
+def _resting_on_tip(s, tip, tip_velocity):
+    """The state, with a payload that has come to the tip resting there."""
+    if s.x > tip:
+        return SlackState(tip, min(s.v, tip_velocity), s.y, s.chamber)
+    return s

@@ -1,0 +1,198 @@
+"""What the integrator needs to know of one model and one trial: compiled functions, and the arrays that go with them.
+
+`vinetrack.dynamics.kernel` writes the functions of one model and puts them into an `Equations`; the integrator
+(`radau`, `slack_tail`, `integrator`) takes that as its first argument. To numba the `Equations` of every model are a
+type of their own (`EquationsType`), so that it compiles the integrator for each model and sees through the calls.
+
+The integrator is ordinary Python too: with NUMBA_DISABLE_JIT=1 a debugger or a coverage tool follows every line.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit, types
+from numba.core.imputils import lower_constant, lower_getattr_generic
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import infer_getattr, models, register_model, typeof_impl
+
+from vinetrack.core.records import Floats
+
+_FLAGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+
+compiled: Any = njit(**_FLAGS)
+"""How every function of the integrator is compiled: outside the interpreter's lock, dividing by zero as NumPy does, and
+without counting references to arrays. Measured by `benchmarks/catalogue_speed.py`: the last two together make it three
+times as fast; in return no function may make an array."""
+
+
+class TrialArrays(NamedTuple):
+    """One trial as the equations see it: everything that stays the same while it grows."""
+
+    on: Any  #: which effects act, shape (n_effects,)
+    inputs: Floats  #: the fields of `vinetrack.effects.TrialInputs`, SI
+    theta: Floats  #: parameters of all effects, in the order of the model
+    trace_time: Floats  #: times of a measured pressure since release, s, shape (n_samples,); empty without one
+    trace_pressure: Floats  #: gauge pressure there, Pa
+    bends: Floats  #: rows of start, arc and radius, m, shape (n_bends, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """The compiled functions of one model. All are asked at `(time, x, v, chamber, trial)` unless stated.
+
+    x, v are position and speed of the tail, m and m/s; `chamber` is the gauge pressure of the chamber, Pa.
+
+    The last five are for tails that may go slack; for all others they are the functions at the end of this file.
+    """
+
+    name: str  #: of the model, unique in a process: it tells numba's types apart
+    rates: Callable  #: acceleration of the tail, m/s², and rate of change of the chamber's pressure, Pa/s
+    rest_acceleration: Callable  #: of a vine at rest (no v), with all that holds it there
+    observed: Callable  #: position of the leading edge that the camera reports, m
+    first_chamber: Callable  #: pressure of the chamber at release, of (trial) alone
+    has_chamber: Callable  #: whether an effect gives the chamber an equation of its own, of no argument
+    tip_tension: Callable  #: tension that the tip leaves for the tail, N, and rate of the chamber; one more argument
+    free_fall: Callable  #: acceleration of a slack tail, m/s², at (time, y, ẏ, x, v, chamber, trial)
+    slack_fraction: Callable  #: `vinetrack.dynamics.slack_tail.slack_fraction`
+    slack_at_rest: Callable  #: `vinetrack.dynamics.slack_tail.slack_at_rest`
+    follow_slack: Callable  #: `vinetrack.dynamics.slack_tail.follow_slack`
+
+
+class EquationsType(types.Opaque):
+    """Numba's type for the `Equations` of one model: nothing at run time, its attributes are compiled functions.
+
+    A tuple of functions would do as well, but numba passes the functions in it by their addresses in memory, and then
+    cannot keep the compiled form for the next process.
+    """
+
+    def __init__(self, equations: Equations) -> None:
+        self.equations = equations
+        super().__init__(f"Equations({equations.name})")
+
+
+register_model(EquationsType)(models.OpaqueModel)
+
+
+@typeof_impl.register(Equations)
+def _type_of_equations(value: Equations, _context: Any) -> EquationsType:
+    return EquationsType(value)
+
+
+@infer_getattr
+class _EquationsAttributes(AttributeTemplate):
+    key = EquationsType
+
+    def generic_resolve(self, value: EquationsType, attr: str) -> Any:  # type: ignore[override]
+        return types.Dispatcher(getattr(value.equations, attr))
+
+
+@lower_constant(EquationsType)
+def _lower_equations(context: Any, _builder: Any, _type: Any, _value: Any) -> Any:
+    return context.get_dummy_value()
+
+
+@lower_getattr_generic(EquationsType)
+def _lower_function(context: Any, _builder: Any, _type: Any, _value: Any, _attribute: str) -> Any:
+    return context.get_dummy_value()
+
+
+class Point(NamedTuple):
+    """The vine at one instant: time, s; position, speed and acceleration of the tail; pressure of the chamber, Pa."""
+
+    time: float
+    x: float
+    v: float
+    slope: float
+    chamber: float
+
+
+RUNNING, ENDED, STALLED, TOO_HARD, TAUT = 0, 1, 2, 3, 4
+"""Status of a trajectory (the first four index `vinetrack.dynamics.simulate.STATUS`); a convention of this package.
+TAUT: a slack tail has pulled tight and the integrator goes on."""
+
+
+@compiled
+def trace_at(time, trial):
+    """The measured pressure, Pa: linear between its samples, constant before the first and after the last."""
+    last = trial.trace_time.size - 1
+    if time <= trial.trace_time[0]:
+        return trial.trace_pressure[0]
+    if time >= trial.trace_time[last]:
+        return trial.trace_pressure[last]
+    k = np.searchsorted(trial.trace_time, time)
+    fraction = (time - trial.trace_time[k - 1]) / (trial.trace_time[k] - trial.trace_time[k - 1])
+    return trial.trace_pressure[k - 1] + fraction * (trial.trace_pressure[k] - trial.trace_pressure[k - 1])
+
+
+@compiled
+def next_slope_change(k, time, trial):
+    """Index of the first sample of the measured pressure after `time`, from index k on, where its slope changes.
+
+    No step of the integrator is accurate across such a sample. The number of samples where there is none.
+    """
+    trace_time, trace_pressure = trial.trace_time, trial.trace_pressure
+    last = trace_time.size - 1
+    while k <= last:
+        if trace_time[k] > time + 1e-12 * (1.0 + abs(time)):
+            before = after = 0.0
+            if k > 0:
+                before = (trace_pressure[k] - trace_pressure[k - 1]) / (trace_time[k] - trace_time[k - 1])
+            if k < last:
+                after = (trace_pressure[k + 1] - trace_pressure[k]) / (trace_time[k + 1] - trace_time[k])
+            if before != after:
+                break
+        k += 1
+    return k
+
+
+@compiled
+def angle_passed(y, trial):
+    """Angle of the bends that the tip has passed at y, rad."""
+    angle = 0.0
+    for k in range(trial.bends.shape[0]):
+        angle += min(max(y - trial.bends[k, 0], 0.0), trial.bends[k, 1]) / trial.bends[k, 2]
+    return angle
+
+
+@compiled
+def yes():
+    """True, as a function that the compiler sees through."""
+    return True
+
+
+@compiled
+def no():
+    """False, as a function that the compiler sees through."""
+    return False
+
+
+@compiled
+def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
+    """Stands for `tip_tension` where no tail may go slack."""
+    return 0.0, 0.0
+
+
+@compiled
+def no_free_fall(time, y, ydot, x, v, chamber, trial):  # noqa: ARG001
+    """Stands for `free_fall` where no tail may go slack."""
+    return 0.0
+
+
+@compiled
+def never_slack(equations, trial, h, start, end):  # noqa: ARG001
+    """Stands for `slack_fraction` where no tail may go slack: beyond the end of every step."""
+    return 2.0
+
+
+@compiled
+def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
+    """Stands for `slack_at_rest` where no tail may go slack."""
+    return False
+
+
+@compiled
+def no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
+    """Stands for `follow_slack` where no tail may go slack."""
+    return TAUT, row, start, 0.0
