@@ -10,25 +10,29 @@ import typer
 
 from vinetrack.cli.design_options import (
     BELIEF,
+    GUESSED_YIELD,
     OUT,
     RIG,
     VINE,
-    Angle,
-    Chamber,
     Effects,
     Exponent,
     FigurePath,
-    Inlet,
     LogPath,
     Results,
     Seed,
-    Yield,
-    YieldSigma,
-    given,
+    column_options,
     say,
 )
 
 
+@column_options(
+    "yield_pressure_kPa",
+    "yield_pressure_sigma_kPa",
+    "growth_angle_deg",
+    "chamber_l",
+    "inlet_mm",
+    meanings={"yield_pressure_kPa": GUESSED_YIELD},
+)
 def campaign(
     vines: Annotated[
         list[str] | None,
@@ -66,11 +70,8 @@ def campaign(
     longest: Annotated[
         float, typer.Option("--longest-s", min=0.01, max=60, help="Longest recording.", rich_help_panel=RIG)
     ] = 4.0,
-    yields: Yield = None,
-    yield_sigma: YieldSigma = None,
-    angle: Angle = None,
-    chamber: Chamber = None,
-    inlet: Inlet = None,
+    *,
+    cells: dict[str, str],
     burst_share: Annotated[
         float, typer.Option("--of-burst", min=0.05, max=1, help="Share of the burst stress that is dared.")
     ] = 0.9,
@@ -104,15 +105,8 @@ def campaign(
         from vinetrack.pipeline.campaign_stage import Wanted, design_campaign
         from vinetrack.pipeline.prediction_inputs import Asked
 
-        values = {
-            "yield_pressure_kPa": yields,
-            "yield_pressure_sigma_kPa": yield_sigma,
-            "growth_angle_deg": angle,
-            "chamber_l": chamber,
-            "inlet_mm": inlet,
-        }
         asked = Asked(
-            cells=given(values),
+            cells=cells,
             results=results,
             effects=tuple(effects or ()),
             n=math.nan if n is None else n,

@@ -2,40 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import functools
+import inspect
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from vinetrack.experiment.schema import COLUMNS, Column, option
 
 VINE, RIG, BELIEF, OUT = "The vine", "The rig", "What is believed", "What is written"
 
 
-def column_option(column: str, words: str, panel: str) -> typer.models.OptionInfo:
-    """An option that is a column of the trial sheet; its text is judged as a cell is."""
-    unit = {"kPa": "KPA", "mm": "MM", "um": "UM", "g": "GRAMS", "l": "LITRES", "deg": "DEGREES"}.get(
-        column.rsplit("_", 1)[-1], "NUMBER"
-    )
-    info: typer.models.OptionInfo = typer.Option(
-        "--" + column.replace("_", "-"), help=words, metavar=unit, rich_help_panel=panel, show_default=False
-    )
-    return info
+_VINE_COLUMNS = frozenset(
+    {"diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3", "yield_pressure_kPa", "yield_pressure_sigma_kPa"}
+)
+"""Columns about the vine itself; the others are about the rig."""
+
+GUESSED_YIELD = "Yield pressure; a scaling prior where it is not given."
+
+_Command = Callable[..., None]
 
 
-Diameter = Annotated[str | None, column_option("diameter_mm", "Diameter.", VINE)]
-Thickness = Annotated[str | None, column_option("thickness_um", "Thickness of the wall.", VINE)]
-Length = Annotated[str | None, column_option("length_mm", "Length.", VINE)]
-Density = Annotated[str | None, column_option("film_density_kg_m3", "Density of the film, kg/m³ (1200).", VINE)]
-Pressure = Annotated[str | None, column_option("pressure_kPa", "Gauge pressure.", RIG)]
-PressureSigma = Annotated[
-    str | None, column_option("pressure_sigma_kPa", "Its scatter from trial to trial (1 %).", RIG)
-]
-Yield = Annotated[str | None, column_option("yield_pressure_kPa", "Yield pressure; guessed if not given.", VINE)]
-YieldSigma = Annotated[str | None, column_option("yield_pressure_sigma_kPa", "Its error (0.2 kPa).", VINE)]
-Payload = Annotated[str | None, column_option("payload_g", "Payload (0).", RIG)]
-Angle = Annotated[str | None, column_option("growth_angle_deg", "Way of growth: 0 down, 90 level, 180 up.", RIG)]
-Chamber = Annotated[str | None, column_option("chamber_l", "Volume of the chamber.", RIG)]
-Inlet = Annotated[str | None, column_option("inlet_mm", "Diameter of the inlet.", RIG)]
+def column_options(*columns: str, meanings: Mapping[str, str] | None = None) -> Callable[[_Command], _Command]:
+    """Give a command an option for each of these columns of the trial sheet, in place of its argument `cells`.
+
+    The command is called with `cells`: the texts that were given, by column. They are judged as cells of a sheet are.
+
+    Parameters
+    ----------
+    columns : names of columns, in the order of the help.
+    meanings : what a column is for this command, where that is not its meaning in the sheet.
+    """
+    words = meanings or {}
+    options = [_column_option(COLUMNS[name], words.get(name)) for name in columns]
+
+    def decorate(command: _Command) -> _Command:
+        @functools.wraps(command)
+        def with_cells(**arguments: Any) -> None:
+            texts = {name: arguments.pop(name) for name in columns}
+            command(cells={name: text for name, text in texts.items() if text is not None}, **arguments)
+
+        signature = inspect.signature(command, eval_str=True)
+        parameters = []
+        for parameter in signature.parameters.values():
+            parameters += options if parameter.name == "cells" else [parameter]
+        keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+        with_cells.__signature__ = signature.replace(parameters=keywords)  # type: ignore[attr-defined]
+        with_cells.__annotations__ = {parameter.name: parameter.annotation for parameter in keywords}
+        del with_cells.__wrapped__
+        return with_cells
+
+    return decorate
+
+
+def _column_option(column: Column, meaning: str | None) -> inspect.Parameter:
+    """The parameter of a command that Typer makes an option of."""
+    unset = "" if column.default in ("", "unknown") or column.default.startswith("required") else f" ({column.default})"
+    info = typer.Option(
+        option(column.name),
+        help=meaning or f"{column.meaning.rstrip('.')}{unset}.",
+        metavar=column.scale.metavar if column.scale else "NUMBER",
+        rich_help_panel=VINE if column.name in _VINE_COLUMNS else RIG,
+        show_default=False,
+    )
+    return inspect.Parameter(
+        column.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[str | None, info]
+    )
+
 
 Results = Annotated[
     Path | None,
@@ -74,11 +109,6 @@ FigurePath = Annotated[
     Path | None, typer.Option("--figure", help="Draw it, to this file.", rich_help_panel=OUT, show_default=False)
 ]
 LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.", rich_help_panel=OUT)]
-
-
-def given(values: Mapping[str, str | None]) -> dict[str, str]:
-    """Options that were given."""
-    return {name: text for name, text in values.items() if text is not None}
 
 
 def say(lines: Iterable[str]) -> None:

@@ -9,54 +9,48 @@ from typing import Annotated
 import typer
 
 from vinetrack.cli.design_options import (
+    GUESSED_YIELD,
     OUT,
     RIG,
-    Angle,
     AtFraction,
-    Chamber,
     Damping,
     DampingError,
-    Density,
-    Diameter,
     Effects,
     Exponent,
     ExponentError,
     FigurePath,
-    Inlet,
-    Length,
     LogPath,
-    Payload,
-    Pressure,
-    PressureSigma,
     Results,
     Samples,
     Seed,
-    Thickness,
-    Yield,
-    YieldSigma,
-    given,
+    column_options,
     say,
 )
 
 
+@column_options(
+    "diameter_mm",
+    "thickness_um",
+    "length_mm",
+    "film_density_kg_m3",
+    "yield_pressure_kPa",
+    "yield_pressure_sigma_kPa",
+    "pressure_kPa",
+    "pressure_sigma_kPa",
+    "payload_g",
+    "growth_angle_deg",
+    "chamber_l",
+    "inlet_mm",
+    meanings={"yield_pressure_kPa": GUESSED_YIELD},
+)
 def predict(
     sheet: Annotated[
         Path | None,
         typer.Argument(help="An experiment's folder or a sheet; else the options below.", metavar="SHEET",
                        show_default=False),
     ] = None,
-    diameter: Diameter = None,
-    thickness: Thickness = None,
-    length: Length = None,
-    density: Density = None,
-    yields: Yield = None,
-    yield_sigma: YieldSigma = None,
-    pressure: Pressure = None,
-    pressure_sigma: PressureSigma = None,
-    payload: Payload = None,
-    angle: Angle = None,
-    chamber: Chamber = None,
-    inlet: Inlet = None,
+    *,
+    cells: dict[str, str],
     tail_slack: Annotated[
         str | None,
         typer.Option("--tail-slack", metavar="taut|free", help="Whether a tail that would push goes slack.",
@@ -91,22 +85,8 @@ def predict(
 
         if tail_slack not in (None, "taut", "free"):
             raise typer.BadParameter(f"{tail_slack!r} is neither taut nor free", param_hint="--tail-slack")
-        values = {
-            "diameter_mm": diameter,
-            "thickness_um": thickness,
-            "length_mm": length,
-            "film_density_kg_m3": density,
-            "yield_pressure_kPa": yields,
-            "yield_pressure_sigma_kPa": yield_sigma,
-            "pressure_kPa": pressure,
-            "pressure_sigma_kPa": pressure_sigma,
-            "payload_g": payload,
-            "growth_angle_deg": angle,
-            "chamber_l": chamber,
-            "inlet_mm": inlet,
-        }
         asked = Asked(
-            cells=given(values),
+            cells=cells,
             sheet=sheet,
             results=results,
             effects=tuple(effects or ()),

@@ -8,35 +8,35 @@ from typing import Annotated
 import typer
 
 from vinetrack.cli.design_options import (
+    GUESSED_YIELD,
     RIG,
     VINE,
-    Angle,
     AtFraction,
-    Chamber,
     Damping,
-    Density,
-    Diameter,
     Effects,
     Exponent,
     ExponentError,
     FigurePath,
-    Inlet,
-    Length,
     LogPath,
-    Payload,
-    Pressure,
     Results,
     Samples,
     Seed,
-    Yield,
-    column_option,
-    given,
+    column_options,
     say,
 )
 
 
+@column_options(
+    "pressure_kPa",
+    "film_density_kg_m3",
+    "yield_pressure_kPa",
+    "payload_g",
+    "growth_angle_deg",
+    "chamber_l",
+    "inlet_mm",
+    meanings={"pressure_kPa": "Highest gauge pressure of the supply.", "yield_pressure_kPa": GUESSED_YIELD},
+)
 def vine(
-    pressure: Annotated[str | None, column_option("pressure_kPa", "Highest gauge pressure of the supply.", RIG)] = None,
     films: Annotated[
         str, typer.Option("--films-um", metavar="UM,…", help="Films to choose from.", rich_help_panel=VINE)
     ] = "50,100,150,200",
@@ -46,8 +46,6 @@ def vine(
     length: Annotated[
         str, typer.Option("--length-mm", metavar="LOW:HIGH", help="Range of lengths.", rich_help_panel=VINE)
     ] = "100:400",
-    density: Density = None,
-    yields: Yield = None,
     burst_share: Annotated[
         float,
         typer.Option("--of-burst", min=0.05, max=1, help="Share of the burst stress that is dared.",
@@ -58,10 +56,8 @@ def vine(
         typer.Option("--burst-MPa", min=0.01, max=1000, help="Hoop stress at which the film bursts; a guess.",
                      rich_help_panel=VINE),
     ] = 7.8,
-    payload: Payload = None,
-    angle: Angle = None,
-    chamber: Chamber = None,
-    inlet: Inlet = None,
+    *,
+    cells: dict[str, str],
     results: Results = None,
     n: Exponent = None,
     n_error: ExponentError = 0.0,
@@ -79,17 +75,8 @@ def vine(
         from vinetrack.pipeline.prediction_inputs import Asked
         from vinetrack.pipeline.vine_stage import design_vine
 
-        values = {
-            "pressure_kPa": pressure,
-            "film_density_kg_m3": density,
-            "yield_pressure_kPa": yields,
-            "payload_g": payload,
-            "growth_angle_deg": angle,
-            "chamber_l": chamber,
-            "inlet_mm": inlet,
-        }
         asked = Asked(
-            cells=given(values),
+            cells=cells,
             results=results,
             effects=tuple(effects or ()),
             n=math.nan if n is None else n,
@@ -111,29 +98,36 @@ def vine(
         )
 
 
+@column_options(
+    "diameter_mm",
+    "length_mm",
+    "pressure_kPa",
+    "chamber_l",
+    "thickness_um",
+    "film_density_kg_m3",
+    "yield_pressure_kPa",
+    "payload_g",
+    "growth_angle_deg",
+    "inlet_mm",
+    meanings={
+        "chamber_l": "A chamber to look at as well.",
+        "thickness_um": "Thickness of the wall: speeds are then told as well.",
+        "yield_pressure_kPa": GUESSED_YIELD,
+    },
+)
 def reservoir(
-    diameter: Diameter = None,
-    length: Length = None,
-    pressure: Pressure = None,
+    *,
+    cells: dict[str, str],
     within: Annotated[
         float,
         typer.Option("--within", min=0.01, max=90, help="Per cent of the gauge pressure that may be lost.",
                      rich_help_panel=RIG),
     ] = 5.0,
-    chamber: Annotated[str | None, column_option("chamber_l", "A chamber to look at as well.", RIG)] = None,
     supply: Annotated[
         float | None,
         typer.Option("--supply-s", min=1e-6, max=1e4, help="Time in which a supply closes the gap.",
                      rich_help_panel=RIG, show_default=False),
     ] = None,
-    thickness: Annotated[
-        str | None, column_option("thickness_um", "Thickness of the wall: speeds are then told as well.", VINE)
-    ] = None,
-    density: Density = None,
-    yields: Yield = None,
-    payload: Payload = None,
-    angle: Angle = None,
-    inlet: Inlet = None,
     results: Results = None,
     B: Damping = None,
     n: Exponent = None,
@@ -149,20 +143,8 @@ def reservoir(
         from vinetrack.pipeline.prediction_inputs import Asked
         from vinetrack.pipeline.reservoir_stage import design_reservoir
 
-        values = {
-            "diameter_mm": diameter,
-            "thickness_um": thickness,
-            "length_mm": length,
-            "pressure_kPa": pressure,
-            "film_density_kg_m3": density,
-            "yield_pressure_kPa": yields,
-            "payload_g": payload,
-            "growth_angle_deg": angle,
-            "chamber_l": chamber,
-            "inlet_mm": inlet,
-        }
         asked = Asked(
-            cells=given(values),
+            cells=cells,
             results=results,
             effects=tuple(effects or ()),
             B=math.nan if B is None else B,

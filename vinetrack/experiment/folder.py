@@ -18,8 +18,9 @@ import numpy as np
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
+from vinetrack.experiment.cells import oddity
 from vinetrack.experiment.naming import with_names
-from vinetrack.experiment.schema import COLUMNS, SHARED, oddity
+from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import (
     SHEET,

@@ -15,7 +15,7 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import Table, TableError, read_table
 from vinetrack.experiment.naming import with_names
-from vinetrack.experiment.schema import COLUMNS, SHARED
+from vinetrack.experiment.schema import COLUMNS, SHARED, option
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, Row, judge_pressures, judge_wall, make_trial, read_row, unknown_columns
 
@@ -36,15 +36,6 @@ class Planned:
     settings: ExperimentSettings
     folder: Path | None
     problems: tuple[Problem, ...]
-
-
-def option(column: str) -> str:
-    """The command line's option for a column of the sheet.
-
-    >>> option("pressure_kPa")
-    '--pressure-kPa'
-    """
-    return "--" + column.replace("_", "-")
 
 
 def planned_trial(

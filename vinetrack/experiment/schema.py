@@ -4,30 +4,19 @@ From these declarations derive the reading of `trials.csv` (`vinetrack.experimen
 name in `experiment.yaml` and its `limits` (`settings`), the options of `vinetrack predict` and `design`
 (`vinetrack.cli.design_options`), what an effect may need (`vinetrack.dynamics.trial_inputs`), and `vinetrack settings`.
 
-A cell of the sheet and a value of `experiment.yaml` pass the same checks and get the same remedies. Values stay in the
-column's own unit until a trial is made of them.
+Nothing heavy is loaded here: the command line reads it at every start. `vinetrack.experiment.cells` reads values.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from vinetrack.core.records import Bend, Trial
-from vinetrack.core.tables import TableError, parse_number
-from vinetrack.core.units import UNITS, Unit, convert, split_unit
+from vinetrack.core.units import UNITS, Unit, split_unit
 
-Value = float | bool | str | tuple[float, float] | tuple[Bend, ...]
-
-YES_NO = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
-
-
-class CellError(ValueError):
-    """A value that its column does not allow: what is wrong, what is allowed, what to do."""
-
-    def __init__(self, message: str, allowed: str = "", remedy: str = "") -> None:
-        super().__init__(message)
-        self.message, self.allowed, self.remedy = message, allowed, remedy
+if TYPE_CHECKING:
+    from vinetrack.core.records import Trial
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,97 +338,10 @@ def column_in_other_unit(name: str) -> tuple[Column, str] | None:
     return None
 
 
-def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
-    """Value of a cell that is not blank, in the unit of its column.
+def option(column: str) -> str:
+    """The command line's option for a column of the sheet.
 
-    Raises
-    ------
-    CellError
-        If the column does not allow it.
-
-    Examples
-    --------
-    >>> read_cell(COLUMNS["pressure_kPa"], "28"), read_cell(COLUMNS["steady"], "0.05:0.2")
-    (28.0, (0.05, 0.2))
-    >>> try:
-    ...     read_cell(COLUMNS["pressure_kPa"], "24000")
-    ... except CellError as error:
-    ...     print(error.message, "|", error.remedy)
-    is above 1000 kPa | looks like Pa: 24000 Pa is 24 kPa
+    >>> option("pressure_kPa")
+    '--pressure-kPa'
     """
-    if column.kind == "yes_no":
-        if text.lower() not in YES_NO:
-            raise CellError("is neither yes nor no", "yes or no")
-        return YES_NO[text.lower()]
-    if column.kind == "window":
-        return _read_window(text, decimal)
-    if column.kind == "bends":
-        return _read_bends(text, decimal)
-    if column.kind in ("text", "path"):
-        return text
-    return check_number(column, _number(text, decimal, column.allowed))
-
-
-def check_number(column: Column, value: float) -> float:
-    """The value itself, if its column allows it; see `read_cell`."""
-    if column.kind == "choice":
-        if value not in (column.low, column.high):
-            raise CellError("is not a travel ratio", "2 for eversion, 1 for a body that moves as a whole")
-    elif value > column.high:
-        raise CellError(f"is above {column.high:g} {column.unit}", column.allowed, _slip(column, value))
-    elif value < column.low or (column.above_low and value == column.low):
-        relation = "is not above" if column.above_low else "is below"
-        raise CellError(f"{relation} {column.low:g} {column.unit}".strip(), column.allowed, _slip(column, value))
-    return value
-
-
-def oddity(column: Column, value: float) -> str:
-    """Why a legal value is suspicious, or blank. Zero never is: it is written on purpose."""
-    return "" if value == 0 or column.usual[0] <= value <= column.usual[1] else column.unusual_hint
-
-
-def _slip(column: Column, value: float) -> str:
-    """The unit that was probably meant, where the value is allowed in it."""
-    own = column.unit_key or split_unit(column.name)[1]
-    for key in column.slips:
-        unit, factor = UNITS[key].text, convert(1.0, key, own)
-        meant = value * factor
-        # A slip enlarges numbers that are too small and shrinks those that are too large, never the other way round.
-        if (factor > 1) == (value < column.high) and max(column.low, 1e-9) <= meant <= column.high:
-            return f"looks like {unit}: {value:g} {unit} is {meant:g} {column.unit}"
-    return ""
-
-
-def _number(text: str, decimal: str, allowed: str = "") -> float:
-    try:
-        return parse_number(text, decimal)
-    except TableError as error:
-        message, _, remedy = str(error).partition(": ")
-        raise CellError(message, allowed, remedy) from None
-
-
-def _read_window(text: str, decimal: str) -> tuple[float, float]:
-    """`from_s:to_s`, in seconds."""
-    allowed = "from_s:to_s, such as 0.05:0.20"
-    parts = text.split(":")
-    if len(parts) != 2:
-        raise CellError("is not a window", allowed)
-    start, end = (_number(part, decimal, allowed) for part in parts)
-    if start >= end:
-        raise CellError("ends before it starts", allowed)
-    return start, end
-
-
-def _read_bends(text: str, decimal: str) -> tuple[Bend, ...]:
-    """`start_mm:arc_mm:radius_mm;…`, as bends in metres."""
-    allowed = "start_mm:arc_mm:radius_mm, several joined by ;"
-    bends = []
-    for piece in filter(None, (piece.strip() for piece in text.split(";"))):
-        parts = piece.split(":")
-        if len(parts) != 3:
-            raise CellError(f"has a bend {piece!r} that is not three numbers", allowed)
-        start, arc, radius = (_number(part, decimal, allowed) / 1000 for part in parts)
-        if start < 0 or arc <= 0 or radius <= 0:
-            raise CellError(f"has a bend {piece!r} with a length that is not positive", allowed)
-        bends.append(Bend(start, arc, radius))
-    return tuple(bends)
+    return "--" + column.replace("_", "-")

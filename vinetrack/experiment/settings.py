@@ -25,7 +25,8 @@ from pydantic import (
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Bend
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
-from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, CellError, Column, read_cell
+from vinetrack.experiment.cells import CellError, read_cell
+from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, Column
 
 BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
 """Eq. (2): the effects in use unless `model` says otherwise, whatever columns the sheet has."""

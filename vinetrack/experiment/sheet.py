@@ -15,7 +15,8 @@ from typing import Any
 from vinetrack.core.problems import Problem
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
 from vinetrack.core.tables import Table, TableError, safe_join
-from vinetrack.experiment.schema import COLUMNS, SHARED, CellError, Column, oddity, read_cell
+from vinetrack.experiment.cells import CellError, oddity, read_cell
+from vinetrack.experiment.schema import COLUMNS, SHARED, Column
 from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSettings
 
 SHEET = "trials.csv"

@@ -13,7 +13,8 @@ from vinetrack.core.numbers import number
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_bytes
 from vinetrack.core.units import PREDICTION_UNITS, display_unit
-from vinetrack.experiment.planned import Planned, option, planned_sheet, planned_trial
+from vinetrack.experiment.planned import Planned, planned_sheet, planned_trial
+from vinetrack.experiment.schema import option
 from vinetrack.results.folder_layout import Results, ResultsError, read_json
 
 if TYPE_CHECKING:

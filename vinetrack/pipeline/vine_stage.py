@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.experiment.planned import option
+from vinetrack.experiment.schema import option
 from vinetrack.pipeline.prediction_inputs import (
     Asked,
     as_option,
@@ -52,20 +52,17 @@ def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
     return tuple(dict.fromkeys(_cell(column, part, name) for part in text.split(",") if part.strip()))
 
 
-SI = {"mm": 1e-3, "um": 1e-6, "kPa": 1e3, "g": 1e-3}
-
-
 def _cell(column: str, text: str, name: str = "") -> float:
-    """One number of a column, in SI; divided, so that 25 mm are 0.025 m and not a digit off."""
-    from vinetrack.experiment.schema import COLUMNS, CellError, read_cell
+    """One number of a column, in SI."""
+    from vinetrack.experiment.cells import CellError, read_cell
+    from vinetrack.experiment.schema import COLUMNS
 
     try:
         value = read_cell(COLUMNS[column], text.strip())
     except CellError as error:
         raise _refusal(column, text, error.message, error.remedy, error.allowed, name) from None
     assert isinstance(value, float)
-    factor = SI[column.rsplit("_", 1)[-1]]
-    return value / round(1 / factor) if factor < 1 else value * factor
+    return COLUMNS[column].to_si(value)
 
 
 def _refusal(column: str, text: str, message: str, remedy: str, allowed: str = "", name: str = "") -> ExperimentError:
