@@ -5,15 +5,9 @@
 
 from pathlib import Path
 
+from vinetrack.figures.registry import FIGURES
 from vinetrack.pipeline.stage_code import code_hash
-from vinetrack.pipeline.workflow import (
-    CAMPAIGN_FIGURES,
-    DIAGNOSIS_FIGURES,
-    PAPER_FIGURES,
-    plan_or_stop,
-    say_where_at_exit,
-    shell_prefix,
-)
+from vinetrack.pipeline.workflow import plan_or_stop, say_where_at_exit, shell_prefix
 
 
 configfile: Path(workflow.basedir) / "config" / "config.yaml"
@@ -61,7 +55,7 @@ rule recording:
         [
             report(
                 plan.result("figures", f"strip_{{trial}}.{form}"),
-                caption="vinetrack/report/captions/strip.rst",
+                caption=FIGURES["strip"].caption_file,
                 category="Recordings",
                 labels={"trial": "{trial}", "format": form},
             )
@@ -211,7 +205,7 @@ rule trial_figures:
         [
             report(
                 path,
-                caption="vinetrack/report/captions/trial_motion.rst",
+                caption=FIGURES["trial_motion"].caption_file,
                 category="Trials",
                 labels={"trial": trial, "format": form},
             )
@@ -250,9 +244,9 @@ rule campaign_figures:
         [
             report(
                 path,
-                caption=f"vinetrack/report/captions/{name}.rst",
-                category="Diagnosis" if name in DIAGNOSIS_FIGURES else "Experiment",
-                labels={"figure": CAMPAIGN_FIGURES[name], "format": form},
+                caption=FIGURES[name].caption_file,
+                category=FIGURES[name].category,
+                labels={"figure": FIGURES[name].label, "format": form},
             )
             for name, form, path in plan.campaign_figures()
         ],
@@ -286,9 +280,9 @@ if plan.published:
             [
                 report(
                     path,
-                    caption=f"vinetrack/report/captions/{name}.rst",
-                    category="Beside the paper",
-                    labels={"figure": PAPER_FIGURES[name], "format": form},
+                    caption=FIGURES[name].caption_file,
+                    category=FIGURES[name].category,
+                    labels={"figure": FIGURES[name].label, "format": form},
                 )
                 for name, form, path in plan.paper_figures()
             ],
@@ -319,7 +313,7 @@ if plan.clips:
             report(
                 directory(plan.result("overlays")),
                 patterns=["{trial}.mp4"],
-                caption="vinetrack/report/captions/overlay.rst",
+                caption=FIGURES["overlay"].caption_file,
                 category="Clips",
                 labels={"trial": "{trial}"},
             ),

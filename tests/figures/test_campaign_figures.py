@@ -10,10 +10,9 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from vinetrack.figures.damping_law import draw_damping_law, log_force_sigma
-from vinetrack.figures.exponents import draw_exponents
+from vinetrack.figures.damping_figures import draw_damping_law, draw_exponents, log_force_sigma
 from vinetrack.figures.overview import MAX_CONDITION_PANELS, draw_overview
-from vinetrack.figures.scaling import draw_scaling
+from vinetrack.figures.size_figures import draw_scaling
 from vinetrack.figures.style import look, render, vine_styles
 
 N = 0.4

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from vinetrack.figures.campaign import draw_campaign
-from vinetrack.figures.reservoir import Law, draw_reservoir
+from vinetrack.figures.design_figures import FilmChoice, GasLawLoss, draw_campaign, draw_choice, draw_reservoir
 from vinetrack.figures.style import render
-from vinetrack.figures.vine_choice import Film, draw_choice
 
 
 def words(fig: Figure) -> str:
@@ -20,8 +18,8 @@ def words(fig: Figure) -> str:
     return " | ".join([*found, *(text.get_text() for text in fig.texts)])
 
 
-def film(thickness_um: float, odds: float) -> Film:
-    return Film(
+def film(thickness_um: float, odds: float) -> FilmChoice:
+    return FilmChoice(
         thickness_um, np.array([5.0, 10.0, 25.0]), np.array([1.0, 20.0, 45.0]), (25.0, 45.0), (29.0, 55.0), odds
     )
 
@@ -42,17 +40,17 @@ def test_a_payloads_speed_has_no_place_before_the_end() -> None:
 @pytest.mark.parametrize(("swept_m3", "unit"), [(1.96e-4, "L"), (6.1e-8, "mL")])
 def test_a_reservoir_in_the_unit_of_its_size(swept_m3: float, unit: str) -> None:
     volumes = swept_m3 * np.geomspace(3, 300, 20)
-    laws = [Law("slow", swept_m3 / volumes), Law("fast", 1.4 * swept_m3 / volumes)]
+    laws = [GasLawLoss("slow", swept_m3 / volumes), GasLawLoss("fast", 1.4 * swept_m3 / volumes)]
     said = words(draw_reservoir(volumes, laws, 0.05, swept_m3, 20 * swept_m3))
     assert f"volume of the chamber ({unit})" in said
     assert "allowed: 5 %" in said
-    assert f"asked about: {20 * swept_m3 * (1e3 if unit == 'L' else 1e6):.3g} {unit}" in said
+    assert f"chosen: {20 * swept_m3 * (1e3 if unit == 'L' else 1e6):.3g} {unit}" in said
 
 
 def test_a_reservoir_far_off_is_not_drawn() -> None:
     volumes = 1e-4 * np.geomspace(3, 300, 20)
-    laws = [Law("slow", 1e-4 / volumes), Law("fast", 1.4e-4 / volumes)]
-    assert "asked about" not in words(draw_reservoir(volumes, laws, 0.05, 1e-4, 10.0))
+    laws = [GasLawLoss("slow", 1e-4 / volumes), GasLawLoss("fast", 1.4e-4 / volumes)]
+    assert "chosen" not in words(draw_reservoir(volumes, laws, 0.05, 1e-4, 10.0))
 
 
 def test_a_campaign_with_its_vines_loads_and_counts() -> None:

@@ -10,14 +10,10 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from vinetrack.figures.before_after import AFTER, BEFORE, draw_before_after, rms_m
-from vinetrack.figures.candidates import MAX_ROWS, draw_candidates
-from vinetrack.figures.cosines import MAX_EFFECTS, draw_cosines
-from vinetrack.figures.drift import draw_drift
-from vinetrack.figures.ladder import draw_ladder
-from vinetrack.figures.missing_force import draw_missing_force
+from vinetrack.figures.candidate_figures import MAX_CANDIDATES, MAX_EFFECTS, draw_candidates, draw_cosines, draw_drift
+from vinetrack.figures.ladder_figures import AFTER, BEFORE, draw_before_after, draw_ladder, rms_m
+from vinetrack.figures.misfit_figures import draw_missing_force, draw_where
 from vinetrack.figures.style import BLUE, MUTED, ORANGE, VERMILLION, render
-from vinetrack.figures.where import draw_where
 
 
 def texts(fig: Figure) -> str:
@@ -54,14 +50,14 @@ def test_the_ladder_falls_in_millimetres_on_a_logarithmic_axis() -> None:
     curves = [line.get_ydata() for line in ax.lines if len(line.get_xdata()) == 2 and line.get_marker() != "None"]
     assert np.array(curves) == pytest.approx(np.array([[9, 2.25], [10, 2.5], [11, 2.75]]))
     assert [label.get_text() for label in ax.get_xticklabels()] == [
-        "the model\nyou came with",
+        "initial\nmodel",
         "+ reservoir\ndepletion",
     ]
 
 
 def test_the_ladder_says_where_the_floor_is_and_every_error() -> None:
     said = texts(draw_ladder(steps("", "air_drag")))
-    for number in ("floor: replicates differ by 1.00 mm", "9.00", "10.0", "11.0", "2.25"):
+    for number in ("replicate scatter: 1.00 mm", "9.00", "10.0", "11.0", "2.25"):
         assert number in said
 
 
@@ -73,7 +69,7 @@ def test_nothing_of_a_ladder_is_cut_off(added: tuple[str, ...]) -> None:
 def test_a_ladder_without_replicates_or_left_out_errors_is_drawn_with_what_there_is() -> None:
     table = steps("", "air_drag", floor_m=math.nan).assign(rms_highest_pressure_m=math.nan)
     fig = draw_ladder(table)
-    assert "floor" not in texts(fig)
+    assert "replicate scatter" not in texts(fig)
     assert [text.get_text() for text in fig.axes[0].get_legend().get_texts()] == ["in sample", "on left-out conditions"]
 
 
@@ -100,7 +96,7 @@ def test_a_condition_is_drawn_before_and_after_with_its_errors() -> None:
     growth, left = draw_before_after("24 kPa", table, "air drag").axes
     assert [text.get_text() for text in growth.get_legend().get_texts()] == [
         "measured, N = 2",
-        "model you came with: 8.0 mm rms",
+        "initial model: 8.0 mm rms",
         "with air drag: 1.0 mm rms",
     ]
     assert {to_hex(line.get_color()) for line in left.lines} >= {BEFORE.lower(), AFTER.lower()}
@@ -154,7 +150,7 @@ def test_what_is_not_plausible_is_said_beside_its_size() -> None:
 def test_the_longest_of_lists_is_cut_and_rounds_stand_below_each_other() -> None:
     many = ranking(*((f"effect_{i}", "physical", "screened", 100.0 - i, False) for i in range(30)))
     fig = draw_candidates([("one", many), ("two", many.head(2)), ("three", many.head(0))])
-    assert [len(ax.patches) for ax in fig.axes] == [MAX_ROWS, 2]
+    assert [len(ax.patches) for ax in fig.axes] == [MAX_CANDIDATES, 2]
     assert in_bounds(fig)
 
 

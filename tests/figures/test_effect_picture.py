@@ -9,7 +9,7 @@ import pytest
 
 from vinetrack.dynamics.effect_motion import effect_motion, reference_words, size_words
 from vinetrack.effects import catalogue
-from vinetrack.figures.effect_picture import draw_effect
+from vinetrack.figures.prediction_figures import draw_effect
 from vinetrack.figures.style import BLUE, render
 
 FASTER = {"fold_inertia", "wall_stretch", "gravity"}

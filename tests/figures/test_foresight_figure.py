@@ -6,12 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.figures.prediction import MOST_CURVES, Picture, draw_foresight
+from vinetrack.figures.prediction_figures import MOST_CURVES, PredictionPicture, draw_foresight
 from vinetrack.figures.style import render
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
 
-def picture(until_s: float = 0.02, arrives: bool = True, least_N: float = 1.0) -> Picture:
+def picture(until_s: float = 0.02, arrives: bool = True, least_N: float = 1.0) -> PredictionPicture:
     along = np.linspace(0.0, 0.99, 50)
     table = pd.DataFrame(dict.fromkeys(CURVE_COLUMNS, along))
     table["condition"] = "a"
@@ -21,10 +21,12 @@ def picture(until_s: float = 0.02, arrives: bool = True, least_N: float = 1.0) -
     table["tension_low_90_N"] = least_N
     if not arrives:
         table.loc[30:, ["time_s", "time_high_90_s"]] = np.inf
-    return Picture("a vine", table, "speed of the leading edge", [("guess of B", 30.0, 55.0)], (29.0, 46.0, 56.0))
+    return PredictionPicture(
+        "a vine", table, "speed of the leading edge", [("guess of B", 30.0, 55.0)], (29.0, 46.0, 56.0)
+    )
 
 
-def words(pictures: list[Picture]) -> str:
+def words(pictures: list[PredictionPicture]) -> str:
     fig = draw_foresight(pictures, 0.95)
     texts = [text.get_text() for ax in fig.axes for text in (ax.xaxis.label, ax.yaxis.label, *ax.texts)]
     texts += [ax.get_title(loc="left") for ax in fig.axes]
@@ -37,8 +39,8 @@ def test_one_condition_shows_what_leaves_it_open() -> None:
     for expected in ("leading edge y (mm)", "ẏ (m/s)", "tension of the tail (N)", "growth y/L", "y/L = 0.95"):
         assert expected in said
     assert "guess of B" in said
-    assert "all together" in said
-    assert "would have to push" not in said
+    assert "all inputs" in said
+    assert "compression" not in said
 
 
 def test_several_conditions_are_told_apart_by_name() -> None:
@@ -50,7 +52,7 @@ def test_conditions_that_have_no_colour_left_are_counted() -> None:
 
 
 def test_a_tail_that_pushes_is_marked() -> None:
-    assert "below 0 the tail would have to push" in words([picture(least_N=-0.5)])
+    assert "below 0 the model predicts compression in the tail" in words([picture(least_N=-0.5)])
 
 
 def test_times_far_apart_have_a_logarithmic_axis() -> None:

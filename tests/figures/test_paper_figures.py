@@ -8,10 +8,12 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from vinetrack.figures.paper_damping import draw_paper_damping
-from vinetrack.figures.paper_position import draw_paper_position
-from vinetrack.figures.paper_reservoir import draw_paper_reservoir
-from vinetrack.figures.paper_rms import draw_paper_rms
+from vinetrack.figures.paper_figures import (
+    draw_paper_damping,
+    draw_paper_position,
+    draw_paper_reservoir,
+    draw_paper_rms,
+)
 from vinetrack.figures.style import look
 
 NAMES = ("depletion_slow", "depletion_fast", "slack", "depletion_slow_slack", "depletion_fast_slack")

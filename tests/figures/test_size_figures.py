@@ -11,9 +11,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from vinetrack.figures.efficiency import draw_efficiency
-from vinetrack.figures.payload_speed import draw_payload_speed
-from vinetrack.figures.speed_scaling import draw_speed_scaling
+from vinetrack.figures.size_figures import draw_efficiency, draw_payload_speed, draw_speed_scaling
 from vinetrack.figures.style import look
 
 LINE = {"slope": 0.1, "slope_95": [0.02, 0.18], "intercept": 0.5, "intercept_95": [0, 1], "R2": 0.935, "p": 0.033}
@@ -112,7 +110,7 @@ def test_two_points_of_nearly_one_value_stand_inside_the_axes() -> None:
     assert left.get_xlim()[1] > 1.05 * 20
     assert "N = 2 vines of 1 trial\n" in words(figure)
     assert "no trend: 2 sizes; at least 3" in words(figure)
-    assert "without what replicates would differ by" in words(figure).replace("\n", " ")
+    assert "the scatter of replicates is not in it" in words(figure).replace("\n", " ")
 
 
 def test_single_trials_have_no_standard_error() -> None:

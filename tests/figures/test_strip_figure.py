@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Track
-from vinetrack.figures.strip import LARGEST_PX, draw_strip, flagged, shrunk
+from vinetrack.figures.strip_figure import LARGEST_PX, draw_strip, flagged, shrunk
 from vinetrack.figures.style import render
 from vinetrack.report.compact import compact_svg
 from vinetrack.video.axis import Axis

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from vinetrack.core.problems import ExperimentError
+from vinetrack.figures.registry import FIGURES
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.workflow import find_experiment, make_plan, shell_prefix
+from vinetrack.report.section import figure_caption
 
 ROOT = Path(__file__).parents[2]
 
@@ -113,10 +115,11 @@ def test_a_stage_depends_on_its_own_settings_alone(tmp_path: Path) -> None:
 
 
 def test_every_figure_has_a_caption_for_both_reports() -> None:
-    captions = workflow.PACKAGE / "report" / "captions"
-    figures = {*workflow.CAMPAIGN_FIGURES, *workflow.PAPER_FIGURES, "overlay", "strip", "trial_motion"}
-    assert not {name for name in figures if not (captions / f"{name}.rst").read_text(encoding="utf-8").strip()}
-    assert set(workflow.CAMPAIGN_FIGURES) >= workflow.DIAGNOSIS_FIGURES
+    captions = {path.stem for path in (workflow.PACKAGE / "report" / "captions").glob("*.rst")}
+    assert captions == set(FIGURES)
+    assert not {name for name in FIGURES if len(figure_caption(name)) < 50}
+    root = workflow.PACKAGE.parent
+    assert not {name for name, figure in FIGURES.items() if not (root / figure.caption_file).is_file()}
 
 
 def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_path: Path) -> None:

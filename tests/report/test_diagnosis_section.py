@@ -8,9 +8,9 @@ import pytest
 from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, laws, moved, next_experiment, number, refused
 from test_report import EVIL, SVG, Tags, page
 
+from vinetrack.figures.registry import DIAGNOSIS_FIGURES
 from vinetrack.report.build import ReportFigure
 from vinetrack.report.diagnosis import (
-    DIAGNOSIS_FIGURES,
     DiagnosisResult,
     diagnosis_section,
     hidden_table,

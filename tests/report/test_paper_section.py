@@ -8,7 +8,7 @@ import pandas as pd
 
 from vinetrack.paper.departures import DEPARTURE_COLUMNS, DEPARTURES
 from vinetrack.paper.rows import COMPUTED, NOT_CHECKABLE, SIMULATED, PaperRow, as_table
-from vinetrack.report.paper import FIGURES, paper_section, tally
+from vinetrack.report.paper import paper_section, tally
 
 nan = math.nan
 
@@ -85,10 +85,3 @@ def test_every_row_is_there_with_its_mark() -> None:
     assert elsewhere.rows[-1] == ("p-value, of a fit", "0.32", "0.0330", COMPUTED, "somehow; a note")
     (fourth,) = (table for table in tables if table.title.startswith("Figs. 4 and 5"))
     assert fourth.rows[0][:4] == ("rms (cm)", "1.9", "0.320", SIMULATED)
-
-
-def test_every_figure_has_a_caption() -> None:
-    from importlib.resources import files
-
-    for name in FIGURES:
-        assert len((files("vinetrack.report") / "captions" / f"{name}.rst").read_text(encoding="utf-8")) > 50

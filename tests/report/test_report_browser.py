@@ -11,8 +11,7 @@ import pytest
 from hand_diagnosis import diagnosis, ladder, moved
 from test_report import curves, page, trials, windows
 
-from vinetrack.figures.before_after import draw_before_after
-from vinetrack.figures.ladder import draw_ladder
+from vinetrack.figures.ladder_figures import draw_before_after, draw_ladder
 from vinetrack.figures.style import render
 from vinetrack.report.build import Clip, ReportFigure
 from vinetrack.report.diagnosis import DiagnosisResult

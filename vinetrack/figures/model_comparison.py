@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.style import INK, MUTED, blank, fitting_size, look, rows, vine_styles
+from vinetrack.figures.panels import fitting_size, page_columns, panel_font, panel_grid
+from vinetrack.figures.style import DASHED, INK, MUTED, blank, look, rows, vine_styles
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,11 +18,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_PANELS = 60
-_MAX_POINTS_IN_ALL = 12_000  # keeps the SVG under a megabyte, with 200 trials too
-_WIDTH_IN = 11.0
-_NOTHING = "The model in use was not fitted, so there is nothing to hold against the measurement."
+"""Chosen: 60 panels in rows of eight are 1.4 in wide, the narrowest that has room for its label."""
 
-Drawing = Callable[["Axes", "pd.DataFrame", str, int], None]
+_MAX_POINTS_IN_ALL = 12_000
+"""Measured: 12,000 points keep the SVG below a megabyte, with 200 trials too."""
+
+_WIDTH_IN = 11.0
+_NOTHING = "The model in use was not fitted: there is no prediction to compare with the measurement."
+
+_Drawing = Callable[["Axes", "pd.DataFrame", str, int], None]
 
 
 def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
@@ -42,29 +47,26 @@ def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd
 
 
 def _panels(
-    comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame], draw: Drawing, x_label: str, y_label: str
+    comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame], draw: _Drawing, x_label: str, y_label: str
 ) -> Figure:
     from matplotlib.figure import Figure
 
     shown = [row for row in rows(comparison) if row.condition in trajectories][:MAX_PANELS]
     if not shown:
         return blank(_NOTHING)
-    n_columns = _columns(len(shown))
+    n_columns = page_columns(len(shown), 8)
     n_rows = math.ceil(len(shown) / n_columns)
     n_trials = sum(trajectories[row.condition]["trial"].nunique() for row in shown)
     n_points = min(max(_MAX_POINTS_IN_ALL // n_trials, 25), 150)
     styles = vine_styles([row.vine for row in shown])
     with look():
-        font = 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
+        font = panel_font(n_columns)
         panel_in = min(_WIDTH_IN / n_columns, 6.0)
         row_in = min(max(0.78 * panel_in, 1.35), 3.6)
         fig = Figure(figsize=(n_columns * panel_in, n_rows * row_in + 0.95), layout="constrained")
-        axes = fig.subplots(n_rows, n_columns, squeeze=False)
-        for ax, row in zip(axes.flat, shown, strict=False):
+        for ax, row in zip(panel_grid(fig, len(shown), n_columns), shown, strict=True):
             draw(ax, trajectories[row.condition], styles[row.vine].colour, n_points)
             _label(ax, row, trajectories[row.condition]["trial"].nunique(), font, 72 * (panel_in - 0.45), draw)
-        for ax in axes.flat[len(shown) :]:
-            ax.set_visible(False)
         fig.supxlabel(x_label, fontsize=11)
         fig.supylabel(y_label, fontsize=11)
         title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
@@ -75,12 +77,7 @@ def _panels(
     return fig
 
 
-def _columns(n_panels: int) -> int:
-    """Enough columns that the page is not much taller than wide, and never more than eight."""
-    return min(max(math.ceil(math.sqrt(1.3 * n_panels)), 1), 8) if n_panels > 3 else n_panels
-
-
-def _label(ax: Axes, row: Any, n_trials: int, font: float, width_pt: float, draw: Drawing) -> None:
+def _label(ax: Axes, row: Any, n_trials: int, font: float, width_pt: float, draw: _Drawing) -> None:
     label = str(row.condition_label)
     size = fitting_size(label, width_pt, font, bold=False)
     ax.set_title(label, fontsize=size, fontweight="normal", pad=3)
@@ -119,7 +116,7 @@ def _draw_positions(ax: Axes, table: pd.DataFrame, colour: str, n_points: int) -
     ax.fill_between(time_ms, mean_mm - sigma_mm, mean_mm + sigma_mm, color=colour, alpha=0.22, lw=0)
     for part in parts:
         ax.plot(1e3 * part["time_s"], 1e3 * part["lead_position_m"], color=colour, lw=0.8)
-    ax.plot(1e3 * longest["time_s"], 1e3 * longest["model_position_m"], color=INK, lw=1.5, ls=(0, (4, 2)))
+    ax.plot(1e3 * longest["time_s"], 1e3 * longest["model_position_m"], color=INK, lw=1.5, ls=DASHED)
     if "model_after_m" in longest:
         ax.plot(1e3 * longest["time_s"], 1e3 * longest["model_after_m"], color=INK, lw=1.5)
 
@@ -132,9 +129,9 @@ def _draw_residuals(ax: Axes, table: pd.DataFrame, colour: str, n_points: int) -
     )
     order = np.argsort(growth_mm)
     ax.fill_between(growth_mm[order], -sigma_mm[order], sigma_mm[order], color=colour, alpha=0.22, lw=0)
-    ax.axhline(0, color=INK, lw=1.0, ls=(0, (4, 2)))
+    ax.axhline(0, color=INK, lw=1.0, ls=DASHED)
     for part in parts:
-        left_mm = 1e3 * (part["lead_position_m"] - part["model_position_m"])
-        ax.plot(1e3 * part["lead_position_m"], left_mm, color=colour, lw=0.9)
+        residual_mm = 1e3 * (part["lead_position_m"] - part["model_position_m"])
+        ax.plot(1e3 * part["lead_position_m"], residual_mm, color=colour, lw=0.9)
     low, high = ax.get_ylim()
     ax.set_ylim(low - 0.35 * (high - low), high)  # room for the words below

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.figures.style import INK, MUTED, VERMILLION, blank, look, plain_log_ticks, rows, vine_styles
+from vinetrack.figures.panels import page_columns, panel_font, panel_grid, plain_log_ticks
+from vinetrack.figures.style import INK, MUTED, VERMILLION, blank, look, rows, vine_styles
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,8 +25,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_CONDITION_PANELS = 60
+"""Chosen: 60 panels in rows of nine are 1.2 in wide, the narrowest that has room for its label."""
+
 MAX_PANELS = 120
-_MAX_POINTS_IN_ALL = 12_000  # keeps the SVG well under a megabyte, with 500 trials too
+"""Chosen: twelve rows of ten panels; vines beyond are left out, and the title states it."""
+
+_MAX_POINTS_IN_ALL = 12_000
+"""Measured: 12,000 points keep the SVG below a megabyte, with 500 trials too."""
+
 _WIDTH_IN = 11.0
 
 
@@ -61,30 +68,28 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
         return blank("No trial has positions from which a speed could be computed.")
     by_condition = shown["condition"].nunique() <= MAX_CONDITION_PANELS
     panels = _panels(shown, by_condition)
-    n_columns = _columns(len(panels))
+    n_columns = page_columns(len(panels), 10)
     n_rows = math.ceil(len(panels) / n_columns)
     panel_in = _WIDTH_IN / n_columns
     with look():
-        font = 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
+        font = panel_font(n_columns)
         row_in = min(max(0.72 * panel_in, 1.15), 3.6)
         height_in = n_rows * row_in + 1.15
         fig = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
-        axes = fig.subplots(n_rows, n_columns, sharex=True, sharey=not by_condition, squeeze=False)
+        axes = panel_grid(fig, len(panels), n_columns, sharex=True, sharey=not by_condition)
         colours = _colours(shown, by_condition)
-        for ax, panel in zip(axes.flat, panels, strict=False):
+        for ax, panel in zip(axes, panels, strict=True):
             _draw_panel(ax, panel, curves, colours, font)
             if by_condition:
                 _limit_speed(ax, [curves[name] for name in panel.trials["trial"] if name in curves])
-        for ax in axes.flat[len(panels) :]:
-            ax.set_visible(False)
-        for ax in axes.flat[max(len(panels) - n_columns, 0) : len(panels)]:
+        for ax in axes[-n_columns:]:
             ax.tick_params(labelbottom=True)
-        axes[0, 0].set_xlim(0, 1.02 * max(float(np.nanmax(curve.growth_mm)) for curve in curves.values()))
+        axes[0].set_xlim(0, 1.02 * max(float(np.nanmax(curve.growth_mm)) for curve in curves.values()))
         fig.supxlabel("growth (mm)", fontsize=11)
         fig.supylabel("leading-edge speed (m/s)", fontsize=11)
         fig.suptitle(_title(shown, curves, len(panels), by_condition), fontsize=11, x=0.01, ha="left")
         if not by_condition:
-            _limit_speed(axes[0, 0], list(curves.values()), logarithmic=True)
+            _limit_speed(axes[0], list(curves.values()), logarithmic=True)
             _pressure_bar(fig, shown)
     return fig
 
@@ -117,11 +122,6 @@ def _in_order_of_appearance(column: pd.Series) -> pd.Series:
         return column
     first = {name: i for i, name in enumerate(dict.fromkeys(column))}
     return column.map(first)
-
-
-def _columns(n_panels: int) -> int:
-    """Enough columns that the page is not much taller than wide, and never more than ten."""
-    return min(max(math.ceil(math.sqrt(1.3 * n_panels)), 1), 10) if n_panels > 3 else n_panels
 
 
 def _colours(trials: pd.DataFrame, by_condition: bool) -> dict[str, Any]:

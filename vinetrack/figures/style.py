@@ -8,7 +8,6 @@ for a dark screen; a PNG gets a white background.
 from __future__ import annotations
 
 import io
-import math
 import textwrap
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 INK = "#20242a"
@@ -37,9 +35,12 @@ RULE_COLOURS = {"gated": BLUE, "quasi_steady": PURPLE, "paper": VERMILLION, "use
 
 RULE_NAMES = {"gated": "gated rule", "quasi_steady": "quasi-steady", "paper": "paper's rule", "user": "chosen by hand"}
 
+DASHED: Any = (0, (4, 2))
+"""Line of the second of two models, methods or laws: dashes of four line widths with gaps of two."""
+
 METHOD_COLOURS = {"log_log": VERMILLION, "both_axes": BLUE}
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
-METHOD_LINES = {"log_log": (0, (4, 2)), "both_axes": "-"}
+METHOD_LINES = {"log_log": DASHED, "both_axes": "-"}
 
 _RC: Any = {
     "font.family": ["DejaVu Sans", "sans-serif"],
@@ -115,80 +116,6 @@ def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure
         wrapped = textwrap.fill(message, int(width_in * 11))
         fig.text(0.5, 0.5, wrapped, ha="center", va="center", color=MUTED)
     return fig
-
-
-def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) -> float:
-    """Font size at which `text` fits a width, at most `largest`: names come as long as people make them."""
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import TextPath
-
-    font = FontProperties(family="DejaVu Sans", weight="bold" if bold else "normal")
-    taken_pt = TextPath((0, 0), text.replace("$", "S"), size=largest, prop=font).get_extents().width
-    return largest * min(1.0, width_pt / max(taken_pt, 1e-9))
-
-
-def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
-    """Put the legend over the axes, where no datum can lie under it."""
-    handles, labels = ax.get_legend_handles_labels()
-    handles = keywords.pop("handles", handles)
-    if handles:
-        ax.legend(
-            handles=handles,
-            labels=[handle.get_label() for handle in handles] if not labels else None,
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.01),
-            borderaxespad=0.0,
-            ncols=n_columns,
-            handlelength=1.8,
-            columnspacing=1.4,
-            **keywords,
-        )
-
-
-def note_below(fig: Figure, note: str) -> None:
-    """Put a sentence under the whole figure, wrapped to its width; nothing where it is blank."""
-    if note:
-        fig.supxlabel(textwrap.fill(note, int(fig.get_figwidth() * 12.5)), fontsize=10)
-
-
-def up_from_zero(ax: Axes, *, x: bool = False) -> None:
-    """Let the axes begin at zero and end a little above all that is drawn, however near to each other the values are.
-
-    A margin that goes with the range of the data would be none where two points of nearly one value are all there is.
-    """
-    ax.set_ylim(0, 1.08 * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
-    if x:
-        ax.set_xlim(0, 1.08 * ax.dataLim.x1 if ax.dataLim.x1 > 0 else None)
-
-
-def counted(low: int, high: int, what: str) -> str:
-    """So many of something, from the fewest to the most.
-
-    >>> counted(1, 1, "trial"), counted(2, 3, "trial")
-    ('1 trial', '2–3 trials')
-    """
-    return f"{low}–{high} {what}s" if low != high else f"{low} {what}" + ("" if low == 1 else "s")
-
-
-def plain_log_ticks(ax: Axes, which: str = "both") -> None:
-    """Ticks at 1, 2, 5 written as plain numbers, so that less than a decade still has readable values."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
-    axes = {"x": (ax.xaxis,), "y": (ax.yaxis,), "both": (ax.xaxis, ax.yaxis)}[which]
-    for axis in axes:
-        low, high = _at_least_an_octave(*axis.get_view_interval())
-        axis.set_view_interval(low, high, ignore=True)
-        decades = math.log10(high / low)
-        steps = (1, 2, 3, 5, 7) if decades < 1 else (1, 2, 5) if decades < 3.2 else (1,)
-        axis.set_major_locator(LogLocator(subs=steps))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_locator(NullLocator())
-
-
-def _at_least_an_octave(low: float, high: float) -> tuple[float, float]:
-    """Limits a factor two apart or more: a single point must not fill the figure with its error bars."""
-    middle = math.sqrt(low * high)
-    return min(low, middle / math.sqrt(2)), max(high, middle * math.sqrt(2))
 
 
 def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 150) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""One trial: position and speed against time, and what each rule took for its steady stretch.
+"""One trial: position and speed against time, and the steady window of each rule.
 
 The three rules are bars in a strip of their own below the curves, so that windows that overlap stay apart, with the
 verdict of each in words beside it; their x_ss is drawn across the curve where it was measured.
@@ -13,18 +13,8 @@ import numpy as np
 
 from vinetrack.core.numbers import with_error
 from vinetrack.core.records import UNUSABLE_FLAGS
-from vinetrack.figures.style import (
-    GRID,
-    INK,
-    MUTED,
-    RULE_COLOURS,
-    RULE_NAMES,
-    VERMILLION,
-    blank,
-    fitting_size,
-    look,
-    rows,
-)
+from vinetrack.figures.panels import fitting_size
+from vinetrack.figures.style import GRID, INK, MUTED, RULE_COLOURS, RULE_NAMES, VERMILLION, blank, look, rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,8 +23,13 @@ if TYPE_CHECKING:
 
 _WIDTH_IN = 7.2
 _TEXT_COLUMNS = 106
+"""Characters of 8.8 pt in 7.2 in: a mean one is 4.1 pt wide, which makes 126; a sixth is left for wide letters."""
+
 _LINE_IN = 0.175
-_MAX_DOTS = 600  # more would make the SVG of a long track weigh megabytes and look the same
+"""Height of a line of 8.8 pt with 1.43 spacing."""
+
+_MAX_DOTS = 600
+"""Chosen: on 5.5 in, 600 dots of 3.5 pt overlap; more would enlarge the SVG of a long track by megabytes."""
 
 
 def draw_trial_motion(
@@ -44,7 +39,7 @@ def draw_trial_motion(
 
     Parameters
     ----------
-    title : what the trial is: name, vine, pressure.
+    title : the trial's name, vine and pressure.
     track, kinematics : tables as in `tracks/<trial>.csv` and `kinematics/<trial>.csv`.
     windows : rows of `steady.csv` for this trial.
     travel_ratio : tail speed over that of the leading edge, for the axis on the right.
@@ -86,7 +81,7 @@ def _three_rows(fig: Figure, heights_in: dict[str, float], height_in: float) -> 
 
 
 def _unusable(track: pd.DataFrame) -> np.ndarray:
-    """Mask of the rows that say nothing about where the leading edge was."""
+    """Mask of the rows without a usable position of the leading edge."""
     flags = track["flag"].fillna("").astype(str)
     return flags.map(lambda flag: bool(UNUSABLE_FLAGS.intersection(flag.split(";")))).to_numpy(dtype=bool)
 
@@ -163,7 +158,7 @@ def _draw_strip(ax: Axes, windows: pd.DataFrame) -> None:
 
 
 def _verdict(row: Any) -> list[tuple[str, str]]:
-    """What one rule found, as coloured lines of text that fit the figure's width."""
+    """The result of one rule, as coloured lines of text that fit the figure's width."""
     name, colour = RULE_NAMES[row.rule], RULE_COLOURS[row.rule]
     parts = ["accepted" if row.accepted else "rejected"]
     if np.isfinite(row.x_ss_m_s):

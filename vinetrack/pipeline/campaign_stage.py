@@ -192,7 +192,7 @@ def film_sheet(shown: Candidates, one: Plan, wanted: Wanted) -> pd.DataFrame:
 
 
 def _picture(shown: Candidates, one: Plan, longest_s: float) -> Figure:
-    from vinetrack.figures.campaign import draw_campaign
+    from vinetrack.figures.design_figures import draw_campaign
     from vinetrack.planning.campaign_design import trials_of
     from vinetrack.planning.campaign_information import final_lead_speeds
 

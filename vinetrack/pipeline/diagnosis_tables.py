@@ -124,29 +124,23 @@ def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
     return found
 
 
-def draw_diagnosed(found: DiagnosisTables | None) -> dict[str, Figure]:
-    """All pictures of a diagnosis, by name; those without anything in them say so."""
-    from vinetrack.figures.before_after import draw_before_after
-    from vinetrack.figures.candidates import draw_candidates
-    from vinetrack.figures.cosines import draw_cosines
-    from vinetrack.figures.drift import draw_drift
-    from vinetrack.figures.ladder import draw_ladder
-    from vinetrack.figures.missing_force import draw_missing_force
+def draw_diagnosed(tables: DiagnosisTables | None) -> dict[str, Figure]:
+    """Draw all figures of a diagnosis, by name; those without data state so."""
+    from vinetrack.figures.registry import DIAGNOSIS_FIGURES, draw
     from vinetrack.figures.style import blank
-    from vinetrack.figures.where import draw_where
 
-    if found is None:
-        names = ("ladder", "before_after", "where", "missing_force", "candidates", "cosines", "drift")
-        return {name: blank("There is no diagnosis of this model.") for name in names}
-    return {
-        "ladder": draw_ladder(found.ladder),
-        "before_after": draw_before_after(found.labels.get(found.worst, found.worst), found.before_after, found.added),
-        "where": draw_where(found.where, found.added),
-        "missing_force": draw_missing_force(found.force),
-        "candidates": draw_candidates(found.rounds),
-        "cosines": draw_cosines(*found.cosines),
-        "drift": draw_drift(found.drift, found.added),
+    if tables is None:
+        return {name: blank("There is no diagnosis of this model.") for name in DIAGNOSIS_FIGURES}
+    inputs: dict[str, tuple[Any, ...]] = {
+        "ladder": (tables.ladder,),
+        "before_after": (tables.labels.get(tables.worst, tables.worst), tables.before_after, tables.added),
+        "where": (tables.where, tables.added),
+        "missing_force": (tables.force,),
+        "candidates": (tables.rounds,),
+        "cosines": tables.cosines,
+        "drift": (tables.drift, tables.added),
     }
+    return {name: draw(name, *inputs[name]) for name in DIAGNOSIS_FIGURES}
 
 
 def with_after(trajectories: Mapping[str, pd.DataFrame], found: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
@@ -225,7 +219,7 @@ def _first_moving_s(table: pd.DataFrame, origin_m: float) -> float:
 
 def worst_condition(trials: pd.DataFrame) -> str:
     """The condition where the model that the user came with is farthest off; blank without predictions."""
-    from vinetrack.figures.before_after import rms_m
+    from vinetrack.figures.ladder_figures import rms_m
 
     if not len(trials):
         return ""
@@ -235,7 +229,7 @@ def worst_condition(trials: pd.DataFrame) -> str:
 
 
 def where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
-    """Mean misfit of every condition in stretches of its growth, as `vinetrack.figures.where` draws it.
+    """Mean misfit of every condition in stretches of its growth, as `misfit_figures.draw_where` draws it.
 
     Where the diagnosis found the misfit of the first model itself, with its error, that is taken.
     """

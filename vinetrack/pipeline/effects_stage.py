@@ -91,7 +91,7 @@ def write_picture(effect: Effect, path: Path) -> None:
     """Draw what an effect does to the reference vine; the file's ending says in which form."""
     from vinetrack.core.tables import write_bytes
     from vinetrack.dynamics.effect_motion import effect_motion, reference_words, size_words
-    from vinetrack.figures.effect_picture import draw_effect
+    from vinetrack.figures.prediction_figures import draw_effect
     from vinetrack.figures.style import render
 
     if path.suffix.lower() not in FORMATS:

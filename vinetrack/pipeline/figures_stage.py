@@ -55,23 +55,16 @@ def draw_trials(experiment: Experiment, folder: Path, settings: FigureSettings, 
 
 
 def _draw_trial(picture: _TrialPicture, results: Results, settings: FigureSettings) -> None:
-    from vinetrack.figures.trial_motion import draw_trial_motion
+    from vinetrack.figures.registry import draw
 
     track, kinematics = read_result(results.track(picture.name)), read_result(results.kinematics(picture.name))
-    figure = draw_trial_motion(picture.title, track, kinematics, picture.windows, picture.travel_ratio)
+    figure = draw("trial_motion", picture.title, track, kinematics, picture.windows, picture.travel_ratio)
     _write(figure, partial(results.trial_figure, picture.name), settings)
 
 
 def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> None:
     """Draw the figures of the whole experiment."""
-    from vinetrack.figures.damping_law import draw_damping_law
-    from vinetrack.figures.efficiency import draw_efficiency
-    from vinetrack.figures.exponents import draw_exponents
-    from vinetrack.figures.model_comparison import draw_model_comparison, draw_model_residuals
-    from vinetrack.figures.overview import draw_overview
-    from vinetrack.figures.payload_speed import draw_payload_speed
-    from vinetrack.figures.scaling import draw_scaling
-    from vinetrack.figures.speed_scaling import draw_speed_scaling
+    from vinetrack.figures.registry import draw
     from vinetrack.figures.style import METHOD_NAMES
     from vinetrack.pipeline.diagnosis_tables import draw_diagnosed, read_diagnosed, with_after
 
@@ -87,18 +80,18 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     compared = label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
     scaling, diagnosed = read_json(results.scaling), read_diagnosed(results, described)
-    drawings: dict[str, Figure] = {
-        "damping_law": draw_damping_law(points, damping),
-        "exponents": draw_exponents(damping),
-        "scaling": draw_scaling(scaling),
-        "speed_scaling": draw_speed_scaling(scaling),
-        "efficiency": draw_efficiency(scaling),
-        "payload_speed": draw_payload_speed(read_result(results.conditions), read_result(results.payload_model)),
-        "overview": draw_overview(described, moved),
-        "model_comparison": draw_model_comparison(compared, with_after(trajectories, diagnosed)),
-        "model_residuals": draw_model_residuals(compared, trajectories),
-        **draw_diagnosed(diagnosed),
+    inputs: dict[str, tuple[Any, ...]] = {
+        "damping_law": (points, damping),
+        "exponents": (damping,),
+        "scaling": (scaling,),
+        "speed_scaling": (scaling,),
+        "efficiency": (scaling,),
+        "payload_speed": (read_result(results.conditions), read_result(results.payload_model)),
+        "overview": (described, moved),
+        "model_comparison": (compared, with_after(trajectories, diagnosed)),
+        "model_residuals": (compared, trajectories),
     }
+    drawings = {name: draw(name, *values) for name, values in inputs.items()} | draw_diagnosed(diagnosed)
     for name, figure in drawings.items():
         _write(figure, partial(results.figure, name), settings)
         log.info("drew %s", name)

@@ -13,7 +13,6 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_json, re
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import FigureSettings
@@ -103,23 +102,17 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
 
 def draw_paper(folder: Path, settings: FigureSettings) -> None:
     """Draw the figures that stand beside the paper's, from the tables of `set_beside_paper`."""
+    from vinetrack.figures.registry import draw
     from vinetrack.figures.style import render
 
-    for name, figure in _drawings(Results(folder)).items():
-        for form, data in render(figure, settings.formats, settings.dpi).items():
+    for name, inputs in _figure_inputs(Results(folder)).items():
+        for form, data in render(draw(name, *inputs), settings.formats, settings.dpi).items():
             write_bytes(Results(folder).figure(name, f".{form}"), data)
 
 
-def _drawings(results: Results) -> dict[str, Figure]:
+def _figure_inputs(results: Results) -> dict[str, tuple[Any, ...]]:
+    """What each figure beside the paper is drawn from, by its name in the registry."""
     from vinetrack.core import published
-    from vinetrack.figures.efficiency import draw_efficiency
-    from vinetrack.figures.paper_damping import draw_paper_damping
-    from vinetrack.figures.paper_position import draw_paper_position
-    from vinetrack.figures.paper_reservoir import draw_paper_reservoir
-    from vinetrack.figures.paper_rms import draw_paper_rms
-    from vinetrack.figures.payload_speed import draw_payload_speed
-    from vinetrack.figures.scaling import draw_scaling
-    from vinetrack.figures.speed_scaling import draw_speed_scaling
     from vinetrack.paper.rows import SIMULATED
 
     tables = {name: read_result(results.folder / f"{name}.csv") for name in (*DRAWN_FROM, *DRAWN_FROM_SPEEDS)}
@@ -128,19 +121,22 @@ def _drawings(results: Results) -> dict[str, Figure]:
     fig7, fig8 = (FIG7_VIRTUAL, FIG8_NOTE + FIG8_VIRTUAL) if virtual else ("", FIG8_NOTE)
     speed = {"steady_speed": _near(scaling["steady_speed"], published.STEADY_SPEED_KPA)}
     efficiency = {"efficiency": _near(scaling["efficiency"], published.EFFICIENCY_KPA)}
+    motions = (tables[f"paper_{name}"] for name in ("motions", "means", "positions"))
+    printed_B = {"B": _printed_B(damping), "source": f"{published.SOURCE}, printed"}
     return {
-        "paper_fig4": draw_paper_position(
-            tables["paper_motions"], tables["paper_means"], tables["paper_positions"], published.POSITION_RMS_CM
+        "paper_fig4": (*motions, published.POSITION_RMS_CM),
+        "paper_fig5": (
+            tables["paper_speeds"],
+            tables["paper_speed_curves"],
+            FIG5_NOTE,
+            "Eq. (2), B in proportion to the wall",
         ),
-        "paper_fig5": draw_payload_speed(
-            tables["paper_speeds"], tables["paper_speed_curves"], FIG5_NOTE, "Eq. (2), B in proportion to the wall"
-        ),
-        "paper_fig6": draw_paper_damping(read_result(results.points), damping, published.DAMPING_B, published.EXPONENT),
-        "paper_fig7": draw_scaling(scaling, {"B": _printed_B(damping), "source": f"{published.SOURCE}, printed"}, fig7),
-        "paper_fig8": draw_speed_scaling(speed, fig8),
-        "paper_fig9": draw_efficiency(efficiency, FIG9_NOTE),
-        "paper_reservoir": draw_paper_reservoir(tables["paper_pressures"]),
-        "paper_table2": draw_paper_rms(tables["paper"], tables["paper_departures"]),
+        "paper_fig6": (read_result(results.points), damping, published.DAMPING_B, published.EXPONENT),
+        "paper_fig7": (scaling, printed_B, fig7),
+        "paper_fig8": (speed, fig8),
+        "paper_fig9": (efficiency, FIG9_NOTE),
+        "paper_reservoir": (tables["paper_pressures"],),
+        "paper_table2": (tables["paper"], tables["paper_departures"]),
     }
 
 

@@ -27,7 +27,7 @@ from vinetrack.pipeline.prediction_inputs import (
 from vinetrack.results.folder_layout import ResultsError
 
 if TYPE_CHECKING:
-    from vinetrack.figures.prediction import Picture
+    from vinetrack.figures.prediction_figures import PredictionPicture
     from vinetrack.planning.design_checks import Neglected
     from vinetrack.planning.prediction import Quantity, VinePrediction
 
@@ -70,7 +70,7 @@ def foretell(
     lines = [*_one(found[0])] if len(found) == 1 else [*_several(found)]
     lines += [f"! {words}" for words in warnings_of(ground)]
     if figure is not None:
-        from vinetrack.figures.prediction import draw_foresight
+        from vinetrack.figures.prediction_figures import draw_foresight
 
         write_figure(draw_foresight([_picture(one.sight) for one in found], at_fraction), figure)
         lines.append(f"Figure: {figure}")
@@ -198,10 +198,10 @@ def _several(found: Sequence[Foretold]) -> Iterator[str]:
         yield f"! {'all conditions' if len(conditions) == len(found) else ', '.join(conditions)}: {text}"
 
 
-def _picture(sight: VinePrediction) -> Picture:
-    from vinetrack.figures.prediction import Picture
+def _picture(sight: VinePrediction) -> PredictionPicture:
+    from vinetrack.figures.prediction_figures import PredictionPicture
 
-    return Picture(
+    return PredictionPicture(
         title=trial_words(sight.belief.trial),
         curve=sight.curve,
         final_name=sight.final.name,

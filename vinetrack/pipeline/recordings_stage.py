@@ -99,7 +99,7 @@ def _add_view(results: Results, name: str, measurement: Measurement, image: str 
 
 
 def _draw(trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings) -> None:
-    from vinetrack.figures.strip import draw_strip
+    from vinetrack.figures.strip_figure import draw_strip
     from vinetrack.figures.style import blank, render
 
     if measurement is None:

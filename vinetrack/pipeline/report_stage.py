@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.tables import write_json, write_text
 from vinetrack.experiment.provenance import describe_run
+from vinetrack.figures.registry import CAMPAIGN_FIGURES, PAPER_FIGURES, RegisteredFigure
 from vinetrack.figures.style import METHOD_NAMES
 from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
 from vinetrack.pipeline.figures_stage import describe_conditions
@@ -22,28 +22,8 @@ if TYPE_CHECKING:
     from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
     from vinetrack.report.recordings import Recording
 
-FIGURES = {
-    "ladder": ("The ladder of errors", ""),
-    "before_after": ("The worst condition", ""),
-    "damping_law": ("Steady force and steady speed", "damping_points.csv"),
-    "exponents": ("The exponent and the coefficients, by both methods", "damping.json"),
-    "scaling": ("How damping grows with size", "scaling.json"),
-    "speed_scaling": ("How steady speed goes with size", "conditions.csv"),
-    "efficiency": ("How much of the work becomes motion", "conditions.csv"),
-    "payload_speed": ("Final speed and payload", "conditions.csv"),
-    "overview": ("All trials at a glance", "trials.csv"),
-    "model_comparison": ("Model and measurement", ""),
-    "model_residuals": ("What the model leaves", "comparison.csv"),
-    "where": ("Misfit by condition and position", ""),
-    "missing_force": ("The missing force", ""),
-    "candidates": ("What would explain it", ""),
-    "cosines": ("What can be taken for what", ""),
-    "drift": ("What follows a condition it should not know", ""),
-}
-"""Figures of the page in their order: title, and the file their numbers stand in where it is not one of their own."""
-
 MOST_CURVE_ROWS = 6000
-"""Of the curves of all trials as data to download."""
+"""Rows of the curves of all trials as data to download; chosen: about 300 kB of the page."""
 
 
 def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> Path:
@@ -89,7 +69,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         damping=read_json(results.damping),
         provenance=_provenance(experiment, settings),
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
-        figures=[figure for name in _drawn(results, own_data) if (figure := _figure(results, name, own_data))],
+        figures=[_figure(results, figure, own_data.get(figure.name, "")) for figure in _drawn(results, own_data)],
         trial_figures=_trial_figures(results, drawn),
         recordings={name: _recording(results, name) for name in filmed},
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
@@ -110,28 +90,14 @@ def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str
 
 
 def _paper_section(results: Results) -> ReportSection:
-    from vinetrack.report.build import ReportFigure
-    from vinetrack.report.paper import FIGURES as PAPER_FIGURES
     from vinetrack.report.paper import paper_section
 
-    captions = files("vinetrack.report") / "captions"
-    figures = [
-        ReportFigure(
-            name,
-            title,
-            " ".join((captions / f"{name}.rst").read_text(encoding="utf-8").split()),
-            results.figure(name, ".svg").read_text(encoding="utf-8"),
-            data,
-            (results.folder / data).read_text(encoding="utf-8"),
-        )
-        for name, (title, data) in PAPER_FIGURES.items()
-        if results.figure(name, ".svg").exists()
-    ]
+    figures = [_figure(results, figure) for figure in PAPER_FIGURES.values() if _svg(results, figure).exists()]
     table, departures = (read_result(results.folder / f"{name}.csv") for name in ("paper", "paper_departures"))
     return paper_section(table, departures, figures)
 
 
-def _drawn(results: Results, own_data: Mapping[str, str]) -> list[str]:
+def _drawn(results: Results, own_data: Mapping[str, str]) -> list[RegisteredFigure]:
     """Figures with something in them; the others would only repeat why there is no law."""
     damping, scaling = read_json(results.damping), read_json(results.scaling)
     empty = set() if any(damping[method]["vines"] for method in METHOD_NAMES) else {"exponents"}
@@ -139,22 +105,22 @@ def _drawn(results: Results, own_data: Mapping[str, str]) -> list[str]:
     empty |= {key for key, of in (("speed_scaling", "steady_speed"), ("efficiency", "efficiency")) if not scaling[of]}
     empty |= set() if len(read_result(results.payload_model)) else {"payload_speed"}
     empty |= {"model_comparison", "model_residuals"} if read_json(results.fit)["refused"] else set()
-    empty |= {name for name, (_, file) in FIGURES.items() if not file and name not in own_data}
-    return [name for name in FIGURES if name not in empty]
+    empty |= {name for name, figure in CAMPAIGN_FIGURES.items() if not figure.data and name not in own_data}
+    return [figure for name, figure in CAMPAIGN_FIGURES.items() if name not in empty and _svg(results, figure).exists()]
 
 
-def _figure(results: Results, name: str, own_data: Mapping[str, str]) -> ReportFigure | None:
-    from vinetrack.report.build import ReportFigure
+def _svg(results: Results, figure: RegisteredFigure) -> Path:
+    return results.figure(figure.name, ".svg")
 
-    path = results.figure(name, ".svg")
-    if not path.exists():
-        return None
-    title, data_name = FIGURES[name]
-    caption = (files("vinetrack.report") / "captions" / f"{name}.rst").read_text(encoding="utf-8")
-    data = (results.folder / data_name).read_text(encoding="utf-8") if data_name else own_data[name]
-    return ReportFigure(
-        name, title, " ".join(caption.split()), path.read_text(encoding="utf-8"), data_name or f"{name}.csv", data
-    )
+
+def _figure(results: Results, figure: RegisteredFigure, own_data: str = "") -> ReportFigure:
+    """A figure for the page with the file of its numbers, or with a table of its own."""
+    from vinetrack.report.section import ReportFigure, figure_caption
+
+    data = (results.folder / figure.data).read_text(encoding="utf-8") if figure.data else own_data
+    svg = _svg(results, figure).read_text(encoding="utf-8")
+    caption, data_name = figure_caption(figure.name), figure.data or f"{figure.name}.csv"
+    return ReportFigure(figure.name, figure.title, caption, svg, data_name, data)
 
 
 def _as_csv(table: pd.DataFrame) -> str:

@@ -121,13 +121,13 @@ def _supplied(belief: PredictiveInputs, loss: float, supply_s: float) -> list[st
 def _picture(trial: Trial, loss: float) -> Figure:
     import numpy as np
 
-    from vinetrack.figures.reservoir import Law, draw_reservoir
+    from vinetrack.figures.design_figures import GasLawLoss, draw_reservoir
     from vinetrack.planning.reservoir_design import GAMMAS, chambers, gauge_loss, swept_m3
 
     swept = swept_m3(trial)
     volumes = swept * np.geomspace(3.0, 300.0, 200)
     laws = [
-        Law(
+        GasLawLoss(
             name,
             np.array([
                 gauge_loss(trial.pressure_Pa, swept, float(volume), gamma, trial.ambient_pressure_Pa)

@@ -194,10 +194,10 @@ def _lines(room: Room, found: Sequence[Choice]) -> Iterator[str]:
 
 
 def _picture(found: Sequence[Choice]) -> Figure:
-    from vinetrack.figures.vine_choice import Film, draw_choice
+    from vinetrack.figures.design_figures import FilmChoice, draw_choice
 
     films = [
-        Film(
+        FilmChoice(
             thickness_um=1e6 * choice.thickness_m,
             diameters_mm=1e3 * choice.others[:, 0],
             speeds_m_s=choice.others[:, 1],

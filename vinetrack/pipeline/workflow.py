@@ -17,34 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
+from vinetrack.figures.registry import CAMPAIGN_FIGURES, PAPER_FIGURES
 
 if TYPE_CHECKING:
     from vinetrack.experiment.settings import RunSettings
 
 PACKAGE = Path(__file__).parents[1]
-
-CAMPAIGN_FIGURES = {
-    "damping_law": "Force and steady speed",
-    "exponents": "Exponent and coefficients",
-    "scaling": "Coefficient and size",
-    "speed_scaling": "Steady speed and size",
-    "efficiency": "Energy efficiency",
-    "payload_speed": "Final speed and payload",
-    "overview": "All trials",
-    "model_comparison": "Model and measurement",
-    "model_residuals": "What the model leaves",
-    "ladder": "The ladder of errors",
-    "before_after": "The worst condition",
-    "where": "Where it fails",
-    "missing_force": "The missing force",
-    "candidates": "Candidates",
-    "cosines": "What is tied",
-    "drift": "Drift of parameters",
-}
-"""Figures of a whole experiment, by file name, with the label Snakemake's own report gives them."""
-
-DIAGNOSIS_FIGURES = frozenset({"ladder", "before_after", "where", "missing_force", "candidates", "cosines", "drift"})
-"""Those of them that show the diagnosis: they have a folder of their own there."""
 
 PAPER_TABLES = (
     "paper",
@@ -56,17 +34,7 @@ PAPER_TABLES = (
     "paper_speeds",
     "paper_speed_curves",
 )
-PAPER_FIGURES = {
-    "paper_fig4": "Fig. 4, position",
-    "paper_table2": "Table II, drawn",
-    "paper_fig5": "Fig. 5, final speed",
-    "paper_fig6": "Fig. 6, force and speed",
-    "paper_fig7": "Fig. 7, damping and size",
-    "paper_fig8": "Fig. 8, speed and size",
-    "paper_fig9": "Fig. 9, efficiency",
-    "paper_reservoir": "What a chamber loses",
-}
-"""What an experiment that is set beside the paper gets besides: tables, and figures with their labels."""
+"""Tables that an experiment gets besides where published numbers are set beside it."""
 
 SHARED_FILES = ("trials.csv", "experiment.yaml")
 

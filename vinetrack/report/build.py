@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.page_tokens import page_tokens
-from vinetrack.report.diagnosis import DIAGNOSIS_FIGURES, DiagnosisResult, diagnosis_section
+from vinetrack.figures.registry import FIGURES
+from vinetrack.report.diagnosis import DiagnosisResult, diagnosis_section
 from vinetrack.report.law_text import (
     DIAGNOSIS_METHODS,
     DIAGNOSIS_REFERENCES,
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 __all__ = ["Clip", "ReportContent", "ReportFigure", "ReportSection", "ReportTable", "build_report"]
-
-MODEL_FIGURES = ("model_comparison", "model_residuals")
-"""Figures that stand in the section on the model, not among the others."""
 
 LARGEST_CLIP_BYTES = 2_500_000
 """A larger clip is left as a file beside the report."""
@@ -103,7 +101,7 @@ def build_report(content: ReportContent) -> str:
         vines=vine_table(content.damping),
         model=model_section(content.model),
         diagnosis=diagnosis_section(content.diagnosis),
-        **_figures(content),
+        figures=_figures(content),
         clip=_clip(content.clip),
         sections=[section_entry(section, LARGEST_SVG_BYTES) for section in content.sections],
         trials=trials,
@@ -121,19 +119,14 @@ def build_report(content: ReportContent) -> str:
     )
 
 
-def _figures(content: ReportContent) -> dict[str, Any]:
-    """Pictures by the part of the page they stand in."""
-    entries = [figure_entry(figure) for figure in content.figures if len(figure.svg) <= LARGEST_SVG_BYTES]
-    diagnosed: dict[str, list[dict[str, Any]]] = {place: [] for place in DIAGNOSIS_FIGURES.values()}
-    for entry in entries:
-        if entry["key"] in DIAGNOSIS_FIGURES:
-            diagnosed[DIAGNOSIS_FIGURES[entry["key"]]].append(entry)
-    apart = {*MODEL_FIGURES, *DIAGNOSIS_FIGURES}
-    return {
-        "figures": [entry for entry in entries if entry["key"] not in apart],
-        "model_figures": [entry for entry in entries if entry["key"] in MODEL_FIGURES],
-        "diagnosis_figures": diagnosed,
-    }
+def _figures(content: ReportContent) -> dict[str, list[dict[str, Any]]]:
+    """Figures for the template, by the section of the page that they stand in."""
+    by_section: dict[str, list[dict[str, Any]]] = {figure.section: [] for figure in FIGURES.values()}
+    for figure in content.figures:
+        if len(figure.svg) <= LARGEST_SVG_BYTES:
+            section = FIGURES[figure.key].section if figure.key in FIGURES else "damping"
+            by_section[section].append(figure_entry(figure))
+    return by_section
 
 
 def _clip(clip: Clip | None) -> dict[str, str] | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.numbers import interval, number, with_error
 from vinetrack.core.units import display_unit
 from vinetrack.experiment.schema import LIMITED
+from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.report.law_text import PREFERRED
 from vinetrack.report.section import ReportTable
 from vinetrack.report.verdict import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
@@ -17,17 +18,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NOT_TESTABLE = "not testable here"
-TIED = 0.95
-DIAGNOSIS_FIGURES = {
-    "ladder": "first",
-    "before_after": "first",
-    "where": "where",
-    "missing_force": "where",
-    "candidates": "candidates",
-    "cosines": "tied",
-    "drift": "drift",
-}
-"""Pictures of a diagnosis, and the part of the page each stands in."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +175,7 @@ def tied_pairs(cosines: Mapping[str, Any]) -> list[str]:
         (abs(float(matrix[i][j])), names[i], names[j], float(matrix[i][j]))
         for i in range(len(matrix))
         for j in range(i)
-        if known(matrix[i][j]) and abs(float(matrix[i][j])) >= TIED
+        if known(matrix[i][j]) and abs(float(matrix[i][j])) >= TIED_COSINE
     ]
     return [f"{plain(b)} and {plain(a)} (cosine {number(value)})" for _, a, b, value in sorted(pairs, reverse=True)]
 

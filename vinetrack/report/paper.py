@@ -14,18 +14,6 @@ from vinetrack.report.section import ReportFigure, ReportSection, ReportTable
 if TYPE_CHECKING:
     import pandas as pd
 
-FIGURES = {
-    "paper_fig4": ("Fig. 4: the leading edge with the payload", "paper_motions.csv"),
-    "paper_table2": ("Table II, drawn", "paper.csv"),
-    "paper_fig5": ("Fig. 5: final speed and payload", "paper_speeds.csv"),
-    "paper_fig6": ("Fig. 6: growth force and steady speed", "damping_points.csv"),
-    "paper_fig7": ("Fig. 7: B against scale and wall", "scaling.json"),
-    "paper_fig8": ("Fig. 8: steady speed and scale", "conditions.csv"),
-    "paper_fig9": ("Fig. 9: energy efficiency", "conditions.csv"),
-    "paper_reservoir": ("What a chamber loses", "paper_pressures.csv"),
-}
-"""Title of each figure, and the file that its numbers stand in."""
-
 
 def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequence[ReportFigure]) -> ReportSection:
     """Put the section together.

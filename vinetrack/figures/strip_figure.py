@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.records import UNUSABLE_FLAGS
-from vinetrack.figures.style import INK, MUTED, ORANGE, SKY, VERMILLION, legend_above, look
+from vinetrack.figures.panels import legend_above
+from vinetrack.figures.style import INK, MUTED, ORANGE, SKY, VERMILLION, look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,12 +17,12 @@ if TYPE_CHECKING:
     from vinetrack.video.track import Tracking
 
 LARGEST_PX = 480
-"""The strip is drawn with at most so many pixels a side: enough to see the edge, small enough for a page of many."""
+"""Pixels a side of the strip; chosen: 67 an inch, so that the edge is seen and 200 strips fit a page of 10 MB."""
 
-FRAME_PX = 320
-"""Frames are a third as wide on the page."""
+_FRAME_PX = 320
+"""Pixels a side of a frame; chosen: frames are a third as wide as the strip, 133 pixels an inch."""
 
-UNREMARKABLE = frozenset({"before_release"})
+_UNREMARKABLE = frozenset({"before_release"})
 
 
 def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
@@ -30,8 +31,8 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     Parameters
     ----------
     title : name of the trial.
-    tracking : what the tracker made of the recording.
-    m_per_px : scale along the axis, for millimetres on the right.
+    tracking : the tracker's result.
+    m_per_px : scale along the axis, for the axis in millimetres.
     """
     from matplotlib.figure import Figure
 
@@ -81,7 +82,7 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
-    """A picture of at most so many pixels a side, each the mean of those it stands for: less noise, a smaller file."""
+    """Return a picture of at most `largest_px` pixels a side, each the mean of those it replaces that are not NaN."""
     for axis in (0, 1):
         step = -(-picture.shape[axis] // largest_px)
         if step > 1:
@@ -94,15 +95,14 @@ def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
 
 
 def flagged(flag: Any) -> np.ndarray:
-    """Mask, shape (n,): points whose flag says more than that the vine still rests."""
-    parts = [set(str(one).split(";")) - UNREMARKABLE - {""} for one in flag]
-    return np.array([bool(one) for one in parts], dtype=bool)
+    """Return a mask, shape (n_frames,), of the frames with any flag but `before_release`."""
+    return np.array([bool(set(str(entry).split(";")) - _UNREMARKABLE - {""}) for entry in flag], dtype=bool)
 
 
 def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -> None:
     height, width = picture.shape
     whole = (-0.5, width - 0.5, height - 0.5, -0.5)
-    ax.imshow(shrunk(picture, FRAME_PX), cmap="gray", extent=whole, interpolation="none")
+    ax.imshow(shrunk(picture, _FRAME_PX), cmap="gray", extent=whole, interpolation="none")
     ax.set(xticks=[], yticks=[])
     ax.grid(visible=False)
     track = tracking.track

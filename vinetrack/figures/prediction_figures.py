@@ -1,4 +1,4 @@
-"""What vines not yet built will do: position, speed and tension with their bands, and what leaves it open."""
+"""Simulated motions: what vines not yet built will do, and what one effect changes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.figures.style import BLUE, INK, MUTED, VINE_COLOURS, fitting_size, look, plain_log_ticks
+from vinetrack.figures.panels import fitting_size, plain_log_ticks
+from vinetrack.figures.style import BLUE, INK, MUTED, VERMILLION, VINE_COLOURS, look
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -17,20 +18,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_CURVES = len(VINE_COLOURS)
-_WIDTH_IN = 9.6
-_FAR_APART = 6.0
-"""Ratio of the largest to the least above which an axis is logarithmic; that of time from 1 % of the fastest on."""
+"""As many as there are colours."""
+_PREDICTION_WIDTH_IN = 9.6
+_LOG_AXIS_RATIO = 6.0
+"""Chosen: with a larger ratio of slowest to fastest the fastest takes less than a sixth of a linear axis; then it is
+logarithmic, that of time from 1 % of the fastest on."""
 
 _SLACK = 0.01
-"""Of the largest tension, that a tail must push with before it is worth a word."""
+"""Chosen: compression in the tail below 1 % of the largest tension is rounding of the simulation and gets no note."""
 
 
 @dataclass(frozen=True)
-class Picture:
-    """What is drawn of one condition.
+class PredictionPicture:
+    """The prediction of one condition.
 
-    `curve` has the columns of `vinetrack.planning.prediction.CURVE_COLUMNS`; `shares` are (name, low, high) of the
-    final speed with one uncertainty alone, m/s, largest first; `final` its low, median and high with all.
+    Attributes
+    ----------
+    curve : table with the columns of `vinetrack.planning.prediction.CURVE_COLUMNS`.
+    final_name : name of the final speed.
+    shares : uncertainty budget: (input, low, high) of the final speed with that input's uncertainty alone, m/s,
+        largest first.
+    final : low, median and high of the final speed with all uncertainties, m/s.
     """
 
     title: str
@@ -40,37 +48,39 @@ class Picture:
     final: tuple[float, float, float]
 
 
-def draw_foresight(pictures: Sequence[Picture], at_fraction: float) -> Figure:
-    """Draw one condition with what leaves its final speed open, or several beside each other.
+def draw_foresight(pictures: Sequence[PredictionPicture], at_fraction: float) -> Figure:
+    """Draw one condition with the uncertainty budget of its final speed, or several conditions over each other.
 
     Parameters
     ----------
-    pictures : the conditions; beyond the number of colours the last are left out, and that is said.
+    pictures : the conditions; the first six are drawn and the number of the others is stated.
     at_fraction : y/L at which final speeds are taken.
     """
     from matplotlib.figure import Figure
 
     drawn = pictures[:MOST_CURVES]
     with look():
-        fig = Figure(figsize=(_WIDTH_IN, 7.2))
+        fig = Figure(figsize=(_PREDICTION_WIDTH_IN, 7.2))
         axes = fig.subplots(2, 2)
         for colour, picture in zip(VINE_COLOURS, drawn, strict=False):
             _draw_curves(axes, picture, colour)
-        _label(axes, drawn, at_fraction)
+        _label_prediction(axes, drawn, at_fraction)
         if len(drawn) == 1:
             _draw_shares(axes[1, 1], drawn[0])
         else:
             _list_conditions(axes[1, 1], pictures)
         title = drawn[0].title if len(drawn) == 1 else f"{len(pictures)} conditions"
-        fig.text(0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * _WIDTH_IN, 12))
-        words = "line: median; band: nine draws in ten; everything simulated from what is believed of the vine"
+        fig.text(
+            0.075, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.9 * 72 * _PREDICTION_WIDTH_IN, 12)
+        )
+        words = "line: median; band: 90 % interval; simulated from the distributions of the inputs"
         fig.text(0.075, 0.012, words, color=MUTED, fontsize=8.8)
         fig.align_ylabels(axes[:, 0])
         fig.subplots_adjust(left=0.075, right=0.985, top=0.91, bottom=0.105, hspace=0.3, wspace=0.27)
     return fig
 
 
-def _draw_curves(axes: np.ndarray, picture: Picture, colour: str) -> None:
+def _draw_curves(axes: np.ndarray, picture: PredictionPicture, colour: str) -> None:
     """Position against time; speed and tension against growth."""
     position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
     table = picture.curve
@@ -96,7 +106,7 @@ def _longest(*times_ms: np.ndarray) -> float:
     return min(ends[2], 4 * ends[1]) if ends[1] > 0 else ends[0] or 1.0
 
 
-def _label(axes: np.ndarray, drawn: Sequence[Picture], at_fraction: float) -> None:
+def _label_prediction(axes: np.ndarray, drawn: Sequence[PredictionPicture], at_fraction: float) -> None:
     position, speed, tension = axes[0, 0], axes[0, 1], axes[1, 0]
     position.set_xlabel("time since release (ms)")
     position.set_ylabel("leading edge y (mm)")
@@ -115,18 +125,20 @@ def _label(axes: np.ndarray, drawn: Sequence[Picture], at_fraction: float) -> No
     )
     if min(lows) < -_SLACK * max(highs):
         tension.axhline(0.0, color=INK, lw=0.8)
-        tension.set_title("below 0 the tail would have to push", fontsize=9.5, fontweight="normal", color=MUTED)
+        tension.set_title(
+            "below 0 the model predicts compression in the tail", fontsize=9.5, fontweight="normal", color=MUTED
+        )
     ends = [float(picture.curve["time_s"].replace(np.inf, np.nan).max()) for picture in drawn]
-    if max(ends) > _FAR_APART * min(ends):
+    if max(ends) > _LOG_AXIS_RATIO * min(ends):
         position.set_xscale("log")
         position.set_xlim(left=10.0 * min(ends))
         plain_log_ticks(position, "x")
 
 
-def _draw_shares(ax: Axes, picture: Picture) -> None:
-    """Bars of the final speed: all uncertainties together, then each alone."""
+def _draw_shares(ax: Axes, picture: PredictionPicture) -> None:
+    """Bars of the final speed: all uncertainties, then each alone."""
     low, median, high = picture.final
-    rows = [("all together", low, high), *picture.shares]
+    rows = [("all inputs", low, high), *picture.shares]
     for k, (_, start, stop) in enumerate(rows):
         ax.barh(k, stop - start, left=start, height=0.55, color=BLUE, alpha=0.85 if k == 0 else 0.4, lw=0)
     ax.axvline(median, color=INK, lw=1.0)
@@ -134,12 +146,12 @@ def _draw_shares(ax: Axes, picture: Picture) -> None:
     ax.invert_yaxis()
     ax.margins(x=0.06)
     ax.use_sticky_edges = False
-    if low > 0 and high > _FAR_APART * low:
+    if low > 0 and high > _LOG_AXIS_RATIO * low:
         ax.set_xscale("log")
         plain_log_ticks(ax, "x")
     ax.grid(visible=False, axis="y")
     ax.set_xlabel(f"{picture.final_name} (m/s)")
-    ax.set_title("What leaves it open", fontsize=10.5)
+    ax.set_title("Uncertainty budget", fontsize=10.5)
 
 
 def _folded(name: str) -> str:
@@ -147,8 +159,8 @@ def _folded(name: str) -> str:
     return textwrap.fill(name if len(name) <= 15 else name.replace("_", " "), 15)
 
 
-def _list_conditions(ax: Axes, pictures: Sequence[Picture]) -> None:
-    """Which colour is which condition, in place of the bars."""
+def _list_conditions(ax: Axes, pictures: Sequence[PredictionPicture]) -> None:
+    """Name the condition of each colour, in place of the bars."""
     ax.set_axis_off()
     lines = [(colour, picture.title) for colour, picture in zip(VINE_COLOURS, pictures, strict=False)]
     for k, (colour, words) in enumerate(lines):
@@ -157,3 +169,50 @@ def _list_conditions(ax: Axes, pictures: Sequence[Picture]) -> None:
         ax.text(0.1, y, textwrap.fill(words, 50), transform=ax.transAxes, va="top", fontsize=9.2)
     if len(pictures) > len(lines):
         ax.text(0.1, 0.02, f"and {len(pictures) - len(lines)} more, not drawn", transform=ax.transAxes, color=MUTED)
+
+
+_EFFECT_WIDTH_IN = 7.2
+
+
+def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
+    """Draw position and speed of the leading edge with and without one effect, and the difference.
+
+    Parameters
+    ----------
+    name : of the effect.
+    size : its parameters as text, such as `C_D = 1`; blank where it has none.
+    vine : the vine and the trial as text.
+    table : columns as of `vinetrack.dynamics.effect_motion.effect_motion`.
+    """
+    from matplotlib.figure import Figure
+
+    time_ms = 1e3 * table["time_s"].to_numpy()
+    with look():
+        fig = Figure(figsize=(_EFFECT_WIDTH_IN, 7.0))
+        position, speed, gap = fig.subplots(3, 1, sharex=True, height_ratios=(3, 3, 2))
+        for axes, key, factor in ((position, "position_m", 1e3), (speed, "velocity_m_s", 1.0)):
+            axes.plot(time_ms, factor * table[f"without_{key}"], color=MUTED, lw=2.4, label="without")
+            axes.plot(time_ms, factor * table[f"with_{key}"], color=BLUE, label="with")
+        difference_mm = 1e3 * table["difference_m"].to_numpy()
+        gap.axhline(0.0, color=INK, lw=0.8)
+        gap.plot(time_ms, difference_mm, color=VERMILLION)
+        gap.fill_between(time_ms, 0.0, difference_mm, color=VERMILLION, alpha=0.15, lw=0)
+        speed.set_ylim(*_bulk_limits(table))
+        position.set_ylabel("leading edge y (mm)")
+        speed.set_ylabel("its speed ẏ (m/s)")
+        gap.set_ylabel("difference (mm)")
+        gap.set_xlabel("time since release (ms)")
+        title = name + (f": {size}" if size else "")
+        fig.text(0.12, 0.955, title, fontweight="bold", fontsize=fitting_size(title, 0.52 * 72 * _EFFECT_WIDTH_IN, 11))
+        position.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+        fig.align_ylabels()
+        fig.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.135, hspace=0.14)
+        fig.text(0.012, 0.012, textwrap.fill(f"Simulated: {vine}.", 104), color=MUTED, fontsize=8.8, va="bottom")
+    return fig
+
+
+def _bulk_limits(table: pd.DataFrame) -> tuple[float, float]:
+    """From 0 past the bulk of both curves: the jump of a first frame or of a diverging end would hide them."""
+    speeds = np.concatenate([table["without_velocity_m_s"], table["with_velocity_m_s"]])
+    top = 1.15 * float(np.quantile(speeds, 0.99))
+    return min(0.0, 1.15 * float(np.quantile(speeds, 0.01))), top if top > 0 else 1.0
