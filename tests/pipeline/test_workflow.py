@@ -12,7 +12,7 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.figures.registry import FIGURES
 from vinetrack.pipeline import workflow
 from vinetrack.pipeline.workflow import find_experiment, make_plan, shell_prefix
-from vinetrack.report.section import figure_caption
+from vinetrack.report.build import figure_caption
 
 ROOT = Path(__file__).parents[2]
 

@@ -115,7 +115,7 @@ def _svg(results: Results, figure: RegisteredFigure) -> Path:
 
 def _figure(results: Results, figure: RegisteredFigure, own_data: str = "") -> ReportFigure:
     """A figure for the page with the file of its numbers, or with a table of its own."""
-    from vinetrack.report.section import ReportFigure, figure_caption
+    from vinetrack.report.build import ReportFigure, figure_caption
 
     data = (results.folder / figure.data).read_text(encoding="utf-8") if figure.data else own_data
     svg = _svg(results, figure).read_text(encoding="utf-8")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.page_tokens import page_tokens
@@ -79,8 +80,6 @@ def build_report(content: ReportContent) -> str:
     ----------
     content : see `ReportContent`; `trial_figures` holds an SVG per trial that is to be shown in full.
     """
-    from importlib.resources import files
-
     from jinja2 import Environment, FunctionLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -117,6 +116,12 @@ def build_report(content: ReportContent) -> str:
         settings=sorted(_flat(settings)),
         provenance=content.provenance,
     )
+
+
+def figure_caption(name: str) -> str:
+    """Return the caption of a figure of `vinetrack.figures.registry` as one line of text."""
+    path = files("vinetrack.report") / "captions" / f"{name}.rst"
+    return " ".join(path.read_text(encoding="utf-8").split())
 
 
 def _figures(content: ReportContent) -> dict[str, list[dict[str, Any]]]:

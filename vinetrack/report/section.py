@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from typing import Any
 from urllib.parse import quote
 
@@ -47,12 +46,6 @@ class ReportSection:
     paragraphs: Sequence[str] = ()
     tables: Sequence[ReportTable] = ()
     figures: Sequence[ReportFigure] = ()
-
-
-def figure_caption(name: str) -> str:
-    """Return the caption of a figure of `vinetrack.figures.registry` as one line of text."""
-    path = files("vinetrack.report") / "captions" / f"{name}.rst"
-    return " ".join(path.read_text(encoding="utf-8").split())
 
 
 def figure_entry(figure: ReportFigure) -> dict[str, Any]:
