@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from vinetrack.figures.style import rows
-from vinetrack.report.paper import every_row, table_one, table_two
+from vinetrack.report.paper_section import every_row, table_one, table_two
 from vinetrack.report.section import ReportTable
 from vinetrack.results.folder_layout import read_result
 

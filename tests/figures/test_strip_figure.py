@@ -8,7 +8,7 @@ import pytest
 from vinetrack.core.records import Track
 from vinetrack.figures.strip_figure import LARGEST_PX, draw_strip, flagged, shrunk
 from vinetrack.figures.style import render
-from vinetrack.report.compact import compact_svg
+from vinetrack.report.svg import compact_svg
 from vinetrack.video.axis import Axis
 from vinetrack.video.track import Tracking
 

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vinetrack.figures.style import BLUE, INK, PAPER, look, render
-from vinetrack.report.compact import compact_svg, recoded
-from vinetrack.report.svg_path import circle_diameter, moved, parse_path, write_path
+from vinetrack.report.svg import circle_diameter, compact_svg, moved, parse_path, recoded, write_path
 
 
 def drawn(draw) -> str:  # type: ignore[no-untyped-def]

@@ -9,8 +9,9 @@ from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, laws, moved, 
 from test_report import EVIL, SVG, Tags, page
 
 from vinetrack.figures.registry import DIAGNOSIS_FIGURES
+from vinetrack.narrative.verdict_summary import facts, listed, meaning, sentence, size
 from vinetrack.report.build import ReportFigure
-from vinetrack.report.diagnosis import (
+from vinetrack.report.diagnosis_section import (
     DiagnosisResult,
     diagnosis_section,
     hidden_table,
@@ -18,8 +19,7 @@ from vinetrack.report.diagnosis import (
     moved_table,
     tied_pairs,
 )
-from vinetrack.report.diagnosis import next_experiment as next_entry
-from vinetrack.report.verdict import facts, listed, meaning, sentence, size
+from vinetrack.report.diagnosis_section import next_experiment as next_entry
 
 
 def heading(html: str) -> str:

@@ -8,7 +8,7 @@ import pandas as pd
 
 from vinetrack.paper.departures import DEPARTURE_COLUMNS, DEPARTURES
 from vinetrack.paper.rows import COMPUTED, NOT_CHECKABLE, SIMULATED, PaperRow, as_table
-from vinetrack.report.paper import paper_section, tally
+from vinetrack.report.paper_section import paper_section, tally
 
 nan = math.nan
 

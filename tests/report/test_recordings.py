@@ -7,10 +7,10 @@ import math
 import pytest
 from test_report import EVIL, SVG, Tags, page, trials
 
-from vinetrack.report import trials as report_trials
+from vinetrack.report import trials_section as report_trials
 from vinetrack.report.build import LARGEST_CLIP_BYTES, Clip
-from vinetrack.report.recordings import LARGEST_SVG_BYTES, SHARED_ERROR, Recording, calibration_table, count_frames
 from vinetrack.report.svg import inline_svg
+from vinetrack.report.trials_section import LARGEST_SVG_BYTES, SHARED_ERROR, Recording, calibration_table, count_frames
 
 BOARD = {
     "kind": "charuco",

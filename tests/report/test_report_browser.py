@@ -14,8 +14,8 @@ from test_report import curves, page, trials, windows
 from vinetrack.figures.ladder_figures import draw_before_after, draw_ladder
 from vinetrack.figures.style import render
 from vinetrack.report.build import Clip, ReportFigure
-from vinetrack.report.diagnosis import DiagnosisResult
-from vinetrack.report.recordings import Recording
+from vinetrack.report.diagnosis_section import DiagnosisResult
+from vinetrack.report.trials_section import Recording
 from vinetrack.video.write import write_clip
 
 pytest.importorskip("tornado", reason="the browser is driven through bokeh's server, which is not installed")

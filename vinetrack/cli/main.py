@@ -211,8 +211,8 @@ def gather(
 def damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
     """Steady points to the damping law, damping.json."""
     with _sentences(log):
+        from vinetrack.narrative.law_text import headline
         from vinetrack.pipeline.damping_stage import fit_law
-        from vinetrack.report.law_text import headline
 
         with _busy("fitting the law and resampling its trials", log):
             law = fit_law(results, _run_settings(settings).damping)
@@ -260,7 +260,7 @@ def paper(experiment: ExperimentPath, results: ResultsPath, settings: SettingsTe
     """Set the paper's published numbers and figures beside ours: paper.csv."""
     with _sentences(log):
         from vinetrack.pipeline.paper_stage import draw_paper, set_beside_paper
-        from vinetrack.report.paper import tally
+        from vinetrack.report.paper_section import tally
 
         typer.echo(f"Beside the paper: {tally(set_beside_paper(_read(experiment), results))}")
         draw_paper(results, _run_settings(settings).figures)

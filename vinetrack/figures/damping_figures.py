@@ -12,18 +12,8 @@ import numpy as np
 
 from vinetrack.core.numbers import half_width, number, with_error
 from vinetrack.figures.panels import legend_above, line_key, plain_log_ticks
-from vinetrack.figures.style import (
-    INK,
-    METHOD_COLOURS,
-    METHOD_LINES,
-    METHOD_NAMES,
-    MUTED,
-    PAPER,
-    VineStyle,
-    blank,
-    look,
-    vine_styles,
-)
+from vinetrack.figures.style import INK, METHOD_COLOURS, METHOD_LINES, MUTED, PAPER, VineStyle, blank, look, vine_styles
+from vinetrack.narrative.law_text import METHOD_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

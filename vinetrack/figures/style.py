@@ -39,7 +39,6 @@ DASHED: Any = (0, (4, 2))
 """Line of the second of two models, methods or laws: dashes of four line widths with gaps of two."""
 
 METHOD_COLOURS = {"log_log": VERMILLION, "both_axes": BLUE}
-METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
 METHOD_LINES = {"log_log": DASHED, "both_axes": "-"}
 
 _RC: Any = {

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.figures.style import rows as iter_rows
-from vinetrack.report.verdict import known, listed, sizes
+from vinetrack.narrative.verdict_summary import known, listed, sizes
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from vinetrack.effects import Effect
     from vinetrack.experiment.folder import Experiment
-    from vinetrack.report.diagnosis import DiagnosisResult
+    from vinetrack.report.diagnosis_section import DiagnosisResult
 
 STRETCHES = 8
 """Parts of the growth in which misfits are averaged where the diagnosis did not say."""
@@ -89,7 +89,7 @@ def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTable
 
 def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult | None:
     """What the page says of the diagnosis; None where there is none."""
-    from vinetrack.report.diagnosis import DiagnosisResult
+    from vinetrack.report.diagnosis_section import DiagnosisResult
 
     if not results.diagnosis.exists():
         return None

@@ -65,7 +65,7 @@ def _draw_trial(picture: _TrialPicture, results: Results, settings: FigureSettin
 def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> None:
     """Draw the figures of the whole experiment."""
     from vinetrack.figures.registry import draw
-    from vinetrack.figures.style import METHOD_NAMES
+    from vinetrack.narrative.law_text import METHOD_NAMES
     from vinetrack.pipeline.diagnosis_tables import draw_diagnosed, read_diagnosed, with_after
 
     results = Results(folder)

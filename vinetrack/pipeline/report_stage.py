@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.tables import write_json, write_text
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.figures.registry import CAMPAIGN_FIGURES, PAPER_FIGURES, RegisteredFigure
-from vinetrack.figures.style import METHOD_NAMES
+from vinetrack.narrative.law_text import METHOD_NAMES
 from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
 from vinetrack.pipeline.figures_stage import describe_conditions
 from vinetrack.results.folder_layout import Results, read_json, read_result
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.pipeline.diagnosis_tables import DiagnosisTables
     from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
-    from vinetrack.report.recordings import Recording
+    from vinetrack.report.trials_section import Recording
 
 MOST_CURVE_ROWS = 6000
 """Rows of the curves of all trials as data to download; chosen: about 300 kB of the page."""
@@ -53,7 +53,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         If a stage has not run.
     """
     from vinetrack.report.build import ReportContent
-    from vinetrack.report.model import ModelResult
+    from vinetrack.report.model_section import ModelResult
 
     results = Results(folder)
     trials = read_result(results.trials)
@@ -90,7 +90,7 @@ def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str
 
 
 def _paper_section(results: Results) -> ReportSection:
-    from vinetrack.report.paper import paper_section
+    from vinetrack.report.paper_section import paper_section
 
     figures = [_figure(results, figure) for figure in PAPER_FIGURES.values() if _svg(results, figure).exists()]
     table, departures = (read_result(results.folder / f"{name}.csv") for name in ("paper", "paper_departures"))
@@ -178,7 +178,7 @@ def _poster(path: Path) -> bytes:
 
 
 def _recording(results: Results, name: str) -> Recording:
-    from vinetrack.report.recordings import Recording
+    from vinetrack.report.trials_section import Recording
 
     strip = results.strip_figure(name, ".svg")
     return Recording(

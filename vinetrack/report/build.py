@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.figures.page_tokens import page_tokens
 from vinetrack.figures.registry import FIGURES
-from vinetrack.report.diagnosis import DiagnosisResult, diagnosis_section
-from vinetrack.report.law_text import (
+from vinetrack.narrative.law_text import (
     DIAGNOSIS_METHODS,
     DIAGNOSIS_REFERENCES,
     REFERENCES,
@@ -22,10 +21,17 @@ from vinetrack.report.law_text import (
     vine_table,
     without_law,
 )
-from vinetrack.report.model import ModelResult, model_section
-from vinetrack.report.recordings import LARGEST_SVG_BYTES, METHODS, SHARED_ERROR, Recording, calibration_table
+from vinetrack.report.diagnosis_section import DiagnosisResult, diagnosis_section
+from vinetrack.report.model_section import ModelResult, model_section
 from vinetrack.report.section import ReportFigure, ReportSection, ReportTable, figure_entry, section_entry
-from vinetrack.report.trials import trial_entries
+from vinetrack.report.trials_section import (
+    LARGEST_SVG_BYTES,
+    METHODS,
+    SHARED_ERROR,
+    Recording,
+    calibration_table,
+    trial_entries,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,54 +1,313 @@
-"""Pictures inside a page: matplotlib's SVG made fit for HTML, and tiny curves for tables, written by hand."""
+"""Matplotlib's SVG made small and fit for a page: a tenth of its size, the same picture, and its text is text.
+
+Three things make such files large and slow: an element for every marker, tick and grid line; coordinates to a millionth
+of a point; and pictures as PNG. Here neighbours of equal style become one path, round markers
+become the round ends of lines without length, coordinates are relative and rounded, and pictures are WebP.
+"""
 
 from __future__ import annotations
 
+import base64
+import io
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from html import escape
-
-import numpy as np
-from numpy.typing import NDArray
+from xml.etree import ElementTree
 
 from vinetrack.figures.page_tokens import TOKENS
-from vinetrack.report.compact import compact_svg
+
+Command = tuple[str, tuple[float, ...]]
+"""A command of a path and its numbers: M, L, Q, C or Z in absolute coordinates, pt."""
 
 _THEMED = {colour: "currentColor" if token == "--ink" else f"var({token})" for colour, token in TOKENS.items()}
+
+_PICTURE_QUALITY = 45
+"""Of WebP, 0 to 100; chosen: strips are noise with one edge in it, and the edge survives what the noise does not."""
+
+_SHORT_MARKER = 8
+"""Filled shapes of so few commands are markers, which look the same drawn as one path: a diamond has 5, a cross 8."""
+
+_LONGEST_PATH = 20_000
+"""Commands of a merged path; chosen: browsers slow down on paths of several hundred thousand."""
+
+_COUNTS = {"M": 2, "L": 2, "Q": 4, "C": 6, "Z": 0}
+_TOKEN = re.compile(r"[MLHVCQZz]|[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_NUMBERS = re.compile(r"[-\d.eE+]+|[a-z]+\([-\d.eE+ ,]+\)( [a-z]+\([-\d.eE+ ,]+\))*")
+_KEPT = {
+    "g": ("clip-path", "transform", "opacity"),
+    "path": ("clip-path",),
+    "text": ("x", "y", "transform"),
+    "image": ("x", "y", "width", "height", "transform", "clip-path"),
+}
+
+
+@dataclass
+class _Element:
+    """One element of the compact picture; `commands` stand for the `d` of a path."""
+
+    tag: str
+    style: dict[str, str] = field(default_factory=dict)
+    attributes: dict[str, str] = field(default_factory=dict)
+    commands: list[Command] = field(default_factory=list)
+    children: list[_Element] = field(default_factory=list)
+    text: str = ""
 
 
 def inline_svg(svg: str, prefix: str, description: str) -> str:
     """Return an SVG file as an element ready to stand in a page.
 
-    Neutral colours become the page's own, so that it follows a dark screen; identifiers get `prefix`, since several
-    pictures share one page. `description` is for those who cannot see it. The page's style sheet sets the size by
+    Neutral colours become the page's own, so that it follows a dark screen. The page's style sheet sets the size by
     `--wide`, at which text in the picture is as large as that of the page.
+
+    Parameters
+    ----------
+    svg : a file as matplotlib writes it.
+    prefix : put before every identifier, since several pictures share one page.
+    description : for readers who cannot see the picture.
     """
     body, width_pt, height_pt = compact_svg(svg, prefix, _THEMED)
     label, box = escape(description, quote=True), f"0 0 {width_pt:g} {height_pt:g}"
     return f'<svg viewBox="{box}" role="img" aria-label="{label}" style="--wide:{1.33 * width_pt:.0f}px">{body}</svg>'
 
 
-def speed_sparkline(
-    time_s: NDArray[np.float64],
-    speed_m_s: NDArray[np.float64],
-    steady_s: tuple[float, float],
-    width_px: int = 132,
-    height_px: int = 30,
-) -> str:
-    """Speed against time as a small SVG, the steady stretch thick; blank where there is nothing to draw."""
-    good = np.isfinite(time_s) & np.isfinite(speed_m_s)
-    time_s, speed_m_s = time_s[good], speed_m_s[good]
-    if time_s.size < 2 or np.ptp(time_s) <= 0:
-        return ""
-    step = max(time_s.size // width_px, 1)
-    time_s, speed_m_s = time_s[::step], speed_m_s[::step]
-    top = max(float(np.percentile(speed_m_s, 99)), 1e-12)
-    x = 1 + (width_px - 2) * (time_s - time_s[0]) / np.ptp(time_s)
-    y = np.clip(height_px - 2 - (height_px - 5) * speed_m_s / top, 1, height_px - 1)
-    steady = (time_s >= steady_s[0]) & (time_s <= steady_s[1])
-    thick = f'<polyline class="steady" points="{_points(x[steady], y[steady])}"/>' if steady.sum() > 1 else ""
+def compact_svg(svg: str, prefix: str, colours: Mapping[str, str]) -> tuple[str, float, float]:
+    """Return the content of the root element, and the picture's width and height, pt.
+
+    Parameters
+    ----------
+    svg, prefix : as of `inline_svg`.
+    colours : what to write in place of a colour, by its hexadecimal code in lower case.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file.
+    """
+    try:
+        root = ElementTree.fromstring(svg)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"not an SVG file: {error}") from error
+    left, top, width, height = (float(part) for part in root.attrib["viewBox"].split())
+    if (left, top) != (0.0, 0.0):
+        raise ValueError("the view box of the picture does not begin at 0, 0")
+    markers = {node.attrib["id"]: node for node in root.iter() if _tag(node) == "path" and "id" in node.attrib}
+    elements = _merged([element for node in root for element in _converted(node, markers)])
+    used = set(re.findall(r"#([\w.-]+)", " ".join(_clips(elements))))
+    return "".join(_written(element, prefix, used, colours) for element in elements), width, height
+
+
+def _tag(node: ElementTree.Element) -> str:
+    return node.tag.rsplit("}", 1)[-1]
+
+
+def _attributes(node: ElementTree.Element) -> dict[str, str]:
+    return {key.rsplit("}", 1)[-1]: value for key, value in node.attrib.items()}
+
+
+def _style(node: ElementTree.Element) -> dict[str, str]:
+    pairs = (part.split(":", 1) for part in node.attrib.get("style", "").split(";") if ":" in part)
+    return {key.strip(): value.strip() for key, value in pairs if key.strip() != "font-family"}
+
+
+def _converted(node: ElementTree.Element, markers: Mapping[str, ElementTree.Element]) -> list[_Element]:
+    """One node of the file: left out, as an element, or as its children where it only groups them."""
+    tag, style, attributes = _tag(node), _style(node), _attributes(node)
+    kept = {key: _rounded(attributes[key]) for key in _KEPT.get(tag, ()) if key in attributes}
+    if tag in ("metadata", "style", "title"):
+        return []
+    if tag == "defs":
+        clips = [_copied(child) for child in node if _tag(child) not in ("path", "style")]
+        return [_Element("defs", children=clips)] if clips else []
+    if tag == "g":
+        inside = [element for child in node for element in _converted(child, markers)]
+        children = _merged(inside, axis="axis" in attributes.get("id", ""))
+        return [_Element("g", style, kept, children=children)] * bool(children) if kept or style else children
+    if tag == "path":
+        invisible = style.get("fill") == "none" and style.get("stroke", "none") == "none"
+        commands = [] if invisible else parse_path(attributes.get("d", ""))
+        return [_Element("path", style, kept, commands)] * bool(commands)
+    if tag == "use":
+        return [_marker(markers[attributes["href"].lstrip("#")], style, attributes)]
+    if tag == "image":
+        return [_Element("image", {}, kept | {"href": recoded(attributes["href"]), "preserveAspectRatio": "none"})]
+    if tag == "text":
+        kept = {key: value for key, value in kept.items() if not re.fullmatch(r"rotate\(-?0 .*\)", value)}
+        style = {key: value for key, value in style.items() if (key, value) != ("text-anchor", "start")}
+        return [_Element("text", style, kept, children=[_copied(child) for child in node], text=node.text or "")]
+    return [_copied(node)]
+
+
+def _copied(node: ElementTree.Element) -> _Element:
+    """A node as it is, its numbers rounded."""
+    attributes = {key: _rounded(value) for key, value in _attributes(node).items() if key != "style"}
+    commands = parse_path(attributes.pop("d")) if _tag(node) == "path" else []
+    children = [_copied(child) for child in node]
+    return _Element(_tag(node), _style(node), attributes, commands, children, (node.text or "").strip())
+
+
+def _rounded(value: str) -> str:
+    """A number, or the numbers of a transform, to two decimals; names are left alone."""
+    if not _NUMBERS.fullmatch(value):
+        return value
+    # A matrix or a scale stretches hundreds of pixels: at two decimals, 0.005 · 300 px would be off by 1.5 px.
+    decimals = 5 if "matrix" in value or "scale" in value else 2
+    return re.sub(r"[-+]?\d+\.\d+(?:[eE][-+]?\d+)?", lambda match: _short(float(match[0]), decimals), value)
+
+
+def _short(value: float, decimals: int = 2) -> str:
+    return f"{value:.{decimals}f}".rstrip("0").rstrip(".")
+
+
+def _marker(shape: ElementTree.Element, style: dict[str, str], place: Mapping[str, str]) -> _Element:
+    """One marker as a path of its own; a round one without an edge as the round end of a line without length."""
+    commands, style = parse_path(shape.attrib.get("d", "")), {**_style(shape), **style}
+    x, y = float(place.get("x", 0)), float(place.get("y", 0))
+    diameter, fill, edge = circle_diameter(commands), style.get("fill", "#000000"), style.get("stroke", "none")
+    if diameter is None or fill == "none" or edge not in ("none", fill):
+        return _Element("path", style, commands=moved(commands, x, y))
+    width = diameter + (float(style.get("stroke-width", 1)) if edge != "none" else 0.0)
+    dot = {"fill": "none", "stroke": fill, "stroke-width": f"{width:.2f}", "stroke-linecap": "round"}
+    dot |= {key: value for key, value in style.items() if key == "opacity"}
+    dot |= {"stroke-opacity": style["fill-opacity"]} if "fill-opacity" in style else {}
+    return _Element("path", dot, commands=[("M", (x, y)), ("L", (x, y))])
+
+
+def recoded(href: str) -> str:
+    """Return a PNG in a data address as WebP; unchanged where that is no smaller, or where it is no PNG."""
+    from PIL import Image
+
+    head, _, data = href.partition("base64,")
+    if not head.startswith("data:image/png"):
+        return href
+    raw = base64.b64decode("".join(data.split()))
+    picture = Image.open(io.BytesIO(raw))
+    alpha = picture.mode == "RGBA" and picture.getchannel("A").getextrema() != (255, 255)
+    file = io.BytesIO()
+    picture.convert("RGBA" if alpha else "RGB").save(file, "WEBP", quality=_PICTURE_QUALITY, method=4)
+    kind, small = ("webp", file.getvalue()) if file.tell() < len(raw) else ("png", raw)
+    return f"data:image/{kind};base64,{base64.b64encode(small).decode('ascii')}"
+
+
+def _merged(elements: Sequence[_Element], axis: bool = False) -> list[_Element]:
+    """Neighbouring paths of equal style as one; in an axis, where nothing hides anything, all of equal style."""
+    merged: list[_Element] = []
+    for element in sorted(elements, key=lambda element: element.tag == "text") if axis else elements:
+        candidates = merged if axis else merged[-1:]
+        same = next((earlier for earlier in candidates if _mergeable(earlier, element)), None)
+        if same is None:
+            merged.append(element)
+        else:
+            same.commands = same.commands + element.commands
+    return merged
+
+
+def _mergeable(first: _Element, second: _Element) -> bool:
     return (
-        f'<svg class="spark" viewBox="0 0 {width_px} {height_px}" width="{width_px}" height="{height_px}" '
-        f'aria-hidden="true"><polyline points="{_points(x, y)}"/>{thick}</svg>'
+        first.tag == second.tag == "path"
+        and first.style == second.style
+        and first.attributes == second.attributes
+        and len(first.commands) + len(second.commands) < _LONGEST_PATH
+        and (first.style.get("fill") == "none" or len(second.commands) <= _SHORT_MARKER)
     )
 
 
-def _points(x: NDArray[np.float64], y: NDArray[np.float64]) -> str:
-    return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+def _clips(elements: Iterable[_Element]) -> Iterable[str]:
+    for element in elements:
+        yield element.attributes.get("clip-path", "")
+        yield from _clips(element.children)
+
+
+def _written(element: _Element, prefix: str, used: set[str], colours: Mapping[str, str]) -> str:
+    attributes = dict(element.attributes)
+    name = attributes.pop("id", "")
+    inside = "".join(_written(child, prefix, used, colours) for child in element.children)
+    if (element.tag == "clipPath" and name not in used) or (element.tag == "defs" and not inside):
+        return ""
+    pairs = {"id": f"{prefix}-{name}"} if name in used else {}
+    pairs |= {"style": _short_style(element.style, colours)} if element.style else {}
+    pairs |= {"d": write_path(element.commands)} if element.commands else {}
+    pairs |= {key: value.replace("url(#", f"url(#{prefix}-") for key, value in attributes.items()}
+    head = " ".join([element.tag, *(f'{key}="{escape(value, quote=True)}"' for key, value in pairs.items())])
+    inside = escape(element.text, quote=False) + inside
+    return f"<{head}>{inside}</{element.tag}>" if inside else f"<{head}/>"
+
+
+def _short_style(style: Mapping[str, str], colours: Mapping[str, str]) -> str:
+    values = {key: colours.get(value.lower(), value) for key, value in style.items()}
+    short = re.compile(r"\d*\.\d+(?=(px)?$)")
+    return ";".join(f"{key}:{short.sub(lambda m: _short(float(m[0])), value)}" for key, value in values.items())
+
+
+def parse_path(d: str) -> list[Command]:
+    """Return the commands of a path in absolute coordinates, as matplotlib writes them: M, L, Q, C and Z.
+
+    >>> parse_path("M 1 2 L 3 4 z")
+    [('M', (1.0, 2.0)), ('L', (3.0, 4.0)), ('Z', ())]
+
+    Raises
+    ------
+    ValueError
+        If there is anything else in it.
+    """
+    commands: list[Command] = []
+    letter, numbers = "", [0.0][:0]
+    for token in _TOKEN.findall(d):
+        if token.isalpha():
+            letter = token.upper()
+            commands += [("Z", ())] if letter == "Z" else []
+            continue
+        numbers.append(float(token))
+        if letter not in _COUNTS:
+            raise ValueError(f"the path command {letter!r} is not known here")
+        if len(numbers) == _COUNTS[letter]:
+            commands.append((letter, tuple(numbers)))
+            letter, numbers = "L" if letter == "M" else letter, []
+    return commands
+
+
+def moved(commands: Sequence[Command], x: float, y: float) -> list[Command]:
+    """Return the commands with every point moved by (x, y), pt."""
+    return [(letter, tuple(v + (x, y)[i % 2] for i, v in enumerate(numbers))) for letter, numbers in commands]
+
+
+def write_path(commands: Sequence[Command]) -> str:
+    """Return the `d` of a path: relative steps on a grid of 0.1 pt (0.13 pixels of a screen, 35 µm on paper).
+
+    Every step begins where the rounded one before it ended, so that rounding does not add up. Steps of no length are
+    left out, but for those that make a dot.
+
+    >>> write_path([("M", (10.04, 20.0)), ("L", (10.04, 25.5)), ("L", (12.0, 25.5)), ("Z", ())])
+    'M10 20v5.5h2z'
+    """
+    parts: list[str] = []
+    here, start, last = (0, 0), (0, 0), ""
+    for (letter, numbers), (following, _) in zip(commands, (*commands[1:], ("", ())), strict=True):
+        if letter == "Z":
+            parts.append("z")
+            here, last = start, "z"
+            continue
+        grid = [round(10 * value) for value in numbers]
+        there = (grid[-2], grid[-1])
+        if letter == "L" and there == here and not (last == "M" and following != "L"):
+            continue
+        if letter == "M":
+            name, steps, start = "M", grid, there
+        else:
+            name, steps = letter.lower(), [value - here[i % 2] for i, value in enumerate(grid)]
+        if name == "l" and 0 in steps:
+            name, steps = ("h", steps[:1]) if steps[1] == 0 else ("v", steps[1:])
+        text = " ".join(f"{step / 10:g}" for step in steps).replace(" -", "-")
+        repeated = name == last != "M"
+        parts.append(text if repeated and text.startswith("-") else (" " if repeated else name) + text)
+        here, last = there, name
+    return re.sub(r"(?<!\d)0\.", ".", "".join(parts))
+
+
+def circle_diameter(commands: Sequence[Command]) -> float | None:
+    """Return the diameter of a circle about the origin as matplotlib draws its round markers, pt; None for others."""
+    ends = [numbers[-2:] for letter, numbers in commands if letter == "C"]
+    if len(ends) != 8 or any(letter not in "MCZ" for letter, _ in commands):
+        return None
+    radii = [(x * x + y * y) ** 0.5 for x, y in ends]
+    return 2 * max(radii) if max(radii) - min(radii) < 0.02 * max(radii) else None

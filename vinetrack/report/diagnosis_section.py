@@ -10,9 +10,9 @@ from vinetrack.core.numbers import interval, number, with_error
 from vinetrack.core.units import display_unit
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.candidate_figures import TIED_COSINE
-from vinetrack.report.law_text import PREFERRED
+from vinetrack.narrative.law_text import PREFERRED
+from vinetrack.narrative.verdict_summary import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
 from vinetrack.report.section import ReportTable
-from vinetrack.report.verdict import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
 
 if TYPE_CHECKING:
     import pandas as pd

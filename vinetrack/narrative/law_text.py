@@ -6,13 +6,15 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.numbers import half_width, interval, number, with_error
-from vinetrack.figures.style import METHOD_NAMES
 
 if TYPE_CHECKING:
     import pandas as pd
 
 STATUSES = ("ok", "warning", "failed", "left_out")
 _STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "left_out": "left out on request"}
+
+METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
+"""The two fits of the damping law, by their keys in `damping.json`."""
 
 TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, to the letter"}
 """Rows of the tables of n and B; the last has set pressure, no weight, and the windows of the 3 % rule."""
