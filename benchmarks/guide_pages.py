@@ -40,7 +40,7 @@ WIDTH = 116
 LARGEST_BYTES, LARGEST_WITH_A_RECORDING_BYTES = 150_000, 200_000
 EXPLORER_PX = (1400, 1330)
 CAPTION = (
-    "*The demonstration. The base model is off by {before} where replicates differ by {floor}; with reservoir "
+    "*The demonstration. The base model is off by {before}, and replicates scatter by {floor}; with reservoir "
     "depletion ticked and refitted, {after} are left.*"
 )
 FIGURES = {"tutorial_strip": "strip_d24_30kPa_1", "tutorial_before_after": "before_after", "verdict_ladder": "ladder"}
@@ -179,7 +179,7 @@ def save_explorer(results: Path, scratch: Path) -> None:
 
 def off_by(headline: str) -> tuple[str, str]:
     """What a headline of the explorer says the model is off by, and replicates differ by."""
-    found = re.search(r"off by ([\d.]+ mm)<.*replicates differ by ([\d.]+ mm)", headline)
+    found = re.search(r"off by ([\d.]+ mm)<.*replicate scatter ([\d.]+ mm)", headline)
     assert found is not None, headline
     return found[1], found[2]
 

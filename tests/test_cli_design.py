@@ -72,7 +72,7 @@ def test_a_campaign_is_planned_rehearsed_and_written_as_a_sheet(tmp_path: Path) 
                "--figure", tmp_path / "a.svg", "--yield-pressure-kPa", 3)  # fmt: skip
     assert done.exit_code == 0, done.output
     assert cells(done.output, "this campaign")[1] in done.output.splitlines()[3]
-    assert "rehearsed 2 times" in done.output
+    assert "simulated 2 times" in done.output
     assert cells(done.output, "n ")[0] == "n"
     trials = read_experiment(sheet.parent).trials
     assert len(trials) == int(cells(done.output, "this campaign")[1])
@@ -84,7 +84,7 @@ def test_a_campaign_is_planned_rehearsed_and_written_as_a_sheet(tmp_path: Path) 
 
 def test_a_campaign_out_of_reach_says_what_would_help() -> None:
     output = run("campaign", *TWO, "--n-within", 1e-5, "--most-trials", 30, "--check", 0).output
-    assert "! no campaign of 30 trials or fewer, with the pressures and replicates allowed, leaves so little" in output
+    assert "! no campaign of 30 trials or fewer with the allowed pressures and replicates reaches this" in output
     assert "widen the pressures" in output
 
 

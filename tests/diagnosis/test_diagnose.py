@@ -52,7 +52,7 @@ def depleted(depleted_pairs: Pairs) -> Diagnosis:
 def test_nothing_missing_is_adequate(nothing_missing: Diagnosis) -> None:
     assert nothing_missing.verdict == nothing_missing.final_verdict == "adequate"
     assert nothing_missing.effects == nothing_missing.answer_set == ()
-    assert "nothing missing can be detected" in nothing_missing.explanation
+    assert "no missing effect can be detected" in nothing_missing.explanation
 
 
 def test_adequate_says_how_large_an_effect_could_still_be(nothing_missing: Diagnosis) -> None:

@@ -64,7 +64,7 @@ def test_an_emptying_chamber_makes_it_fail_and_the_words_say_where(depleting: Fa
     assert worst["z"] == depleting.by_condition["z"].max() > 3.5
     first = depleting.sentences()[0]
     assert first.startswith(f"The model fails most at {worst['pressure_Pa'] / 1e3:.3g} kPa ({worst['vine']})")
-    assert "where replicates differ by" in first
+    assert "where replicates scatter by" in first
     assert any("B" in said and "pressure" in said for said in depleting.sentences()[1:])
 
 

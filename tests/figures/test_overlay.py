@@ -24,7 +24,7 @@ def view(axis: Axis | None = None, width_px: int = 640) -> View:
 def edges(tracked: float = 200.0, before: float = 300.0, after: float = 210.0) -> list[Edge]:
     return [
         Edge("tracked edge", TRACKED, np.array([math.nan, tracked])),
-        Edge("the model you came with", BEFORE, np.array([0.0, before]), np.array([0.0, 25.0])),
+        Edge("initial model", BEFORE, np.array([0.0, before]), np.array([0.0, 25.0])),
         Edge("with air drag", AFTER, np.array([0.0, after]), np.array([0.0, math.nan])),
     ]
 

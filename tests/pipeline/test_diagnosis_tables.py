@@ -155,8 +155,8 @@ def test_rankings_keep_what_could_not_be_tested_and_round_two_says_what_was_adde
     table = ranking_table(rounds[0])
     assert table["effect"].tolist() == ["air_drag", "leak", "time_base", "payload_drag"]
     assert math.isnan(table["delta_chi2"].iloc[-1])
-    assert question(0, rounds) == "What does the model you came with lack?"
-    assert question(1, rounds) == "And with air drag added?"
+    assert question(0, rounds) == "Which effect is missing from the initial model?"
+    assert question(1, rounds) == "Which is missing with air drag added?"
 
 
 def test_ties_stand_in_the_order_of_the_ranking() -> None:

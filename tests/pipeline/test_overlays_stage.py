@@ -112,7 +112,7 @@ def test_where_nothing_was_added_there_is_no_model_after(tmp_path: Path) -> None
     _, results = campaign(tmp_path)
     (results / "diagnosis.json").write_text(json.dumps({"effects": []}))
     edges, release_s = edges_of("a", Results(results), read_result(Results(results).track("a")))
-    assert [edge.name for edge in edges] == ["tracked edge", "the model you came with"]
+    assert [edge.name for edge in edges] == ["tracked edge", "initial model"]
     assert release_s == 0.02
     assert edges[1].off_mm == pytest.approx(np.full(N, 20.0))
 

@@ -36,9 +36,9 @@ def shown(content: dict, **changes: object) -> str:
 SENTENCES = {
     "missing": "Missing from the model: reservoir depletion.",
     "ambiguous": "Missing from the model: air drag or inlet loss. These trials cannot tell which.",
-    "artefact": "The measurement is at fault, not the physics: length scale.",
-    "adequate": "Nothing missing from the model can be detected.",
-    "unexplained": "The model fails, and nothing in the catalogue mends it.",
+    "artefact": "A fault of the measurement, not of the physics: length scale.",
+    "adequate": "No missing effect can be detected.",
+    "unexplained": "The model fails, and no effect of the catalogue explains it.",
 }
 
 
@@ -64,20 +64,20 @@ def test_identifiers_are_unique_and_every_link_of_the_page_leads_somewhere(verdi
 
 def test_what_is_missing_comes_with_how_sure_how_large_and_what_it_did() -> None:
     found = {fact.question: fact for fact in facts(diagnosis(), ladder("", "reservoir_depletion"))}
-    assert found["How sure"].answer == "20 σ"
-    assert found["How sure"].note == "next best: leak, worse by Δχ² = 50.0, not plausible"
+    assert found["Significance"].answer == "20 σ"
+    assert found["Significance"].note == "next best: leak, worse by Δχ² = 50.0, not plausible"
     assert found["Size of reservoir depletion"].answer == "γ = 1.1700 ± 0.0040"
     assert found["Size of reservoir depletion"].note == "95 %: 1.162 to 1.178"
     assert found["Error on conditions left out"].answer == "10.0 → 2.00 mm"
-    assert found["Error on conditions left out"].note == "replicates differ by 1.50 mm"
+    assert found["Error on conditions left out"].note == "replicate scatter 1.50 mm"
     assert found["Damping exponent"].answer == "n = 0.3700 ± 0.0040"
 
 
 @pytest.mark.parametrize(
     ("answers", "words"),
     [
-        (("reservoir_depletion",), "3 candidates were tried"),
-        (("air_drag", "inlet_loss"), "2 of 4 candidates fit alike"),
+        (("reservoir_depletion",), "of 3 candidates tested"),
+        (("air_drag", "inlet_loss"), "2 of 4 candidates fit equally well"),
     ],
 )
 def test_where_no_other_was_fitted_it_says_of_how_many_it_is_the_answer(answers: tuple[str, ...], words: str) -> None:
@@ -93,13 +93,13 @@ def test_two_effects_are_named_in_order_each_with_its_size() -> None:
     content = diagnosis(effects=["reservoir_depletion", "tail_friction"])
     content["parameters"].append(number("tail_friction.f", "f", 3.0, 0.2, "N/m"))
     assert sentence(content) == "Missing from the model: reservoir depletion and tail friction."
-    assert meaning(content).endswith("With them, nothing more can be detected.")
+    assert meaning(content).endswith("With them, no further effect can be detected.")
     questions = [fact.question for fact in facts(content, None)]
     assert questions[1:3] == ["Size of reservoir depletion", "Size of tail friction"]
 
 
 @pytest.mark.parametrize(
-    ("final", "words"), [("unexplained", "Even then the model fails"), ("missing", "still missing")]
+    ("final", "words"), [("unexplained", "With it, the model still fails"), ("missing", "still missing")]
 )
 def test_what_is_left_after_the_last_effect_is_said(final: str, words: str) -> None:
     assert words in meaning(diagnosis(final_verdict=final))
@@ -108,7 +108,7 @@ def test_what_is_left_after_the_last_effect_is_said(final: str, words: str) -> N
 def test_what_cannot_be_told_apart_has_the_size_of_each_and_the_next_trial() -> None:
     content = diagnosis("ambiguous")
     questions = [fact.question for fact in facts(content, None)]
-    assert questions == ["How sure", "If air drag", "If inlet loss", "Damping exponent"]
+    assert questions == ["Significance", "If air drag", "If inlet loss", "Damping exponent"]
     html = shown(content)
     assert "Make four trials on a tube of half the wall." in html
     assert "air drag from inlet loss" in html
@@ -119,9 +119,9 @@ def test_what_cannot_be_told_apart_has_the_size_of_each_and_the_next_trial() -> 
 
 def test_adequate_says_what_could_still_hide() -> None:
     html = shown(diagnosis("adequate"))
-    assert "What could still hide" in html
+    assert "Upper limits on undetected effects" in html
     assert "<details open>" in html
-    assert facts(diagnosis("adequate"), None)[0].question == "Most suspicious"
+    assert facts(diagnosis("adequate"), None)[0].question == "Most significant candidate"
 
 
 def test_the_most_suspicious_is_so_by_its_score_not_by_what_a_wrong_sign_would_gain() -> None:
@@ -176,7 +176,7 @@ def test_ties_are_named_most_alike_first() -> None:
 def test_how_the_numbers_moved_stands_side_by_side() -> None:
     table = moved_table(moved())
     assert table is not None
-    assert list(table.head) == ["Number", "as you came with it", "+ reservoir depletion"]
+    assert list(table.head) == ["Number", "initial model", "+ reservoir depletion"]
     assert [list(row) for row in table.rows] == [
         ["n", "0.5000 ± 0.0090", "0.3700 ± 0.0040"],
         ["γ", "–", "1.1700 ± 0.0040"],
@@ -188,7 +188,7 @@ def test_the_law_under_every_model_is_by_the_method_that_heads_the_report() -> N
     assert table is not None
     rows = [tuple(row) for row in table.rows]
     assert rows == [
-        ("as you came with it", "v", "0.4000", "0.35 to 0.45", "1.800", "1.70 to 1.90", "5"),
+        ("initial model", "v", "0.4000", "0.35 to 0.45", "1.800", "1.70 to 1.90", "5"),
         ("+ reservoir depletion", "v", "0.3700", "0.35 to 0.45", "1.800", "1.70 to 1.90", "5"),
     ]
     assert law_table(None) is None

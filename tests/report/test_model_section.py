@@ -74,7 +74,7 @@ def words(html: str) -> str:
 
 def test_the_verdict_is_the_root_mean_square_over_conditions_and_names_the_worst() -> None:
     assert verdict(comparison(3.0, 4.0)) == (
-        "Over 2 conditions the model is off by 3.54 mm, where replicates differ by 1.00 mm (root mean square). "
+        "Over 2 conditions the model is off by 3.54 mm, and replicates scatter by 1.00 mm (root mean square). "
         "Worst is c1, by 4.00 mm, most of all after 123 mm of growth."
     )
 

@@ -97,7 +97,7 @@ def test_pictures_too_many_for_one_page_stay_files_and_it_says_so(monkeypatch: p
     monkeypatch.setattr(report_trials, "PICTURES_BYTES", 2 * weight)
     html = page(trials=trials(*names), recordings=recordings)
     assert html.count('aria-label="Strip of') == 2
-    assert "The pictures of 1 trials were too much for one page" in html
+    assert "The pictures of 1 trials are left out here" in html
     assert html.count("4 frames: 1 before release, 1 doubtful") == 3
 
 

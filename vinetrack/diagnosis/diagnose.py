@@ -39,7 +39,8 @@ from vinetrack.inference.fit import fit as fit_model
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.narrative.verdict_text import dropped_in_words, explain, listed
+from vinetrack.narrative.verdict_summary import joined
+from vinetrack.narrative.verdict_text import dropped_in_words, explain
 from vinetrack.tracks.wild_points import listed_wild_points
 
 if TYPE_CHECKING:
@@ -205,7 +206,7 @@ def _conclude(found: Fit, findings: Sequence[SelectionStep], blind: Mapping[str,
     explanation = " ".join(one.explanation for one in rounds)
     lacking = [name for name, why in blind.items() if "`" in why]
     if lacking and any(one.verdict == UNEXPLAINED for one in rounds):
-        explanation += f" Not tried, because the sheet does not say what they need: {listed(lacking)}."
+        explanation += f" Not tried, because the sheet does not say what they need: {joined(lacking)}."
     return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits))
 
 

@@ -219,7 +219,7 @@ def _where(table: pd.DataFrame, fails: bool) -> list[str]:
         ]
     worst = failing.iloc[0]
     beside = (
-        f"where replicates differ by {_mm(worst['floor_m'])}"
+        f"where replicates scatter by {_mm(worst['floor_m'])}"
         if math.isfinite(worst["floor_m"])
         else "without replicates"
     )

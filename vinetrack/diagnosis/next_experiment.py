@@ -24,7 +24,8 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.plan_text import calibration_for, entries, in_words, listed, only_measurement, outlook
+from vinetrack.narrative.plan_text import calibration_for, entries, in_words, only_measurement, outlook
+from vinetrack.narrative.verdict_summary import joined
 from vinetrack.planning.design_simulation import Bench, expected, observed, separation
 from vinetrack.planning.discriminating_design import Side, all_sides, best_design, likeliest_vines, worth
 from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, conditions
@@ -152,7 +153,7 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
         advice = calibration_for(list(itertools.combinations(tied, 2)))
         faults = [name for name in names if name != NOTHING]
         are = "are errors" if len(faults) > 1 else "is an error"
-        text = f"Measure before making more trials: {listed(faults)} {are} of measurement. {advice}"
+        text = f"Measure before making more trials: {joined(faults)} {are} of measurement. {advice}"
         return NextExperiment(text=text, calibration=advice)
     bench, sides = _bench(tied, names, limits)
     options = _options(bench, sides, limits, seed)

@@ -46,9 +46,9 @@ def headline(campaign: Campaign, choice: Choice, now_m: Mapping[str, float], bef
     grade = "good" if at_floor else "bad"
     was = f", {_mm(before)} when the page opened" if math.isfinite(before) and _mm(before) != _mm(now) else ""
     if math.isfinite(floor):
-        least = f"; replicates differ by {_mm(floor)}" + (": nothing is left to explain" if at_floor else "")
+        least = f"; replicate scatter {_mm(floor)}" + (": nothing is left to explain" if at_floor else "")
     else:
-        least = "; there are no replicates to say how good it could be"
+        least = "; there are no replicates to compare with"
     return f'<h1>{model}: <span class="{grade}">off by {_mm(now)}</span> rms{was}{least}.</h1>'
 
 

@@ -1,4 +1,4 @@
-"""What an experiment found, in sentences, and how it was found."""
+"""The damping law of an experiment in sentences and tables, for terminal and page, and how it was determined."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from vinetrack.core.numbers import half_width, interval, number, with_error
 if TYPE_CHECKING:
     import pandas as pd
 
-STATUSES = ("ok", "warning", "failed", "left_out")
+_STATUSES = ("ok", "warning", "failed", "left_out")
 _STATUS_WORDS = {"ok": "ok", "warning": "with a warning", "failed": "failed", "left_out": "left out on request"}
 
 METHOD_NAMES = {"log_log": "log–log least squares", "both_axes": "errors on both axes"}
 """The two fits of the damping law, by their keys in `damping.json`."""
 
-TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, to the letter"}
+_TABLE_METHODS = METHOD_NAMES | {"paper": "the published rule, to the letter"}
 """Rows of the tables of n and B; the last has set pressure, no weight, and the windows of the 3 % rule."""
 
 PREFERRED = "both_axes"
@@ -35,36 +35,41 @@ REFERENCES = (
 DIAGNOSIS_METHODS = (
     (
         "Model",
-        "Simulated positions are fitted to measured ones, of all trials at once: the numbers of the model, B for every "
-        "vine, n for all, the yield pressure with the sheet's error as prior; for every trial its release, its origin, "
-        "and deviations of pressure and of B whose spreads are estimated too. What replicates differ by, the noise and "
-        "its correlation are found with it.",
+        "Simulated positions are fitted to the measured ones of all trials at once. Shared parameters: those of the "
+        "model, B of every vine, one n, and the yield pressure with the sheet's error as prior. Parameters of each "
+        "trial: its release, its origin, and deviations of pressure and of B, whose standard deviations between trials "
+        "are estimated too, like replicate scatter, noise and the noise's correlation.",
     ),
     (
         "Diagnosis",
-        "Every candidate of the catalogue is asked by how much the trajectories would be explained better with it, "
-        "after all that is fitted anyway has taken its share; faults of the measurement are candidates like any other. "
-        "The best, and all that look like them, are fitted in full. Hypotheses within Δχ² = 9 of the best form the "
-        "answer set. The threshold for calling anything missing allows for how many candidates were asked and how "
-        "alike they are. An effect is added only where it is the only answer, and the question is asked again.",
+        "For every candidate of the catalogue a score test predicts by how much the fit would improve with it, all "
+        "fitted parameters estimated anew; faults of the measurement are candidates too. The best, and those "
+        "correlated with them, are fitted in full. Hypotheses within Δχ² = 9 of the best form the answer set. The "
+        "threshold for calling an effect missing accounts for the number of candidates and the correlation between "
+        "them. An effect is added only where it is the only answer; then all candidates are tested again.",
     ),
     (
         "Ladder",
         "Errors of position are root mean squares with a release and an origin of each trial's own and nothing else. "
         "Left-out conditions are predicted by the model fitted to all other conditions, the highest pressure of each "
-        "vine by the model fitted to all lower ones. The floor is what replicates differ by.",
+        "vine by the model fitted to all lower ones. The floor is the replicate scatter.",
     ),
 )
 DIAGNOSIS_REFERENCES = (
     "Rao, Large sample tests of statistical hypotheses concerning several parameters with applications to problems of "
-    "estimation, Proceedings of the Cambridge Philosophical Society 44, 1948: asking candidates without fitting each.",
+    "estimation, Proceedings of the Cambridge Philosophical Society 44, 1948: testing candidates without fitting each.",
     "Wilks, The large-sample distribution of the likelihood ratio for testing composite hypotheses, Annals of "
-    "Mathematical Statistics 9, 1938: what a Δχ² is worth.",
+    "Mathematical Statistics 9, 1938: the significance of a Δχ².",
 )
 
 
 def headline(damping: Mapping[str, Any]) -> str:
-    """The main result in one sentence."""
+    """Return the main result in one sentence.
+
+    Parameters
+    ----------
+    damping : content of `damping.json`.
+    """
     fit = damping.get(PREFERRED) or {}
     if fit.get("refused") or fit.get("n") is None or not fit.get("vines"):
         return f"No damping law: {_sentence(fit.get('refused') or 'no trial gave a steady speed')}"
@@ -81,16 +86,21 @@ def headline(damping: Mapping[str, Any]) -> str:
 
 
 def tally(trials: pd.DataFrame) -> str:
-    """How many trials there are, and of which status, as a sentence."""
+    """Return how many trials there are of each status, as a sentence.
+
+    Parameters
+    ----------
+    trials : `trials.csv`; its column `status`.
+    """
     counts = trials["status"].value_counts()
-    parts = [f"{counts[status]} {_STATUS_WORDS[status]}" for status in STATUSES if counts.get(status, 0)]
+    parts = [f"{counts[status]} {_STATUS_WORDS[status]}" for status in _STATUSES if counts.get(status, 0)]
     return f"{_count(len(trials), 'trial')}: {', '.join(parts)}." if parts else "No trials."
 
 
 def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """One row a vine and method, smallest vine first: size, B and its intervals, R² and N, as text."""
+    """Return size, B, its intervals, R² and N by vine and method of `damping.json` as text, smallest vine first."""
     table, sizes = [], []
-    for method, method_name in TABLE_METHODS.items():
+    for method, method_name in _TABLE_METHODS.items():
         for vine, law in ((damping.get(method) or {}).get("vines") or {}).items():
             table.append(
                 {
@@ -110,9 +120,9 @@ def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """One row a method: n and its intervals, or why there is none, as text."""
+    """Return n and its intervals by every method of `damping.json` as text, or why a method has none."""
     table = []
-    for method, method_name in TABLE_METHODS.items():
+    for method, method_name in _TABLE_METHODS.items():
         fit = damping.get(method)
         if fit is None:
             continue
@@ -129,13 +139,13 @@ def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def without_law(damping: Mapping[str, Any]) -> list[str]:
-    """Vines that the fit left out, each with the reason."""
+    """Return the vines that the preferred fit of `damping.json` left out, each with the reason."""
     left_out = (damping.get(PREFERRED) or {}).get("left_out") or {}
     return [f"{vine}: {reason}" for vine, reason in left_out.items()]
 
 
 def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """How it was done, as (heading, paragraph) pairs; numbers from the settings that were used."""
+    """Return how the results were computed, as (heading, paragraph) pairs, with the numbers of the run's settings."""
     velocity, steady, damping = (settings.get(key) or {} for key in ("velocity", "steady", "damping"))
     return [
         (
@@ -162,7 +172,7 @@ def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
         (
             "Damping law",
             "F = B·x_ssⁿ with one n for all vines and a B for each: by least squares on logarithms, as in the paper, "
-            "and with errors on both axes (York), where the vines' own scatter stands with the measured errors. "
+            "and with errors on both axes (York), where the scatter between vines is added to the measured errors. "
             f"Intervals hold 95 % and come from {damping.get('resamples', 2000)} resamplings of whole trials (seed "
             f"{damping.get('seed', 0)}), or from Student's t where there are too few trials to resample; the wider "
             "ones add the stated errors that trials share: of the yield pressure, common to a vine, and of the scale, "

@@ -1,4 +1,4 @@
-"""The next experiment in words: which trials to make, what they will tell, and what to measure instead."""
+"""The next experiment in sentences: which trials to make, which hypotheses they separate, what to measure instead."""
 
 from __future__ import annotations
 
@@ -12,41 +12,45 @@ from vinetrack.effects import Effect
 from vinetrack.effects._words import remedy, told_apart
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.inference.fit_result import Fit
+from vinetrack.narrative.verdict_summary import joined
 from vinetrack.planning.feasible_trials import NEW_VINE, Condition
 
-MUCH_MORE = 1.5
+_MUCH_MORE = 1.5
+"""Chosen: the larger of two significances is stated beside the smaller where it is 1.5 times that."""
 
-WITH_TRACE = (
+_WITH_TRACE = (
     "Record the pressure at the vine during growth and give it with the track: what the chamber does is then measured,"
-    " and only the other is left to explain what remains."
+    " and only the other can explain the remaining misfit."
 )
 
 
-def effects_between(one: Fit, other: Fit) -> tuple[list[Effect], list[Effect]]:
-    """What the first has in its model and the second has not, and the other way round."""
-    mine, yours = one.model, other.model
-    return [e for e in mine if e.name not in yours], [e for e in yours if e.name not in mine]
+def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]]:
+    """Return the effects that only the first model has, and those that only the second has."""
+    return (
+        [effect for effect in first.model if effect.name not in second.model],
+        [effect for effect in second.model if effect.name not in first.model],
+    )
 
 
 def only_measurement(tied: Sequence[Fit]) -> bool:
-    """Whether all that the hypotheses differ by is how things were measured."""
+    """Return whether the hypotheses differ in effects of the measurement alone."""
     common = set.intersection(*(set(fit.model.names) for fit in tied))
     differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
     return bool(differ) and all(effect.kind == "measurement" for effect in differ)
 
 
 def calibration_for(pairs: Sequence[tuple[Fit, Fit]]) -> str:
-    """What to measure so that one of each pair can be ruled out, in the words of the effects themselves.
+    """Return what to measure so that one of each pair can be ruled out, as the effects' own files state it.
 
-    Where an error of measurement is among them it is what can be settled for certain, and the rest is not spoken of.
+    Where an effect of the measurement is among them, a calibration decides, and only that is returned.
     """
     sentences: list[str] = []
     effects: dict[str, Effect] = {}
-    for one, other in pairs:
-        mine, yours = effects_between(one, other)
-        if any(e.in_trace for e in mine) != any(e.in_trace for e in yours) and WITH_TRACE not in sentences:
-            sentences.append(WITH_TRACE)
-        effects.update({effect.name: effect for effect in [*mine, *yours]})
+    for pair in pairs:
+        only_first, only_second = effects_between(*pair)
+        if any(e.in_trace for e in only_first) != any(e.in_trace for e in only_second) and _WITH_TRACE not in sentences:
+            sentences.append(_WITH_TRACE)
+        effects.update({effect.name: effect for effect in [*only_first, *only_second]})
     measured = [effect for effect in effects.values() if effect.kind == "measurement"]
     for effect in measured or effects.values():
         words = " ".join(filter(None, ("" if measured else told_apart(effect), remedy(effect))))
@@ -74,11 +78,18 @@ def _trial_in_words(trial: Mapping[str, Any]) -> str:
 def outlook(
     if_true: Mapping[str, Mapping[str, float]], simulated: Mapping[str, tuple[float, float]] | None = None
 ) -> str:
-    """What the trials are expected to tell, pair by pair; what it is if the other is true only where that is more."""
+    """Return the expected significance with which the trials separate each pair of hypotheses.
+
+    Parameters
+    ----------
+    if_true : by pair (`a | b`) the significance if the one or the other is true; the smaller is stated, the larger
+        only where it is much more.
+    simulated : mean and standard deviation of simulated significances by pair.
+    """
     parts = []
     for pair, ways in if_true.items():
         least, most = sorted(ways, key=ways.__getitem__)
-        notes = [f"{ways[most]:.2g} σ if {most} is true"] if ways[most] > MUCH_MORE * max(ways[least], 1.0) else []
+        notes = [f"{ways[most]:.2g} σ if {most} is true"] if ways[most] > _MUCH_MORE * max(ways[least], 1.0) else []
         mean, sd = (simulated or {}).get(pair, (math.nan, math.nan))
         if math.isfinite(mean):
             notes.append(f"simulated: {mean:.2g}" + (f" ± {max(sd, 0.1):.1g} σ" if math.isfinite(sd) else " σ"))
@@ -87,13 +98,14 @@ def outlook(
     return ", ".join(parts)
 
 
-def listed(names: Sequence[str]) -> str:
-    """Names as a sentence lists them."""
-    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else names[0]
-
-
 def entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str, Any], ...]:
-    """The trials of a design as entries, one a condition."""
+    """Return the trials of a design as entries of `next_experiment`, one a condition.
+
+    Parameters
+    ----------
+    every : all feasible conditions.
+    design : places in `every`, one for each trial.
+    """
     return tuple(
         _entry(every[place], int(count))
         for place, count in zip(*np.unique(np.array(design), return_counts=True), strict=True)
@@ -121,18 +133,27 @@ def in_words(
     worth_it: bool,
     least: float,
 ) -> str:
-    """The advice in plain sentences."""
+    """Return the advice: the trials, what they separate, and what to measure besides.
+
+    Parameters
+    ----------
+    trials : entries of `entries`.
+    promise : the text of `outlook`.
+    left : pairs that the trials do not separate.
+    advice : the text of `calibration_for`.
+    worth_it : whether the best design separates a pair by `least`, in standard deviations.
+    """
     if not worth_it:
         return (
-            f"No trials within the limits separate what is tied by {least:g} σ; the best would separate"
+            f"No trials within the limits separate the tied hypotheses by {least:g} σ; the best would separate"
             f" {promise}. {advice}".rstrip()
         )
     text = f"Make {_trials_in_words(trials)}. Together with the trials so far they separate {promise}."
     if any(trial["new_vine"] for trial in trials):
-        text += " B of the new vine is a guess here and is fitted; its yield pressure has to be measured."
+        text += " B of the new vine is assumed here from scaling and is fitted; its yield pressure has to be measured."
     if left:
-        pairs = listed([pair.replace(" | ", " from ") for pair in left])
-        text += f" They will not tell {pairs}. {advice}"
+        pairs = joined([pair.replace(" | ", " from ") for pair in left])
+        text += f" They will not separate {pairs}. {advice}"
     elif advice:
         text += f" A measurement would do as well: {advice}"
     return text.rstrip()

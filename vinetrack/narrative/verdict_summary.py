@@ -1,4 +1,7 @@
-"""The first screen: what is missing from the model, how sure that is, and what adding it did, in words for anybody."""
+"""The diagnosis of `diagnosis.json` in sentences: what is missing, how sure that is, and what adding it changed.
+
+The page, the figures and the explorer take these sentences; `verdict_text` prints a diagnosis that is still in memory.
+"""
 
 from __future__ import annotations
 
@@ -23,31 +26,31 @@ BADGES = {
 }
 
 MEANINGS = {
-    "missing": "An effect is missing from the model. It was found, added, and the model fitted again.",
+    "missing": "An effect is missing from the model. It was identified, added, and the model fitted again.",
     "ambiguous": "An effect is missing, and these trials cannot tell which of a few it is: nothing was added. "
-    "The next trial that would tell is below.",
-    "artefact": "What the model misses looks like a fault of the measurement, not like physics: nothing was added. "
-    "Mend the measurement first.",
-    "adequate": "Every candidate was tried, and none explains the trajectories noticeably better. "
-    "How large each could still be is listed below.",
-    "unexplained": "The model fails beyond what replicates differ by, and no effect of the catalogue mends it. "
-    "The force that is missing is drawn below.",
+    "The next trial, which would tell them apart, is below.",
+    "artefact": "The misfit is explained by a fault of the measurement, not by physics: nothing was added. "
+    "Correct the measurement first.",
+    "adequate": "Every candidate was tested, and none improves the fit significantly. "
+    "Upper limits on the size of each are listed below.",
+    "unexplained": "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
+    "The missing force is drawn below.",
 }
 """What each verdict means."""
 
 THEREAFTER = {
-    "missing": "Something else is still missing.",
-    "ambiguous": "What is then still missing cannot be told from these trials.",
-    "artefact": "What is then left looks like a fault of the measurement.",
-    "adequate": "With it, nothing more can be detected.",
-    "unexplained": "Even then the model fails, and nothing in the catalogue mends the rest.",
+    "missing": "A further effect is still missing.",
+    "ambiguous": "A further effect is missing, and these trials cannot tell which.",
+    "artefact": "The remaining misfit is explained by a fault of the measurement.",
+    "adequate": "With it, no further effect can be detected.",
+    "unexplained": "With it, the model still fails, and no effect of the catalogue explains the remaining misfit.",
 }
-"""How the model with everything added stands."""
+"""The verdict on the model with all added effects."""
 
 
 @dataclass(frozen=True)
 class Fact:
-    """A number that answers one question of the first screen, with a line below it."""
+    """One number of the first screen: the question it answers, the answer, and a line below it."""
 
     question: str
     answer: str
@@ -55,20 +58,31 @@ class Fact:
 
 
 def plain(effect: str) -> str:
-    """The name of an effect as a person says it."""
+    """Return the name of an effect with blanks for its underscores."""
     return str(effect).replace("_", " ")
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:
-    """Names of effects in a row: `air drag, leak or gravity`."""
-    said = [plain(name) for name in names]
-    if len(said) < 2:
-        return "".join(said)
-    return f"{', '.join(said[:-1])} {last} {said[-1]}"
+    """Return names of effects as a sentence lists them, with blanks for underscores: `air drag, leak or gravity`."""
+    return joined([plain(name) for name in names], last)
+
+
+def joined(names: Sequence[str], last: str = "and") -> str:
+    """Return names as a sentence lists them; blank for none.
+
+    >>> joined(["leak", "air_drag", "gravity"], "or")
+    'leak, air_drag or gravity'
+    """
+    return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
 
 
 def sentence(diagnosis: Mapping[str, Any]) -> str:
-    """The verdict in one sentence."""
+    """Return the verdict in one sentence.
+
+    Parameters
+    ----------
+    diagnosis : content of `diagnosis.json`.
+    """
     verdict, answers = diagnosis.get("verdict"), list(diagnosis.get("answer_set") or [])
     added = list(diagnosis.get("effects") or [])
     if verdict == "missing":
@@ -76,46 +90,63 @@ def sentence(diagnosis: Mapping[str, Any]) -> str:
     if verdict == "ambiguous":
         return f"Missing from the model: {listed(answers, 'or')}. These trials cannot tell which."
     if verdict == "artefact":
-        return f"The measurement is at fault, not the physics: {listed(answers, 'or')}."
+        return f"A fault of the measurement, not of the physics: {listed(answers, 'or')}."
     if verdict == "adequate":
-        return "Nothing missing from the model can be detected."
+        return "No missing effect can be detected."
     if verdict == "unexplained":
-        return "The model fails, and nothing in the catalogue mends it."
+        return "The model fails, and no effect of the catalogue explains it."
     return "No diagnosis could be made."
 
 
 def meaning(diagnosis: Mapping[str, Any]) -> str:
-    """What the verdict means, and how the model stands with everything added."""
-    said = MEANINGS.get(str(diagnosis.get("verdict")), str(diagnosis.get("refused") or ""))
+    """Return what the verdict means, and the verdict on the model with all added effects.
+
+    Parameters
+    ----------
+    diagnosis : content of `diagnosis.json`.
+    """
+    text = MEANINGS.get(str(diagnosis.get("verdict")), str(diagnosis.get("refused") or ""))
     added = list(diagnosis.get("effects") or [])
     then = THEREAFTER.get(str(diagnosis.get("final_verdict")), "") if added else ""
-    return f"{said} {then.replace('With it,', 'With them,') if len(added) > 1 else then}".strip()
+    return f"{text} {then.replace('With it,', 'With them,') if len(added) > 1 else then}".strip()
 
 
 def facts(diagnosis: Mapping[str, Any], ladder: pd.DataFrame | None) -> list[Fact]:
-    """How sure, how large, and what it did to the error; as many as the verdict allows."""
+    """Return significance, size and change of the error: as many numbers as the verdict has.
+
+    Parameters
+    ----------
+    diagnosis : content of `diagnosis.json`.
+    ladder : `ladder.csv`; None where there is none.
+    """
     first = (diagnosis.get("rounds") or [{}])[0]
     ranking = list(first.get("ranking") or [])
-    found = [_sure(diagnosis, ranking), *_sizes(diagnosis), _hidden(diagnosis), *_errors(ladder), *_moved(diagnosis)]
-    return [fact for fact in found if fact is not None]
+    entries = [
+        _significance(diagnosis, ranking),
+        *_sizes(diagnosis),
+        _upper_limits(diagnosis),
+        *_errors(ladder),
+        *_exponent(diagnosis),
+    ]
+    return [fact for fact in entries if fact is not None]
 
 
 def known(value: Any) -> bool:
-    """Whether a value of a JSON file is a number."""
+    """Return whether a value of a JSON file is a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
 
 
-def _sure(diagnosis: Mapping[str, Any], ranking: Sequence[Mapping[str, Any]]) -> Fact | None:
+def _significance(diagnosis: Mapping[str, Any], ranking: Sequence[Mapping[str, Any]]) -> Fact | None:
     verdict = diagnosis.get("verdict")
     tested = [row for row in ranking if known(row.get("delta_chi2"))]
     others = [row for row in tested if not row.get("in_answer_set")]
     best = max(tested, key=lambda row: float(row["delta_chi2"]), default=None)
     if verdict == "adequate":
-        # By the score: what was only predicted may gain much with the wrong sign, and that counts for nothing.
+        # By the score: a predicted gain may belong to a size of the wrong sign.
         scored = [row for row in ranking if known(row.get("sigma"))]
         best = max(scored, key=lambda row: abs(float(row["sigma"])), default=None)
         note = f"the best of {len(scored)} candidates: {plain(best['effect'])}" if best else ""
-        return Fact("Most suspicious", f"{_sigmas(best)} σ", note) if best else None
+        return Fact("Most significant candidate", f"{_sigmas(best)} σ", note) if best else None
     if verdict == "unexplained" and best is not None:
         note = f"{_sigmas(best)} σ better" + (f", but {best['reason']}" if best.get("reason") else "")
         return Fact("Nearest candidate", plain(best["effect"]), note)
@@ -124,15 +155,15 @@ def _sure(diagnosis: Mapping[str, Any], ranking: Sequence[Mapping[str, Any]]) ->
     if best is None:
         return None
     tried = sum(row.get("status") != "not testable here" for row in ranking)
-    note = f"{tried} candidates were tried" if tried > 1 else "it was the only candidate"
-    note = f"{len(inside)} of {tried} candidates fit alike" if len(inside) > 1 else note
+    note = f"of {tried} candidates tested" if tried > 1 else "the only candidate"
+    note = f"{len(inside)} of {tried} candidates fit equally well" if len(inside) > 1 else note
     rival = max(others, key=lambda row: float(row["delta_chi2"]), default=None)
     if rival is not None:
         behind = float(best["delta_chi2"]) - float(rival["delta_chi2"])
-        # Another's Δχ² may be the larger where it is implausible, or was predicted and not fitted.
+        # An implausible candidate, or one predicted and not fitted, may have the larger Δχ².
         note = f"next best: {plain(rival['effect'])}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
         note += "" if rival.get("plausible", True) else ", not plausible"
-    return Fact("How sure", f"{_sigmas(best)} σ", note)
+    return Fact("Significance", f"{_sigmas(best)} σ", note)
 
 
 def _sigmas(row: Mapping[str, Any]) -> str:
@@ -142,7 +173,12 @@ def _sigmas(row: Mapping[str, Any]) -> str:
 
 
 def size(entry: Mapping[str, Any]) -> str:
-    """A fitted number with its error, in a unit that reads well: `γ = 1.170 ± 0.004`."""
+    """Return a fitted number with its error in its display unit: `γ = 1.170 ± 0.004`.
+
+    Parameters
+    ----------
+    entry : a number of `diagnosis.json` or `fit.json`: `symbol, value, sigma, unit` (SI) and `vine` where it has one.
+    """
     unit, factor = display_unit(entry["unit"])
     sigma = factor * float(entry["sigma"]) if known(entry.get("sigma")) else None
     vine = f" ({entry['vine']})" if entry.get("vine") else ""
@@ -150,7 +186,7 @@ def size(entry: Mapping[str, Any]) -> str:
 
 
 def sizes(row: Mapping[str, Any]) -> str:
-    """All fitted numbers of a candidate."""
+    """Return all fitted numbers of an entry of a ranking."""
     return ", ".join(size(entry) for entry in row.get("numbers") or [] if known(entry.get("value")))
 
 
@@ -174,16 +210,14 @@ def _interval(entry: Mapping[str, Any]) -> str:
     return f"95 %: {number(low, 4)} to {number(high, 4)} {unit}".strip()
 
 
-def _hidden(diagnosis: Mapping[str, Any]) -> Fact | None:
+def _upper_limits(diagnosis: Mapping[str, Any]) -> Fact | None:
     if diagnosis.get("verdict") != "adequate":
         return None
     first = (diagnosis.get("rounds") or [{}])[0]
     bounded = [row for row in first.get("ranking") or [] if row.get("largest")]
     if not bounded:
         return None
-    return Fact(
-        "What could still hide", f"{len(bounded)} candidates bounded", "the largest size of each is listed below"
-    )
+    return Fact("Upper limits", f"{len(bounded)} candidates", "the largest undetected size of each is listed below")
 
 
 def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
@@ -197,10 +231,10 @@ def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
     answer = f"{number(before)} mm"
     if len(ladder) > 1:
         answer = f"{number(before)} → {number(1e3 * float(last[key]))} mm"
-    return [Fact(what, answer, f"replicates differ by {number(floor)} mm" if math.isfinite(floor) else "")]
+    return [Fact(what, answer, f"replicate scatter {number(floor)} mm" if math.isfinite(floor) else "")]
 
 
-def _moved(diagnosis: Mapping[str, Any]) -> list[Fact]:
+def _exponent(diagnosis: Mapping[str, Any]) -> list[Fact]:
     """The damping exponent of the final model."""
     for entry in diagnosis.get("parameters") or []:
         if entry["parameter"] == "eversion_damping.n" and known(entry.get("value")):

@@ -1,4 +1,4 @@
-"""A diagnosis in words that a student understands, and as it is printed on a terminal."""
+"""A diagnosis in sentences: the explanation of every round, and what `vinetrack diagnose` prints."""
 
 from __future__ import annotations
 
@@ -20,25 +20,28 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.model import base_model
 from vinetrack.inference.fit_result import Number
+from vinetrack.narrative.verdict_summary import joined
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.selection import SelectionStep
     from vinetrack.inference.fit_result import Fit
 
-MEANINGS = {
-    ADEQUATE: "nothing missing can be detected",
+_HEADLINES = {
+    ADEQUATE: "no missing effect can be detected",
     MISSING: "one effect is missing",
     AMBIGUOUS: "one of several effects is missing, and these data cannot tell which",
-    ARTEFACT: "the measurement is at fault, not the physics",
-    "unexplained": "the model fails, and nothing in the catalogue mends it",
+    ARTEFACT: "a fault of the measurement, not of the physics",
+    "unexplained": "the model fails, and no effect of the catalogue explains it",
 }
-SHOWN_CANDIDATES = 8
+_SHOWN_CANDIDATES = 8
+"""Of a round on the terminal; chosen: two rounds fit a screen of 24 lines, and `diagnosis.json` has all."""
 
 
 def size_in_words(number: Number) -> str:
-    """`γ = 1.170 ± 0.004`, in a unit that reads well."""
+    """Return `γ = 1.170 ± 0.004` in its display unit; without error where the fit could not state one."""
     unit, factor = display_unit(number.unit)
     tail = f" {unit}" if unit else ""
     if not (math.isfinite(number.sigma) and number.sigma > 0):
@@ -49,17 +52,12 @@ def size_in_words(number: Number) -> str:
 
 
 def sizes_in_words(numbers: Sequence[Number]) -> str:
-    """All sizes of a hypothesis, or nothing where it has none."""
+    """Return all sizes of a hypothesis; blank where it has none."""
     return ", ".join(map(size_in_words, numbers))
 
 
-def listed(names: Sequence[str], word: str = "and") -> str:
-    """`a, b and c`."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
-
-
 def explain(finding: SelectionStep) -> str:
-    """One round in sentences."""
+    """Return the explanation of one round: its verdict with the reasons."""
     questions = finding.questions
     model = " + ".join(questions.found.model.names)
     count = len(questions.found.trials)
@@ -76,65 +74,67 @@ def explain(finding: SelectionStep) -> str:
         )
         if finding.note:
             return f"{text} {finding.note[0].upper()}{finding.note[1:]} ({' and '.join(best.names)} together do)."
-        return f"{text} Nothing is left then that any candidate or any smooth force could explain.{_runner_up(finding)}"
+        text += " With it in the model, no other candidate and no smooth force improves the fit."
+        return text + _runner_up(finding)
     names = list(finding.answer)
     if finding.verdict == AMBIGUOUS:
         return (
-            f"{model} lacks an effect, and these data cannot tell which: {listed(names, 'or')}. "
-            f"{'; '.join(_one(one.names, one.numbers) for one in kept)}. They fit within Δχ² = 9 of each other."
+            f"{model} lacks an effect, and these data cannot tell which: {joined(names, 'or')}. "
+            f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other."
         )
     if finding.verdict == ARTEFACT:
-        which = listed(names, "or")
+        which = joined(names, "or")
         return (
-            f"The measurement is at fault rather than the physics: {which} mends what {model} misses "
-            f"({'; '.join(_one(one.names, one.numbers) for one in kept)}). It is not added to the model: "
+            f"A fault of the measurement, not of the physics: {which} explains the misfit of {model} "
+            f"({_hypotheses(kept)}). It is not added to the model: "
             f"find the fault and measure again, or correct the sheet.{_with_the_fault(finding)}"
         )
     text = (
-        f"{model} fails beyond the noise of {trials}, and no effect of the catalogue nor any two of those that help "
-        "most mend it."
+        f"The misfit of {model} exceeds the noise of {trials}, and no effect of the catalogue nor any two of the best "
+        "explain it."
     )
     for name, why in finding.aside:
-        text += f" Nearest comes {name.replace('+', ' with ')}: {why}."
+        text += f" The nearest is {name.replace('+', ' with ')}: {why}."
     return text
 
 
 def _with_the_fault(finding: SelectionStep) -> str:
-    """What effects found before amount to once the fault is fitted along: without it they make up for it."""
+    """Sizes of effects added before, fitted together with the fault: without it they are biased by it."""
     found, best = finding.questions.found, finding.kept[0]
-    mine = [number for number in best.others if number.key.split(".")[0] not in base_model()]
+    added = [number for number in best.others if number.key.split(".")[0] not in base_model()]
     before = {number.name: number for number in found.numbers}
-    moved = [number for number in mine if number.name in before and math.isfinite(number.sigma)]
+    moved = [number for number in added if number.name in before and math.isfinite(number.sigma)]
     if not moved:
         return ""
     instead = sizes_in_words([before[number.name] for number in moved])
     return f" Fitted along with {best.names[-1]}, {sizes_in_words(moved)} instead of {instead}."
 
 
-def _one(names: Sequence[str], numbers: Sequence[Number]) -> str:
-    sizes = sizes_in_words(numbers)
-    return f"{' with '.join(names)}{f' has {sizes}' if sizes else ''}"
+def _hypotheses(kept: Sequence[LikelihoodRatio]) -> str:
+    """The hypotheses of an answer set with their sizes."""
+    sizes = {" with ".join(result.names): sizes_in_words(result.numbers) for result in kept}
+    return "; ".join(f"{names} has {size}" if size else names for names, size in sizes.items())
 
 
 def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
     questions = finding.questions
-    text = f"{model} explains {trials}: nothing missing can be detected."
+    text = f"{model} explains {trials}: no missing effect can be detected."
     if questions.possible.size:
         place = int(questions.possible.argmax())
         text += (
-            f" The most suspicious of {len(set(questions.answers.effects))} candidates, "
-            f"{questions.answers.effects[place]}, stands at {questions.possible[place]:.1f} σ; by chance the best of "
-            f"them passes {questions.threshold:.1f} σ once in {1 / questions.level:.0f} campaigns."
+            f" The most significant of {len(set(questions.answers.effects))} candidates, "
+            f"{questions.answers.effects[place]}, has {questions.possible[place]:.1f} σ; by chance the best of "
+            f"them exceeds {questions.threshold:.1f} σ once in {1 / questions.level:.0f} campaigns."
         )
     return text
 
 
 def _runner_up(finding: SelectionStep) -> str:
-    others = [one for one in finding.tried if len(one.names) == 1 and one.names not in {k.names for k in finding.kept}]
-    others = [one for one in others if one.label not in dict(finding.aside)]
+    kept, aside = {result.names for result in finding.kept}, dict(finding.aside)
+    others = [r for r in finding.tried if len(r.names) == 1 and r.names not in kept and r.label not in aside]
     text = ""
     if others:
-        best = max(others, key=lambda one: one.fit.log_likelihood)
+        best = max(others, key=lambda result: result.fit.log_likelihood)
         behind = 2 * (finding.kept[0].fit.log_likelihood - best.fit.log_likelihood)
         text = f" The next best, {best.names[0]}, is worse by Δχ² = {behind:.0f}."
     for name, why in finding.aside:
@@ -143,28 +143,28 @@ def _runner_up(finding: SelectionStep) -> str:
 
 
 def dropped_in_words(trials: Sequence[str]) -> str:
-    """What is said where frames are missing from recordings."""
-    some = listed(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
+    """Return the explanation of a diagnosis where frames are missing from these recordings."""
+    some = joined(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
     return (
-        f"Frames are missing from {len(trials)} recording{'s' if len(trials) > 1 else ''} ({some}): there one frame's "
-        "step is far above its neighbours'. That is the camera's or the disk's fault, not the vine's. The times were "
-        "put right; record anew where it matters."
+        f"Frames are missing from {len(trials)} recording{'s' if len(trials) > 1 else ''} ({some}): the step of one "
+        "frame is far above those of its neighbours. Camera or disk dropped frames. The times were corrected; record "
+        "again where it matters."
     )
 
 
-def diagnosis_text(found: Diagnosis) -> str:
-    """The verdict first, then the rounds with their candidates, then what to do next."""
-    lines = [f"{found.verdict}: {_headline(found)}", "", found.explanation]
-    for one in found.rounds:
-        if one.ranking:
-            lines += ["", f"{' + '.join(one.model)}: {one.verdict}", *_ranking(one)]
-    if found.ladder is not None and len(found.ladder) > 1:
-        lines += ["", "position error", *_ladder_table(found.ladder)]
-    if found.where:
-        lines += ["", *found.where]
-    if found.next_experiment:
-        lines += ["", str(found.next_experiment.get("text", ""))]
-    lines += [f"! {note}" for note in found.notes]
+def diagnosis_text(diagnosis: Diagnosis) -> str:
+    """Return what the terminal prints: verdict, rounds with their candidates, ladder, next experiment."""
+    lines = [f"{diagnosis.verdict}: {_headline(diagnosis)}", "", diagnosis.explanation]
+    for step in diagnosis.rounds:
+        if step.ranking:
+            lines += ["", f"{' + '.join(step.model)}: {step.verdict}", *_ranking(step)]
+    if diagnosis.ladder is not None and len(diagnosis.ladder) > 1:
+        lines += ["", "position error", *_ladder_table(diagnosis.ladder)]
+    if diagnosis.where:
+        lines += ["", *diagnosis.where]
+    if diagnosis.next_experiment:
+        lines += ["", str(diagnosis.next_experiment.get("text", ""))]
+    lines += [f"! {note}" for note in diagnosis.notes]
     return "\n".join(lines)
 
 
@@ -172,22 +172,22 @@ def _rows(table: pd.DataFrame) -> Iterator[Any]:
     return iter(table.itertuples(index=False))
 
 
-def _headline(found: Diagnosis) -> str:
-    if found.verdict == MISSING:
-        return listed(list(found.effects)) + (" is missing" if len(found.effects) == 1 else " are missing")
-    if found.verdict in (AMBIGUOUS, ARTEFACT) and found.answer_set:
-        if found.answer_set == (DROPPED_FRAMES,):
+def _headline(diagnosis: Diagnosis) -> str:
+    if diagnosis.verdict == MISSING:
+        return joined(list(diagnosis.effects)) + (" is missing" if len(diagnosis.effects) == 1 else " are missing")
+    if diagnosis.verdict in (AMBIGUOUS, ARTEFACT) and diagnosis.answer_set:
+        if diagnosis.answer_set == (DROPPED_FRAMES,):
             return "frames are missing from the recordings"
-        return f"{MEANINGS[found.verdict]}: {listed(list(found.answer_set), 'or')}"
-    return MEANINGS[found.verdict]
+        return f"{_HEADLINES[diagnosis.verdict]}: {joined(list(diagnosis.answer_set), 'or')}"
+    return _HEADLINES[diagnosis.verdict]
 
 
-def _ranking(one: Round) -> list[str]:
+def _ranking(step: Round) -> list[str]:
     from vinetrack.core.terminal import table
 
     rows = []
-    testable = [candidate for candidate in one.ranking if candidate.status != NOT_TESTABLE]
-    for candidate in testable[:SHOWN_CANDIDATES]:
+    testable = [candidate for candidate in step.ranking if candidate.status != NOT_TESTABLE]
+    for candidate in testable[:_SHOWN_CANDIDATES]:
         rows.append(
             (
                 ("* " if candidate.in_answer_set else "  ") + candidate.effect,
@@ -198,7 +198,7 @@ def _ranking(one: Round) -> list[str]:
             )
         )
     lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
-    blind = [candidate.effect for candidate in one.ranking if candidate.status == NOT_TESTABLE]
+    blind = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
     return lines + ([f"not testable here: {', '.join(blind)}"] if blind else [])
 
 
@@ -207,7 +207,7 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
 
     body = [
         (
-            str(row.added) or "as it came",
+            str(row.added) or "initial model",
             *(
                 f"{1e3 * value:.2f}" if math.isfinite(value) else "–"
                 for value in (row.rms_in_sample_m, row.rms_left_out_m, row.rms_highest_pressure_m, row.floor_m)
@@ -219,7 +219,13 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
 
 
 def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
-    """What an effect put in by hand did to errors and numbers, as lines of aligned tables."""
+    """Return how an effect added by hand changed errors and numbers, as lines of aligned tables.
+
+    Parameters
+    ----------
+    table : the ladder of errors, `before` and `after`.
+    numbers : one row a number and model: `symbol, vine, unit, added, value, sigma` (SI).
+    """
     from vinetrack.core.terminal import table as aligned
 
     gain = 2 * (after.log_likelihood - before.log_likelihood)
@@ -238,6 +244,6 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
         title = f"{row.symbol} ({row.vine})" if row.vine else row.symbol
         place = changed.setdefault((title, unit), {})
         place["after" if row.added else "before"] = f"{row.value * factor:.{digits}f} ± {row.sigma * factor:.{digits}f}"
-    body = [(title, one.get("before", "–"), one.get("after", "–"), unit) for (title, unit), one in changed.items()]
+    body = [(title, row.get("before", "–"), row.get("after", "–"), unit) for (title, unit), row in changed.items()]
     lines += aligned(body, ("", "before", "after", "unit"))
     return lines + [f"! {message}" for message in after.messages]

@@ -309,10 +309,10 @@ def _means(members: pd.DataFrame, along: str, low: float, high: float) -> dict[s
 def question(index: int, rounds: Sequence[Mapping[str, Any]]) -> str:
     """What a round asks, in words."""
     if index == 0:
-        return "What does the model you came with lack?"
+        return "Which effect is missing from the initial model?"
     first = set(rounds[0].get("model") or [])
     added = [name for name in rounds[index].get("model") or [] if name not in first]
-    return f"And with {listed(added)} added?"
+    return f"Which is missing with {listed(added)} added?"
 
 
 def ranking_table(one: Mapping[str, Any]) -> pd.DataFrame:

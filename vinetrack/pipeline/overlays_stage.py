@@ -229,7 +229,7 @@ def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Ed
     said = read_result(path)
     to_px = metres_to_px(track)
     added = added_effects(results)
-    names = {"model_before_m": "the model you came with", "model_after_m": f"with {added}" if added else ""}
+    names = {"model_before_m": "initial model", "model_after_m": f"with {added}" if added else ""}
     time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
     for column, name in names.items():
         known = said[["time_s", column]].dropna()

@@ -150,11 +150,11 @@ def _clip(results: Results, diagnosed: DiagnosisTables | None, trials: pd.DataFr
     worst = diagnosed.worst if diagnosed is not None else ""
     chosen = there[there["condition"] == worst] if (there["condition"] == worst).any() else there
     name = str(chosen["trial"].iloc[0])
-    where = " The condition is the one where the model fails most." if len(chosen) < len(there) else ""
+    where = " The condition is the one that the model predicts worst." if len(chosen) < len(there) else ""
     edges = "the tracked edge (yellow)"
     if diagnosed is not None:
-        edges += ", where the model that you came with has it (vermillion)"
-        edges += f", and where it is with {diagnosed.added} (blue)" if diagnosed.added else ""
+        edges += ", that of the initial model (vermillion)"
+        edges += f", and that with {diagnosed.added} (blue)" if diagnosed.added else ""
     caption = f"The recording, slowed down, with {edges}.{where}"
     path = results.overlay(name)
     return Clip(name, path.read_bytes(), caption, _poster(path))

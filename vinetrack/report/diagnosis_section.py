@@ -1,4 +1,4 @@
-"""The diagnosis as the report shows it: candidates, what could still hide, what is tied, the next trial, drift."""
+"""The section of the report on the diagnosis: candidates, upper limits, tied candidates, the next trial, drift."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class DiagnosisResult:
 
 
 def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
-    """Everything the page says of a diagnosis, as text; None where there is none."""
+    """Return the section on the diagnosis as text for the template; None where there is no diagnosis."""
     if result is None:
         return None
     content = result.content
@@ -63,7 +63,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "ladder": ladder_table(result.ladder),
         "where": [str(line) for line in content.get("where") or [] if str(line) not in drifting],
         "force": missing_force(content.get("missing_force")),
-        "rounds": [_round(i, one) for i, one in enumerate(rounds)],
+        "rounds": [_round(i, entry) for i, entry in enumerate(rounds)],
         "hidden": _hidden(content, result.units),
         "blind": _blind(rounds[0].get("ranking") or []) if rounds else [],
         "tied": tied_pairs(content.get("cosines") or {}),
@@ -76,7 +76,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
 
 
 def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
-    """The errors along the ladder, mm."""
+    """Return the errors of every model of `ladder.csv`, mm; None where there is no ladder."""
     if ladder is None or not len(ladder):
         return None
     keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
@@ -100,12 +100,12 @@ def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
 
 
 def _step(added: str) -> str:
-    return f"+ {listed(added.split('+'))}" if added else "as you came with it"
+    return f"+ {listed(added.split('+'))}" if added else "initial model"
 
 
-def _round(index: int, one: Mapping[str, Any]) -> dict[str, Any]:
-    ranking = [row for row in one.get("ranking") or [] if row.get("status") != NOT_TESTABLE]
-    head = ("Candidate", "kind", "Δχ²", "σ", "size", "how it is known", "")
+def _round(index: int, entry: Mapping[str, Any]) -> dict[str, Any]:
+    ranking = [row for row in entry.get("ranking") or [] if row.get("status") != NOT_TESTABLE]
+    head = ("Candidate", "kind", "Δχ²", "σ", "size", "status", "")
     rows = [
         (
             ("● " if row.get("in_answer_set") else "") + plain(row["effect"]),
@@ -121,20 +121,20 @@ def _round(index: int, one: Mapping[str, Any]) -> dict[str, Any]:
         for row in ranking
     ]
     return {
-        "title": f"Round {index + 1}: {round_question(one)}",
-        "verdict": str(one.get("verdict", "")),
-        "explanation": str(one.get("explanation") or ""),
+        "title": f"Round {index + 1}: {round_question(entry)}",
+        "verdict": str(entry.get("verdict", "")),
+        "explanation": str(entry.get("explanation") or ""),
         "table": ReportTable("", head, rows, frozenset({2, 3}), "● in the answer set") if rows else None,
     }
 
 
-def round_question(one: Mapping[str, Any]) -> str:
-    """What a round asks, in words."""
-    return f"what does {listed(list(one.get('model') or []))} lack?"
+def round_question(entry: Mapping[str, Any]) -> str:
+    """Return the question of a round."""
+    return f"which effect is missing from {listed(list(entry.get('model') or []))}?"
 
 
 def _hidden(content: Mapping[str, Any], units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
-    """What could still hide, which means something only where nothing more is missing."""
+    """Upper limits on undetected effects, where no effect is missing: only then they hold."""
     rounds = list(content.get("rounds") or [])
     return hidden_table(rounds[-1].get("ranking") or [], units) if content.get("final_verdict") == "adequate" else None
 
@@ -142,7 +142,7 @@ def _hidden(content: Mapping[str, Any], units: Mapping[str, tuple[str, str]]) ->
 def hidden_table(
     ranking: Sequence[Mapping[str, Any]], units: Mapping[str, tuple[str, str]] | None = None
 ) -> ReportTable | None:
-    """For every candidate the largest size that could still hide, one-sided 95 %."""
+    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None where there are none."""
     rows = []
     for row in ranking:
         of = {str(n["parameter"]).split(".")[-1]: (str(n["symbol"]), str(n["unit"])) for n in row.get("numbers") or []}
@@ -155,12 +155,14 @@ def hidden_table(
             rows.append((plain(row["effect"]), symbol, f"{number(factor * float(largest))} {shown}".strip()))
     if not rows:
         return None
-    note = "A larger effect than this would have been seen (one-sided 95 %)."
-    return ReportTable("What could still hide", ("Candidate", "number", "largest size"), rows, frozenset({2}), note)
+    note = "A larger effect would have been detected (one-sided 95 %)."
+    return ReportTable(
+        "Upper limits on undetected effects", ("Candidate", "number", "upper limit"), rows, frozenset({2}), note
+    )
 
 
 def _blind(ranking: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Candidates that these conditions could not show, each with the reason."""
+    """Candidates without an observable effect under these conditions, each with the reason."""
     return [
         f"{plain(row['effect'])}: {row.get('reason') or 'no reason is given'}"
         for row in ranking
@@ -169,7 +171,7 @@ def _blind(ranking: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def tied_pairs(cosines: Mapping[str, Any]) -> list[str]:
-    """Pairs of candidates whose traces are nearly the same, most alike first."""
+    """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first."""
     names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
     pairs = [
         (abs(float(matrix[i][j])), names[i], names[j], float(matrix[i][j]))
@@ -181,7 +183,7 @@ def tied_pairs(cosines: Mapping[str, Any]) -> list[str]:
 
 
 def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """What to do next: a sentence, the trials to make, and what they are expected to tell."""
+    """Return the next experiment for the template: text, trials, and the expected significances; None for none."""
     if not content:
         return None
     trials = [dict(trial) for trial in content.get("trials") or []]
@@ -200,7 +202,7 @@ def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         )
         for pair, sigma in (content.get("separation_sigma") or {}).items()
     ]
-    told = ReportTable("", ("These would tell", "by (σ)", "in simulation (σ)"), separations, frozenset({1, 2}))
+    told = ReportTable("", ("They separate", "by (σ)", "in simulation (σ)"), separations, frozenset({1, 2}))
     return {
         "text": str(content.get("text") or ""),
         "trials": ReportTable("", head, rows, frozenset(range(len(head)))) if rows and head else None,
@@ -216,7 +218,7 @@ def _simulated(entry: Mapping[str, Any]) -> str:
 
 
 def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """What is said of the force that is missing, and the simple laws it was held against."""
+    """Return the missing force for the template: a sentence, and simple laws compared with it; None for none."""
     if not content:
         return None
     rows = [
@@ -227,13 +229,13 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         )
         for law in content.get("laws") or []
     ]
-    head = ("Simple law", "of what is missing it explains", "size (N)")
+    head = ("Simple law", "explains of the missing force", "size (N)")
     table = ReportTable("Which simple law it looks like", head, rows, frozenset({1, 2})) if rows else None
     return {"sentence": str(content.get("sentence") or content.get("text") or ""), "laws": table}
 
 
 def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
-    """How every number moved as effects were added: a row a number, a column a model."""
+    """Return how fitted numbers changed as effects were added: a row a number, a column a model; None without any."""
     if moved is None or not len(moved):
         return None
     steps = list(dict.fromkeys(moved["added"].fillna("").astype(str)))
@@ -246,11 +248,11 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
         titles[key] = left
         cells.setdefault(key, {})[str(entry["added"])] = right
     rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]
-    return ReportTable("How the numbers moved", head, rows, frozenset(range(1, len(head))))
+    return ReportTable("Fitted numbers under every model", head, rows, frozenset(range(1, len(head))))
 
 
 def law_table(laws: pd.DataFrame | None) -> ReportTable | None:
-    """The damping law from steady speeds, with the pressure along the way that each model gives."""
+    """Return the damping law from steady speeds with the pressure at the vine that each model gives; None without."""
     if laws is None or not len(laws):
         return None
     chosen = laws[laws["method"] == PREFERRED] if (laws["method"] == PREFERRED).any() else laws
@@ -263,6 +265,6 @@ def law_table(laws: pd.DataFrame | None) -> ReportTable | None:
         rows.append((*row, number(entry["B"], 4), interval(bounds["B"]), f"{entry['n_trials']:.0f}"))
     head = ("Model", "Vine", "n", "95 %", "B, N·(s/m)ⁿ", "95 %", "Trials")
     note = (
-        "From steady speeds, as in the section on the damping law, with the pressure that each model has along the way."
+        "From steady speeds, as in the section on the damping law, with the pressure at the vine that each model gives."
     )
     return ReportTable("The damping law under every model", head, rows, frozenset(range(2, len(head))), note)

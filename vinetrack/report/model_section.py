@@ -1,4 +1,4 @@
-"""The model in use against the measurement, as the report shows it."""
+"""The section of the report that compares the model in use with the measurement."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vinetrack.figures.style import rows
 if TYPE_CHECKING:
     import pandas as pd
 
-EXPLAINED = (
-    "The model in use is fitted to the positions of all trials at once. Each trial is then predicted with a release "
-    "and an origin of its own, at the nominal pressure and the vine's B: what is left is the error of position. A "
-    "model that lacks nothing errs by what replicates differ by: a ratio near 1 leaves nothing to find, and with few "
-    "replicates it falls below 1 as easily by chance. Final speeds of the leading edge are compared at the same growth."
+_EXPLAINED = (
+    "The model in use is fitted to the positions of all trials at once. Each trial is then predicted with its own "
+    "release and origin, at the nominal pressure and the vine's B: the difference is the error of position. The error "
+    "of a complete model equals the replicate scatter: a ratio near 1 leaves nothing to explain, and with few "
+    "replicates it may fall below 1 by chance. Final speeds of the leading edge are compared at the same growth."
 )
 
 
@@ -32,14 +32,14 @@ class ModelResult:
 
 
 def model_section(result: ModelResult | None) -> dict[str, Any] | None:
-    """Everything the page says of the model, as text; None where no model was fitted or refused."""
+    """Return the section on the model in use as text for the template; None where no model was fitted or refused."""
     if result is None:
         return None
     fit = result.fit
     return {
         "names": " + ".join(fit["model"]),
         "refused": fit.get("refused") or "",
-        "explained": EXPLAINED,
+        "explained": _EXPLAINED,
         "verdict": verdict(result.comparison),
         "numbers": [_number(entry) for entry in fit.get("numbers", [])],
         "spreads": [_spread(name, spread) for name, spread in (fit.get("spreads") or {}).items()],
@@ -52,7 +52,12 @@ def model_section(result: ModelResult | None) -> dict[str, Any] | None:
 
 
 def verdict(comparison: pd.DataFrame) -> str:
-    """How far the model is off, in a sentence; blank without a condition."""
+    """Return the position error of the model in two sentences; blank without a condition.
+
+    Parameters
+    ----------
+    comparison : as in `comparison.csv`.
+    """
     if not len(comparison):
         return ""
     worst = comparison.sort_values("rms_position_m").iloc[-1]
@@ -61,7 +66,7 @@ def verdict(comparison: pd.DataFrame) -> str:
     )
     known = comparison[comparison["replicate_floor_m"] > 0]
     if len(known):
-        sentence += f", where replicates differ by {number(1e3 * _rms(known['replicate_floor_m']))} mm"
+        sentence += f", and replicates scatter by {number(1e3 * _rms(known['replicate_floor_m']))} mm"
     return (
         f"{sentence} (root mean square). Worst is {worst['condition']}, by {number(1e3 * worst['rms_position_m'])} mm, "
         f"most of all after {number(1e3 * worst['worst_at_m'])} mm of growth."
