@@ -24,11 +24,6 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
 
-SENTENCES = frozenset(
-    {"ResultsError", "EffectError", "TableError", "FitError", "SimulationError", "ChoiceError", "PageError"}
-)
-"""Errors that say themselves what is wrong and what to do; by name, so that nothing is loaded to know them."""
-
 app = typer.Typer(
     name="vinetrack",
     help="From recordings of everting vine robots to the physics that a model of them lacks.",
@@ -85,6 +80,16 @@ def check(experiment: ExperimentPath) -> None:
             raise typer.Exit(1)
         if not problems:
             typer.echo(f"{experiment}: nothing to mend.")
+
+
+@app.command()
+def settings() -> None:
+    """Every column of the sheet and every key of the settings, with unit, default, bounds and meaning."""
+    with _sentences(None):
+        from vinetrack.experiment.reference import reference_lines
+
+        for line in reference_lines():
+            typer.echo(line)
 
 
 @app.command()
@@ -314,7 +319,7 @@ def _run_settings(text: str) -> RunSettings:
 @contextmanager
 def _sentences(log: Path | None) -> Iterator[None]:
     """Turn every failure into sentences and exit status 1; tracebacks go to the log."""
-    from vinetrack.core.problems import ExperimentError, format_problems
+    from vinetrack.core.problems import ExperimentError, UserError, format_problems
 
     _log_to(log)
     try:
@@ -331,7 +336,7 @@ def _sentences(log: Path | None) -> Iterator[None]:
         raise typer.Exit(1) from None
     except Exception as error:
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
-        if type(error).__name__ in SENTENCES:
+        if isinstance(error, UserError):
             _stop(str(error))
         place = f"; the traceback is in {log}" if log else "; run it with --log FILE to have the traceback"
         _stop(f"A fault of the program, not of your data ({type(error).__name__}: {error}){place}.")

@@ -50,7 +50,14 @@ class Problem:
         return _one_line(": ".join(part for part in (self.severity, where, self.reason) if part))
 
 
-class ExperimentError(Exception):
+class UserError(Exception):
+    """Something that a person can put right: the message says what is wrong and what to do, without a traceback.
+
+    Errors that reach the terminal as their own sentence derive from it; any other is a fault of the program.
+    """
+
+
+class ExperimentError(UserError):
     """An experiment that cannot be read; `problems` holds everything that was found, errors first."""
 
     def __init__(self, problems: Iterable[Problem]) -> None:

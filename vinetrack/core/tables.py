@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import UserError
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -36,7 +38,7 @@ _PLAIN_COLUMN = re.compile(r"[0-9eE+.\n-]*")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*", re.ASCII)
 
 
-class TableError(Exception):
+class TableError(UserError):
     """A file that cannot be read as a table, or a cell that is no number: one sentence, with a remedy."""
 
 

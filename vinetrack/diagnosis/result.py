@@ -64,12 +64,12 @@ class Candidate:
             "status": self.status,
             "delta_chi2": self.delta_chi2,
             "sigma": self.sigma,
-            "numbers": [number_entry(number) for number in self.numbers],
+            "numbers": [number.to_json() for number in self.numbers],
             "plausible": self.plausible,
             "in_answer_set": self.in_answer_set,
             "reason": self.reason,
             "largest": dict(self.largest),
-            "along": [number_entry(number) for number in self.along],
+            "along": [number.to_json() for number in self.along],
         }
 
 
@@ -155,7 +155,7 @@ class Diagnosis:
             "explanation": self.explanation,
             "final_verdict": self.final_verdict,
             "rounds": [one.to_json() for one in self.rounds],
-            "parameters": [number_entry(number) for number in self.fit.numbers] if self.fits else [],
+            "parameters": [number.to_json() for number in self.fit.numbers] if self.fits else [],
             "cosines": self.rounds[0].to_json()["cosines"],
             "where": list(self.where),
             "drift": [dict(row) for row in self.drift],
@@ -168,19 +168,3 @@ class Diagnosis:
         from vinetrack.narrative.verdict_text import diagnosis_text
 
         return diagnosis_text(self)
-
-
-def number_entry(number: Number) -> dict[str, Any]:
-    """A fitted number as files hold it, SI."""
-    return {
-        "parameter": number.key,
-        "vine": number.vine,
-        "symbol": number.symbol,
-        "unit": number.unit,
-        "value": number.value,
-        "sigma": number.sigma,
-        "low_95": number.low,
-        "high_95": number.high,
-        "interval": number.method,
-        "bound": number.bound,
-    }

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, asked, effects_on, hosted
@@ -62,7 +63,7 @@ class Trajectory:
         return self.travel_ratio * self.lead_velocity_m_s
 
 
-class SimulationError(RuntimeError):
+class SimulationError(UserError, RuntimeError):
     """A trajectory could not be followed; the message names the trial."""
 
 

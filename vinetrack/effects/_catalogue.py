@@ -13,13 +13,14 @@ from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 
+from vinetrack.core.problems import UserError
 from vinetrack.effects._base import HOOKS, KINDS, Effect, Parameter, Worked
 
 BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
 """The four effects that make the equation of motion of the paper, Eq. (2)."""
 
 
-class EffectError(ValueError):
+class EffectError(UserError, ValueError):
     """A file that should be an effect is not one, or a name is not in the catalogue; the message says what to mend."""
 
 

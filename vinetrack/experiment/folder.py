@@ -26,6 +26,7 @@ from vinetrack.experiment.sheet import (
     SHEET,
     Row,
     find_missing,
+    in_sheet_units,
     judge_pressures,
     judge_row,
     make_trial,
@@ -167,7 +168,8 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
     except TableError as error:
         problems.append(_from_table_error(error, SHEET))
         return None
-    problems += _judge_columns(table)
+    table, converted = in_sheet_units(table, SHEET)
+    problems += [*converted, *_judge_columns(table)]
     return table
 
 

@@ -17,7 +17,16 @@ from vinetrack.core.tables import Table, TableError, read_table
 from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.schema import COLUMNS, SHARED, option
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
-from vinetrack.experiment.sheet import SHEET, Row, judge_pressures, judge_wall, make_trial, read_row, unknown_columns
+from vinetrack.experiment.sheet import (
+    SHEET,
+    Row,
+    in_sheet_units,
+    judge_pressures,
+    judge_wall,
+    make_trial,
+    read_row,
+    unknown_columns,
+)
 
 NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
 """What must be known of a vine before anything can be said of it; its yield pressure can be guessed."""
@@ -79,10 +88,11 @@ def planned_sheet(path: Path) -> Planned:
     except TableError as error:
         message, _, remedy = str(error).partition(": ")
         raise ExperimentError([Problem(message=message, file=file.name, remedy=remedy)]) from None
+    table, converted = in_sheet_units(table, file.name)
     settings = read_experiment_settings(file.parent / "experiment.yaml")
     if not table.rows:
         raise ExperimentError([Problem(message="has no rows", file=file.name, remedy="write one row a trial")])
-    header = _judge_header(table, settings, file.name)
+    header = [*converted, *_judge_header(table, settings, file.name)]
     return _assembled(table, settings, file.parent, NEEDED, lambda problem: replace(problem, file=file.name), header)
 
 

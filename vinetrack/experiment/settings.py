@@ -136,9 +136,14 @@ class Limits(_LimitedColumns):
     vine can be made for them, `hoop_stress_MPa` what the film is trusted to hold.
     """
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     trials: Annotated[Count, Field(ge=1, le=24)] = 4
+    """How many further trials can be afforded."""
     new_vines: bool = True
+    """Whether a vine can be made for them."""
     hoop_stress_MPa: Positive = 7.8
+    """Hoop stress that the film is trusted to hold."""
 
     @field_validator(*LIMITED["range"], mode="before")
     @classmethod
@@ -218,20 +223,33 @@ class ExperimentSettings(_SharedColumns):
     Every column but `trial`, `video` and `track` may stand here; a cell of the sheet overrides it.
     """
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     ambient_pressure_kPa: Annotated[Number, Field(gt=0, le=1000)] = 101.325
+    """Absolute pressure of the air around: enters the gas of chambers."""
     tail_slack: Literal["taut", "free"] = "taut"
+    """Whether a tail that the model would have to push goes slack (free) or stays taut."""
     tail_store: Literal["body", "reel"] = "body"
+    """Where the tail is kept: in the body of the vine, or on a reel."""
     mass_loss: Literal["geometric", "as_printed"] = "geometric"
+    """How the moving mass shrinks: by the geometry of eversion, or as the paper prints it."""
     position_systematic_mm: Annotated[Number, Field(ge=0, le=100)] | None = None
     """Standard deviation of smooth errors of position that all trials share, such as a lens makes; by default 0.1 for
     positions from elsewhere and for calibrations by two points or a scale, 0 for those by a target."""
     model: tuple[str, ...] = BASE_EFFECTS
+    """Effects of the model in use."""
     candidates: tuple[str, ...] | None = None
+    """Effects that a diagnosis may propose; blank for the whole catalogue."""
     effects: tuple[str, ...] = ()
+    """Paths of Python files with effects of one's own."""
     strict: bool = False
+    """Whether a fault of one trial stops all."""
     axis: Axis | None = None
+    """The growth axis in the picture, from_px, to_px and width_mm; found from the motion where blank."""
     calibration: Calibration | None = None
+    """kind: charuco, checkerboard, two_points or mm_per_px, with the keys of that kind."""
     limits: Limits = Limits()
+    """What further trials may look like; see below."""
     published: Literal["simulated", "measured"] | None = None
     """Set the paper's numbers beside ours, whose trials were grown from its parameters, or filmed."""
 
@@ -257,32 +275,51 @@ class ExperimentSettings(_SharedColumns):
 class SteadySettings(_Strict):
     """When a stretch of motion counts as steady; see `vinetrack.kinematics.steady`."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     drift_limit: Annotated[Number, Field(gt=0, le=1)] = 0.03
+    """Largest relative drift of speed across a steady window, with its 95 % interval."""
     start_fraction: Annotated[Number, Field(ge=0, lt=1)] = 0.2
+    """A window may begin once the speed exceeds this fraction of the largest of its trial,"""
     start_sigmas: Annotated[Number, Field(ge=0)] = 5.0
+    """and this many standard errors of the speed."""
     paper_cv: Annotated[Number, Field(gt=0, le=1)] = 0.03
+    """The paper's rule: largest coefficient of variation of speed,"""
     paper_points: Annotated[Count, Field(ge=3)] = 3
+    """over at least so many consecutive points."""
 
 
 class VelocitySettings(_Strict):
     """How positions become velocities; see `vinetrack.kinematics.velocity`."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     kappa: Positive = 3.0
+    """Smoothing windows must agree within this many standard errors."""
     order: Annotated[Count, Field(ge=1, le=5)] = 3
+    """Degree of the local polynomial."""
 
 
 class DampingSettings(_Strict):
     """How the damping law and its intervals are computed; see `vinetrack.kinematics.damping`."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     resamples: Annotated[Count, Field(ge=100)] = 2000
+    """Resamplings of whole trials behind each 95 % interval."""
     seed: Annotated[Count, Field(ge=0)] = 1
+    """Seed of the resampling."""
 
 
 class FigureSettings(_Strict):
     """Files that every figure is saved as."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     formats: tuple[Literal["png", "svg", "pdf"], ...] = ("png", "svg")
+    """Formats of every figure."""
     dpi: Annotated[Count, Field(ge=50, le=1200)] = 150
+    """Resolution of png files, dots per inch."""
 
     @field_validator("formats")
     @classmethod
@@ -295,23 +332,39 @@ class FigureSettings(_Strict):
 class OverlaySettings(_Strict):
     """Clips of the recordings with the tracked edge and the models' edges; see `vinetrack.figures.overlay`."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     of: Literal["one_per_condition", "all", "none"] = "one_per_condition"
+    """Which recordings get a clip."""
     seconds: Positive = 6.0
+    """About how long a clip plays, in seconds."""
     width_px: Annotated[Count, Field(ge=320, le=3840)] = 960
+    """Width of the picture, in pixels."""
 
 
 class RunSettings(_Strict):
     """Everything in `config/config.yaml`; any key may be overridden by `--config key=value`."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     experiment: str = "data/demo"
+    """The experiment's folder."""
     results: str | None = None
+    """Where results go; blank for results/<name of the experiment>."""
     steady: SteadySettings = SteadySettings()
+    """When a stretch of motion counts as steady; see below."""
     velocity: VelocitySettings = VelocitySettings()
+    """How positions become velocities."""
     damping: DampingSettings = DampingSettings()
+    """The damping law."""
     final_at_fraction: Annotated[Number, Field(gt=0, le=1)] = 0.95
+    """Fraction of the length at which final speeds are taken."""
     efficiency_at_mm: Positive = 150.0
+    """Growth at which the energy efficiency is taken, in mm."""
     figures: FigureSettings = FigureSettings()
+    """Files of the figures."""
     overlays: OverlaySettings = OverlaySettings()
+    """Clips of the recordings."""
 
 
 def read_experiment_settings(path: Path) -> ExperimentSettings:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.effects import BASE_EFFECTS, Effect, Parameter
@@ -14,7 +15,7 @@ from vinetrack.explorer.curves import Sized, yields_of
 from vinetrack.inference.parameters import DAMPING
 
 
-class ChoiceError(ValueError):
+class ChoiceError(UserError, ValueError):
     """Something was chosen that there is not; one sentence with a remedy."""
 
 

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vinetrack.core.problems import UserError
+
 if TYPE_CHECKING:
     from vinetrack.explorer.campaign import Campaign
     from vinetrack.explorer.choice import Choice
 
 
-class PageError(RuntimeError):
+class PageError(UserError, RuntimeError):
     """The page cannot be served; one sentence with a remedy."""
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
 from vinetrack.inference.gauge_noise import noise_of, without_noise
 from vinetrack.tracks.position_noise import position_noise, rest_points, rough_noise
@@ -55,7 +56,7 @@ error carries a ninth of the information; it is left out because a single noise 
 points go, at twice blurred ones stay."""
 
 
-class FitError(ValueError):
+class FitError(UserError, ValueError):
     """A fit cannot be made; the message is one sentence with a remedy."""
 
 

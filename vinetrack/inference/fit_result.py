@@ -52,6 +52,21 @@ class Number:
         """Symbol, and the vine where it has one of its own."""
         return f"{self.symbol} ({self.vine})" if self.vine else self.symbol
 
+    def to_json(self) -> dict[str, Any]:
+        """As `fit.json` and `diagnosis.json` hold it, SI."""
+        return {
+            "parameter": self.key,
+            "vine": self.vine,
+            "symbol": self.symbol,
+            "unit": self.unit,
+            "value": self.value,
+            "sigma": self.sigma,
+            "low_95": self.low,
+            "high_95": self.high,
+            "interval": self.method,
+            "bound": self.bound,
+        }
+
 
 @dataclass(frozen=True)
 class BetweenTrialSpread:

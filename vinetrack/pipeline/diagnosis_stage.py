@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.tables import write_csv, write_json
-from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured
+from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
 from vinetrack.results.folder_layout import Results, empty_table, read_json, read_result
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
-FORESEEN = ("FitError", "EffectError", "SimulationError")
 PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
@@ -75,7 +74,7 @@ def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report 
 
 def _reason(error: Exception) -> str:
     """Why there is no verdict, in a sentence; the traceback of what nobody foresaw goes to the log."""
-    if type(error).__name__ in FORESEEN:
+    if isinstance(error, model_errors()):
         return str(error)
     log.exception("no diagnosis could be made")
     return INTERNAL_FAULT

@@ -179,9 +179,18 @@ def _audited(
     return audit(found.model, motions)
 
 
+def model_errors() -> tuple[type[Exception], ...]:
+    """Errors of a model that cannot be fitted to these trials, each a sentence for a person."""
+    from vinetrack.dynamics.simulate import SimulationError
+    from vinetrack.effects import EffectError
+    from vinetrack.inference.fit_data import FitError
+
+    return FitError, EffectError, SimulationError
+
+
 def _reason(error: Exception) -> str:
     """Why there is no fit, in a sentence; the traceback of what nobody foresaw goes to the log."""
-    if type(error).__name__ in ("FitError", "EffectError", "SimulationError"):
+    if isinstance(error, model_errors()):
         return str(error)
     log.exception("the model could not be fitted")
     return INTERNAL_FAULT
@@ -191,21 +200,7 @@ def fit_entry(found: Fit, warnings: tuple[str, ...], check_message: str = "") ->
     """A fit as `fit.json` holds it: SI units, numbers in the order of `covariance`; deviations are relative."""
     return {
         "model": list(found.model.names),
-        "numbers": [
-            {
-                "parameter": number.key,
-                "vine": number.vine,
-                "symbol": number.symbol,
-                "unit": number.unit,
-                "value": number.value,
-                "sigma": number.sigma,
-                "low_95": number.low,
-                "high_95": number.high,
-                "interval": number.method,
-                "bound": number.bound,
-            }
-            for number in found.numbers
-        ],
+        "numbers": [number.to_json() for number in found.numbers],
         "covariance": found.covariance,
         "spreads": {
             name: {"value": spread.value, "estimated": spread.estimated} for name, spread in found.spreads.items()

@@ -128,22 +128,9 @@ def _stretch(number: Mapping[str, Any], log: bool) -> float:
 
 def numbers_of(found: Fit) -> FitNumbers:
     """Numbers of a fit as `vinetrack.fit` returns it."""
-    numbers = [
-        {
-            "parameter": number.key,
-            "vine": number.vine,
-            "symbol": number.symbol,
-            "value": number.value,
-            "sigma": number.sigma,
-            "low_95": number.low,
-            "high_95": number.high,
-            "interval": number.method,
-        }
-        for number in found.numbers
-    ]
     content = {
         "model": found.model.names,
-        "numbers": numbers,
+        "numbers": [number.to_json() for number in found.numbers],
         "covariance": found.covariance,
         "spreads": {
             name: {"value": spread.value, "estimated": spread.estimated} for name, spread in found.spreads.items()

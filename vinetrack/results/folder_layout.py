@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.core.problems import UserError
 from vinetrack.core.tables import result_file
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ COUNT_COLUMNS = frozenset({"n_frames", "points"})
 TRUTH_COLUMNS = frozenset({"accepted", "eligible", "used", "significant", "relative"})
 
 
-class ResultsError(Exception):
+class ResultsError(UserError):
     """A results folder that is not one, or lacks what a stage needs: one sentence with a remedy."""
 
 

@@ -1,0 +1,137 @@
+"""Every column of `trials.csv` and every key of `experiment.yaml` and `config/config.yaml`, as tables for reading.
+
+Made from the declarations that also read them, so that it cannot differ from what is allowed.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from vinetrack.core.terminal import table
+from vinetrack.core.units import UNITS, split_unit
+from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
+from vinetrack.experiment.settings import ExperimentSettings, RunSettings
+
+_BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+
+_KIND_ALLOWED = {
+    "text": "letters, digits, _ and -",
+    "path": "a path inside the folder",
+    "bends": "start_mm:arc_mm:radius_mm;…",
+    "window": "from_s:to_s",
+    "yes_no": "yes, no",
+    "choice": "1, 2",
+}
+"""What a column may hold that is no number within bounds."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A column or key: its unit, default and what is allowed, blank where there is none, and what it means."""
+
+    name: str
+    unit: str
+    default: str
+    allowed: str
+    meaning: str
+
+
+def column_entries() -> list[Entry]:
+    """Every column of a trial sheet, in the order of the documentation."""
+    return [
+        Entry(
+            name=column.name,
+            unit=column.unit,
+            default=column.default,
+            allowed=_KIND_ALLOWED.get(column.kind) or column.allowed.removesuffix(column.unit).rstrip(),
+            meaning=f"{column.meaning} {column.measured}".rstrip(),
+        )
+        for column in COLUMNS.values()
+    ]
+
+
+def setting_entries(model: type[BaseModel], prefix: str = "") -> Iterator[Entry]:
+    """Every key of a settings model that is no column of the sheet; those of a group as `group.key`."""
+    columns = SHARED if model is ExperimentSettings else ()
+    for name, field in model.model_fields.items():
+        if name in columns:
+            continue
+        limited = next((kind for kind, names in LIMITED.items() if prefix == "limits." and name in names), "")
+        if limited:
+            words = "Range to choose from." if limited == "range" else "Values to choose from."
+            unit = COLUMNS[name].unit
+            allowed = COLUMNS[name].allowed.removesuffix(unit).rstrip()
+            yield Entry(prefix + name, unit, "as in the trials so far", allowed, words)
+            continue
+        key = split_unit(name)[1]
+        yield Entry(
+            prefix + name,
+            UNITS[key].text if key else "",
+            _default(field),
+            _allowed(field),
+            " ".join((field.description or "").split()),
+        )
+        if isinstance(field.default, BaseModel):
+            yield from setting_entries(type(field.default), f"{name}.")
+
+
+def reference_lines() -> list[str]:
+    """Columns and keys, a line each, aligned; for the terminal."""
+    head = ("name", "unit", "default", "allowed", "meaning")
+    one_each = ", ".join(name for name, column in COLUMNS.items() if not column.shared)
+    groups = (
+        (f"Columns of trials.csv; all but {one_each} may stand in experiment.yaml for all", column_entries()),
+        ("Keys of experiment.yaml", list(setting_entries(ExperimentSettings))),
+        ("Keys of config/config.yaml, also --config key=value of snakemake", list(setting_entries(RunSettings))),
+    )
+    lines: list[str] = []
+    for title, entries in groups:
+        rows = [(entry.name, entry.unit, entry.default, entry.allowed, entry.meaning) for entry in entries]
+        lines += ["", title, *table(rows, head, indent="  ", align="<<<<<")]
+    lines += [
+        "",
+        "A column may be in another unit by its name (pressure_psi, pressure_bar, diameter_in, …): it is converted.",
+    ]
+    return lines[1:]
+
+
+def _default(field: FieldInfo) -> str:
+    value = field.default
+    if value is None or isinstance(value, BaseModel):
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _allowed(field: FieldInfo) -> str:
+    """Choices or bounds of a key, from its annotation."""
+    choices = [str(choice) for part in _parts(field.annotation) for choice in _literals(part)]
+    if choices:
+        return ", ".join(dict.fromkeys(choices))
+    bounds = [(name, getattr(rule, name)) for rule in _rules(field) for name in _BOUNDS if hasattr(rule, name)]
+    return ", ".join(f"{_BOUNDS[name]} {value:g}" for name, value in bounds)
+
+
+def _rules(field: FieldInfo) -> list[Any]:
+    """Bounds of a key, those of an annotated part of a union too."""
+    rules = list(field.metadata)
+    for part in _parts(field.annotation):
+        for rule in getattr(part, "__metadata__", ()):
+            rules += rule.metadata if isinstance(rule, FieldInfo) else [rule]
+    return rules
+
+
+def _parts(annotation: Any) -> tuple[Any, ...]:
+    several = get_origin(annotation) in (types.UnionType, Union, tuple)
+    return get_args(annotation) if several else (annotation,)
+
+
+def _literals(annotation: Any) -> tuple[Any, ...]:
+    return get_args(annotation) if get_origin(annotation) is Literal else ()
