@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lsoda_vine import B_TRUE, N_TRUE, small_campaign
+from lsoda_vine import B_TRUE, N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
+from vinetrack.core.constants import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.core.records import Track, Trial
 from vinetrack.inference.intervals import precision
 from vinetrack.inference.robust_covariance import robust_covariance
@@ -75,3 +76,33 @@ def test_trials_that_scatter_as_the_model_says_have_the_errors_of_the_model() ->
         plain, robust = robust_covariance(found.predictor, found.solution)
         ratios.append(np.sqrt(np.diag(robust) / np.diag(plain)))
     assert np.median(ratios) == pytest.approx(1.0, abs=0.2)
+
+
+def dropped(name: str, seed: int, drag: float) -> tuple[Trial, Track]:
+    """A ball of 100 mm and 20 g that falls in air, y = (v²/g) ln cosh(g t/v), filmed with 2 mm of noise."""
+    trial = Trial(name=name, diameter_m=0.1, pressure_Pa=0.0, yield_pressure_Pa=0.0, payload_kg=20e-3, travel_ratio=1.0)
+    terminal_m_s = float(np.sqrt(2 * 20e-3 * GRAVITY_M_S2 / (AIR_DENSITY_KG_M3 * trial.area_m2 * drag)))
+    time_s = np.arange(100) / 120
+    fallen_m = terminal_m_s**2 / GRAVITY_M_S2 * np.log(np.cosh(GRAVITY_M_S2 * time_s / terminal_m_s))
+    return trial, as_track(time_s, fallen_m + np.random.default_rng(seed).normal(0, 2e-3, time_s.size))
+
+
+def test_two_drops_that_disagree_have_an_error_that_says_so() -> None:
+    """0.574 and 0.459, each known to 0.006: half their difference is the error of their mean, with one degree."""
+    drops = [dropped("a", 20200, 0.574), dropped("b", 20201, 0.459)]
+    both = vt.fit(vt.make_model(["gravity", "air_drag"]), drops)["C_D"]
+    assert both.sigma == pytest.approx(0.0575, rel=0.2)
+    assert both.dof == pytest.approx(1.0, abs=0.1)
+    assert both.low < 0.459
+    assert both.high > 0.574
+
+
+def test_intervals_of_few_drops_hold_the_drag_about_which_they_scatter() -> None:
+    held = []
+    for campaign in range(40):
+        draw = np.random.default_rng([20300, campaign])
+        count = 3 + campaign % 4
+        drops = [dropped(f"t{i}", 20300 + 10 * campaign + i, 0.5 + 0.05 * draw.standard_normal()) for i in range(count)]
+        drag = vt.fit(vt.make_model(["gravity", "air_drag"]), drops, profile=False)["C_D"]
+        held.append(drag.low < 0.5 < drag.high)
+    assert sum(held) >= 34  # of 40 at 95 %, fewer once in 600

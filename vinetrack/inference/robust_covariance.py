@@ -65,7 +65,7 @@ def widened_covariance(
         ratio[live] = np.sqrt(np.maximum(np.diag(robust)[live] / diagonal[live], 1.0))
         few = np.full(diagonal.size, float(spare))
     else:
-        variance, few = _few_trials(solution, plain)
+        variance, few = _few_trials(wide or solution, plain)
         ratio[live] = np.sqrt(np.maximum(variance[live] / diagonal[live], 1.0))
     degrees = np.where(ratio > 1, np.minimum(known.degrees, few), known.degrees)
     covariance = np.where(np.isfinite(known.covariance), known.covariance, 0.0) * ratio[:, None] * ratio + shared
