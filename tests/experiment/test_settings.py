@@ -59,7 +59,8 @@ def test_every_column_may_be_shared(tmp_path: Path) -> None:
         "capture_fps: 1069\nexposure_us: 100\ndiameter_mm: 24\nthickness_um: 200\nlength_mm: 280\npressure_kPa: 28\n"
         "pressure_sigma_kPa: 0.3\nyield_pressure_kPa: 3\nyield_pressure_sigma_kPa: 0.1\npressure_trace: p.csv\n"
         "payload_g: 35.6\ngrowth_angle_deg: 90\nchamber_l: 3.7\ninlet_mm: 6\nbends: 100:30:20;150:30:20\n"
-        "film_density_kg_m3: 1180\nmm_per_px: 0.37\ntravel_ratio: 1\nsteady: 0.05:0.2\nuse: no\n",
+        "film_density_kg_m3: 1180\nmm_per_px: 0.37\ntravel_ratio: 1\nsteady: 0.05:0.2\nuse: no\n"
+        "specimen: a\nday: 1\n",
     )
     assert {name for name in SHARED if getattr(settings, name) is None} == set()
     assert settings.bends == (Bend(0.1, 0.03, 0.02), Bend(0.15, 0.03, 0.02))
@@ -68,7 +69,7 @@ def test_every_column_may_be_shared(tmp_path: Path) -> None:
 
 
 def test_settings_cover_exactly_the_columns_of_the_sheet() -> None:
-    assert set(SHARED) == set(COLUMNS) - {"trial", "video", "track"}
+    assert set(SHARED) == set(COLUMNS) - {"trial", "video", "track", "order"}
     assert set(SHARED) <= set(ExperimentSettings.model_fields)
 
 

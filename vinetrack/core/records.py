@@ -45,7 +45,8 @@ class Trial:
     """One row of the trial sheet, shared settings filled in, in SI units; NaN where the sheet is blank.
 
     `vine` names the trials of one diameter, thickness and length; `condition` the replicates: trials whose
-    nominal settings are all the same.
+    nominal settings are all the same. `specimen` is which tube of that vine it was, `day` the day or batch, blank
+    where unknown; `order` the place of the trial among those made, counted from 1, NaN where unknown.
     """
 
     name: str
@@ -78,6 +79,9 @@ class Trial:
     tail_slack: str = "taut"
     tail_store: str = "body"
     position_systematic_m: float = math.nan  #: sd of smooth errors of position that no scatter shows; NaN: the default
+    specimen: str = ""
+    day: str = ""
+    order: float = math.nan
 
     @property
     def area_m2(self) -> float:

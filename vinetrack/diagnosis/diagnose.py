@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.core.records import Track, Trial
+from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import candidates_of, host_for, testable
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
+    BETWEEN_TRIALS,
     DROPPED_FRAMES,
     NOT_TESTABLE,
     REFITTED,
@@ -222,7 +224,7 @@ def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
         cosine_names=names,
         cosines=cosines,
         fit=questions.found,
-        fits={one.names[-1]: one.fit for one in finding.kept},
+        fits={one.names[-1]: one.fit for one in finding.kept if one.effects[-1].kind != BETWEEN_TRIALS},
     )
 
 
@@ -278,6 +280,7 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     largest={} if questions.lost else largest,
                 )
             )
+    rows += between_candidates(finding.tried, finding.answer, aside)
     rows += [
         Candidate(name, "", NOT_TESTABLE, reason=why)
         for name, why in blind.items()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.diagnosis.candidates import is_plausible
+from vinetrack.diagnosis.result import BETWEEN_TRIALS
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
@@ -150,7 +151,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
             for other in near
             if 2 * (one.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET
             and complexity(other) < complexity(one)
-            and (_contains(one, other) or distance(other.fit, one.fit) < LIMIT_DISTANCE)
+            and (_contains(one, other) or (_comparable(one, other) and distance(other.fit, one.fit) < LIMIT_DISTANCE))
         ]
         if simpler:
             aside[one.label] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
@@ -161,6 +162,14 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
         aside |= {one.label: one.reason for one in kept if not one.credible}
         kept = believed
     return kept, aside
+
+
+def _comparable(one: LikelihoodRatio, other: LikelihoodRatio) -> bool:
+    """Whether curves that agree mean that one is a limit of the other.
+
+    With the deviation of B and pressure that every trial has, all hypotheses about levels of trials predict one curve.
+    """
+    return all(one.effects[-1].kind != BETWEEN_TRIALS for one in (one, other))
 
 
 def _contains(one: LikelihoodRatio, other: LikelihoodRatio) -> bool:

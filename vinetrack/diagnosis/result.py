@@ -32,6 +32,19 @@ REFITTED, SCREENED, NOT_TESTABLE = STATUSES = ("refitted", "screened", "not test
 DROPPED_FRAMES = "dropped_frames"
 """Stands in an answer set where frames are missing from a recording: a fault of the measurement without a formula."""
 
+BETWEEN_TRIALS = "between_trials"
+"""Kind of a hypothesis that trials differ: neither physics that is missing nor a fault of the camera or gauge."""
+
+N_BY_VINE, ORDER_DRIFT, SPECIMEN, DAY = ("n_by_vine", "order_drift", "specimen", "day")
+
+BETWEEN_SUMMARIES = {
+    N_BY_VINE: "the exponent n differs between the vines",
+    ORDER_DRIFT: "B drifts with the order of the trials",
+    SPECIMEN: "specimens (tubes of one kind) differ",
+    DAY: "B or the zero of the gauge differs from day to day",
+}
+"""Hypotheses that trials differ, by the names they have in an answer set."""
+
 
 @dataclass(frozen=True)
 class Candidate:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from vinetrack.diagnosis.between_trials import between_fits, called, differences
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report, pairs
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET,
@@ -26,7 +27,7 @@ from vinetrack.diagnosis.misfit_tests import (
     misfit_tests,
 )
 from vinetrack.diagnosis.multi_start import from_other_starts, without
-from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, UNEXPLAINED
+from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit
 
@@ -38,6 +39,10 @@ LOUD = 1.0
 
 NO_BETTER = 1.0
 """Difference in ln L that counts as a better minimum. Chosen: unsettled iterations differ by a tenth."""
+
+
+NOT_PHYSICAL = ("measurement", BETWEEN_TRIALS)
+"""Kinds of hypotheses that are no physics."""
 
 
 @dataclass(frozen=True)
@@ -70,23 +75,30 @@ def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, aga
         found = from_other_starts(found)
     report("questioning the model")
     questions = misfit_tests(found, effects, FIRST_LEVEL)
-    if not questions.something and not questions.suspect:
+    among = differences(found)
+    differ = bool(called(among, FIRST_LEVEL))
+    if not questions.something and not questions.suspect and not differ:
         return [SelectionStep(ADEQUATE, questions)]
     search = CandidateFits(questions, report)
     tried = search.singles()
-    if not questions.something and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
+    between = between_fits(found, among, max((one.delta_chi2 for one in tried), default=0.0), report)
+    tried += between
+    if not questions.something and not differ and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
-    if tried and again < MOST_AGAIN:
+    if tried and again < MOST_AGAIN and best_of(tried) not in between:
         rival = without(found, best_of(tried).fit)
         if rival.log_likelihood > found.log_likelihood + NO_BETTER:
             return select_effects(rival, effects, report, again=again + 1)
     alone = _alone(questions, search, tried)
     if alone is not None:
         return alone
-    tried = search.singles(all_of_them=True)
+    tried = [*search.singles(all_of_them=True), *between]
     alone = _alone(questions, search, tried)
     if alone is not None:
         return alone
+    if not questions.something and not questions.suspect:
+        return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
+    tried = [one for one in tried if one not in between]
     believed = [one for one in tried if one.credible]
     if not believed or best_of(believed).sigma < questions.threshold:
         # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
@@ -161,9 +173,11 @@ def _mending(
 
 
 def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
-    """What an answer set amounts to; of each hypothesis the last effect counts."""
-    kinds = {one.effects[-1].kind for one in kept}
-    if kinds == {"measurement"}:
+    """What an answer set amounts to; of each hypothesis the last effect counts.
+
+    Where nothing in it is physics that is missing, the measurement or the trials are at fault.
+    """
+    if all(one.effects[-1].kind in NOT_PHYSICAL for one in kept):
         return ARTEFACT
     return MISSING if len(kept) == 1 else AMBIGUOUS
 

@@ -33,6 +33,7 @@ from vinetrack.experiment.sheet import (
     read_row,
     unknown_columns,
 )
+from vinetrack.experiment.trial_order import order_problems
 from vinetrack.tracks.importers import TrackError, load_track, read_pressure_trace, read_track
 
 __all__ = ["Experiment", "ExperimentError", "Problem", "check_experiment", "format_problems", "read_experiment"]
@@ -286,6 +287,7 @@ def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> l
             problems.append(
                 Problem(message=message, file=SETTINGS, column=key, value=relative, remedy="check the path")
             )
+    problems += order_problems(experiment.trials, SHEET)
     found: list[Problem] = []
     there: list[Trial] = []
     for trial in experiment.trials:

@@ -312,6 +312,31 @@ COLUMNS: dict[str, Column] = {
             meaning="no: the trial stays in the sheet and is left out of the analysis.",
             default="yes",
         ),
+        Column(
+            name="specimen",
+            field="specimen",
+            kind="text",
+            meaning="Which tube of that vine it was.",
+            measured="Label every tube.",
+            default="unknown",
+        ),
+        Column(
+            name="day",
+            field="day",
+            kind="text",
+            meaning="Day or batch in which the trial was made.",
+            default="unknown",
+        ),
+        Column(
+            name="order",
+            field="order",
+            low=1,
+            high=1_000_000,
+            shared=False,
+            meaning="Place of the trial among those made: 1, 2, …",
+            measured="Count trials as they are made.",
+            default="the order of the rows",
+        ),
     )
 }
 """Every column of `trials.csv`, in the order of the documentation."""

@@ -97,7 +97,7 @@ def fitted_model(layout: ParameterMap, numbers: Sequence[Number]) -> Model:
     """The model with the fitted values; yield pressures belong to the trials and stay in the numbers."""
     values: dict[str, Value] = {}
     for number in numbers:
-        if number.key == YIELD_PRESSURE:
+        if number.key == YIELD_PRESSURE or layout.term(number.key) is not None:
             continue
         if number.vine:
             former = values.get(number.key, {})

@@ -11,7 +11,7 @@ its own, whose spreads are estimated: left out, they would be taken for missing 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,7 +38,7 @@ from vinetrack.inference.optimiser import (
     solve,
     track_correlation,
 )
-from vinetrack.inference.parameters import make_layout
+from vinetrack.inference.parameters import BetweenTerm, make_layout
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import align, candidates, initial_trial_effects
 from vinetrack.inference.trial_effects import trial_costs
@@ -294,6 +294,8 @@ def refit(
     *,
     fixed: Iterable[str] | None = None,
     free: Iterable[str] | None = None,
+    shared: Mapping[str, str] | None = None,
+    between: Sequence[BetweenTerm] | None = None,
     start: Mapping[str, Value] | None = None,
     hold_spreads: bool = False,
     hold_noise: bool = False,
@@ -309,6 +311,10 @@ def refit(
     ----------
     model
         The other model; its values are those of the fit where it has the same parameters.
+    shared
+        `"all"` or `"vine"` by name of parameter, beside what the fit was told.
+    between
+        Differences between trials to fit along, in place of those of the fit.
     start
         Values of parameters to begin from, of a new effect above all: a time constant begun at zero stays there.
     hold_spreads, hold_noise
@@ -332,8 +338,10 @@ def refit(
         key: tuple(name for name in before.options[key] if _belongs(name, names)) if given is None else tuple(given)
         for key, given in (("fixed", fixed), ("free", free))
     }
-    shared = {name: how for name, how in before.options["shared"].items() if _belongs(name, names)}
-    layout = make_layout(model, data, fixed=kept["fixed"], free=kept["free"], shared=shared)
+    told = {**before.options["shared"], **(shared or {})}
+    sharing = {name: how for name, how in told.items() if _belongs(name, names)}
+    between = before.predictor.layout.between if between is None else tuple(between)
+    layout = make_layout(model, data, fixed=kept["fixed"], free=kept["free"], shared=sharing, between=between)
     host = before.predictor.host
     predictor = Predictor(layout, data, host if host is not None and set(model.names) <= set(host.names) else None)
     theta = layout.start
@@ -353,7 +361,7 @@ def refit(
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
     solution = _found_again(predictor, solution, held, watch, thorough=thorough)
-    return assemble(predictor, solution, before.left_out, {**kept, "shared": shared, "held": held}, profile=profile)
+    return assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
 
 
 def _led_back(predictor: Predictor, frame: MixedProblem, state: FitState, held: FixedTerms) -> FitState:

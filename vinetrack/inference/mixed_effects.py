@@ -65,7 +65,8 @@ class MixedProblem:
     tells which trials have a deviation of pressure and of B; `gauge_error`, shape (n_trials,), the relative error of a
     pressure that was measured, 0 of one that was set; `own_centre` and `own_precision`, shape (n_trials, 2),
     belong to release and origin: so wide a prior that it only matters where a track leaves them open.
-    `free` marks the numbers that may move; `points` and `stretches` count those of each trial.
+    `free` marks the numbers that may move; `points` and `stretches` count those of each trial. `random` marks numbers
+    that are random effects of a group of trials, their priors being the distribution of the groups.
     """
 
     index: NDArray[np.int_]
@@ -80,6 +81,7 @@ class MixedProblem:
     free: NDArray[np.bool_]
     points: Floats
     stretches: Floats
+    random: NDArray[np.bool_] | None = None
 
 
 def trial_effect_prior(frame: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
@@ -284,7 +286,19 @@ def deviance(
         total -= float(slope[k] @ solve_scaled(inside, slope[k]))
         if restricted:
             total += float(np.linalg.slogdet(inside)[1])
+        elif frame.random is not None and frame.random[k].any():
+            total += _groups_integrated(inside, frame.prior_precision[k], frame.random[k])
     return total
+
+
+def _groups_integrated(information: Floats, prior_precision: Floats, random: NDArray[np.bool_]) -> float:
+    """What −2 ln L gains when the random effects w of groups of trials are integrated out: ln det(I + D M D).
+
+    With w ~ N(0, D²) and M the data's information of w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is
+    det(D (M + D⁻²) D)^(−½). So a hypothesis with many groups pays for each of them.
+    """
+    sd = 1 / np.sqrt(prior_precision[random])
+    return float(np.linalg.slogdet(sd[:, None] * information[np.ix_(random, random)] * sd)[1])
 
 
 def estimate_spreads(

@@ -140,6 +140,7 @@ def make_problem(predictor: Predictor, own: Floats) -> MixedProblem:
         free=np.ones(lower.size, dtype=bool),
         points=np.array([float(item.time_s.size) for item in data]),
         stretches=np.array([float(np.count_nonzero(item.first)) for item in data]),
+        random=layout.random if layout.between else None,
     )
 
 

@@ -28,6 +28,37 @@ LEAST_DAMPING = 1e-6
 
 
 @dataclass(frozen=True)
+class BetweenTerm:
+    """A difference between trials that is part of the model: deviation_j = Σ_g a_g z_j over the groups of trials.
+
+    It is added to the deviation that trial j has of its set pressure or of its ln B, before the random deviation.
+
+    Parameters
+    ----------
+    key
+        Name of the hypothesis and of the coefficient: `order_drift.B`.
+    pressure
+        Whether the pressure deviates (relative), else ln B.
+    groups
+        For each trial the group whose coefficient it feels, blank where it feels none.
+    regressor
+        z_j, shape (n_trials,), relative deviation per unit of the coefficient.
+    prior_sd
+        Standard deviation of the coefficients, their unit, where they are a random effect of the group; infinite where
+        they are fixed effects. Those with a prior are integrated out of the likelihood (`mixed_effects.deviance`).
+    """
+
+    key: str
+    symbol: str
+    unit: str
+    pressure: bool
+    groups: tuple[str, ...]
+    regressor: Floats
+    scale: float
+    prior_sd: float = math.inf
+
+
+@dataclass(frozen=True)
 class FreeParameter:
     """One number that a fit moves, SI. `vine` is blank where it is the same for all trials.
 
@@ -75,6 +106,7 @@ class ParameterMap:
     keys: tuple[str, ...]
     index: NDArray[np.int_]
     base: Floats
+    between: tuple[BetweenTerm, ...] = ()
 
     @property
     def start(self) -> Floats:
@@ -107,9 +139,29 @@ class ParameterMap:
             felt = self.index[:, column] >= 0
             if key == YIELD_PRESSURE:
                 yields[felt] = values[self.index[felt, column]]
-            else:
+            elif key in self.model.parameter_names:
                 rows[felt, self.model.parameter_names.index(key)] = values[self.index[felt, column]]
         return rows, yields
+
+    def term(self, key: str) -> BetweenTerm | None:
+        """The difference between trials that this key is the coefficient of; None for a parameter of the model."""
+        return next((term for term in self.between if term.key == key), None)
+
+    @property
+    def random(self) -> NDArray[np.bool_]:
+        """Which free numbers are random effects of a group of trials, shape (n_free,)."""
+        keys = {term.key for term in self.between if math.isfinite(term.prior_sd)}
+        return np.array([number.key in keys for number in self.free], dtype=bool)
+
+    def shifts(self, theta: Floats) -> Floats:
+        """Deviations of pressure (relative) and of ln B by the differences between trials, shape (n_trials, 2)."""
+        shifts = np.zeros((self.index.shape[0], 2))
+        values = np.append(self.values(theta), 0.0) if self.between else np.zeros(1)
+        for term in self.between:
+            if term.key in self.keys:
+                place = self.index[:, self.keys.index(term.key)]
+                shifts[:, 0 if term.pressure else 1] += values[place] * term.regressor
+        return shifts
 
 
 def make_layout(
@@ -119,6 +171,7 @@ def make_layout(
     fixed: Iterable[str] = (),
     free: Iterable[str] = (),
     shared: Mapping[str, str] | None = None,
+    between: Sequence[BetweenTerm] = (),
 ) -> ParameterMap:
     """Decide which numbers are free.
 
@@ -133,6 +186,8 @@ def make_layout(
         the only one of that name.
     shared
         `"all"` or `"vine"` by name, in place of what the effect says.
+    between
+        Differences between trials that are fitted along.
 
     Raises
     ------
@@ -163,8 +218,27 @@ def make_layout(
         found, column = _yield_pressures(data, len(numbers))
         if found:
             numbers, keys, index = [*numbers, *found], [*keys, YIELD_PRESSURE], np.column_stack([index, column])
+    for term in between:
+        members = [group for group in dict.fromkeys(term.groups) if group]
+        place = {group: len(numbers) + i for i, group in enumerate(members)} | {"": -1}
+        numbers += [_coefficient(term, group) for group in members]
+        keys, index = [*keys, term.key], np.column_stack([index, [place[group] for group in term.groups]])
     base = np.array([model.parameters_for(vine) for vine in vines]).reshape(len(data), len(model.parameter_names))
-    return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base)
+    return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base, tuple(between))
+
+
+def _coefficient(term: BetweenTerm, group: str) -> FreeParameter:
+    return FreeParameter(
+        key=term.key,
+        vine=group,
+        symbol=term.symbol,
+        unit=term.unit,
+        start=0.0,
+        lower=-math.inf,
+        upper=math.inf,
+        scale=term.scale,
+        prior_sd=term.prior_sd,
+    )
 
 
 def find_name(name: str, names: Sequence[str]) -> str:

@@ -104,7 +104,7 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
         for columns, shape in zip(solution.columns, shapes, strict=True)
     ]
     grams = np.stack([products(one, item.first) for one, item in zip(wide, predictor.data, strict=True)])
-    problem = _with_shapes(solution.frame, count)
+    problem = with_shapes(solution.frame, count)
     state = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
     held = held or FixedTerms()
     moved = np.zeros((len(grown), grams.shape[-1] - 1))
@@ -136,7 +136,7 @@ def _with_residual(columns: Sequence[Floats], residual: Sequence[Floats]) -> lis
     return [np.column_stack([one[:, :-1], left]) for one, left in zip(columns, residual, strict=True)]
 
 
-def _with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
+def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
     """The problem with the sizes of the shapes as further free numbers, each with a normal prior of mean 0 and sd 1."""
     places = problem.prior_mean.size + np.arange(count)
     # A trial's column that belongs to no free number has the place −1: the last of an appended zero.
@@ -149,6 +149,7 @@ def _with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
         lower=np.append(problem.lower, np.full(count, -np.inf)),
         upper=np.append(problem.upper, np.full(count, np.inf)),
         free=np.append(problem.free, np.ones(count, dtype=bool)),
+        random=None if problem.random is None else np.append(problem.random, np.zeros(count, dtype=bool)),
     )
 
 

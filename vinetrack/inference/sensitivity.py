@@ -121,12 +121,21 @@ class Predictor:
     def jobs(self, theta: Floats, own: Floats) -> list[Job]:
         """The unmoved trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4)."""
         rows, yields = self.layout.rows(theta)
+        own = self._deviations(theta, own)
         if self.damping_column >= 0:
             rows[:, self.damping_column] *= np.exp(own[:, DAMPING_DEVIATION])
         return [
             Job(i, rows[i], float(yields[i]), float(own[i, PRESSURE]), float(own[i, RELEASE]))
             for i in range(len(self.data))
         ]
+
+    def _deviations(self, theta: Floats, own: Floats) -> Floats:
+        """The trials' own numbers, their deviations with what trials differ by systematically put in."""
+        if not self.layout.between:
+            return own
+        whole = own.copy()
+        whole[:, [PRESSURE, DAMPING_DEVIATION]] += self.layout.shifts(theta)
+        return whole
 
     def residuals(self, theta: Floats, own: Floats) -> list[Floats]:
         """Measured minus predicted position of every trial, m."""
@@ -141,10 +150,10 @@ class Predictor:
 
         `own_only` leaves the columns of the keys empty, but for B.
         """
-        plain = self.jobs(theta, own)
+        plain, whole = self.jobs(theta, own), self._deviations(theta, own)
         jobs, moves = list(plain), [(-1, 0.0)] * len(plain)
         for i, job in enumerate(plain):
-            for place, step, varied in self._variations(i, job, theta, own, own_only):
+            for place, step, varied in self._variations(i, job, theta, whole, own_only):
                 jobs.append(varied)
                 moves.append((place, step))
         moved = self.run(jobs)
@@ -157,6 +166,7 @@ class Predictor:
             if place >= 0:
                 columns[job.trial][:, place] = _change(moved[job.trial], other) / step
         self._share_damping(columns)
+        self._share_deviations(columns)
         if not own_only:
             self._adapt(columns)
         return columns
@@ -177,7 +187,7 @@ class Predictor:
         upper = self.layout.bounds[1]
         for column, key in enumerate(self.layout.keys):
             place = self.layout.index[i, column]
-            if place < 0 or (own_only and key != DAMPING):
+            if place < 0 or (own_only and key != DAMPING) or self.layout.term(key) is not None:
                 continue
             step = float(self.steps[column])
             if theta[place] + step > upper[place]:
@@ -201,6 +211,15 @@ class Predictor:
         column = self.layout.keys.index(DAMPING)
         for i in np.flatnonzero(self.feels_damping):
             columns[i][:, DAMPING_DEVIATION] = columns[i][:, OWN + column]
+
+    def _share_deviations(self, columns: list[Floats]) -> None:
+        """What trials differ by systematically moves them as their own deviation does, times its regressor."""
+        for term in self.layout.between:
+            if term.key not in self.layout.keys:
+                continue
+            column, source = self.layout.keys.index(term.key), PRESSURE if term.pressure else DAMPING_DEVIATION
+            for i in np.flatnonzero(self.layout.index[:, column] >= 0):
+                columns[i][:, OWN + column] = term.scale * term.regressor[i] * columns[i][:, source]
 
     def _adapt(self, columns: list[Floats]) -> None:
         """Steps for the next time, from how far these moved the trajectories."""

@@ -105,6 +105,10 @@ def subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> Param
         keys=tuple(layout.keys[column] for column in columns),
         index=index[:, columns].astype(int),
         base=layout.base[rows],
+        between=tuple(
+            replace(term, groups=tuple(term.groups[row] for row in rows), regressor=term.regressor[rows])
+            for term in layout.between
+        ),
     )
 
 
@@ -142,6 +146,7 @@ def subset_frame(frame: MixedProblem, layout: ParameterMap, rows: Indices, place
         free=frame.free[places],
         points=frame.points[rows],
         stretches=frame.stretches[rows],
+        random=None if frame.random is None else frame.random[places],
     )
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.numbers import number, with_error
 from vinetrack.core.units import display_unit
+from vinetrack.narrative.between_text import difference_headline, trials_differ
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,6 +38,10 @@ MEANINGS = {
     "The missing force is drawn below.",
 }
 """What each verdict means."""
+
+TRIALS_DIFFER = (
+    "What the model misses is a difference between trials, not physics: nothing was added. What to do is said below."
+)
 
 THEREAFTER = {
     "missing": "A further effect is still missing.",
@@ -89,6 +94,8 @@ def sentence(diagnosis: Mapping[str, Any]) -> str:
         return f"Missing from the model: {listed(added or answers, 'and')}."
     if verdict == "ambiguous":
         return f"Missing from the model: {listed(answers, 'or')}. These trials cannot tell which."
+    if verdict == "artefact" and trials_differ(answers):
+        return f"Trials differ, the physics holds: {difference_headline(answers)}."
     if verdict == "artefact":
         return f"A fault of the measurement, not of the physics: {listed(answers, 'or')}."
     if verdict == "adequate":
@@ -106,6 +113,8 @@ def meaning(diagnosis: Mapping[str, Any]) -> str:
     diagnosis : content of `diagnosis.json`.
     """
     text = MEANINGS.get(str(diagnosis.get("verdict")), str(diagnosis.get("refused") or ""))
+    if diagnosis.get("verdict") == "artefact" and trials_differ(list(diagnosis.get("answer_set") or [])):
+        text = TRIALS_DIFFER
     added = list(diagnosis.get("effects") or [])
     then = THEREAFTER.get(str(diagnosis.get("final_verdict")), "") if added else ""
     return f"{text} {then.replace('With it,', 'With them,') if len(added) > 1 else then}".strip()

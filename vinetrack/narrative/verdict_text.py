@@ -12,6 +12,7 @@ from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
+    BETWEEN_TRIALS,
     DROPPED_FRAMES,
     MISSING,
     NOT_TESTABLE,
@@ -20,6 +21,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.model import base_model
 from vinetrack.inference.fit_result import Number
+from vinetrack.narrative.between_text import difference_headline, difference_in_words, remedies_in_words, trials_differ
 from vinetrack.narrative.verdict_summary import joined
 
 if TYPE_CHECKING:
@@ -80,14 +82,19 @@ def explain(finding: SelectionStep) -> str:
     if finding.verdict == AMBIGUOUS:
         return (
             f"{model} lacks an effect, and these data cannot tell which: {joined(names, 'or')}. "
-            f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other."
+            f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other.{_remedies(finding)}"
+        )
+    if finding.verdict == ARTEFACT and trials_differ(names):
+        return (
+            f"Trials differ, and {model} holds otherwise: {_hypotheses(kept)}. That explains the misfit in {trials} "
+            f"(Δχ² = {kept[0].delta_chi2:.0f}); no effect is needed beside it.{_remedies(finding)}"
         )
     if finding.verdict == ARTEFACT:
         which = joined(names, "or")
         return (
             f"A fault of the measurement, not of the physics: {which} explains the misfit of {model} "
             f"({_hypotheses(kept)}). It is not added to the model: "
-            f"find the fault and measure again, or correct the sheet.{_with_the_fault(finding)}"
+            f"find the fault and measure again, or correct the sheet.{_remedies(finding)}{_with_the_fault(finding)}"
         )
     text = (
         f"The misfit of {model} exceeds the noise of {trials}, and no effect of the catalogue nor any two of the best "
@@ -112,8 +119,14 @@ def _with_the_fault(finding: SelectionStep) -> str:
 
 def _hypotheses(kept: Sequence[LikelihoodRatio]) -> str:
     """The hypotheses of an answer set with their sizes."""
-    sizes = {" with ".join(result.names): sizes_in_words(result.numbers) for result in kept}
-    return "; ".join(f"{names} has {size}" if size else names for names, size in sizes.items())
+    differ = [difference_in_words(result) for result in kept if result.effects[-1].kind == BETWEEN_TRIALS]
+    effects = [result for result in kept if result.effects[-1].kind != BETWEEN_TRIALS]
+    sizes = {" with ".join(result.names): sizes_in_words(result.numbers) for result in effects}
+    return "; ".join([*differ, *(f"{names} has {size}" if size else names for names, size in sizes.items())])
+
+
+def _remedies(finding: SelectionStep) -> str:
+    return remedies_in_words(finding.kept, [trial.trial for trial in finding.questions.found.trials])
 
 
 def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
@@ -178,6 +191,8 @@ def _headline(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict in (AMBIGUOUS, ARTEFACT) and diagnosis.answer_set:
         if diagnosis.answer_set == (DROPPED_FRAMES,):
             return "frames are missing from the recordings"
+        if trials_differ(diagnosis.answer_set):
+            return f"trials differ, the physics holds: {difference_headline(diagnosis.answer_set)}"
         return f"{_HEADLINES[diagnosis.verdict]}: {joined(list(diagnosis.answer_set), 'or')}"
     return _HEADLINES[diagnosis.verdict]
 

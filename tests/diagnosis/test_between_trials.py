@@ -1,0 +1,182 @@
+"""Wear, tubes and exponents that differ between trials are named as such, and physics keeps its name beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from grown import Pairs, pairs_of, sheet
+
+import vinetrack as vt
+from vinetrack.core.records import Trial
+from vinetrack.diagnosis.between_trials import confounded, differences
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
+from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
+from vinetrack.diagnosis.selection import verdict_of
+from vinetrack.effects import find_effect
+from vinetrack.inference.fit import fit, refit
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.parameters import DAMPING, BetweenTerm
+from vinetrack.laboratory.campaign import damping_values
+from vinetrack.laboratory.ground_truth import BASE, Nature
+from vinetrack.laboratory.tracks import grow
+
+B = "eversion_damping.B"
+Change = Callable[[Trial, int], float]
+
+
+def made(trials: Sequence[Trial], order: Sequence[int], factor: Change, seed: int, **more: float) -> Pairs:
+    """Trials made in this order, B of each multiplied by `factor(trial, uses of its vine before)`."""
+    pairs: dict[int, tuple] = {}
+    uses: dict[str, int] = {}
+    values = damping_values(trials)
+    for place, i in enumerate(order):
+        trial, seen = trials[i], uses.get(trials[i].vine, 0)
+        uses[trial.vine] = seen + 1
+        change = factor(trial, seen)
+        held = {**values, B: {vine: change * size for vine, size in values[B].items()}}
+        nature = Nature(
+            effects=BASE, values=held, seed=1000 * seed + place,
+            **{"damping_scatter": 0.005, "pressure_scatter": 0.003, "yield_error_kPa": 0.0, **more},
+        )  # fmt: skip
+        (one,) = pairs_of(grow([trial], nature))
+        pairs[i] = (replace(one[0], order=float(place + 1)), one[1])
+    return [pairs[i] for i in range(len(trials))]
+
+
+def shuffled(count: int, seed: int) -> list[int]:
+    return [int(i) for i in np.random.default_rng(seed).permutation(count)]
+
+
+def diagnosed(pairs: Pairs) -> Diagnosis:
+    return vt.diagnose(pairs, ladder=False, advice=False)
+
+
+@pytest.fixture(scope="module")
+def trials() -> list[Trial]:
+    return sheet((2, 4), replicates=3)
+
+
+@pytest.fixture(scope="module")
+def worn(trials: list[Trial]) -> Pairs:
+    """B rises by 2 % with every use of a tube, pressures in rising order."""
+    return made(trials, range(len(trials)), lambda _, seen: 1 + 0.02 * seen, seed=1)
+
+
+def test_wear_with_rising_pressures_is_not_called_physics(worn: Pairs) -> None:
+    result = diagnosed(worn)
+    assert result.verdict in (ARTEFACT, AMBIGUOUS)
+    assert "order_drift" in result.answer_set
+    assert "made in the order of pressure" in result.explanation
+    assert "Repeat six trials in random order" in result.explanation
+
+
+def test_the_order_of_the_rows_is_taken_and_said_where_the_sheet_has_none(worn: Pairs) -> None:
+    result = diagnosed([(replace(trial, order=np.nan), track) for trial, track in worn])
+    assert "order_drift" in result.answer_set
+    assert "The order of the rows was taken" in result.explanation
+
+
+def test_wear_in_random_order_is_no_effect(trials: list[Trial]) -> None:
+    pairs = made(trials, shuffled(len(trials), 3), lambda _, seen: 1 + 0.01 * seen, seed=2)
+    result = diagnosed(pairs)
+    assert result.verdict == ADEQUATE or set(result.answer_set) <= {"order_drift", "specimen"}
+
+
+def other_tube(trial: Trial) -> bool:
+    return trial.pressure_Pa >= (38e3 if trial.diameter_m > 0.02 else 50e3)
+
+
+def test_another_tube_for_high_pressures_is_named(trials: list[Trial]) -> None:
+    pairs = made(trials, range(len(trials)), lambda trial, _: 1.1 if other_tube(trial) else 1.0, seed=3)
+    known = [(replace(trial, specimen="b" if other_tube(trial) else "a"), track) for trial, track in pairs]
+    result = diagnosed(known)
+    assert result.verdict in (ARTEFACT, AMBIGUOUS)
+    assert "specimen" in result.answer_set
+
+
+def test_exponents_that_differ_by_vine_are_named(trials: list[Trial]) -> None:
+    values = damping_values(trials)
+    n = "eversion_damping.n"
+    pairs: Pairs = []
+    for vine, exponent in zip(dict.fromkeys(trial.vine for trial in trials), (0.40, 0.46), strict=True):
+        nature = Nature(effects=BASE, values={**values, n: exponent}, seed=4, damping_scatter=0.01)
+        pairs += pairs_of(grow([trial for trial in trials if trial.vine == vine], nature))
+    result = diagnosed(pairs)
+    assert (result.verdict, result.answer_set) == (ARTEFACT, ("n_by_vine",))
+    row = next(row for row in result.rounds[0].ranking if row.effect == "n_by_vine")
+    for number, exponent in zip(row.numbers, (0.40, 0.46), strict=True):
+        assert abs(number.value - exponent) < 4 * number.sigma
+
+
+def test_depletion_keeps_its_name_in_random_order(trials: list[Trial]) -> None:
+    nature = Nature(effects=(*BASE, "reservoir_depletion"), values=damping_values(trials), seed=5)
+    pairs = pairs_of(grow(trials, nature))
+    order = shuffled(len(trials), 5)
+    result = diagnosed([(replace(trial, order=1.0 + order[i]), track) for i, (trial, track) in enumerate(pairs)])
+    assert result.verdict in (MISSING, AMBIGUOUS)
+    assert "reservoir_depletion" in result.answer_set
+    assert not {"order_drift", "specimen", "n_by_vine", "day"} & set(result.answer_set)
+
+
+@pytest.fixture(scope="module")
+def questioned(worn: Pairs) -> Fit:
+    return fit(vt.base_model(), worn, profile=False)
+
+
+def test_the_linear_estimate_is_what_the_refit_gains(questioned: Fit) -> None:
+    drift = next(one for one in differences(questioned) if one.name == "order_drift")
+    after = refit(questioned, between=drift.terms)
+    assert 2 * (after.log_likelihood - questioned.log_likelihood) == pytest.approx(drift.gain, rel=0.1)
+    slope = after["order_drift.B"]
+    assert abs(slope.value - 0.02 / 1.1) < 0.003  # 2 % of the first B is 1.8 % of the mean
+    assert drift.p < 1e-6
+
+
+def test_a_random_effect_without_width_is_no_effect(questioned: Fit) -> None:
+    groups = tuple(trial.trial.condition for trial in questioned.trials)
+    term = BetweenTerm("specimen.B", "ΔlnB", "", False, groups, np.ones(len(groups)), 0.05, 1e-7)
+    after = refit(questioned, between=(term,))
+    assert after.log_likelihood == pytest.approx(questioned.log_likelihood, abs=0.05)
+
+
+def test_a_shift_of_every_trial_is_that_of_B(questioned: Fit) -> None:
+    groups = ("all",) * len(questioned.trials)
+    term = BetweenTerm("specimen.B", "ΔlnB", "", False, groups, np.ones(len(groups)), 0.05, 1e-3)
+    fitted = refit(questioned, between=(term,))
+    layout, state = fitted.predictor.layout, fitted.solution.state
+    moved = state.theta.copy()
+    place = next(k for k, number in enumerate(layout.free) if number.key == "specimen.B")
+    moved[place] += 0.1 / layout.free[place].scale
+    up = state.theta.copy()
+    up[[k for k, number in enumerate(layout.free) if number.key == DAMPING]] += 0.1
+    one, other = (fitted.predictor.jobs(theta, state.own) for theta in (moved, up))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a.row, b.row, rtol=1e-12)
+
+
+def test_only_differences_that_follow_the_conditions_are_confounded(trials: list[Trial]) -> None:
+    rising = np.arange(len(trials), dtype=float)[:, None]
+    assert confounded(rising, trials)
+    assert not confounded(rising[shuffled(len(trials), 0)], trials)
+    assert not confounded(rising % 3, trials)  # a tube for each replicate
+
+
+def ratio(kind: str) -> LikelihoodRatio:
+    effect = replace(find_effect("air_drag"), kind=kind)
+    return LikelihoodRatio((effect,), None, 30.0, 5.0, True, "")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "verdict"),
+    [
+        (("between_trials",), ARTEFACT),
+        (("between_trials", "measurement"), ARTEFACT),
+        (("between_trials", "physical"), AMBIGUOUS),
+        (("physical",), MISSING),
+    ],
+)
+def test_a_verdict_says_whether_any_physics_may_be_missing(kinds: tuple[str, ...], verdict: str) -> None:
+    assert verdict_of([ratio(kind) for kind in kinds]) == verdict

@@ -1,0 +1,431 @@
+"""Differences between trials as explanations: n by vine, drift with the order of trials, specimens, days.
+
+A tube that wears, another tube for the high pressures or a gauge whose zero moves from day to day changes B or the
+pressure of whole groups of trials. Where all replicates of a condition share the group, that looks exactly like physics
+that follows the condition. So such differences are hypotheses of the diagnosis like the effects of the catalogue:
+
+    ln B_j          = ln B_vine + Σ_g a_g z_gj + u_j
+    P_j / P_set,j   = 1         + Σ_g b_g z_gj + v_j        u_j, v_j random from trial to trial
+
+with z_gj the number of trials that the vine (or specimen) of trial j has seen, or 1 in group g and 0 elsewhere
+(pressure: 1 kPa / P_set,j, a shift of the zero of the gauge or of P_y, which are the same to a force (P − P_y) A).
+Coefficients of groups are random effects with a prior, integrated out of the likelihood, so that a hypothesis with many
+groups pays for each of them; a drift has one coefficient, fixed. All are compared by the same Δχ² as effects are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.result import (
+    BETWEEN_SUMMARIES,
+    BETWEEN_TRIALS,
+    DAY,
+    N_BY_VINE,
+    ORDER_DRIFT,
+    REFITTED,
+    SPECIMEN,
+    Candidate,
+)
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Effect, Parameter
+from vinetrack.experiment.trial_order import trial_order
+from vinetrack.inference.fit import refit
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, deviance, estimate_spreads, marginal
+from vinetrack.inference.optimiser import Solution, make_problem
+from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm, ParameterMap, make_layout
+from vinetrack.inference.position_errors import smooth_errors, with_shapes
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, Predictor
+
+SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0
+"""Standard deviation of ln B and of P_y among tubes of one kind. Chosen: tubes of a batch differ by 3 to 8 % in B and a
+few tenths of a kPa; at half and twice, ln L of a hypothesis moves by about ln 2 for each coefficient of a group."""
+
+DAY_B_SD, DAY_PA_SD = 0.03, 300.0
+"""The same from day to day: film in other air, a gauge zeroed anew. Chosen: a gauge holds its zero to 0.3 kPa."""
+
+PLAUSIBLE_DRIFT = 0.05
+"""Change of ln B a trial that is still believed. Chosen: a tube whose B rises by 5 % a trial is done for after ten."""
+
+FEWEST_TRIALS = 6
+"""Trials from which a drift or a change is asked for: below, any order of a few pressures is like any other."""
+
+OUT_OF_REACH = 40.0
+"""How far in −2 ln L the linear estimate may stay behind the best hypothesis and still be fitted. Chosen: well above
+the answer set's 9 times the usual inflation of 1 to 3; twice as much only costs time."""
+
+LEAST_GAIN = 2.0
+"""Fall of −2 ln L below which a difference is not fitted. Chosen: a fifth of what the gate asks for."""
+
+SPREAD_OVER_CONDITIONS = 0.5
+"""A difference counts as confounded with the conditions where it varies within them by less than this part of what
+random order gives (1 on average). Chosen: replicates in adjacent places give under 0.1, random order 0.6 to 1.3."""
+
+FIRST_ITERATIONS, MORE_ITERATIONS = 14, 30
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One hypothesis that trials differ.
+
+    Parameters
+    ----------
+    name
+        Of `result.BETWEEN_SUMMARIES`.
+    terms, shared
+        What is fitted along, and parameters that are shared otherwise.
+    stated
+        Whether the sheet has the columns it goes by.
+    confounded
+        Whether it follows the conditions so closely that replicates cannot tell it from an effect of the conditions.
+    gain, p
+        Fall of −2 ln L by the linear estimate, and its chance where trials do not differ.
+    """
+
+    name: str
+    terms: tuple[BetweenTerm, ...] = ()
+    shared: Mapping[str, str] = field(default_factory=dict)
+    stated: bool = True
+    confounded: bool = True
+    gain: float = 0.0
+    p: float = 1.0
+
+
+@dataclass(frozen=True)
+class BetweenRatio(LikelihoodRatio):
+    """The likelihood ratio of a difference between trials; `difference` tells which."""
+
+    difference: Difference = Difference("")
+
+    @property
+    def numbers(self) -> tuple[Number, ...]:
+        """Its coefficients, or the exponents of the vines."""
+        keys = {term.key for term in self.difference.terms} | set(self.difference.shared)
+        return tuple(number for number in self.fit.numbers if number.key in keys and math.isfinite(number.sigma))
+
+    @property
+    def others(self) -> tuple[Number, ...]:
+        """All other numbers of its fit."""
+        keys = {number.name for number in self.numbers}
+        return tuple(number for number in self.fit.numbers if number.name not in keys)
+
+
+def differences(found: Fit) -> list[Difference]:
+    """The hypotheses that trials differ which these data allow, each with its linear estimate.
+
+    Parameters
+    ----------
+    found
+        The fit that is questioned.
+
+    Returns
+    -------
+    list
+        Of the forms of a hypothesis (B, pressure, both) the one that gains most.
+    """
+    if DAMPING not in found.predictor.layout.keys:
+        return []
+    trials = [trial.trial for trial in found.trials]
+    smooth = smooth_errors(found.predictor, found.solution, found.options.get("held"))
+    base = smooth.solution if smooth else found.solution
+    best: dict[str, Difference] = {}
+    for one in (*_law(found, trials), *_drifts(trials), *_groups(trials), *_changes(found, base, trials)):
+        estimated = _estimated(found, base, one)
+        if estimated is not None and (one.name not in best or estimated.gain > best[one.name].gain):
+            best[one.name] = estimated
+    return list(best.values())
+
+
+def called(among: Sequence[Difference], level: float) -> list[Difference]:
+    """Differences that alone make a model inadequate: significant, stated by the sheet, and confounded with conditions.
+
+    One that random order or replicates keep apart from the conditions is a random deviation of the trials, which the
+    fit allows for. `level` is the chance of a false alarm of them all (Bonferroni).
+    """
+    return [one for one in among if one.stated and one.confounded and one.p < level / len(among)]
+
+
+def between_fits(
+    found: Fit, among: Sequence[Difference], best: float, report: Callable[[str], None]
+) -> list[LikelihoodRatio]:
+    """Fits of the differences whose estimate comes near the `best` Δχ² of the effects."""
+    fitted: list[LikelihoodRatio] = []
+    for one in among:
+        if one.gain < LEAST_GAIN or one.gain < best - max(OUT_OF_REACH, 0.3 * best):
+            continue
+        report(f"fitting {one.name}")
+        fit = _fitted(found, one)
+        if fit is None:
+            continue
+        ratio = likelihood_ratio(found, (effect_of(one),), fit)
+        fitted.append(BetweenRatio(**{**vars(ratio), "difference": one}))
+    return fitted
+
+
+def effect_of(one: Difference) -> Effect:
+    """A stand-in for the effect that the tables of candidates and the answer set show."""
+    drift = (Parameter("B", "dlnB", "1/trial", 0.0, plausible=(-PLAUSIBLE_DRIFT, PLAUSIBLE_DRIFT)),)
+    keys = [term.key for term in one.terms] or list(one.shared)
+    parameters = tuple(Parameter(key.split(".")[1], key, "", 0.0) for key in keys)
+    return Effect(
+        name=one.name,
+        kind=BETWEEN_TRIALS,
+        summary=BETWEEN_SUMMARIES[one.name],
+        text=BETWEEN_SUMMARIES[one.name],
+        parameters=drift if one.name == ORDER_DRIFT else parameters,
+        functions={},
+        needs=(),
+        easily_taken_for=(),
+        worked=(),
+        path=Path(one.name),
+    )
+
+
+def _law(found: Fit, trials: Sequence[Trial]) -> list[Difference]:
+    """N of every vine, where there are several with one n."""
+    free = [number for number in found.predictor.layout.free if number.key == EXPONENT]
+    if len(free) != 1 or len({trial.vine for trial in trials}) < 2:
+        return []
+    return [Difference(N_BY_VINE, shared={EXPONENT: "vine"})]
+
+
+def _tube(trial: Trial) -> str:
+    """The tube that a trial was made with: its vine, and the specimen where it is known."""
+    return f"{trial.vine}, {trial.specimen}" if trial.specimen else trial.vine
+
+
+def _drifts(trials: Sequence[Trial]) -> list[Difference]:
+    """Ln B by the number of trials that the tube has seen before."""
+    if len(trials) < FEWEST_TRIALS:
+        return []
+    ranks, stated = trial_order(trials)
+    uses, seen = np.zeros(ranks.size), Counter[str]()
+    for i in np.argsort(ranks):
+        uses[i] = seen[_tube(trials[i])]
+        seen[_tube(trials[i])] += 1
+    if not uses.any():
+        return []
+    term = BetweenTerm(
+        key=f"{ORDER_DRIFT}.B", symbol="dlnB", unit="1/trial", pressure=False, groups=("all",) * ranks.size,
+        regressor=uses, scale=0.01,
+    )  # fmt: skip
+    return [Difference(ORDER_DRIFT, (term,), stated=stated, confounded=confounded(uses[:, None], trials))]
+
+
+def _groups(trials: Sequence[Trial]) -> list[Difference]:
+    """Specimens and days that the sheet states."""
+    found: list[Difference] = []
+    if all(trial.specimen for trial in trials):
+        tubes = tuple(_tube(trial) for trial in trials)
+        # A vine of which there is one tube has a B of its own already.
+        several = {vine for vine in (t.vine for t in trials) if len({_tube(t) for t in trials if t.vine == vine}) > 1}
+        groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
+        found += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
+    if all(trial.day for trial in trials):
+        days = tuple(f"day {trial.day}" for trial in trials)
+        found += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, stated=True)
+    return found
+
+
+def _forms(
+    name: str, groups: Sequence[str], trials: Sequence[Trial], B_sd: float, pressure_sd_Pa: float, *, stated: bool
+) -> list[Difference]:
+    """Groups that differ in B, in pressure, or in both."""
+    if len({group for group in groups if group}) < 2 and stated:
+        return []
+    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    driven = np.isfinite(pressures_Pa) & (pressures_Pa > 0)
+    per_Pa = np.where(driven, 1 / np.where(driven, pressures_Pa, 1.0), 0.0)
+    groups = tuple(groups)
+    in_B = BetweenTerm(f"{name}.B", "ΔlnB", "", False, groups, np.ones(len(groups)), B_sd, B_sd)
+    in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, pressure_sd_Pa, pressure_sd_Pa)
+    member = np.array([[group == one for one in dict.fromkeys(groups) if one] for group in groups], dtype=float)
+    apart = confounded(member, trials)
+    return [
+        Difference(name, terms, stated=stated, confounded=apart)
+        for terms in ((in_B,), (in_P,), (in_B, in_P))
+        if not any(term.pressure for term in terms) or driven.any()
+    ]
+
+
+def _changes(found: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
+    """Where specimens are not stated: another tube of each vine from some trial on, where that gains most."""
+    if all(trial.specimen for trial in trials) or len(trials) < FEWEST_TRIALS:
+        return []
+    ranks, _ = trial_order(trials)
+    groups = [""] * len(trials)
+    for vine in dict.fromkeys(trial.vine for trial in trials):
+        members = sorted((i for i, trial in enumerate(trials) if trial.vine == vine), key=lambda i: ranks[i])
+        ways = []
+        for begin in range(2, len(members) - 1):
+            later = set(members[begin:])
+            way = [f"{vine}, later tube" if i in later else group for i, group in enumerate(groups)]
+            form = _forms(SPECIMEN, way, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
+            gain = _gain(found, base, form, spread=base.state.spread)
+            ways.append((gain, way))
+        if ways:
+            groups = max(ways, key=lambda one: one[0])[1]
+    if not any(groups):
+        return []
+    return _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
+
+
+def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
+    """Whether regressors, shape (n_trials, k), hardly vary among the replicates of a condition.
+
+    The mean square within conditions over that within vines: 1 on average where trials are in random order. Without
+    replicates nothing tells them apart.
+    """
+    within, inner = _square_within(regressors, [trial.condition for trial in trials])
+    whole, outer = _square_within(regressors, [trial.vine for trial in trials])
+    if inner == 0 or whole == 0:
+        return True
+    return within / inner < SPREAD_OVER_CONDITIONS * whole / max(outer, 1)
+
+
+def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
+    """Sum of squares about the means of groups, and its degrees of freedom."""
+    total, names = 0.0, sorted(set(groups))
+    for name in names:
+        member = values[np.array([group == name for group in groups])]
+        total += float(np.sum((member - member.mean(axis=0)) ** 2))
+    return total, len(groups) - len(names)
+
+
+def _estimated(found: Fit, base: Solution, one: Difference) -> Difference | None:
+    """The difference with its linear estimate; None where it cannot be laid out."""
+    gain = _gain(found, base, one)
+    return replace(one, gain=gain, p=_chance(found, one, gain)) if math.isfinite(gain) else None
+
+
+def _chance(found: Fit, one: Difference, gain: float) -> float:
+    """Chance of such a gain where trials do not differ.
+
+    Of fixed coefficients by the F test with as many degrees of freedom as trials leave, LR = N ln(1 + q F / dof):
+    χ² would call too often where trials are few. Of random effects exp(gain / 2) is a Bayes factor B, and
+    P(B > 1/α) ≤ α by Markov's inequality.
+    """
+    from scipy.stats import f as fisher
+
+    if gain <= 0:
+        return 1.0
+    if any(math.isfinite(term.prior_sd) for term in one.terms):
+        return min(1.0, math.exp(-0.5 * gain))
+    trials = len(found.trials)
+    vines = len({trial.trial.vine for trial in found.trials})
+    extra = vines - 1 if one.name == N_BY_VINE else len(one.terms)
+    spare = max(trials - int(np.count_nonzero(found.predictor.layout.prior_precision == 0)) - extra, 1)
+    return float(fisher.sf(math.expm1(min(gain / trials, 500.0)) * spare / extra, extra, spare))
+
+
+def _gain(found: Fit, base: Solution, one: Difference, spread: tuple[float, float] | None = None) -> float:
+    """Fall of −2 ln L with a difference, from the sensitivities of the fit: no trajectory is simulated.
+
+    The deviation of a trial is a column of the linear mixed model already, so the columns of the coefficients are
+    multiples of it. Spreads are estimated anew, or are those given. `base` is the solution of the fit, smooth errors of
+    position among its numbers where there are any.
+    """
+    grams, frame, state = _widened(found, base, one)
+    before = marginal(base.grams, base.frame, base.state)
+    part = marginal(grams, frame, state)
+    if spread is None:
+        old = estimate_spreads(before, base.frame, base.state, base.estimable, restricted=False)
+        new = estimate_spreads(part, frame, state, base.estimable, restricted=False)
+    else:
+        old = new = spread
+    plain = deviance(before, base.frame, base.state, old, restricted=False)
+    return plain - deviance(part, frame, state, new, restricted=False)
+
+
+def _widened(found: Fit, base: Solution, one: Difference) -> tuple[Floats, MixedProblem, FitState]:
+    """Cross products, problem and state of a solution with the coefficients of a difference added, all zero."""
+    old, state = found.predictor.layout, base.state
+    data, options = found.predictor.data, found.options
+    layout = make_layout(
+        old.model, data, fixed=options["fixed"], free=options["free"],
+        shared={**options["shared"], **one.shared}, between=(*old.between, *one.terms),
+    )  # fmt: skip
+    frame = make_problem(Predictor(layout, data, found.predictor.host), state.own)
+    frame = replace(frame, own_centre=base.frame.own_centre)
+    theta = layout.start
+    known = {number.name: number.outside(float(at)) for number, at in zip(old.free, state.theta, strict=False)}
+    for k, number in enumerate(layout.free):
+        value = known.get(number.name, known.get(number.key))
+        theta[k] = theta[k] if value is None else number.inside(value)
+    shapes = base.frame.index.shape[1] - len(old.keys)
+    if shapes:
+        frame, theta = with_shapes(frame, shapes), np.append(theta, state.theta[len(old.free) :])
+    turn = _turn(old, layout, shapes)
+    grams = np.einsum("nka,nckl,nlb->ncab", turn, base.grams, turn, optimize=True)
+    return grams, frame, replace(state, theta=theta)
+
+
+def _turn(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
+    """What makes the columns of one layout those of another, shape (n_trials, n_columns before, n_columns after).
+
+    Columns are those of the trials' own numbers, the keys, the shapes of smooth errors, the residual.
+    """
+    count, size = len(old.keys), OWN + len(layout.keys) + shapes + 1
+    turn = np.zeros((len(layout.index), OWN + count + shapes + 1, size))
+    turn[:, range(OWN), range(OWN)] = 1.0
+    behind = np.arange(shapes + 1)
+    turn[:, OWN + count + behind, OWN + len(layout.keys) + behind] = 1.0
+    before_scale = np.array([number.scale for number in old.free] + [1.0])
+    scale = np.array([number.scale for number in layout.free] + [0.0])
+    logarithmic = np.array([number.logarithmic for number in layout.free] + [False])
+    for column, key in enumerate(layout.keys):
+        term, place = layout.term(key), layout.index[:, column]
+        if term is not None and key not in old.keys:
+            source = PRESSURE if term.pressure else DAMPING_DEVIATION
+            turn[:, source, OWN + column] = np.where(place >= 0, term.scale * term.regressor, 0.0)
+            continue
+        former = old.keys.index(key)
+        ratio = scale[place] / before_scale[old.index[:, former]]
+        turn[:, OWN + former, OWN + column] = np.where(logarithmic[place], 1.0, ratio)
+    return turn
+
+
+def _fitted(found: Fit, one: Difference) -> Fit | None:
+    """The difference fitted; None where it cannot be followed."""
+    between = (*found.predictor.layout.between, *one.terms)
+    try:
+        fit = refit(found, between=between, shared=one.shared, most_iterations=FIRST_ITERATIONS, thorough=False)
+        return fit if fit.converged else refit(fit, most_iterations=MORE_ITERATIONS, thorough=False)
+    except (FitError, SimulationError, np.linalg.LinAlgError):
+        return None
+
+
+def between_candidates(
+    tried: Sequence[LikelihoodRatio], answer: Sequence[str], aside: Mapping[str, str]
+) -> list[Candidate]:
+    """Rows of the ranking of candidates for the differences that were fitted."""
+    return [
+        Candidate(
+            one.names[0],
+            BETWEEN_TRIALS,
+            REFITTED,
+            one.delta_chi2,
+            one.sigma,
+            one.numbers,
+            one.plausible,
+            one.names[0] in answer,
+            aside.get(one.names[0], one.reason),
+            {},
+            one.others if one.names[0] in answer else (),
+        )
+        for one in tried
+        if one.effects[-1].kind == BETWEEN_TRIALS
+    ]
+
+
+__all__ = ["BetweenRatio", "Difference", "between_candidates", "between_fits", "called", "differences"]

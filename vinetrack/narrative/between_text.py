@@ -1,0 +1,84 @@
+"""Differences between trials in words: which trials differ by what, and how to find out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from vinetrack.core.numbers import decimals
+from vinetrack.diagnosis.result import BETWEEN_SUMMARIES, BETWEEN_TRIALS, DAY, N_BY_VINE, ORDER_DRIFT, SPECIMEN
+from vinetrack.experiment.trial_order import FOLLOWS_PRESSURE, order_follows_pressure, trial_order
+from vinetrack.inference.fit_result import Number
+
+if TYPE_CHECKING:
+    from vinetrack.core.records import Trial
+    from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
+
+REMEDIES = {
+    N_BY_VINE: "Give every vine its own n (`shared={'n': 'vine'}`) before asking for effects",
+    ORDER_DRIFT: "Repeat six trials in random order, and number all in the column `order`",
+    SPECIMEN: "Film every specimen at several pressures, and name it in the column `specimen`",
+    DAY: "Repeat some conditions on another day, and zero the gauge before each",
+}
+
+
+def trials_differ(names: Sequence[str]) -> bool:
+    """Whether every name of an answer set is a difference between trials."""
+    return bool(names) and all(name in BETWEEN_SUMMARIES for name in names)
+
+
+def difference_headline(names: Sequence[str]) -> str:
+    """What an answer set of differences between trials says."""
+    return " or ".join(BETWEEN_SUMMARIES[name] for name in names)
+
+
+def difference_in_words(one: LikelihoodRatio) -> str:
+    """The size of one difference between trials: `order_drift: ln B changes by 0.021 ± 0.001 a trial`."""
+    name = one.names[-1]
+    if name == N_BY_VINE:
+        return "n differs between the vines: " + ", ".join(
+            f"{_value(number.value, number.sigma)} ({number.vine})" for number in one.numbers
+        )
+    if name == ORDER_DRIFT:
+        slope = one.numbers[0]
+        way = "rises" if slope.value > 0 else "falls"
+        return f"B {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % with every trial of a tube"
+    parts = []
+    in_B = [number for number in one.numbers if number.key.endswith(".B")]
+    in_P = [number for number in one.numbers if number.key.endswith(".P")]
+    if in_B:
+        parts.append(f"in B by {_range(in_B, 100, '%')}")
+    if in_P:
+        parts.append(f"in pressure (zero of the gauge, or P_y) by {_range(in_P, 1e-3, 'kPa')}")
+    return f"{name}s differ {' and '.join(parts)}"
+
+
+def remedies_in_words(kept: Sequence[LikelihoodRatio], trials: Sequence[Trial]) -> str:
+    """What to do about the differences of an answer set; blank where there are none."""
+    names = [one.names[-1] for one in kept if one.effects[-1].kind == BETWEEN_TRIALS]
+    if not names:
+        return ""
+    text = "".join(f" {REMEDIES[name]}." for name in names)
+    if ORDER_DRIFT not in names and SPECIMEN not in names:
+        return text
+    _, stated = trial_order(trials)
+    if not stated:
+        text = f" The order of the rows was taken for that of the trials.{text}"
+    correlation = order_follows_pressure(trials)
+    if math.isfinite(correlation) and abs(correlation) >= FOLLOWS_PRESSURE:
+        text = f" Trials were made in the order of pressure (rank correlation {correlation:.2f}).{text}"
+    return text
+
+
+def _value(value: float, sigma: float) -> str:
+    digits = decimals(sigma)
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+
+
+def _range(numbers: Sequence[Number], factor: float, unit: str) -> str:
+    """One coefficient with its error, several as a range."""
+    if len(numbers) == 1:
+        return f"{_value(factor * numbers[0].value, factor * numbers[0].sigma)} {unit} ({numbers[0].vine})"
+    values = [factor * number.value for number in numbers]
+    return f"{min(values):+.2g} to {max(values):+.2g} {unit}"
