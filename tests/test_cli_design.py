@@ -30,7 +30,7 @@ def cells(output: str, begins: str) -> list[str]:
 
 
 def test_the_fast_vine_is_found_and_its_choice_of_film_is_open(tmp_path: Path) -> None:
-    done = run("vine", "--pressure-kPa", 62, "--of-burst", 1, "--samples", 60, "--figure", tmp_path / "a.svg")
+    done = run("vine", "--pressure-kPa", 62, "--burst-fraction", 1, "--samples", 60, "--figure", tmp_path / "a.svg")
     assert done.exit_code == 0, done.output
     film, diameter, length, pressure, hoop, *_ = cells(done.output, "100")
     assert (film, diameter, length, pressure, hoop) == ("100", "25", "400", "62", "7.75")
@@ -83,7 +83,7 @@ def test_a_campaign_is_planned_rehearsed_and_written_as_a_sheet(tmp_path: Path) 
 
 
 def test_a_campaign_out_of_reach_says_what_would_help() -> None:
-    output = run("campaign", *TWO, "--n-within", 1e-5, "--most-trials", 30, "--check", 0).output
+    output = run("campaign", *TWO, "--n-se", 1e-5, "--most-trials", 30, "--check", 0).output
     assert "! no campaign of 30 trials or fewer with the allowed pressures and replicates reaches this" in output
     assert "widen the pressures" in output
 
@@ -98,8 +98,9 @@ def test_a_campaign_out_of_reach_says_what_would_help() -> None:
             "to its end, against a yield pressure of 3 kPa: raise",
         ),
         (
-            ("vine", "--pressure-kPa", 62, "--of-burst", 0.05, "--diameter-mm", 25, "--yield-pressure-kPa", 30),
-            "their walls are trusted with 6.24 kPa at most: raise --of-burst",  # 0.05 × 2 × 200 µm × 7.8 MPa/25 mm
+            ("vine", "--pressure-kPa", 62, "--burst-fraction", 0.05, "--diameter-mm", 25, "--yield-pressure-kPa", 30),
+            # 0.05 × 2 × 200 µm × 7.8 MPa/25 mm
+            "their walls are trusted with 6.24 kPa at most: raise --burst-fraction",
         ),
         (("vine", "--pressure-kPa", 62, "--diameter-mm", "25:5"), "write the lower value first"),
         (("vine", "--pressure-kPa", 62, "--diameter-mm", "5:15:25"), "write low:high"),
@@ -139,3 +140,10 @@ def test_ranges_and_lists_are_in_si_and_judged_as_cells_are() -> None:
     assert read_range("diameter_mm", "5:25") == (0.005, 0.025)
     assert read_range("pressure_kPa", "62") == (62e3, 62e3)
     assert read_list("thickness_um", "50, 100,50") == pytest.approx((50e-6, 100e-6))
+
+
+@pytest.mark.parametrize("old", [("--fps", "1000"), ("--of-burst=0.8",), ("--n-within", "0.02"), ("--from", "nowhere")])
+def test_an_option_of_the_last_release_is_read_with_a_warning(old: tuple[str, ...]) -> None:
+    done = run("campaign", *old)
+    assert f"{old[0].partition('=')[0]} is now --" in done.stderr
+    assert "No such option" not in done.stderr

@@ -56,7 +56,7 @@ def test_the_fast_vine_in_a_table_with_units() -> None:
 
 
 def test_every_final_speed_says_where_it_was_taken() -> None:
-    assert row(run("predict", *FAST, *FEW, "--at", 0.8).output, "speed of the leading edge")[1] == "0.8"
+    assert row(run("predict", *FAST, *FEW, "--final-at-fraction", 0.8).output, "speed of the leading edge")[1] == "0.8"
 
 
 def test_a_payload_has_an_ejection_speed() -> None:
@@ -103,7 +103,7 @@ def test_options_of_the_vine_beside_a_sheet_are_refused(tmp_path: Path) -> None:
 
 def test_a_fit_is_believed_with_its_numbers(fitted: Path) -> None:
     vine = ("--diameter-mm", 24, "--thickness-um", 200, "--length-mm", 280, "--pressure-kPa", 25)
-    output = run("predict", *vine, "--from", fitted, *FEW).output
+    output = run("predict", *vine, "--fit", fitted, *FEW).output
     assert float(row(output, "n ")[1]) == pytest.approx(N_TRUE, abs=0.02)
     assert float(row(output, "B ")[1]) == pytest.approx(6.4, rel=0.06)
     assert f"B, n, P_y as {fitted.as_posix()} knows them" in output
@@ -111,7 +111,7 @@ def test_a_fit_is_believed_with_its_numbers(fitted: Path) -> None:
 
 
 def test_a_vine_that_the_fit_does_not_know_is_said_to_be_guessed(fitted: Path) -> None:
-    output = run("predict", *FAST, "--from", fitted, *FEW).output
+    output = run("predict", *FAST, "--fit", fitted, *FEW).output
     assert "no vine of" in output
     assert "scaled from 18mm-150um-210mm" in output
 
@@ -131,7 +131,7 @@ def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_pa
     (belief,) = beliefs_of(read_ground(Asked(cells=values, results=results)))
     assert belief.model.names[-1] == "spring_line"
     write_json(results / "provenance.json", {"experiment": (tmp_path / "gone").as_posix()})
-    done = run("predict", *FAST, "--from", results)
+    done = run("predict", *FAST, "--fit", results)
     assert done.exit_code == 1
     assert "spring_line, an effect of its experiment's own, which is no longer in" in done.output
 
@@ -146,7 +146,7 @@ def test_an_effect_of_an_experiments_own_comes_with_its_fit(fitted: Path, tmp_pa
             (*FAST, "--effect", "reservoir_depletion"),
             "reservoir_depletion needs it: give it, as --chamber-l",
         ),
-        ((*FAST, "--from", "nowhere"), "nowhere/fit.json does not exist"),
+        ((*FAST, "--fit", "nowhere"), "nowhere/fit.json does not exist"),
         ((*FAST, "--figure", "a.doc"), "let it end in .png, .svg, .pdf"),
         ((*FAST, "--chamber-l", 0), "--chamber-l '0' is not above 0 litres"),
     ],

@@ -2,11 +2,359 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
-from vinetrack.cli.campaign_command import campaign
-from vinetrack.cli.predict_command import predict
-from vinetrack.cli.vine_commands import reservoir, vine
+from vinetrack.cli.design_options import (
+    BELIEF,
+    GUESSED_YIELD,
+    OUT,
+    RIG,
+    VINE,
+    AtFraction,
+    Damping,
+    DampingError,
+    Effects,
+    Exponent,
+    ExponentError,
+    FigurePath,
+    LogPath,
+    RenamedOptions,
+    Results,
+    Samples,
+    Seed,
+    column_options,
+    say,
+)
+
+
+@column_options(
+    "diameter_mm",
+    "thickness_um",
+    "length_mm",
+    "film_density_kg_m3",
+    "yield_pressure_kPa",
+    "yield_pressure_sigma_kPa",
+    "pressure_kPa",
+    "pressure_sigma_kPa",
+    "payload_g",
+    "growth_angle_deg",
+    "chamber_l",
+    "inlet_mm",
+    meanings={"yield_pressure_kPa": GUESSED_YIELD},
+)
+def predict(
+    sheet: Annotated[
+        Path | None,
+        typer.Argument(help="An experiment's folder or a sheet; else the options below.", metavar="SHEET",
+                       show_default=False),
+    ] = None,
+    *,
+    cells: dict[str, str],
+    tail_slack: Annotated[
+        str | None,
+        typer.Option("--tail-slack", metavar="taut|free", help="Whether a tail that would push goes slack.",
+                     rich_help_panel=RIG, show_default=False),
+    ] = None,
+    results: Results = None,
+    B: Damping = None,
+    B_error: DampingError = 0.0,
+    n: Exponent = None,
+    n_error: ExponentError = 0.0,
+    effects: Effects = None,
+    samples: Samples = 1000,
+    seed: Seed = 1,
+    at_fraction: AtFraction = 0.95,
+    figure: FigurePath = None,
+    csv: Annotated[
+        Path | None,
+        typer.Option("--csv", help="Write the curves, to this file.", rich_help_panel=OUT, show_default=False),
+    ] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option("--json", help="Write everything said, to this file.", rich_help_panel=OUT, show_default=False),
+    ] = None,
+    log: LogPath = None,
+) -> None:  # fmt: skip
+    """What a vine not yet built will do: position, speed, tension, ejection speed, with their uncertainty."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.pipeline.predict_stage import foretell
+        from vinetrack.pipeline.prediction_inputs import Asked
+
+        if tail_slack not in (None, "taut", "free"):
+            raise typer.BadParameter(f"{tail_slack!r} is neither taut nor free", param_hint="--tail-slack")
+        asked = Asked(
+            cells=cells,
+            sheet=sheet,
+            results=results,
+            effects=tuple(effects or ()),
+            tail_slack=tail_slack,
+            B=math.nan if B is None else B,
+            B_error=B_error / 100,
+            n=math.nan if n is None else n,
+            n_error=n_error,
+        )
+        say(foretell(asked, samples=samples, seed=seed, at_fraction=at_fraction, figure=figure, csv=csv, json=json))
+
+
+@column_options(
+    "pressure_kPa",
+    "film_density_kg_m3",
+    "yield_pressure_kPa",
+    "payload_g",
+    "growth_angle_deg",
+    "chamber_l",
+    "inlet_mm",
+    meanings={"pressure_kPa": "Highest gauge pressure of the supply.", "yield_pressure_kPa": GUESSED_YIELD},
+)
+def vine(
+    films: Annotated[
+        str, typer.Option("--films-um", metavar="UM,…", help="Films to choose from.", rich_help_panel=VINE)
+    ] = "50,100,150,200",
+    diameter: Annotated[
+        str, typer.Option("--diameter-mm", metavar="LOW:HIGH", help="Range of diameters.", rich_help_panel=VINE)
+    ] = "5:25",
+    length: Annotated[
+        str, typer.Option("--length-mm", metavar="LOW:HIGH", help="Range of lengths.", rich_help_panel=VINE)
+    ] = "100:400",
+    burst_share: Annotated[
+        float,
+        typer.Option("--burst-fraction", min=0.05, max=1, help="Share of the burst stress that is dared.",
+                     rich_help_panel=VINE),
+    ] = 0.9,
+    burst_stress: Annotated[
+        float,
+        typer.Option("--burst-MPa", min=0.01, max=1000, help="Hoop stress at which the film bursts; a guess.",
+                     rich_help_panel=VINE),
+    ] = 7.8,
+    *,
+    cells: dict[str, str],
+    results: Results = None,
+    n: Exponent = None,
+    n_error: ExponentError = 0.0,
+    effects: Effects = None,
+    samples: Samples = 400,
+    seed: Seed = 1,
+    at_fraction: AtFraction = 0.95,
+    figure: FigurePath = None,
+    log: LogPath = None,
+) -> None:  # fmt: skip
+    """The fastest vine within burst pressure, diameter, length, and films to choose from."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.pipeline.prediction_inputs import Asked
+        from vinetrack.pipeline.vine_stage import design_vine
+
+        asked = Asked(
+            cells=cells,
+            results=results,
+            effects=tuple(effects or ()),
+            n=math.nan if n is None else n,
+            n_error=n_error,
+        )
+        say(
+            design_vine(
+                asked,
+                films=films,
+                diameter=diameter,
+                length=length,
+                burst_share=burst_share,
+                burst_stress_MPa=burst_stress,
+                samples=samples,
+                seed=seed,
+                at_fraction=at_fraction,
+                figure=figure,
+            )
+        )
+
+
+@column_options(
+    "diameter_mm",
+    "length_mm",
+    "pressure_kPa",
+    "chamber_l",
+    "thickness_um",
+    "film_density_kg_m3",
+    "yield_pressure_kPa",
+    "payload_g",
+    "growth_angle_deg",
+    "inlet_mm",
+    meanings={
+        "chamber_l": "A chamber to look at as well.",
+        "thickness_um": "Thickness of the wall: speeds are then told as well.",
+        "yield_pressure_kPa": GUESSED_YIELD,
+    },
+)
+def reservoir(
+    *,
+    cells: dict[str, str],
+    within: Annotated[
+        float,
+        typer.Option("--within", min=0.01, max=90, help="Per cent of the gauge pressure that may be lost.",
+                     rich_help_panel=RIG),
+    ] = 5.0,
+    supply: Annotated[
+        float | None,
+        typer.Option("--supply-s", min=1e-6, max=1e4, help="Time in which a supply closes the gap.",
+                     rich_help_panel=RIG, show_default=False),
+    ] = None,
+    results: Results = None,
+    B: Damping = None,
+    n: Exponent = None,
+    effects: Effects = None,
+    at_fraction: AtFraction = 0.95,
+    figure: FigurePath = None,
+    log: LogPath = None,
+) -> None:  # fmt: skip
+    """The chamber that keeps the gauge pressure within so many per cent, by the gas law in absolute pressure."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.pipeline.prediction_inputs import Asked
+        from vinetrack.pipeline.reservoir_stage import design_reservoir
+
+        asked = Asked(
+            cells=cells,
+            results=results,
+            effects=tuple(effects or ()),
+            B=math.nan if B is None else B,
+            n=math.nan if n is None else n,
+        )
+        say(design_reservoir(asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure))
+
+
+@column_options(
+    "yield_pressure_kPa",
+    "yield_pressure_sigma_kPa",
+    "growth_angle_deg",
+    "chamber_l",
+    "inlet_mm",
+    meanings={"yield_pressure_kPa": GUESSED_YIELD},
+)
+def campaign(
+    vines: Annotated[
+        list[str] | None,
+        typer.Option("--vine", metavar="MMxUMxMM", help="Diameter, wall, length of a vine. May be repeated.",
+                     rich_help_panel=VINE, show_default=False),
+    ] = None,
+    n_se: Annotated[
+        float, typer.Option("--n-se", min=1e-5, max=1, help="Standard error of n that is wanted.")
+    ] = 0.01,
+    B_se_percent: Annotated[
+        float, typer.Option("--B-se-percent", min=1e-3, max=100, help="Standard error of every B, per cent.")
+    ] = 3.0,
+    pressure: Annotated[
+        str | None,
+        typer.Option("--pressure-kPa", metavar="LOW:HIGH", help="Range of pressures; else all that can be filmed.",
+                     rich_help_panel=RIG, show_default=False),
+    ] = None,
+    payloads: Annotated[
+        str, typer.Option("--payload-g", metavar="GRAMS,…", help="Payloads to choose from.", rich_help_panel=RIG)
+    ] = "0",
+    pressures: Annotated[
+        str, typer.Option("--pressures", metavar="LEAST:MOST", help="Pressures a vine.", rich_help_panel=RIG)
+    ] = "4:8",
+    replicates: Annotated[
+        str, typer.Option("--replicates", metavar="LEAST:MOST", help="Trials of each condition.", rich_help_panel=RIG)
+    ] = "2:12",
+    most_trials: Annotated[int, typer.Option("--most-trials", min=2, max=2000, help="In all.")] = 200,
+    capture_fps: Annotated[
+        float, typer.Option("--capture-fps", min=1, max=1e6, help="Frames a second.", rich_help_panel=RIG)
+    ] = 1069.0,
+    noise: Annotated[
+        float, typer.Option("--noise-mm", min=1e-5, max=50, help="Noise of a position.", rich_help_panel=RIG)
+    ] = 0.1,
+    correlation: Annotated[
+        float, typer.Option("--noise-correlation", min=-0.5, max=0.98, help="From frame to frame.", rich_help_panel=RIG)
+    ] = 0.0,
+    longest: Annotated[
+        float, typer.Option("--longest-s", min=0.01, max=60, help="Longest recording.", rich_help_panel=RIG)
+    ] = 4.0,
+    *,
+    cells: dict[str, str],
+    burst_share: Annotated[
+        float, typer.Option("--burst-fraction", min=0.05, max=1, help="Share of the burst stress that is dared.")
+    ] = 0.9,
+    pressure_spread: Annotated[
+        float | None,
+        typer.Option("--P-spread", min=0, max=4, help="Of pressure from trial to trial, per cent (1).",
+                     rich_help_panel=BELIEF, show_default=False),
+    ] = None,
+    damping_spread: Annotated[
+        float | None,
+        typer.Option("--B-spread", min=0, max=15, help="Of B from trial to trial, per cent (3).",
+                     rich_help_panel=BELIEF, show_default=False),
+    ] = None,
+    results: Results = None,
+    n: Exponent = None,
+    effects: Effects = None,
+    check: Annotated[int, typer.Option("--check", min=0, max=1000, help="Campaigns to rehearse.")] = 20,
+    seed: Seed = 1,
+    sheet: Annotated[
+        Path | None,
+        typer.Option("--sheet", help="Write a sheet to film by, to this file.", rich_help_panel=OUT,
+                     show_default=False),
+    ] = None,
+    figure: FigurePath = None,
+    log: LogPath = None,
+) -> None:  # fmt: skip
+    """Pressures, payloads and replicates that pin n and B to a wanted error, rehearsed before they are made."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.pipeline.campaign_stage import Wanted, design_campaign
+        from vinetrack.pipeline.prediction_inputs import Asked
+
+        asked = Asked(
+            cells=cells,
+            results=results,
+            effects=tuple(effects or ()),
+            n=math.nan if n is None else n,
+            spreads=spreads(pressure_spread, damping_spread),
+        )
+        wanted = Wanted(
+            vines=tuple(vines or ()),
+            pressure=pressure,
+            payloads=payloads,
+            n_error=n_se,
+            B_error=B_se_percent / 100,
+            capture_fps=capture_fps,
+            noise_mm=noise,
+            correlation=correlation,
+            longest_s=longest,
+            pressures=counts(pressures, "--pressures", 2, 13),
+            replicates=counts(replicates, "--replicates", 1, 50),
+            most_trials=most_trials,
+            burst_share=burst_share,
+            check=check,
+            seed=seed,
+        )
+        say(design_campaign(asked, wanted, sheet=sheet, figure=figure))
+
+
+def spreads(pressure: float | None, damping: float | None) -> tuple[float, float] | None:
+    """Relative spreads from trial to trial, where either is given; the other as a batch of vines shows it."""
+    if pressure is None and damping is None:
+        return None
+    return (1.0 if pressure is None else pressure) / 100, (3.0 if damping is None else damping) / 100
+
+
+def counts(text: str, name: str, least: int, most: int) -> tuple[int, int]:
+    """Two numbers of things from `low:high` or one number."""
+    try:
+        values = [int(part) for part in text.split(":")]
+    except ValueError:
+        values = []
+    if len(values) not in (1, 2) or not least <= values[0] <= values[-1] <= most:
+        raise typer.BadParameter(f"{text!r} is no range within {least}:{most}, such as 4:8", param_hint=name)
+    return values[0], values[-1]
+
 
 design_app = typer.Typer(
     name="design",
@@ -15,12 +363,12 @@ design_app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-design_app.command()(vine)
-design_app.command()(reservoir)
-design_app.command()(campaign)
+design_app.command(cls=RenamedOptions)(vine)
+design_app.command(cls=RenamedOptions)(reservoir)
+design_app.command(cls=RenamedOptions)(campaign)
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    app.command()(predict)
+    app.command(cls=RenamedOptions)(predict)
     app.add_typer(design_app)

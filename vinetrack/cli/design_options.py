@@ -9,16 +9,43 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import typer.core
 
 from vinetrack.experiment.schema import COLUMNS, Column, option
 
-VINE, RIG, BELIEF, OUT = "The vine", "The rig", "What is believed", "What is written"
+VINE, RIG, BELIEF, OUT = "The vine", "The rig", "Inputs of the model", "Output files"
 
 
 _VINE_COLUMNS = frozenset(
     {"diameter_mm", "thickness_um", "length_mm", "film_density_kg_m3", "yield_pressure_kPa", "yield_pressure_sigma_kPa"}
 )
 """Columns about the vine itself; the others are about the rig."""
+
+RENAMED_OPTIONS = {
+    "--fps": "--capture-fps",
+    "--of-burst": "--burst-fraction",
+    "--at": "--final-at-fraction",
+    "--n-within": "--n-se",
+    "--B-within": "--B-se-percent",
+    "--from": "--fit",
+}
+"""Options of version 0.1 and their names now; the old ones are read, with a warning, until the next release."""
+
+
+class RenamedOptions(typer.core.TyperCommand):
+    """A command that also reads options by their former names."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        """Read the options, former names replaced, with a line to the terminal for each."""
+        current = []
+        for argument in args:
+            name, equals, value = argument.partition("=")
+            if name in RENAMED_OPTIONS:
+                typer.echo(f"{name} is now {RENAMED_OPTIONS[name]}; the old name goes with the next release.", err=True)
+                name = RENAMED_OPTIONS[name]
+            current.append(name + equals + value)
+        return super().parse_args(ctx, current)
+
 
 GUESSED_YIELD = "Yield pressure; a scaling prior where it is not given."
 
@@ -75,7 +102,7 @@ def _column_option(column: Column, meaning: str | None) -> inspect.Parameter:
 Results = Annotated[
     Path | None,
     typer.Option(
-        "--from", help="Results folder whose fit is believed.", metavar="RESULTS", rich_help_panel=BELIEF,
+        "--fit", help="Results folder whose fit gives the inputs.", metavar="RESULTS", rich_help_panel=BELIEF,
         show_default=False,
     ),
 ]  # fmt: skip
@@ -103,7 +130,9 @@ Samples = Annotated[int, typer.Option("--samples", min=50, max=100_000, help="Dr
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Of the random numbers.", rich_help_panel=BELIEF)]
 AtFraction = Annotated[
     float,
-    typer.Option("--at", min=0.05, max=0.99, help="y/L at which final speeds are taken.", rich_help_panel=BELIEF),
+    typer.Option(
+        "--final-at-fraction", min=0.05, max=0.99, help="y/L at which final speeds are taken.", rich_help_panel=BELIEF
+    ),
 ]
 FigurePath = Annotated[
     Path | None, typer.Option("--figure", help="Draw it, to this file.", rich_help_panel=OUT, show_default=False)

@@ -143,7 +143,7 @@ def _refuse_standstill(room: Room, found: Sequence[Choice]) -> None:
     remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
     if highest_Pa < 0.995 * room.pressure_Pa:
         message += f": their walls are trusted with {highest_Pa / 1e3:.3g} kPa at most"
-        remedy = "raise --of-burst, or allow thicker films or smaller diameters"
+        remedy = "raise --burst-fraction, or allow thicker films or smaller diameters"
     raise _refusal("pressure_kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
 

@@ -128,7 +128,7 @@ def candidates(beliefs: Sequence[PredictiveInputs], scope: Scope, camera: Filmin
     if not kept:
         raise CampaignError(
             f"No trial of the campaign could be filmed: none grows within {camera.longest_s:g} s and in a dozen frames "
-            "or more; widen the range of pressures, or change --fps or --longest-s."
+            "or more; widen the range of pressures, or change --capture-fps or --longest-s."
         )
     shown = tuple(item.trial for item in kept)
     return Candidates(
