@@ -26,6 +26,7 @@ from vinetrack.dynamics.equations import (
     Point,
     TrialArrays,
     compiled,
+    inlined,
     next_slope_change,
 )
 from vinetrack.dynamics.radau import NO_STAGES, first_stages, quintic, radau_step
@@ -213,13 +214,13 @@ def integrate_trials(
         ends[i, 4] = slack_time
 
 
-@compiled
+@inlined
 def _at(point, x):
     """The same point at another position."""
     return Point(point.time, x, point.v, point.slope, point.chamber)
 
 
-@compiled
+@inlined
 def _write_at_rest(equations, trial, times, row, until, point, out):
     """Fill the rows of `out` from `row` up to the time `until` with a vine at rest; returns the next row."""
     while row < times.size and times[row] <= until:
@@ -232,7 +233,7 @@ def _write_at_rest(equations, trial, times, row, until, point, out):
     return row
 
 
-@compiled
+@inlined
 def _write_moving(equations, trial, times, row, fraction, h, start, end, out):
     """Fill the rows of `out` from `row` up to a fraction of a step; returns the next row."""
     while row < times.size and times[row] <= start.time + fraction * h:
@@ -247,14 +248,14 @@ def _write_moving(equations, trial, times, row, fraction, h, start, end, out):
     return row
 
 
-@compiled
+@inlined
 def _within_step(fraction, h, start, end):
     """The vine at a fraction of a step."""
     x, v, a = quintic(fraction, h, start, end)
     return Point(start.time + fraction * h, x, v, a, start.chamber + fraction * (end.chamber - start.chamber))
 
 
-@compiled
+@inlined
 def _fraction_at(x_wanted, h, start, end):
     """Fraction of a step at which x reaches a position, by bisection."""
     low, high = 0.0, 1.0
@@ -268,7 +269,7 @@ def _fraction_at(x_wanted, h, start, end):
     return 0.5 * (low + high)
 
 
-@compiled
+@inlined
 def _limited_step(h, point, x_limit):
     """The step size, cut so that the step ends just behind the next breakpoint or the end of growth."""
     ahead = x_limit - point.x
@@ -277,7 +278,7 @@ def _limited_step(h, point, x_limit):
     return h
 
 
-@compiled
+@inlined
 def _up_to_sample(h, time, sample, trial):
     """The step size, cut at the next sample of a measured pressure: a step across it would be refused repeatedly."""
     if sample < trial.trace_time.size and time + h > trial.trace_time[sample]:
@@ -285,7 +286,7 @@ def _up_to_sample(h, time, sample, trial):
     return h
 
 
-@compiled
+@inlined
 def _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale):
     """Whether a step counts, and otherwise the factor on its size for the next attempt.
 
@@ -305,14 +306,14 @@ def _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale)
     return ACCEPTED, 1.0
 
 
-@compiled
+@inlined
 def _next_step_size(h, wished, error):
     """Size of the step after an accepted one, from its error: Hairer & Wanner IV.8, an estimate of order 3."""
     longer = h * min(6.0, 0.9 * max(error, 1e-8) ** -0.25)
     return max(longer, wished) if wished > h and error < EASY else longer
 
 
-@compiled
+@inlined
 def _set_off(equations, trial, point, until, stop):
     """From rest: the point with its acceleration, the speed that the motion will reach, and the first step."""
     slope, _rate = equations.rates(point.time, point.x, 0.0, point.chamber, trial)
@@ -321,7 +322,7 @@ def _set_off(equations, trial, point, until, stop):
     return Point(point.time, point.x, 0.0, slope, point.chamber), scale, 1e-4 * scale / slope
 
 
-@compiled
+@inlined
 def _pulled_taut(equations, trial, point, scale):
     """After a slack phase: the point with its acceleration, the speed to be expected, and the first step."""
     time, x, v, _slope, chamber = point

@@ -9,7 +9,7 @@ table 5.6) and IV.8 (its implementation in RADAU5: simplified Newton iterations,
 
 from typing import NamedTuple
 
-from vinetrack.dynamics.equations import Point, compiled
+from vinetrack.dynamics.equations import Point, inlined
 
 SQRT6 = 6.0**0.5
 C1, C2 = (4 - SQRT6) / 10, (4 + SQRT6) / 10
@@ -55,7 +55,7 @@ NO_STAGES = Stages(0.0, 0.0, 0.0, 0.0)
 """For a step that no other precedes: after a start and after a step was refused."""
 
 
-@compiled
+@inlined
 def _solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
     """Solution of three linear equations by Cramer's rule: the Newton step of the three stages."""
     k1 = m22 * m33 - m23 * m32
@@ -68,7 +68,7 @@ def _solve3(m11, m12, m13, m21, m22, m23, m31, m32, m33, b1, b2, b3):
     return z1, z2, z3
 
 
-@compiled
+@inlined
 def _slope_in_speed(equations, trial, time, x, v, chamber, acceleration, scale):
     """∂a/∂v, 1/s, by a one-sided difference, upwards: below rest the law is another."""
     delta = 1e-6 * max(abs(v), 1e-4 * scale)
@@ -76,7 +76,7 @@ def _slope_in_speed(equations, trial, time, x, v, chamber, acceleration, scale):
     return (higher - acceleration) / delta
 
 
-@compiled
+@inlined
 def first_stages(point, h, before):
     """Starting values of the Newton iterations: the last step's cubic, continued beyond its end.
 
@@ -92,7 +92,7 @@ def first_stages(point, h, before):
     return Stages(h, max(w1, lowest), max(w2, lowest), max(w3, lowest))
 
 
-@compiled
+@inlined
 def _continued(s, stages):
     """The cubic through (0, 0), (C1, z1), (C2, z2), (1, z3), at s."""
     l1 = s * (s - C2) * (s - 1) / (C1 * (C1 - C2) * (C1 - 1))
@@ -101,7 +101,7 @@ def _continued(s, stages):
     return l1 * stages.z1 + l2 * stages.z2 + l3 * stages.z3
 
 
-@compiled
+@inlined
 def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
     """Newton's change of the stage speeds: (I − h A J) d = h A f − z, J the slopes of the acceleration in speed."""
     return _solve3(
@@ -114,7 +114,7 @@ def _newton_speeds(h, j1, j2, j3, f1, f2, f3, z1, z2, z3):
     )  # fmt: skip
 
 
-@compiled
+@inlined
 def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
     """Newton's change of the chamber's pressures at the stages; jc is h times the slope of its rate in pressure."""
     return _solve3(
@@ -127,7 +127,7 @@ def _newton_chamber(h, jc, g1, g2, g3, q1, q2, q3, chamber):
     )  # fmt: skip
 
 
-@compiled
+@inlined
 def radau_step(equations, trial, point, stages, scale, rtol):
     """One step from `point`, of the size and with the starting values that `first_stages` gave.
 
@@ -197,7 +197,7 @@ def radau_step(equations, trial, point, stages, scale, rtol):
     return True, _local_error(point, gained, scale, rtol), _end_of_step(point, gained, q3), gained
 
 
-@compiled
+@inlined
 def _local_error(point, stages, scale, rtol):
     """Hairer's estimate of the error of the speed, in units of the tolerance.
 
@@ -210,7 +210,7 @@ def _local_error(point, stages, scale, rtol):
     return abs(raw) / weight
 
 
-@compiled
+@inlined
 def _end_of_step(point, stages, chamber):
     """The vine at the end of a step; `chamber` is the pressure at its last stage."""
     h, z1, z2, z3 = stages
@@ -219,7 +219,7 @@ def _end_of_step(point, stages, chamber):
     return Point(point.time + h, x_end, point.v + z3, slope_end, chamber)
 
 
-@compiled
+@inlined
 def quintic(s, h, start, end):
     """Position, speed and acceleration at the fraction s of a step h, from those at its ends (Hermite, order 6)."""
     d = end.x - start.x - h * start.v - 0.5 * h * h * start.slope
