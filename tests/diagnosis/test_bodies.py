@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,9 @@ from lsoda_vine import as_track
 import vinetrack as vt
 from vinetrack.core.constants import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.core.records import Track, Trial
+from vinetrack.diagnosis.force_inversion import Gain
+from vinetrack.diagnosis.force_laws import Law
+from vinetrack.diagnosis.missing_force import _Judged
 
 REAL = os.environ.get("VINETRACK_REAL_DATA", "")
 DRAG = 0.5
@@ -65,3 +69,15 @@ def test_the_drag_of_eight_real_paper_cups_is_named() -> None:
     found = vt.diagnose(Path(REAL) / "falling_cups", ladder=False, advice=False)
     assert (found.verdict, found.effects) == ("missing", ("air_drag",))
     assert found.fits[-1]["C_D"].value == pytest.approx(1.24, abs=0.03)
+
+
+def test_a_local_force_narrower_than_a_millimetre_is_not_named() -> None:
+    assert Law("patch", shapes=2, low=-2e-3, high=4e-4).is_a_point
+    assert not Law("patch", shapes=2, low=0.02, high=0.04).is_a_point
+
+
+def test_a_force_far_beyond_drive_and_weight_is_not_named() -> None:
+    gain = Gain(100.0, np.array([-1.6e6]), 10.0, np.empty(0), 1)
+    law = Law("patch", shapes=2, low=0.274, high=0.294)
+    assert not _Judged(law, gain, 0.0, largest_N=50.0).seen
+    assert _Judged(law, replace(gain, amplitude=np.array([-20.0]), sigma=1.0), 0.0, largest_N=50.0).seen

@@ -42,6 +42,10 @@ START = 0.05
 """Of the growth, over which a vine gathers speed: a force there is not the largest that is seen. Chosen; wording alone
 depends on it."""
 
+LEAST_PATCH_M = 1e-3
+"""Least width of a local force that is named. Chosen: its ends are printed in millimetres; at half of it both ends
+could be the same number, at twice a narrow obstacle goes unnamed."""
+
 SAME_AREA = 1.02
 """Ratio of areas up to which two vines count as one. Chosen: twice the error of a diameter of 0.5 %."""
 
@@ -63,6 +67,11 @@ class Law:
     scale: float = math.nan
     by_area: float = 0.0
     largest: float = 1.0
+
+    @property
+    def is_a_point(self) -> bool:
+        """Whether it acts over less than a millimetre, which no camera that sees the growth resolves."""
+        return self.kind == "patch" and not self.high - max(self.low, 0.0) > LEAST_PATCH_M
 
     @property
     def shape_names(self) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.constants import GRAVITY_M_S2
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import ForceFit, Gain
 from vinetrack.diagnosis.force_laws import Law, coarse_laws, finer_laws
@@ -75,6 +76,12 @@ misfit, below which the sentence says that it is no force."""
 EQUALLY = 0.05
 """Laws that explain as much but for this part are named beside it. Chosen: a twentieth is what single trials scatter
 by."""
+
+
+BEYOND_DRIVE = 10.0
+"""Times the largest drive, weight and inertia of the trials, above which a force is not named: such a law acts at the
+edge of what was visited, where next to nothing is felt of it. Chosen: one missing force of the drive's own size is a
+gross failure already; at half of it a stop that a vine runs into may go unnamed, at twice nonsense is as rare."""
 
 
 Answers = Callable[[Sequence[Law]], list[Floats]]
@@ -171,11 +178,13 @@ class _Judged:
     gain: Gain
     bic: float
     explained: float = 0.0
+    largest_N: float = math.inf
 
     @property
     def seen(self) -> bool:
-        """Whether its force is more than the errors of single trials could make."""
-        return math.hypot(*self.gain.amplitude) > SEEN * self.gain.sigma
+        """Whether its force is more than the errors of single trials could make, and one that these motions allow."""
+        size_N = math.hypot(*self.gain.amplitude)
+        return SEEN * self.gain.sigma < size_N < self.largest_N and not self.law.is_a_point
 
 
 def curves(at: Floats, count: int) -> Floats:
@@ -202,12 +211,12 @@ def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[FittedMotion], ev
         found = zip(laws, fit.gains(answers(laws), [law.columns for law in laws]), strict=True)
         return [(law, gain) for law, gain in found if gain.terms or law.kind == "constant"]
 
-    found = gains(coarse_laws(motions))
+    found, largest = gains(coarse_laws(motions)), _largest_N(motions)
     most = max(everything.chi2, *(gain.chi2 for _, gain in found))
-    finer = [law for one in _best_of_kinds(_judged(fit, found, most)) for law in finer_laws(one.law, motions)]
+    finer = [law for one in _best_of_kinds(_judged(fit, found, most, largest)) for law in finer_laws(one.law, motions)]
     found += gains(finer)
     most = max(most, *(gain.chi2 for _, gain in found))
-    return sorted(_best_of_kinds(_judged(fit, found, most)), key=lambda one: (not one.seen, one.bic))
+    return sorted(_best_of_kinds(_judged(fit, found, most, largest)), key=lambda one: (not one.seen, one.bic))
 
 
 def _in_full(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion], laws: list[_Judged]) -> list[_Judged]:
@@ -225,12 +234,25 @@ def _in_full(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion], laws: l
             gains[k] = Gain(fit.chi2 - full.chi2, full.amplitude, full.sigma, full.numbers, one.gain.terms)
             laws = [*laws[:k], replace(one, law=full.law), *laws[k + 1 :]]
     most = max(gain.chi2 for gain in gains)
-    judged = _judged(fit, list(zip((one.law for one in laws), gains, strict=True)), most)
+    judged = _judged(fit, list(zip((one.law for one in laws), gains, strict=True)), most, _largest_N(motions))
     return sorted(judged, key=lambda one: (not one.seen, one.bic))
 
 
-def _judged(fit: ForceFit, found: Sequence[tuple[Law, Gain]], most: float) -> list[_Judged]:
-    return [_Judged(law, gain, fit.bic(gain.chi2, law.columns + law.shapes, most)) for law, gain in found]
+def _judged(fit: ForceFit, found: Sequence[tuple[Law, Gain]], most: float, largest_N: float) -> list[_Judged]:
+    return [
+        _Judged(law, gain, fit.bic(gain.chi2, law.columns + law.shapes, most), largest_N=largest_N)
+        for law, gain in found
+    ]
+
+
+def _largest_N(motions: Sequence[FittedMotion]) -> float:
+    """The largest force that is named: BEYOND_DRIVE times drive, weight and inertia at their largest."""
+    sizes = []
+    for motion in motions:
+        drive_N = np.nan_to_num(motion.pressure_Pa * motion.trial.area_m2 / motion.trial.travel_ratio)
+        body_N = motion.mass_kg * (GRAVITY_M_S2 + np.abs(motion.actual))
+        sizes.append(float(np.max(drive_N + body_N)))
+    return BEYOND_DRIVE * max(sizes)
 
 
 def _best_of_kinds(found: Sequence[_Judged]) -> list[_Judged]:

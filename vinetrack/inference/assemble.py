@@ -247,10 +247,16 @@ def _messages(
             found.append(f"the spread of {name} from trial to trial is taken as {100 * solution.state.spread[k]:.2g} %")
     if chi2 > MISSES:
         found.append(
-            f"the model leaves {math.sqrt(chi2):.3g} times the noise of the tracks, with B and pressure of every trial"
-            " free to help: something is missing, or tracks err slowly by more than their noise"
+            f"the model leaves {math.sqrt(chi2):.3g} times the noise of the tracks{_free_in_trials(solution)}:"
+            " something is missing, or tracks err slowly by more than their noise"
         )
     return found
+
+
+def _free_in_trials(solution: Solution) -> str:
+    """What every trial may have of its own, where it may: a falling body has neither B nor pressure."""
+    felt = [SPREAD_NAMES[k] for k in (1, 0) if solution.frame.feels[:, k].any()]
+    return f", with {' and '.join(felt)} of every trial free to help" if felt else ""
 
 
 def _close_pairs(numbers: Sequence[Number], known: Precision) -> list[str]:

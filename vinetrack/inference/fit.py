@@ -57,6 +57,9 @@ POOR_FIT = 3.0
 """χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried. Chosen: half would
 try further starts for most fits (time), twice would keep local minima."""
 
+STANDSTILL_M = 1e-9
+"""Derived: no camera sees a nanometre; a trajectory that spans less is one of a model that nothing drives."""
+
 MOST_STARTS = 3
 """Starts and iterations at most. Chosen for time: fits that need more are taken up again by the search for a better
 minimum."""
@@ -141,7 +144,34 @@ def fit(
     predictor = Predictor(layout, data, host)
     held = _held(spreads, noise, data)
     solution = _solve_from_scratch(predictor, held, watch, thorough=thorough)
+    _refuse_a_standstill(predictor, solution)
     return assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
+
+
+def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
+    """A model in which nothing drives any trial has no trajectories, and so nothing to compare or to add to.
+
+    Raises
+    ------
+    FitError
+        If no trial moves.
+    """
+    moved = predictor.run(predictor.jobs(solution.state.theta, solution.state.own))
+    if any(float(np.ptp(one.observed_position_m)) > STANDSTILL_M for one in moved):
+        return
+    model = " + ".join(predictor.layout.model.names)
+    angles = sorted({round(math.degrees(item.trial.growth_angle_rad)) for item in predictor.data})
+    pressures = sorted({round(item.trial.pressure_Pa / 1e3, 1) for item in predictor.data})
+    angle, pressure = (_range_in_words(values) for values in (angles, pressures))
+    raise FitError(
+        f"The model {model} moves no trial: at a growth angle of {angle}° and {pressure} kPa nothing in it drives"
+        " them. Check growth_angle_deg (0 is straight down), pressure_kPa and yield_pressure_kPa, or put the effect"
+        " that drives them in `model:`."
+    )
+
+
+def _range_in_words(values: list[float]) -> str:
+    return f"{values[0]:g}" if values[0] == values[-1] else f"{values[0]:g} to {values[-1]:g}"
 
 
 def _held(spreads: tuple[float, float] | None, noise: tuple[float, float] | None, data: list[FitTrial]) -> FixedTerms:

@@ -156,6 +156,8 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
             f"its pressure, {trial.pressure_Pa / 1e3:g} kPa, lies below the yield pressure,"
             f" {trial.yield_pressure_Pa / 1e3:g} kPa, yet it moves: correct the sheet"
         )
+    if trial.payload_kg == 0 and not trial.linear_density_kg_m > 0:
+        raise FitError("it has no mass: fill in payload_g, the mass of a body that moves as a whole")
     moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
     if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
         raise FitError("its leading edge never moves forward beyond its noise")
