@@ -170,7 +170,7 @@ def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
     )
 
 
-def _range_in_words(values: list[float]) -> str:
+def _range_in_words(values: Sequence[float]) -> str:
     return f"{values[0]:g}" if values[0] == values[-1] else f"{values[0]:g} to {values[-1]:g}"
 
 
