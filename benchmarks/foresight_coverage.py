@@ -32,7 +32,7 @@ from vinetrack.laboratory.ground_truth import Nature
 from vinetrack.laboratory.tracks import grow
 from vinetrack.planning.fit_inputs import numbers_of
 from vinetrack.planning.input_sources import predictive_inputs
-from vinetrack.planning.prediction_runs import run
+from vinetrack.planning.prediction import run
 
 DAMPING_SCATTER, PRESSURE_SCATTER = 0.03, 0.01
 SAMPLES = 400

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.core.tables import read_table
 from vinetrack.experiment.folder import read_experiment
-from vinetrack.pipeline.vine_stage import read_list, read_range
+from vinetrack.pipeline.design_stage import read_list, read_range
 
 TWO = ("--vine", "24x200x280", "--vine", "12×100×140")
 INJECTOR = ("--diameter-mm", 2.5, "--length-mm", 12.5, "--pressure-kPa", 48, "--chamber-l", 0.003534)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from vinetrack.dynamics.kernel import PARTS
 from vinetrack.pipeline import stage_code
 from vinetrack.pipeline.stage_code import PACKAGE, STAGE_MODULES, code_hash, imported_names, stage_files
 
@@ -111,8 +112,8 @@ def test_an_effect_reruns_the_model_though_nothing_imports_it(copy: Path) -> Non
     assert "damping" not in changed
 
 
-def test_the_text_that_is_compiled_behind_the_effects_reruns_the_model(copy: Path) -> None:
-    for name in ("radau.py", "breakpoints.py", "slack_tail.py", "integrator.py"):
+def test_every_part_of_the_compiled_integrator_reruns_the_model(copy: Path) -> None:
+    for name in PARTS:
         assert {"laboratory", "model", "diagnosis"} <= changed_by_an_edit(copy / "dynamics" / name, copy)
 
 

@@ -10,11 +10,18 @@ import pytest
 import vinetrack as vt
 from vinetrack.experiment.planned import planned_trial
 from vinetrack.planning.campaign_design import Candidates, Planned, Scope, candidates, plan, trials_of
-from vinetrack.planning.campaign_information import FilmingPlan, filmed, information, joint_model
+from vinetrack.planning.campaign_information import (
+    FilmingPlan,
+    filmed,
+    information,
+    joint_model,
+    reaches_steady,
+    steady_error,
+    steady_speed,
+)
 from vinetrack.planning.input_sources import StatedValues, predictive_inputs
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.planning.simulated_campaigns import make, simulate_campaign
-from vinetrack.planning.steady_information import reaches_steady, steady_error, steady_speed
 
 CAMERA = FilmingPlan(1069.0, 1e-4)
 SIZES = ((24, 200, 280), (12, 100, 140))

@@ -148,8 +148,8 @@ def vine(
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
+        from vinetrack.pipeline.design_stage import design_vine
         from vinetrack.pipeline.prediction_inputs import Asked
-        from vinetrack.pipeline.vine_stage import design_vine
 
         asked = Asked(
             cells=cells,
@@ -216,8 +216,8 @@ def reservoir(
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
+        from vinetrack.pipeline.design_stage import design_reservoir
         from vinetrack.pipeline.prediction_inputs import Asked
-        from vinetrack.pipeline.reservoir_stage import design_reservoir
 
         asked = Asked(
             cells=cells,

@@ -82,7 +82,7 @@ def add(
         for line in lines:
             typer.echo(line)
         if save:
-            from vinetrack.pipeline.save_model import save_model
+            from vinetrack.pipeline.source_experiment import save_model
 
             path = save_model(read.folder, [*read.settings.model, effect])
             typer.echo(f"Saved to {path}; run snakemake again to have everything with it.")

@@ -90,7 +90,7 @@ def _without_a_page(
     from vinetrack.explorer.curves import errors_m, follow
     from vinetrack.explorer.export import model_words, write_export
     from vinetrack.explorer.fitting import first_fit, fit_choice, gained_words
-    from vinetrack.pipeline.save_model import save_model
+    from vinetrack.pipeline.source_experiment import save_model
 
     with waiting("simulating the trials"):
         before = errors_m(campaign, follow(campaign, sized(campaign, start)))

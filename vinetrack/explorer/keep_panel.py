@@ -12,7 +12,7 @@ from vinetrack.core.problems import ExperimentError, format_problems
 from vinetrack.core.tables import TableError
 from vinetrack.explorer.export import commands, exported, model_words
 from vinetrack.explorer.look import command_block, escaped, sheet, words
-from vinetrack.pipeline.save_model import save_model
+from vinetrack.pipeline.source_experiment import save_model
 
 if TYPE_CHECKING:
     from vinetrack.explorer.page import Page

@@ -20,6 +20,7 @@ from vinetrack.dynamics.force_terms import pressure_along
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.laboratory.ground_truth import Nature
+from vinetrack.tracks.noise import ar1_noise
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def _measure(
     if moved.status == "ended":
         stop = min(stop, int(np.searchsorted(time_s - release_s, moved.end_time_s)) + nature.frames_after_end)
     origin_m = draw.uniform(*nature.origin_m)
-    noise = _ar1(stop, nature.noise_m, nature.noise_correlation, draw)
+    noise = ar1_noise(stop, nature.noise_m, nature.noise_correlation, draw)
     shown, index, dropped, repeated = _faults(moved.lead_velocity_m_s[:stop], nature, draw)
     measured = (origin_m + moved.observed_position_m[:stop] + noise)[shown]
     gauge = None
@@ -140,17 +141,6 @@ def _measure(
         dropped=dropped,
         repeated=repeated,
     )
-
-
-def _ar1(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
-    """Stationary noise with this standard deviation and lag-one correlation, shape (count,)."""
-    from scipy.signal import lfilter
-
-    white = draw.standard_normal(count)
-    if correlation == 0:
-        return sd * white
-    white[1:] *= math.sqrt(1 - correlation**2)
-    return sd * np.asarray(lfilter([1.0], [1.0, -correlation], white))
 
 
 def _faults(

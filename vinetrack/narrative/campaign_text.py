@@ -82,7 +82,7 @@ def _conditions(planned: Planned, best: Plan) -> Iterator[str]:
 def _compared(planned: Planned, inputs: Sequence[PredictiveInputs], camera: FilmingPlan) -> Iterator[str]:
     """The campaign beside others that meet the limits and the cheapest; the error of n from steady speeds alone."""
     from vinetrack.core.terminal import table
-    from vinetrack.planning.steady_information import reaches_steady, steady_error
+    from vinetrack.planning.campaign_information import reaches_steady, steady_error
 
     shown = planned.candidates
     steady = reaches_steady(shown.model, shown.trials, camera.longest_s)

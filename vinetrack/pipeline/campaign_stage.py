@@ -14,8 +14,8 @@ import numpy as np
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_csv
 from vinetrack.narrative.campaign_text import campaign_lines, rehearsal_lines
+from vinetrack.pipeline.design_stage import read_list, read_range
 from vinetrack.pipeline.prediction_inputs import Asked, as_option, beliefs_of, check_figure, read_ground, write_figure
-from vinetrack.pipeline.vine_stage import read_list, read_range
 from vinetrack.results.folder_layout import ResultsError
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 Starting from the modules that a stage's command calls, every import of a vinetrack module is followed, those inside
 functions included; imports for the type checker alone are not. A module also depends on the files beside it that it
-names in a string: effects (`"*.py"`), the texts of the compiled integrator, templates, style sheets, yaml files.
+names in a string: effects (`"*.py"`), templates, style sheets, yaml files.
 
 The sources are scanned with regular expressions: parsing 300 files takes 1.3 s, scanning those of all stages 0.15 s,
 and Snakemake waits for it at every start. A test compares the scan with the syntax trees of all files.

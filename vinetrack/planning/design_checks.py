@@ -13,8 +13,15 @@ from vinetrack.dynamics.audit import AuditedMotion, audit
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.planning.prediction import EJECTION, LEAST_TENSION, VinePrediction, told_by_payload
-from vinetrack.planning.prediction_runs import LONGEST_S, POINTS, follow
+from vinetrack.planning.prediction import (
+    EJECTION,
+    LEAST_TENSION,
+    LONGEST_S,
+    POINTS,
+    VinePrediction,
+    follow,
+    told_by_payload,
+)
 from vinetrack.planning.predictive_inputs import BAND, YIELD, PredictiveInputs
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, burst_pressure_Pa, hoop_stress_Pa
 

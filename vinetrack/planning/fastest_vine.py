@@ -18,8 +18,7 @@ from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.experiment.naming import with_names
 from vinetrack.planning.fit_inputs import FitNumbers
 from vinetrack.planning.input_sources import StatedValues, predictive_inputs
-from vinetrack.planning.prediction import VinePrediction, predict_vine, told_by_payload
-from vinetrack.planning.prediction_runs import LONGEST_S, POINTS, run
+from vinetrack.planning.prediction import LONGEST_S, POINTS, VinePrediction, predict_vine, run, told_by_payload
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, burst_pressure_Pa
 

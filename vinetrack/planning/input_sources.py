@@ -17,7 +17,6 @@ from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.planning import scaling_priors as guess
-from vinetrack.planning.distributions import even, relative, scaled, shifted
 from vinetrack.planning.fit_inputs import FitNumbers, alike, nearest_vine, numbers_of, same_vine, yield_place
 from vinetrack.planning.predictive_inputs import (
     PRESSURE,
@@ -27,6 +26,10 @@ from vinetrack.planning.predictive_inputs import (
     PredictiveInputs,
     Size,
     Uncertainty,
+    even,
+    relative,
+    scaled,
+    shifted,
     wanted_model,
 )
 

@@ -21,7 +21,7 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import catalogue
 from vinetrack.planning.design_checks import final_m_s, whole_model
-from vinetrack.planning.prediction_runs import LONGEST_S, POINTS
+from vinetrack.planning.prediction import LONGEST_S, POINTS
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
 GAMMAS = {"slow, isothermal (γ = 1)": 1.0, "fast, adiabatic (γ = 1.4)": 1.4}

@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.dynamics.model import Model
@@ -21,6 +20,7 @@ from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.planning.campaign_information import REST_FRAMES, FilmingPlan
+from vinetrack.tracks.noise import ar1_noise
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,7 @@ def make(
 
 def _track(time_s: Floats, position_m: Floats, camera: FilmingPlan, draw: np.random.Generator) -> Track:
     """Positions with the camera's noise and an arbitrary origin."""
-    rho = camera.noise_correlation
-    kicks = draw.standard_normal(time_s.size)
-    kicks[1:] *= math.sqrt(1 - rho**2)
-    noise_m = camera.noise_m * np.asarray(lfilter([1.0], [1.0, -rho], kicks))
+    noise_m = ar1_noise(time_s.size, camera.noise_m, camera.noise_correlation, draw)
     blank = np.full(time_s.size, math.nan)
     flags = np.full(time_s.size, "", dtype="<U32")
     return Track(time_s, position_m + noise_m + draw.uniform(-0.05, 0.05), blank, flags, blank)

@@ -16,6 +16,7 @@ from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Job, Predictor
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis
+from vinetrack.tracks.noise import ar1_noise
 
 LONGEST = 1.5
 """A recording lasts no longer than this many times the longest that was used."""
@@ -208,19 +209,10 @@ def film(
         if moved.status == "ended":
             last_s = own[i, RELEASE] + moved.end_time_s
             stop = min(stop, int(np.searchsorted(times[i], last_s)) + lenses[i].frames_behind_end)
-        noise = _noise(stop, truth.rho, math.sqrt(truth.variance), rng)
+        noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - truth.rho**2)), truth.rho, rng)
         position_m = own[i, ORIGIN] + moved.observed_position_m[:stop] + noise
         seen.append(_as_seen(chosen[i], times[i][:stop], position_m, items[i].trace))
     return seen
-
-
-def _noise(count: int, rho: float, innovation_m: float, draw: np.random.Generator) -> Floats:
-    """Stationary AR(1) noise, shape (count,)."""
-    from scipy.signal import lfilter
-
-    white = innovation_m * draw.standard_normal(count)
-    white[0] /= math.sqrt(1 - rho**2)
-    return np.asarray(lfilter([1.0], [1.0, -rho], white))
 
 
 def _as_seen(
