@@ -88,7 +88,7 @@ class ForceFit:
         for i, (columns, more) in enumerate(zip(self.columns, answers, strict=True)):
             left = columns[:, -1] + columns[:, list(SPREAD_COLUMNS)] @ self.state.own[i, list(SPREAD_COLUMNS)]
             rows = np.column_stack([columns[:, :-1], more, left])
-            white = whiten(rows, self.data[i].first, self.state.rho)
+            white = whiten(rows, self.data[i].first, self.state.rho, self.data[i].relative_sd)
             gram = white.T @ white / self.state.variance[i]
             own = gram[:OWN, :OWN] + np.diag(self.precision[i])
             blocks.append(gram[OWN:, OWN:] - gram[OWN:, :OWN] @ np.linalg.solve(own, gram[:OWN, OWN:]))

@@ -191,7 +191,10 @@ def _normal(found: Fit, fit: ForceFit, place: _Place) -> _Normal:
         answers = columns[i]
         rows = np.column_stack([answers[:, 2:], -velocity, np.ones(left.size), answers[:, :2], left])
         growing = _growing(item, own[i])
-        white = whiten(rows[growing], item.first[growing], fit.state.rho) / math.sqrt(fit.state.variance[i])
+        relative_sd = None if item.relative_sd is None else item.relative_sd[growing]
+        white = whiten(rows[growing], item.first[growing], fit.state.rho, relative_sd) / math.sqrt(
+            fit.state.variance[i]
+        )
         gram = white.T @ white
         mine = p + q + s + i * OWN + np.arange(OWN)
         keys = np.where(fit.frame.index[i] >= 0, fit.frame.index[i], size)

@@ -122,8 +122,11 @@ def distance(one: Fit, other: Fit) -> float:
     """Squared distance of what two fits predict, in units of the noise of the first, its correlation counted."""
     rho = one.noise_correlation
     total = 0.0
-    for a, b, variance in zip(one.trials, other.trials, one.solution.state.variance, strict=True):
+    data = one.predictor.data
+    for a, b, variance, item in zip(one.trials, other.trials, one.solution.state.variance, data, strict=True):
         gap = a.predicted_position_m - b.predicted_position_m
+        if item.relative_sd is not None:
+            gap = gap / item.relative_sd
         total += float(np.sum((gap[1:] - rho * gap[:-1]) ** 2) + (1 - rho**2) * gap[0] ** 2) / float(variance)
     return total
 

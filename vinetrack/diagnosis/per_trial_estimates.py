@@ -189,6 +189,6 @@ def _variance(laid: AlignedTrial, projected: list[Floats], scale: Floats) -> Flo
         others = c[:, [RELEASE]] if held[i] else c[:, [RELEASE, ORIGIN]]
         levers = [float(mine @ without(c[:, k], others)) / square for k in (PRESSURE, DAMPING_DEVIATION)]
         scatter = sum((sd * lever) ** 2 for sd, lever in zip(LIKELY_SCATTER, levers, strict=True))
-        noise = laid.predictor.data[i].noise_m ** 2 / square
+        noise = laid.predictor.data[i].mean_noise_m ** 2 / square
         variance[i] = (scatter + noise + 1e-12) * scale[i] ** 2
     return variance

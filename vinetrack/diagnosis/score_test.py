@@ -112,7 +112,7 @@ def products_of(found: Fit, answers: EffectSensitivities, doubts: Sequence[Float
     columns = found.solution.columns
     grams = np.stack(
         [
-            products(np.column_stack([own, more, doubt]), item.first)
+            products(np.column_stack([own, more, doubt]), item.first, item.relative_sd)
             for own, more, doubt, item in zip(columns, answers.columns, doubts, found.predictor.data, strict=True)
         ]
     )

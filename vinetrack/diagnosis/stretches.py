@@ -75,7 +75,7 @@ def replicate_scatter(found: Fit, courses: Sequence[Course]) -> Scatter:
 
 
 def _course(trial: TrialFit, answers: Floats, item: FitTrial) -> Course:
-    noise_m2 = item.noise_m**2 * (1 + item.correlation) / (1 - item.correlation)
+    noise_m2 = item.mean_noise_m**2 * (1 + item.correlation) / (1 - item.correlation)
     begin = first_that_counts(trial)
     growth = trial.predicted_position_m - trial.origin_m
     return Course(

@@ -76,7 +76,7 @@ def assemble(
         chi2_per_dof=chi2,
         log_likelihood=smooth.log_likelihood if smooth else log_likelihood(solution),
         trials=trials,
-        messages=tuple(_messages(layout, solution, numbers, known, chi2)),
+        messages=(*_messages(layout, solution, numbers, known, chi2), *_weighted(predictor.data)),
         left_out=dict(left_out),
         converged=solution.converged,
         iterations=solution.iterations,
@@ -210,7 +210,7 @@ def trial_fit(
         predicted_position_m=predicted_m,
         predicted_velocity_m_s=velocity_m_s,
         residual_m=residual_m,
-        whitened=whiten(residual_m, item.first, rho) / math.sqrt(variance),
+        whitened=whiten(residual_m, item.first, rho, item.relative_sd) / math.sqrt(variance),
         release_s=float(own[RELEASE]),
         release_sigma_s=float(sigma[RELEASE]),
         origin_m=float(own[ORIGIN]),
@@ -257,6 +257,17 @@ def _free_in_trials(solution: Solution) -> str:
     """What every trial may have of its own, where it may: a falling body has neither B nor pressure."""
     felt = [SPREAD_NAMES[k] for k in (1, 0) if solution.frame.feels[:, k].any()]
     return f", with {' and '.join(felt)} of every trial free to help" if felt else ""
+
+
+def _weighted(data: Sequence[FitTrial]) -> list[str]:
+    """What is to be said of points that do not count alike."""
+    weighted = [item for item in data if item.relative_sd is not None]
+    if not weighted:
+        return []
+    if weighted[0].blur_s > 0:
+        blur_us = 1e6 * weighted[0].blur_s
+        return [f"the noise of positions grows with speed, by {blur_us:.2g} µs × speed: points are weighted by it"]
+    return ["points are weighted by the standard deviations that their files state"]
 
 
 def _close_pairs(numbers: Sequence[Number], known: Precision) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
 from vinetrack.inference.gauge_noise import noise_of, without_noise
+from vinetrack.tracks.noise_shape import correlated_gain, noise_shape
 from vinetrack.tracks.position_noise import position_noise, rest_points, rough_noise
 
 if TYPE_CHECKING:
@@ -77,6 +78,9 @@ class FitTrial:
     where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
     `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
     pressure, Pa; `gauge_error` is by what part of it the noise of the gauge leaves it wrong along the whole motion.
+    `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
+    changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
+    the noise over speed that it follows from, 0 where it follows `stated_m`, the file's own standard deviations.
     """
 
     trial: Trial
@@ -91,11 +95,21 @@ class FitTrial:
     vague_rest: VagueRest | None = None
     tracker_sigma_m: float = math.nan  #: median error of a position that was read from a recording
     position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
+    stated_m: Floats | None = None
+    relative_sd: Floats | None = None
+    blur_s: float = 0.0
 
     @cached_property
     def frame_s(self) -> float:
         """Spacing of the points, s."""
         return float(np.median(np.diff(self.time_s)))
+
+    @property
+    def mean_noise_m(self) -> float:
+        """Root mean square of the noise of the points, m."""
+        if self.relative_sd is None:
+            return self.noise_m
+        return self.noise_m * math.sqrt(float(np.mean(self.relative_sd**2)))
 
     @property
     def shows_rest(self) -> bool:
@@ -129,7 +143,34 @@ def prepare(pairs: Pairs) -> tuple[list[FitTrial], dict[str, str]]:
             data.append(prepare_trial(trial, track))
         except FitError as error:
             left_out[trial.name] = str(error)
-    return data, left_out
+    return _with_noise_shape(data), left_out
+
+
+def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:
+    """The trials with their points weighted, where the noise of positions that somebody else measured varies.
+
+    A tracker's own points are left as they are: it states what each errs by, and leaves out the worst.
+    """
+    places = [i for i, item in enumerate(data) if not math.isfinite(item.tracker_sigma_m)]
+    shape = noise_shape(
+        [data[i].time_s for i in places], [data[i].lead_position_m for i in places], [data[i].stated_m for i in places]
+    )
+    if shape is None:
+        return data
+    # One correlation for all, as in a fit: that of a single track with unequal noise is hardly known.
+    correlation = np.average([data[i].correlation for i in places], weights=[data[i].time_s.size for i in places])
+    gain = correlated_gain(float(correlation))
+    weighted = list(data)
+    for i, sd_m in zip(places, shape.sd_m, strict=True):
+        typical_m = math.exp(float(np.mean(np.log(sd_m))))
+        weighted[i] = replace(
+            data[i],
+            relative_sd=sd_m / typical_m,
+            noise_m=typical_m / gain,
+            correlation=float(correlation),
+            blur_s=shape.blur_s,
+        )
+    return weighted
 
 
 def prepare_trial(trial: Trial, track: Track) -> FitTrial:
@@ -179,6 +220,7 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         vague_rest=vague_rest,
         tracker_sigma_m=float(np.nanmedian(stated_m)) if filmed and np.isfinite(stated_m).any() else math.nan,
         position_systematic_m=_position_systematic_m(trial),
+        stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
     )
 
 

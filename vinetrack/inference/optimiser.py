@@ -24,7 +24,7 @@ from vinetrack.inference.release_search import search_releases
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import initial_trial_effects
 from vinetrack.inference.trial_effects import follow_trial_effects, limited, trial_costs
-from vinetrack.inference.whitening import all_products, at_correlation
+from vinetrack.inference.whitening import at_correlation
 
 MOST_ITERATIONS = 60
 """Chosen as a safeguard against creeping; a fit that reaches it says that it has not settled."""
@@ -249,7 +249,7 @@ def solve(
 def _about(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:
     """Sensitivities at a state, and their sums of products."""
     columns = predictor.linearise(state.theta, state.own)
-    return columns, _products(predictor, columns)
+    return columns, predictor.products(columns)
 
 
 def _step_report(predictor: Predictor, state: FitState, iteration: int, promised: float) -> Step:
@@ -267,10 +267,6 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     left = at_correlation(solution.grams, rho)[:, -1, -1]
     taken = np.count_nonzero(solution.frame.free) / left.size + 2 + solution.frame.feels.any(axis=1)
     return float(np.sum(left / noise) / np.sum(np.maximum(solution.frame.points - taken, 1.0)))
-
-
-def _products(predictor: Predictor, columns: Sequence[Floats]) -> Floats:
-    return all_products(columns, [item.first for item in predictor.data])
 
 
 def _update_variances(

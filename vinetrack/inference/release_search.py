@@ -26,7 +26,7 @@ from vinetrack.inference.sensitivity import (
     Predictor,
 )
 from vinetrack.inference.trial_effects import follow_trial_effects, trial_costs
-from vinetrack.inference.whitening import all_products, at_correlation, whiten
+from vinetrack.inference.whitening import at_correlation, whiten
 
 RELEASES = 60
 """Releases tried for a trial seen only in motion. Chosen for time; the best is improved by Newton steps afterwards."""
@@ -98,7 +98,7 @@ def _borne_out(predictor: Predictor, frame: MixedProblem, state: FitState, tried
 def _levels(predictor: Predictor, frame: MixedProblem, state: FitState) -> Floats:
     """−2 ln L of every trial with its own numbers integrated out about where they stand, shape (n_trials,)."""
     columns = predictor.linearise(state.theta, state.own, own_only=True)
-    white = at_correlation(all_products(columns, [item.first for item in predictor.data]), state.rho)
+    white = at_correlation(predictor.products(columns), state.rho)
     square = white[:, :OWN, :OWN] / state.variance[:, None, None]
     precision = trial_effect_prior(frame, state)[1]
     log_volume = np.linalg.slogdet(square + precision[:, :, None] * np.eye(OWN))[1]
@@ -121,7 +121,7 @@ def _best(
     since = np.clip(item.time_s - releases[:, None], 0.0, times[-1])
     moved = [np.interp(since, times, one) for one in (*answers, plain)]
     moved[-1] = item.lead_position_m - own[ORIGIN] - moved[-1]
-    white = whiten(np.stack(moved, axis=-1), item.first, state.rho) / np.sqrt(state.variance[i])
+    white = whiten(np.stack(moved, axis=-1), item.first, state.rho, item.relative_sd) / np.sqrt(state.variance[i])
     tried = np.tile(own, (releases.size, 1))
     tried[:, RELEASE] = releases
     square = np.swapaxes(white, 1, 2) @ white

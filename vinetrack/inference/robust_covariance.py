@@ -149,7 +149,9 @@ def _sandwich(predictor: Predictor, solution: Solution, doubts: Sequence[Floats]
     grams = solution.grams
     if doubts[0].shape[1]:
         both = zip(solution.columns, doubts, predictor.data, strict=True)
-        grams = np.stack([products(np.column_stack([own, doubt]), item.first) for own, doubt, item in both])
+        grams = np.stack(
+            [products(np.column_stack([own, doubt]), item.first, item.relative_sd) for own, doubt, item in both]
+        )
     blocks = trial_effects_eliminated(grams, p, frame, state)
     square = cross_products(blocks[:, :p, :p], frame) + np.diag(frame.prior_precision)
     inside = (state.theta > frame.lower) & (state.theta < frame.upper)

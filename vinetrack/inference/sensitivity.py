@@ -20,6 +20,7 @@ from vinetrack.dynamics.trial_inputs import check_needs, trial_inputs, with_pres
 from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, ParameterMap
+from vinetrack.inference.whitening import all_products
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 OWN = 4
@@ -170,6 +171,10 @@ class Predictor:
         if not own_only:
             self._adapt(columns)
         return columns
+
+    def products(self, columns: Sequence[Floats]) -> Floats:
+        """Sums of products of the trials' columns under their noise, shape (n_trials, 3, k, k), see `whitening`."""
+        return all_products(columns, [item.first for item in self.data], [item.relative_sd for item in self.data])
 
     def _variations(self, i: int, job: Job, theta: Floats, own: Floats, own_only: bool) -> list[tuple[int, float, Job]]:
         """What to simulate for the differences of one trial: place of the column, step, and the moved trajectory."""

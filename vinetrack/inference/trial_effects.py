@@ -9,7 +9,7 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effect_penalty, trial_effect_step
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, RELEASE, Predictor
-from vinetrack.inference.whitening import all_products, whiten
+from vinetrack.inference.whitening import whiten
 
 LARGEST_DEVIATION_STEP = 0.3
 """Largest step and largest size of a trial's deviation of pressure and ln B, and the largest step of its release,
@@ -26,7 +26,7 @@ def follow_trial_effects(predictor: Predictor, frame: MixedProblem, state: FitSt
     takes what serves it best: where a release meets a frame, the cost has a corner at which no full step helps.
     """
     columns = predictor.linearise(state.theta, state.own, own_only=True)
-    grams = all_products(columns, [item.first for item in predictor.data])
+    grams = predictor.products(columns)
     ways = [
         state,
         *(
@@ -55,7 +55,7 @@ def trial_costs(predictor: Predictor, frame: MixedProblem, state: FitState) -> F
     """Whitened sum of squares of every trial with what the priors of its own numbers add, shape (n_trials,)."""
     residuals = predictor.residuals(state.theta, state.own)
     squares = [
-        float(np.sum(whiten(residual, item.first, state.rho) ** 2)) / variance
+        float(np.sum(whiten(residual, item.first, state.rho, item.relative_sd) ** 2)) / variance
         for item, residual, variance in zip(predictor.data, residuals, state.variance, strict=True)
     ]
     return np.array(squares) + trial_effect_penalty(frame, state)

@@ -5,7 +5,8 @@ With noise e_k = ρ e_{k−1} + s ε_k, the columns c_k enter every quantity of 
     Σ (c_k − ρ c_{k−1})(c_k − ρ c_{k−1})ᵀ + (1 − ρ²) Σ_first c cᵀ = G₀ − ρ G₁ + ρ² G₂
 
 so three small matrices a trial stand for all its points, whatever ρ turns out to be. `first` are the points that begin
-a stretch without gaps; the noise of stretches is independent.
+a stretch without gaps; the noise of stretches is independent. Where noise varies from point to point, columns are
+divided by each point's relative standard deviation first: what is left is AR(1) of one variance.
 """
 
 from __future__ import annotations
@@ -18,8 +19,13 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 
 
-def products(columns: Floats, first: NDArray[np.bool_]) -> Floats:
-    """G₀, G₁, G₂ of one trial, shape (3, k, k), for columns of shape (n_points, k)."""
+def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | None = None) -> Floats:
+    """G₀, G₁, G₂ of one trial, shape (3, k, k), for columns of shape (n_points, k).
+
+    `relative_sd`, shape (n_points,), is the noise of every point relative to that of the trial, see `FitTrial`.
+    """
+    if relative_sd is not None:
+        columns = columns / relative_sd[:, None]
     follows = np.flatnonzero(~first)
     now, before = columns[follows], columns[follows - 1]
     begin = columns[first]
@@ -27,9 +33,14 @@ def products(columns: Floats, first: NDArray[np.bool_]) -> Floats:
     return np.stack([columns.T @ columns, cross + cross.T, before.T @ before - begin.T @ begin])
 
 
-def all_products(columns: Sequence[Floats], first: Sequence[NDArray[np.bool_]]) -> Floats:
+def all_products(
+    columns: Sequence[Floats],
+    first: Sequence[NDArray[np.bool_]],
+    relative_sd: Sequence[Floats | None] | None = None,
+) -> Floats:
     """`products` of every trial, shape (n_trials, 3, k, k)."""
-    return np.stack([products(c, f) for c, f in zip(columns, first, strict=True)])
+    relative = [None] * len(columns) if relative_sd is None else relative_sd
+    return np.stack([products(c, f, sd) for c, f, sd in zip(columns, first, relative, strict=True)])
 
 
 def at_correlation(grams: Floats, rho: float) -> Floats:
@@ -37,11 +48,13 @@ def at_correlation(grams: Floats, rho: float) -> Floats:
     return np.asarray(grams[:, 0] - rho * grams[:, 1] + rho**2 * grams[:, 2])
 
 
-def whiten(residual: Floats, first: NDArray[np.bool_], rho: float) -> Floats:
+def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: Floats | None = None) -> Floats:
     """Residuals freed of their correlation, same variance at the first point of a stretch as at the others.
 
-    They have shape (n_points,), (n_points, k) or (m, n_points, k), `first` (n_points,).
+    They have shape (n_points,), (n_points, k) or (m, n_points, k), `first` and `relative_sd` (n_points,).
     """
+    if relative_sd is not None:
+        residual = residual / (relative_sd if residual.ndim == 1 else relative_sd[:, None])
     white = residual.copy()
     along, before = (np.swapaxes(one, 0, 1) if one.ndim == 3 else one for one in (white, residual))
     follows = np.flatnonzero(~first)

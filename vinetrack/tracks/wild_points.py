@@ -134,12 +134,11 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     )
 
 
-def local_noise(fit: LocalFit, half_width: int = SCALE_HALF_WIDTH) -> Floats:
-    """Standard deviation of a position around each point, m: the running median of the residuals, shape (n_points,)."""
-    size = np.abs(fit.residual_m) / fit.gain
-    width = min(2 * half_width + 1, size.size)
-    view = np.median(np.lib.stride_tricks.sliding_window_view(size, width), axis=1) / 0.6745
-    middle = np.clip(np.arange(size.size) - width // 2, 0, view.size - 1)
+def running_noise(distance_m: Floats, half_width: int = SCALE_HALF_WIDTH) -> Floats:
+    """Standard deviation around each point, m: the running median of distances ≥ 0, shape (n_points,)."""
+    width = min(2 * half_width + 1, distance_m.size)
+    view = np.median(np.lib.stride_tricks.sliding_window_view(distance_m, width), axis=1) / 0.6745
+    middle = np.clip(np.arange(distance_m.size) - width // 2, 0, view.size - 1)
     return np.asarray(view[middle])
 
 
@@ -233,7 +232,7 @@ def _far_off(time_s: Floats, position_m: Floats, limit: float) -> NDArray[np.boo
     # The likelihood of stretches takes wild points for noise where they are many; the median third difference does not.
     noise_m = min(noise_m, 1.84 * rough_noise(position_m))
     fit = local_fit(time_s, position_m, noise_m)
-    sigma_m = np.maximum(np.maximum(local_noise(fit), noise_m), fit.spread_m)
+    sigma_m = np.maximum(np.maximum(running_noise(np.abs(fit.residual_m) / fit.gain), noise_m), fit.spread_m)
     size = np.abs(fit.residual_m)
     step_m = np.abs(fit.speed_m_s) * float(np.median(np.diff(time_s)))
     from_end = np.minimum(np.arange(size.size), np.arange(size.size)[::-1])
