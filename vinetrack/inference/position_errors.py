@@ -29,7 +29,7 @@ from vinetrack.inference.mixed_effects import (
 )
 from vinetrack.inference.optimiser import SETTLED_SPREAD, FixedTerms, Solution, floor, variances_moved
 from vinetrack.inference.sensitivity import ORIGIN, Predictor
-from vinetrack.inference.whitening import products, whiten
+from vinetrack.inference.whitening import whiten
 
 ORDERS = (1, 2, 3, 4)
 """Legendre orders of the shapes. Order 0 is the origin, which is free in every trial; a lens to lowest order is orders
@@ -103,7 +103,7 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
         np.column_stack([columns[:, :-1], shape, columns[:, -1]])
         for columns, shape in zip(solution.columns, shapes, strict=True)
     ]
-    grams = np.stack([products(one, item.first) for one, item in zip(wide, predictor.data, strict=True)])
+    grams = predictor.products(wide)
     problem = with_shapes(solution.frame, count)
     state = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
     held = held or FixedTerms()
@@ -125,7 +125,7 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
         solution=replace(solution, state=state, frame=problem, grams=grams, columns=tuple(_with_residual(wide, left))),
         log_likelihood=-0.5 * deviance(part, problem, state, spread, restricted=False),
         whitened=tuple(
-            whiten(one, item.first, state.rho) / np.sqrt(variance)
+            whiten(one, item.first, state.rho, item.relative_sd) / np.sqrt(variance)
             for one, item, variance in zip(left, predictor.data, state.variance, strict=True)
         ),
         displacement_m=tuple(shape @ state.theta[-count:] for shape in shapes),
