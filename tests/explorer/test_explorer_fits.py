@@ -12,9 +12,17 @@ import pytest
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.choice import first_choice
 from vinetrack.explorer.curves import overall_m
-from vinetrack.explorer.fitting import FAULT, Fitted, Job, first_fit, fit_choice, gained_words, tied_words
-from vinetrack.explorer.ground import Ground
-from vinetrack.explorer.waiting import Waiting
+from vinetrack.explorer.fitting import (
+    FAULT,
+    BackgroundFit,
+    FitJob,
+    FitProgress,
+    Fitted,
+    first_fit,
+    fit_choice,
+    gained_words,
+    tied_words,
+)
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import Step, Watch
@@ -90,8 +98,8 @@ class Heard:
         self.found: list[Fitted] = []
         self.reasons: list[str] = []
 
-    def job(self, work: object) -> Job:
-        return Job(work, told=self.steps.append, done=self.found.append, failed=self.reasons.append)  # type: ignore[arg-type]
+    def job(self, work: object) -> FitJob:
+        return FitJob(work, told=self.steps.append, done=self.found.append, failed=self.reasons.append)  # type: ignore[arg-type]
 
 
 def test_a_job_tells_and_ends(campaign: Campaign, first: Fitted) -> None:
@@ -136,7 +144,7 @@ def test_a_job_that_fails_says_why_in_a_sentence(error: Exception, said: str) ->
 
 
 def test_the_ground_grows_once_for_all_pages(campaign: Campaign) -> None:
-    ground = Ground(campaign)
+    ground = BackgroundFit(campaign)
     news: list[bool] = []
 
     def hear() -> None:
@@ -156,7 +164,7 @@ def test_the_ground_grows_once_for_all_pages(campaign: Campaign) -> None:
 
 
 def test_what_a_person_waits_for_only_ever_comes_nearer() -> None:
-    waiting = Waiting()
+    waiting = FitProgress()
     waiting.begin(100.0)
     assert waiting.state(100.5, "refitting")[1] == "refitting · 0.5 s"
     shares = []

@@ -16,15 +16,15 @@ from explorer_campaign import SETTINGS, write_diagnosis
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.command import open_campaign
-from vinetrack.explorer.ground import Ground
+from vinetrack.explorer.fitting import BackgroundFit
 from vinetrack.explorer.page import Page
 
 GAMMA = "size_reservoir_depletion.gamma"
 
 
 @pytest.fixture(scope="module")
-def ground(campaign: Campaign) -> Ground:
-    grown = Ground(campaign).begin()
+def ground(campaign: Campaign) -> BackgroundFit:
+    grown = BackgroundFit(campaign).begin()
     grown.wait(240)
     assert grown.trouble == ""
     return grown
@@ -33,7 +33,7 @@ def ground(campaign: Campaign) -> Ground:
 class Browser:
     """Stands for the browser: a document whose callbacks are run by hand."""
 
-    def __init__(self, ground: Ground) -> None:
+    def __init__(self, ground: BackgroundFit) -> None:
         self.document = Document()
         self.page = Page(ground, self.document)
         self.turn()
@@ -68,7 +68,7 @@ class Browser:
 
 
 @pytest.fixture
-def browser(ground: Ground) -> Iterator[Browser]:
+def browser(ground: BackgroundFit) -> Iterator[Browser]:
     opened = Browser(ground)
     yield opened
     opened.page.close()
@@ -193,7 +193,7 @@ def test_figure_and_data_can_be_taken_along(browser: Browser, form: str, head: b
 def test_the_model_is_saved_with_the_comments_around_it(campaign: Campaign, tmp_path: Path) -> None:
     experiment = tmp_path / "vines"
     shutil.copytree(campaign.experiment.folder, experiment)
-    page = Browser(Ground(open_campaign(campaign.folder, experiment)).begin())
+    page = Browser(BackgroundFit(open_campaign(campaign.folder, experiment)).begin())
     page.page.ground.wait(240)
     page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))
     page.model("tick_reservoir_depletion").active = True
@@ -209,15 +209,15 @@ def test_the_model_is_saved_with_the_comments_around_it(campaign: Campaign, tmp_
     page.page.close()
 
 
-def test_a_diagnosis_appears_by_itself(campaign: Campaign, ground: Ground, tmp_path: Path) -> None:
+def test_a_diagnosis_appears_by_itself(campaign: Campaign, ground: BackgroundFit, tmp_path: Path) -> None:
     folder = tmp_path / "vines"
     shutil.copytree(campaign.folder, folder)
-    own = Ground(open_campaign(folder, campaign.experiment.folder))
+    own = BackgroundFit(open_campaign(folder, campaign.experiment.folder))
     own.curves, own.errors_m, own.fitted = ground.curves, ground.errors_m, ground.fitted
     page = Browser(own)
     write_diagnosis(folder)
     page.page._look_again()
-    assert "Not to be told apart: <b>reservoir depletion, leak</b>" in page.text("tied")
+    assert "Cannot be told apart: <b>reservoir depletion, leak</b>" in page.text("tied")
     assert "+0.97" in page.text("tied")
     assert "chamber of 4 L" in page.text("next")
     assert "chamber 4 L" in page.text("next")
@@ -252,7 +252,7 @@ def test_a_model_that_cannot_be_followed_is_said_and_the_curves_stay(
 def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
     from vinetrack.explorer.choice import chosen, first_choice
 
-    ground = Ground(campaign, chosen(campaign, first_choice(campaign), ["leak"], [], ["leak.rate=0.2"])).begin()
+    ground = BackgroundFit(campaign, chosen(campaign, first_choice(campaign), ["leak"], [], ["leak.rate=0.2"])).begin()
     ground.wait(240)
     page = Browser(ground)
     page.turn()

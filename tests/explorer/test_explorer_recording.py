@@ -11,7 +11,7 @@ import pytest
 from explorer_campaign import write_bars
 
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.recording import Film, View, view_of
+from vinetrack.explorer.recording import DecodedRecording, RecordingView, view_of
 from vinetrack.results.folder_layout import Results
 
 
@@ -22,7 +22,7 @@ def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) 
 
 def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
     told: list[int] = []
-    film = Film(write_clip(tmp_path / "a.mp4")).decode(lambda one: told.append(one.count))
+    film = DecodedRecording(write_clip(tmp_path / "a.mp4")).decode(lambda one: told.append(one.count))
     assert film.complete
     assert film.words == ""
     assert (film.count, film.expected, film.shape, film.scale) == (30, 30, (96, 320), 1.0)
@@ -33,30 +33,30 @@ def test_frames_come_back_as_they_were_filmed(tmp_path: Path) -> None:
 
 
 def test_a_wide_recording_is_kept_as_wide_as_the_page_shows_it(tmp_path: Path) -> None:
-    film = Film(write_clip(tmp_path / "a.mp4", count=4, width=1920, height=200)).decode()
+    film = DecodedRecording(write_clip(tmp_path / "a.mp4", count=4, width=1920, height=200)).decode()
     assert film.shape == (100, 960)
     assert film.scale == 0.5
 
 
 def test_a_file_that_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"not a film")
-    film = Film(tmp_path / "a.mp4").decode()
+    film = DecodedRecording(tmp_path / "a.mp4").decode()
     assert film.complete
     assert film.count == 0
     assert "a.mp4" in film.words
 
 
 def test_a_film_nobody_wants_any_more_stops(tmp_path: Path) -> None:
-    film = Film(write_clip(tmp_path / "a.mp4"))
+    film = DecodedRecording(write_clip(tmp_path / "a.mp4"))
     film.decode(lambda one: one.give_up())
     assert not film.complete
     assert film.count == 1
 
 
-def view(angle: float = 0.0) -> View:
+def view(angle: float = 0.0) -> RecordingView:
     frames = np.arange(20.0)
     edge_px = np.where(frames < 15, 10 + 5 * frames, np.nan)
-    return View(
+    return RecordingView(
         trial="a",
         path=Path("a.mp4"),
         from_px=(100.0, 50.0),
@@ -93,7 +93,7 @@ def test_an_edge_goes_along_with_a_shaken_picture() -> None:
 
 
 def test_of_a_track_only_it_is_said_that_there_is_no_recording(campaign: Campaign) -> None:
-    words = view_of(Results(campaign.folder), campaign.trials[0].item.trial)
+    words = view_of(Results(campaign.folder), campaign.trials[0].data.trial)
     assert isinstance(words, str)
     assert "came as a track (d24_24kPa_1.csv): there is no recording to show" in words
 
@@ -101,7 +101,7 @@ def test_of_a_track_only_it_is_said_that_there_is_no_recording(campaign: Campaig
 def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campaign, tmp_path: Path) -> None:
     seen = campaign.trials[0]
     results = Results(tmp_path)
-    trial = replace(seen.item.trial, video=tmp_path / "gone.mp4", track=None)
+    trial = replace(seen.data.trial, video=tmp_path / "gone.mp4", track=None)
     assert "no longer there" in str(view_of(results, trial))
     trial = replace(trial, video=write_clip(tmp_path / "a.mp4", count=2))
     assert "does not exist" in str(view_of(results, trial))
@@ -115,6 +115,6 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campa
     axis = {"from_px": [0, 10], "to_px": [300, 10], "width_px": None}
     results.analysed(trial.name).write_text(json.dumps({"axis": axis}))
     found = view_of(results, trial)
-    assert isinstance(found, View)
+    assert isinstance(found, RecordingView)
     assert found.half_width_px == pytest.approx(15.0)
     assert found.direction == (1.0, 0.0)

@@ -16,12 +16,23 @@ from explorer_campaign import DEMO, SMALL, make_experiment, make_results
 
 from vinetrack.core.records import Trial
 from vinetrack.effects import Parameter
-from vinetrack.explorer.campaign import Campaign, Seen, condition_labels
+from vinetrack.explorer.campaign import AlignedTrial, Campaign, condition_labels
 from vinetrack.explorer.choice import ChoiceError, changed, chosen, first_choice, sized, slider_range
 from vinetrack.explorer.command import open_campaign
-from vinetrack.explorer.curves import errors_m, follow, overall_m
+from vinetrack.explorer.curves import (
+    bands,
+    error_bars,
+    errors_m,
+    follow,
+    measured,
+    modelled,
+    overall_m,
+    residuals,
+    symmetric,
+    thinned,
+    vine_colours,
+)
 from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, exported, model_words
-from vinetrack.explorer.series import bands, error_bars, measured, modelled, residuals, symmetric, thinned, vine_colours
 from vinetrack.laboratory.ground_truth import read_nature
 from vinetrack.laboratory.tracks import grow
 from vinetrack.results.folder_layout import ResultsError
@@ -47,7 +58,7 @@ def test_a_rest_behind_a_door_is_where_the_comparison_has_it(tmp_path: Path) -> 
     table = pd.read_csv(door.folder / "comparison.csv").set_index("condition")
     curves = follow(door, sized(door, first_choice(door)))
     for seen, motion in zip(door.trials, curves, strict=True):
-        assert seen.item.vague_rest is not None
+        assert seen.data.vague_rest is not None
         assert motion.origin_m == seen.origin_m
     for condition, error in errors_m(door, curves).items():
         assert error == pytest.approx(table.loc[condition, "rms_position_m"], rel=2e-3)
@@ -94,15 +105,15 @@ def test_curves_do_not_depend_on_where_releases_are_looked_for_from(campaign: Ca
 def test_a_motion_is_told_on_the_ruler_of_its_track(campaign: Campaign) -> None:
     curves = follow(campaign, sized(campaign, first_choice(campaign)))
     seen, motion = campaign.trials[0], curves[0]
-    positions = motion.lead_position_m(seen.item.time_s)
-    np.testing.assert_allclose(seen.item.lead_position_m - positions, motion.residual_m, atol=1e-12)
+    positions = motion.lead_position_m(seen.data.time_s)
+    np.testing.assert_allclose(seen.data.lead_position_m - positions, motion.residual_m, atol=1e-12)
     assert math.isnan(motion.lead_position_m(np.array([99.0]))[0])
 
 
-def traced(seen: Seen) -> Seen:
+def traced(seen: AlignedTrial) -> AlignedTrial:
     """With a pressure measured along that is the set one all the time."""
-    trace = (np.array([-1.0, 2.0]), np.full(2, seen.item.trial.pressure_Pa))
-    return replace(seen, item=replace(seen.item, trace=trace))
+    trace = (np.array([-1.0, 2.0]), np.full(2, seen.data.trial.pressure_Pa))
+    return replace(seen, data=replace(seen.data, trace=trace))
 
 
 def test_a_motion_that_follows_a_measured_pressure_keeps_its_release(campaign: Campaign) -> None:

@@ -46,8 +46,8 @@ def explore(
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
-        from vinetrack.explorer.command import Wanted
+        from vinetrack.explorer.command import ExploreOptions
         from vinetrack.explorer.command import explore as run
 
-        asked = Wanted(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)
+        asked = ExploreOptions(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)
         run(results, experiment, asked, typer.echo)

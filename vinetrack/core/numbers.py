@@ -12,7 +12,7 @@ _FIXED_EXPONENTS = (-4, 6)
 """Decimal exponents written without "e": the range of Python's own `g` format, 0.0001 to 999999."""
 
 _MOST_DECIMALS = 12
-"""Of a value beside its error: an error below 1e-11 is rounding of a double of order 1e5, not knowledge."""
+"""Derived: an error below 1e-11 is the rounding of a double of order 1e5."""
 
 
 def decimals(sigma: float) -> int:

@@ -18,7 +18,7 @@ from typing import Any, Generic, TextIO, TypeVar
 Item = TypeVar("Item")
 
 SHOWS_AFTER_S = 0.5
-"""What is done by then needs no bar; what takes two seconds has had one for most of them."""
+"""Chosen: work done within half a second needs no bar; work of two seconds shows one for most of its time."""
 
 GAP = "  "
 CODES = {"bold": "1", "dim": "2", "red": "31", "green": "32", "yellow": "33", "blue": "34", "cyan": "36"}
@@ -48,8 +48,8 @@ def styled(text: str, *styles: str, stream: TextIO | None = None) -> str:
 
 def severity_first(line: str, stream: TextIO | None = None) -> str:
     """A line of `format_problems` with its first word in the colour of how bad it is."""
-    word, colon, rest = line.partition(":")
-    return styled(word, SEVERITIES[word], "bold", stream=stream) + colon + rest if word in SEVERITIES else line
+    word, colon, message = line.partition(":")
+    return styled(word, SEVERITIES[word], "bold", stream=stream) + colon + message if word in SEVERITIES else line
 
 
 def width(text: str) -> int:
@@ -141,8 +141,8 @@ class Progress(Generic[Item]):
 
     def __iter__(self) -> Iterator[Item]:
         with self:
-            for item in self._items or ():
-                yield item
+            for element in self._items or ():
+                yield element
                 self.advance()
 
     def __enter__(self) -> Progress[Item]:

@@ -1,6 +1,6 @@
-"""What a results folder holds for the explorer: trials on one clock, the model in use, and what may be added to it.
+"""A results folder as the explorer reads it: trials on one clock, the model in use, and the effects to choose from.
 
-Everything is read once and never changed; what a person chooses lives in `choice`, what follows from it in `curves`.
+It is read once and never changed; the choice of the user is in `choice`, its curves are in `curves`.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One trial as it was filmed; its release and origin put it on the clock and the ruler that all trials share.
+class AlignedTrial:
+    """One trial with its release and origin, which align it with the common clock and ruler of all trials.
 
-    `origin_known` tells whether the vine was filmed at rest: where it was not, the origin is a model's to find.
+    `origin_known` tells whether the vine was filmed at rest; where it was not, the origin is fitted with a model.
     """
 
-    item: FitTrial
+    data: FitTrial
     release_s: float
     origin_m: float
     origin_known: bool
@@ -46,31 +46,31 @@ class Seen:
     @property
     def name(self) -> str:
         """The trial's name."""
-        return self.item.trial.name
+        return self.data.trial.name
 
     @property
     def condition(self) -> str:
         """The condition it is a replicate of."""
-        return self.item.trial.condition
+        return self.data.trial.condition
 
     @cached_property
     def time_s(self) -> Floats:
         """Since release, shape (n_points,)."""
-        return self.item.time_s - self.release_s
+        return self.data.time_s - self.release_s
 
     @cached_property
     def growth_m(self) -> Floats:
         """From the origin, shape (n_points,)."""
-        return self.item.lead_position_m - self.origin_m
+        return self.data.lead_position_m - self.origin_m
 
     def counts_from(self, release_s: float) -> int:
-        """The frame where the first of a model released then and the measurement moves: rest would dilute an error."""
-        released = int(np.searchsorted(self.item.time_s, release_s))
-        return min(released, max(self.item.n_rest - 1, 0), self.item.time_s.size - 1)
+        """Return the first frame where a model with this release or the measurement moves: rest dilutes an error."""
+        released = int(np.searchsorted(self.data.time_s, release_s))
+        return min(released, max(self.data.n_rest - 1, 0), self.data.time_s.size - 1)
 
 
 @dataclass(frozen=True)
-class Band:
+class ReplicateBand:
     """Mean and standard deviation of the replicates of one condition, shape (n_times,); empty where there is one."""
 
     time_s: Floats
@@ -84,8 +84,8 @@ class Campaign:
 
     `numbers` are those of the fit in `fit.json`, by name, SI; empty where it was refused, for the `refused` reason.
     `log_likelihood` is that of the same fit, NaN where it was refused.
-    `floors_m` holds by condition what replicates differ by, NaN where there is one alone. `unusable` gives effects
-    that these trials cannot be asked about, and why.
+    `floors_m` holds the replicate scatter by condition, NaN where there is one trial. `unusable` gives effects that
+    cannot be simulated for these trials, and why.
     """
 
     name: str
@@ -93,9 +93,9 @@ class Campaign:
     experiment: Experiment
     pairs: tuple[tuple[Trial, Track], ...]
     kinematics: Mapping[str, Kinematics]
-    trials: tuple[Seen, ...]
+    trials: tuple[AlignedTrial, ...]
     left_out: Mapping[str, str]
-    bands: Mapping[str, Band]
+    bands: Mapping[str, ReplicateBand]
     floors_m: Mapping[str, float]
     numbers: Mapping[str, float]
     log_likelihood: float
@@ -111,41 +111,41 @@ class Campaign:
     @cached_property
     def conditions(self) -> tuple[str, ...]:
         """In the order of the sheet, vines together, pressure rising."""
-        first = {seen.condition: seen.item.trial for seen in reversed(self.trials)}
-        vines = list(dict.fromkeys(seen.item.trial.vine for seen in self.trials))
+        first = {seen.condition: seen.data.trial for seen in reversed(self.trials)}
+        vines = list(dict.fromkeys(seen.data.trial.vine for seen in self.trials))
         rank = {name: (vines.index(t.vine), t.payload_kg, t.pressure_Pa) for name, t in first.items()}
         return tuple(sorted(rank, key=lambda name: rank[name]))
 
     @cached_property
     def vines(self) -> tuple[str, ...]:
         """In the order of the sheet."""
-        return tuple(dict.fromkeys(seen.item.trial.vine for seen in self.trials))
+        return tuple(dict.fromkeys(seen.data.trial.vine for seen in self.trials))
 
     @cached_property
     def labels(self) -> Mapping[str, str]:
         """A short name of every condition: of its settings those that vary."""
-        return condition_labels({name: self.trials[self.of_condition(name)[0]].item.trial for name in self.conditions})
+        return condition_labels({name: self.trials[self.of_condition(name)[0]].data.trial for name in self.conditions})
 
     @cached_property
     def host(self) -> Model:
-        """All effects in one, as in a diagnosis: its compiled form serves every model that a person may choose."""
+        """One model with all effects, as in a diagnosis: its compiled form serves every model that can be chosen."""
         return host_for(Model(()), self.effects.values())
 
     def of_condition(self, condition: str) -> list[int]:
         """Places of the trials of a condition among `trials`."""
         return [i for i, seen in enumerate(self.trials) if seen.condition == condition]
 
-    def trial(self, name: str) -> Seen:
+    def trial(self, name: str) -> AlignedTrial:
         """The trial of that name; KeyError where there is none."""
         return {seen.name: seen for seen in self.trials}[name]
 
 
-def read_campaign(folder: Path, experiment: Experiment, own: Mapping[str, Effect]) -> Campaign:
-    """What the results folder of an experiment holds.
+def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[str, Effect]) -> Campaign:
+    """Read the results folder of an experiment.
 
     Parameters
     ----------
-    own
+    user_effects
         The user's own effects, see `vinetrack.pipeline.effects_stage.effects_of`.
 
     Raises
@@ -163,7 +163,7 @@ def read_campaign(folder: Path, experiment: Experiment, own: Mapping[str, Effect
     refused = str(fitted.get("refused") or "")
     compared = {} if refused else _compared(results)
     seen = _on_one_clock(data, compared)
-    effects = {**catalogue(), **own}
+    effects = {**catalogue(), **user_effects}
     floors = {} if refused else _floors(results)
     return Campaign(
         name=folder.name,
@@ -179,7 +179,7 @@ def read_campaign(folder: Path, experiment: Experiment, own: Mapping[str, Effect
         log_likelihood=float(math.nan if fitted.get("log_likelihood") is None else fitted["log_likelihood"]),
         refused=refused,
         effects=effects,
-        unusable=_unusable(effects.values(), [item.trial for item in data]),
+        unusable=_unusable(effects.values(), [trial_data.trial for trial_data in data]),
     )
 
 
@@ -198,24 +198,24 @@ def _floors(results: Results) -> dict[str, float]:
     return dict(zip(table["condition"].astype(str), table["replicate_floor_m"].astype(float), strict=True))
 
 
-def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[Seen]:
+def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[AlignedTrial]:
     """Trials with the release and origin that the comparison found, or else what the track alone shows."""
-    own, at_rest = initial_trial_effects(data), rest_is_seen(data)
-    found = []
-    for i, item in enumerate(data):
-        release_s, origin_m = float(own[i, 0]), float(own[i, 1])
-        table = compared.get(item.trial.condition)
-        rows = None if table is None else table[table["trial"] == item.trial.name]
-        if rows is not None and len(rows) == item.time_s.size:
-            release_s = float(item.time_s[0] - rows["time_s"].iloc[0])
-            origin_m = float(item.lead_position_m[0] - rows["lead_position_m"].iloc[0])
+    starts, at_rest = initial_trial_effects(data), rest_is_seen(data)
+    aligned = []
+    for i, trial_data in enumerate(data):
+        release_s, origin_m = float(starts[i, 0]), float(starts[i, 1])
+        table = compared.get(trial_data.trial.condition)
+        rows = None if table is None else table[table["trial"] == trial_data.trial.name]
+        if rows is not None and len(rows) == trial_data.time_s.size:
+            release_s = float(trial_data.time_s[0] - rows["time_s"].iloc[0])
+            origin_m = float(trial_data.lead_position_m[0] - rows["lead_position_m"].iloc[0])
         if at_rest[i]:
-            origin_m = item.rest_origin_m
-        found.append(Seen(item, release_s, origin_m, bool(at_rest[i])))
-    return found
+            origin_m = trial_data.rest_origin_m
+        aligned.append(AlignedTrial(trial_data, release_s, origin_m, bool(at_rest[i])))
+    return aligned
 
 
-def _bands(compared: Mapping[str, pd.DataFrame]) -> dict[str, Band]:
+def _bands(compared: Mapping[str, pd.DataFrame]) -> dict[str, ReplicateBand]:
     """The replicates' mean and spread, along the longest trial of each condition."""
     bands = {}
     for condition, table in compared.items():
@@ -226,7 +226,7 @@ def _bands(compared: Mapping[str, pd.DataFrame]) -> dict[str, Band]:
         names = ("time_s", "replicates_mean_m", "replicates_sigma_m")
         time_s, mean_m, sigma_m = (rows[name].to_numpy(dtype=float) for name in names)
         known = np.isfinite(sigma_m) & np.isfinite(mean_m)
-        bands[condition] = Band(time_s[known], mean_m[known], sigma_m[known])
+        bands[condition] = ReplicateBand(time_s[known], mean_m[known], sigma_m[known])
     return bands
 
 

@@ -11,7 +11,7 @@ from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.effects import BASE_EFFECTS, Effect, Parameter
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.curves import Sized, yields_of
+from vinetrack.explorer.curves import SizedModel, yields_of
 from vinetrack.inference.parameters import DAMPING
 
 
@@ -82,13 +82,13 @@ def first_choice(campaign: Campaign) -> Choice:
 
 def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[Size]:
     """The sliders of an effect: one a number, or one a vine where each has its own; ranges hold the present value."""
-    found = []
+    sizes = []
     for parameter in effect.parameters:
         for vine in campaign.vines if parameter.shared == "vine" else ("",):
             bare = Size(effect.name, parameter, vine, 0.0, 1.0)
             low, high = slider_range(bare.key, parameter, numbers.get(bare.name, parameter.default))
-            found.append(replace(bare, low=low, high=high))
-    return found
+            sizes.append(replace(bare, low=low, high=high))
+    return sizes
 
 
 def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, float]:
@@ -107,7 +107,7 @@ def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, f
     return max(low, parameter.bounds[0]), min(high, parameter.bounds[1]) if value < parameter.bounds[1] else value
 
 
-def sized(campaign: Campaign, choice: Choice) -> Sized:
+def sized(campaign: Campaign, choice: Choice) -> SizedModel:
     """The model that was chosen, ready to be followed."""
     effects = tuple(campaign.effects[name] for name in choice.effects)
     values: dict[str, Value] = {}
@@ -120,7 +120,7 @@ def sized(campaign: Campaign, choice: Choice) -> Sized:
                 values[size.key] = {**former, size.vine: value}
             else:
                 values[size.key] = value
-    return Sized(Model(effects, values), yields_of(campaign, choice.numbers))
+    return SizedModel(Model(effects, values), yields_of(campaign, choice.numbers))
 
 
 def can_leave(effect: str) -> bool:

@@ -20,7 +20,7 @@ class PageError(UserError, RuntimeError):
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ExploreOptions:
     """What the command line asks for; see `vinetrack explore --help`."""
 
     add: Sequence[str] = ()
@@ -56,7 +56,7 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     return read_campaign(folder, read, effects_of(read.folder))
 
 
-def explore(folder: Path, experiment: Path | None, wanted: Wanted, say: Callable[[str], None]) -> None:
+def explore(folder: Path, experiment: Path | None, wanted: ExploreOptions, say: Callable[[str], None]) -> None:
     """Serve the page, or do what was asked for and say what came of it.
 
     Raises
@@ -74,16 +74,16 @@ def explore(folder: Path, experiment: Path | None, wanted: Wanted, say: Callable
     if wanted.is_for_a_page:
         if importlib.util.find_spec("bokeh") is None:
             raise PageError("The page needs bokeh, which is not installed: pip install 'vinetrack[explorer]'.")
-        from vinetrack.explorer.ground import Ground
+        from vinetrack.explorer.fitting import BackgroundFit
         from vinetrack.explorer.server import serve
 
-        serve(Ground(campaign, start if choice == start else choice), say, wanted.port, browser=wanted.browser)
+        serve(BackgroundFit(campaign, start if choice == start else choice), say, wanted.port, browser=wanted.browser)
         return
     _without_a_page(campaign, start, choice, wanted, say)
 
 
 def _without_a_page(
-    campaign: Campaign, start: Choice, choice: Choice, wanted: Wanted, say: Callable[[str], None]
+    campaign: Campaign, start: Choice, choice: Choice, wanted: ExploreOptions, say: Callable[[str], None]
 ) -> None:
     from vinetrack.core.terminal import waiting
     from vinetrack.explorer.choice import sized
@@ -98,10 +98,10 @@ def _without_a_page(
         with waiting("fitting the model in use"):
             first = first_fit(campaign, start)
         with waiting(f"fitting {model_words(choice.effects)}"):
-            found = fit_choice(campaign, first.fit, choice)
-        choice = found.choice
-        say(str(found.fit))
-        say(gained_words(first.fit, found.fit))
+            fitted = fit_choice(campaign, first.fit, choice)
+        choice = fitted.choice
+        say(str(fitted.fit))
+        say(gained_words(first.fit, fitted.fit))
     curves = follow(campaign, sized(campaign, choice))
     for line in error_lines(campaign, choice, errors_m(campaign, curves), before):
         say(line)

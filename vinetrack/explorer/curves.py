@@ -1,9 +1,9 @@
-"""What a model of given sizes says of every trial, fast enough to follow a finger on a slider.
+"""Curves of a model at given sizes for every trial, fast enough to follow a slider, and the columns that are drawn.
 
-As in a comparison, a prediction has a release and an origin of its own and nothing else: the origin is where the vine
-is seen at rest; the release, and the origin where no rest was filmed, are where the mean square is least. Each trial
-is simulated once on a grid and shifted there. A motion that follows a pressure measured along with it has the clock of
-that pressure and cannot be shifted: its release stays that of the comparison.
+As in a comparison, a prediction is aligned by the trial's own release and origin alone: the origin is where the vine is
+seen at rest; the release, and the origin where no rest was filmed, minimise the mean square. Each trial is simulated
+once on a grid and shifted there. A motion that follows a pressure measured along with it has the clock of that pressure
+and cannot be shifted: its release stays that of the comparison. Drawn columns are in milliseconds and millimetres.
 """
 
 from __future__ import annotations
@@ -11,29 +11,37 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trace, Trajectory, simulate_many
-from vinetrack.explorer.campaign import Campaign, Seen
+from vinetrack.explorer.campaign import AlignedTrial, Campaign, condition_labels
+from vinetrack.figures.style import vine_styles
 from vinetrack.inference.left_out import TOLD_APART, told_apart
 from vinetrack.inference.parameters import YIELD_PRESSURE
 
 GRID_POINTS = 500
-"""Points of the grid a trial is simulated on: linear between them it is good to a part in 10⁵ of its length."""
+"""Of the grid a trial is simulated on. Derived: linear interpolation errs by h²·x″/8; with h = T/500 and x″ of order
+8·L/T² that is 4·10⁻⁶ of the length; half the points make it 1.6·10⁻⁵."""
 
 ROOM_FRAMES = 25
-"""Frames beyond the recording that the grid reaches, for a release that comes earlier."""
+"""Frames beyond the recording that the grid reaches; derived: five of the largest steps of the alignment."""
 
 SHIFTS = 12
+"""Newton steps of the alignment; chosen: a release found by the comparison settles in two or three."""
+
 LARGEST_SHIFT_FRAMES = 5.0
+"""Of one step; chosen: a steep start cannot throw the release beyond the data."""
+
 SETTLED_FRAMES = 1e-3
+"""Chosen: at 1 m/s and 1000 frames a second, a thousandth of a frame is 1 µm."""
 
 
 @dataclass(frozen=True)
-class Sized:
+class SizedModel:
     """A model with its sizes: parameters in `model`, yield pressures, Pa, by name of trial."""
 
     model: Model
@@ -42,10 +50,10 @@ class Sized:
 
 @dataclass(frozen=True)
 class ModelCurves:
-    """What the model says of one trial; arrays have shape (n_points,), at the trial's own frames.
+    """The model's prediction of one trial; arrays have shape (n_points,), at the trial's own frames.
 
     `release_s` and `origin_m` are on the track's clock and ruler. `growth_m` is the position the camera would report,
-    from the origin that the page uses (`Seen.origin_m`), `residual_m` measurement minus model. `path_m`, shape
+    from the origin that the page uses (`AlignedTrial.origin_m`), `residual_m` measurement minus model. `path_m`, shape
     (GRID_POINTS,), is the whole motion at `path_s` since that release, from the model's own origin.
     """
 
@@ -72,13 +80,13 @@ Curves = tuple[ModelCurves, ...]
 """A motion for every trial of a campaign, in its order."""
 
 
-def follow(campaign: Campaign, sized: Sized, before: Curves | None = None) -> Curves:
-    """Simulate every trial and lay it on its measurement.
+def follow(campaign: Campaign, sized: SizedModel, before: Curves | None = None) -> Curves:
+    """Simulate every trial and align it with its measurement.
 
     Parameters
     ----------
     before
-        Where releases are looked for from; by default those of the comparison.
+        Curves whose releases the alignment starts from; by default those of the comparison.
 
     Raises
     ------
@@ -86,21 +94,21 @@ def follow(campaign: Campaign, sized: Sized, before: Curves | None = None) -> Cu
         If the model cannot be followed at these sizes.
     """
     seen = campaign.trials
-    starts = [one.release_s for one in seen]
+    starts = [trial.release_s for trial in seen]
     if before is not None:
         starts = [
-            own.release_s if one.item.trace is None else start
-            for own, one, start in zip(before, seen, starts, strict=True)
+            curve.release_s if trial.data.trace is None else start
+            for curve, trial, start in zip(before, seen, starts, strict=True)
         ]
-    grids = [_grid(one) for one in seen]
+    grids = [_grid(trial) for trial in seen]
     moved = simulate_many(
         sized.model,
-        [with_yield(one.item.trial, sized.yield_Pa) for one in seen],
+        [with_yield(trial.data.trial, sized.yield_Pa) for trial in seen],
         grids,
-        traces=[_since(one) for one in seen],
+        traces=[_since(trial) for trial in seen],
         host=campaign.host,
     )
-    return tuple(_laid(*one) for one in zip(seen, grids, moved, starts, strict=True))
+    return tuple(_aligned(*parts) for parts in zip(seen, grids, moved, starts, strict=True))
 
 
 def with_yield(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
@@ -108,38 +116,38 @@ def with_yield(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
     return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
 
 
-def _grid(seen: Seen) -> Floats:
+def _grid(seen: AlignedTrial) -> Floats:
     """Instants since release: until the end of the recording and a little on."""
-    item = seen.item
-    last_s = max(item.time_s[-1] - seen.release_s, 0.0) + ROOM_FRAMES * item.frame_s
+    data = seen.data
+    last_s = max(data.time_s[-1] - seen.release_s, 0.0) + ROOM_FRAMES * data.frame_s
     return np.linspace(0.0, last_s, GRID_POINTS)
 
 
-def _since(seen: Seen) -> Trace | None:
-    trace = seen.item.trace
+def _since(seen: AlignedTrial) -> Trace | None:
+    trace = seen.data.trace
     return None if trace is None else (trace[0] - seen.release_s, trace[1])
 
 
-def _laid(seen: Seen, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
+def _aligned(seen: AlignedTrial, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
     """Newton's steps in release, and in the origin where the vine was not seen at rest."""
-    item, position = seen.item, moved.observed_position_m
+    data, position = seen.data, moved.observed_position_m
     speed = np.gradient(position, grid)
     release_s, origin_m = start_s, seen.origin_m
-    longest_s = LARGEST_SHIFT_FRAMES * item.frame_s
+    longest_s = LARGEST_SHIFT_FRAMES * data.frame_s
     for _ in range(SHIFTS):
-        since = item.time_s - release_s
-        left = item.lead_position_m - origin_m - np.interp(since, grid, position)
-        # Before release the vine stands: its speed there is nothing.
-        held = item.trace is not None
+        since = data.time_s - release_s
+        left = data.lead_position_m - origin_m - np.interp(since, grid, position)
+        # Before release the vine stands: its speed is zero there.
+        held = data.trace is not None
         slope = np.zeros(since.size) if held else -np.interp(since, grid, speed, left=0.0, right=0.0)
         later_s, higher_m = _step(slope, left, free_origin=not seen.origin_known)
         later_s = min(max(later_s, -longest_s), longest_s)
         release_s += later_s
         origin_m += higher_m
-        if abs(later_s) < SETTLED_FRAMES * item.frame_s:
+        if abs(later_s) < SETTLED_FRAMES * data.frame_s:
             break
-    growth = np.interp(item.time_s - release_s, grid, position)
-    residual = item.lead_position_m - origin_m - growth
+    growth = np.interp(data.time_s - release_s, grid, position)
+    residual = data.lead_position_m - origin_m - growth
     counted = residual[seen.counts_from(release_s) :]
     above = origin_m - seen.origin_m
     return ModelCurves(release_s, origin_m, growth + above, residual, float(np.mean(counted**2)), grid, position)
@@ -171,11 +179,157 @@ def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
 
 def yields_of(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, float]:
     """Yield pressures, Pa, by trial, from those that a fit gives by vine (and stated value, where it has several)."""
-    found = {}
+    yields_Pa = {}
     for seen in campaign.trials:
-        trial = seen.item.trial
+        trial = seen.data.trial
         for vine in (trial.vine, f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"):
             value = numbers.get(f"{YIELD_PRESSURE}[{vine}]")
             if value is not None:
-                found[trial.name] = value
-    return found
+                yields_Pa[trial.name] = value
+    return yields_Pa
+
+
+MOST_POINTS = 250
+"""Points of a line on the page; chosen: one every three or four pixels; more take longer to send than to compute."""
+
+Columns = dict[str, list[Any]]
+
+
+def colours(campaign: Campaign) -> dict[str, str]:
+    """Colour of each condition: that of its vine, as in every figure."""
+    styles = vine_styles(campaign.vines)
+    return {seen.condition: styles[seen.data.trial.vine].colour for seen in campaign.trials}
+
+
+def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
+    """Each vine, by what tells it from the others, with its colour."""
+    styles = vine_styles(campaign.vines)
+    first = {seen.data.trial.vine: seen.data.trial for seen in reversed(campaign.trials)}
+    bare = {vine: replace(trial, pressure_Pa=math.nan, payload_kg=0.0) for vine, trial in first.items()}
+    labels = condition_labels(bare) if len(bare) > 1 else dict.fromkeys(bare, "measured")
+    return [(labels[vine], styles[vine].colour) for vine in campaign.vines]
+
+
+def thinned(count: int, first: int) -> slice:
+    """Rows to draw of a track: from a little before the motion, no more than can be seen."""
+    begin = max(first - max((count - first) // 20, 2), 0)
+    return slice(begin, None, max(math.ceil((count - begin) / MOST_POINTS), 1))
+
+
+def measured(campaign: Campaign, shown: Sequence[int]) -> Columns:
+    """Lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`, `condition`."""
+    colour = colours(campaign)
+    columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
+    for i in shown:
+        seen = campaign.trials[i]
+        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
+        columns["xs"].append(1e3 * seen.time_s[rows])
+        columns["ys"].append(1e3 * _broken(seen, rows, seen.growth_m[rows]))
+        columns["colour"].append(colour[seen.condition])
+        columns["trial"].append(seen.name)
+        columns["condition"].append(campaign.labels[seen.condition])
+    return columns
+
+
+def _broken(seen: AlignedTrial, rows: slice, values: Floats) -> Floats:
+    """Values with NaN where frames are left out, so that no line is drawn over frames that were not compared."""
+    stretch = np.cumsum(seen.data.first)[rows]
+    out = values.copy()
+    out[np.flatnonzero(np.diff(stretch) > 0) + 1] = math.nan
+    return out
+
+
+def bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
+    """Outlines of one standard deviation of the replicates about their mean, ms and mm."""
+    colour = colours(campaign)
+    columns: Columns = {"xs": [], "ys": [], "colour": []}
+    for condition in _conditions(campaign, shown):
+        band = campaign.bands.get(condition)
+        if band is None or band.time_s.size < 2:
+            continue
+        rows = thinned(band.time_s.size, int(np.searchsorted(band.time_s, 0.0)))
+        time_ms, mean_mm, sigma_mm = (1e3 * part[rows] for part in (band.time_s, band.mean_m, band.sigma_m))
+        columns["xs"].append(np.concatenate([time_ms, time_ms[::-1]]))
+        columns["ys"].append(np.concatenate([mean_mm - sigma_mm, (mean_mm + sigma_mm)[::-1]]))
+        columns["colour"].append(colour[condition])
+    return columns
+
+
+def modelled(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
+    """A line a condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
+    columns: Columns = {"xs": [], "ys": []}
+    for condition in _conditions(campaign, shown):
+        members = [i for i in shown if campaign.trials[i].condition == condition]
+        longest = max(members, key=lambda i: campaign.trials[i].time_s[-1])
+        seen = campaign.trials[longest]
+        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
+        columns["xs"].append(1e3 * seen.time_s[rows])
+        columns["ys"].append(1e3 * curves[longest].growth_m[rows])
+    return columns
+
+
+def residuals(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
+    """Lines of measurement minus model, `ys` mm, along the growth, `xs` mm."""
+    colour = colours(campaign)
+    columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
+    for i in shown:
+        seen, motion = campaign.trials[i], curves[i]
+        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
+        columns["xs"].append(1e3 * seen.growth_m[rows])
+        columns["ys"].append(1e3 * _broken(seen, rows, motion.residual_m[rows]))
+        columns["colour"].append(colour[seen.condition])
+        columns["trial"].append(seen.name)
+        columns["condition"].append(campaign.labels[seen.condition])
+    return columns
+
+
+def error_bars(
+    campaign: Campaign,
+    now_m: Mapping[str, float],
+    before_m: Mapping[str, float],
+    floors_m: Mapping[str, float],
+    shown: Sequence[str],
+) -> Columns:
+    """A row a condition, the first at the bottom: `label`, `now`, `before`, `floor`, mm, `colour` and how opaque."""
+    colour = colours(campaign)
+    names = list(reversed(campaign.conditions))
+    return {
+        "condition": names,
+        "label": [campaign.labels[name] for name in names],
+        "now": [_mm(now_m.get(name)) for name in names],
+        "before": [_mm(before_m.get(name)) for name in names],
+        "floor": [_mm(floors_m.get(name)) for name in names],
+        "colour": [colour[name] for name in names],
+        "alpha": [0.95 if name in shown else 0.3 for name in names],
+    }
+
+
+def extent(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Ranges that hold all lines with a little room: (left, right), (bottom, top)."""
+    if not columns["xs"]:
+        return (0.0, 1.0), (0.0, 1.0)
+    ranges = []
+    for key in ("xs", "ys"):
+        low = min(float(np.nanmin(part)) for part in columns[key])
+        high = max(float(np.nanmax(part)) for part in columns[key])
+        room = share * ((high - low) or 1.0)
+        ranges.append((low - room, high + room))
+    return ranges[0], ranges[1]
+
+
+def symmetric(columns: Columns, least_mm: float = 0.1) -> tuple[float, float]:
+    """A range about zero for residuals, in round steps so that it does not twitch while a slider moves."""
+    parts: list[Floats] = columns["ys"]
+    largest = max((float(np.nanmax(np.abs(part))) for part in parts), default=least_mm)
+    step = 10 ** math.floor(math.log10(max(largest, least_mm)))
+    reach = next(step * k for k in (1.2, 2, 3, 5, 7, 10) if step * k >= 1.05 * max(largest, least_mm) or k == 10)
+    return -reach, reach
+
+
+def _conditions(campaign: Campaign, shown: Sequence[int]) -> list[str]:
+    present = {campaign.trials[i].condition for i in shown}
+    return [name for name in campaign.conditions if name in present]
+
+
+def _mm(value: float | None) -> float:
+    return math.nan if value is None else 1e3 * value

@@ -45,8 +45,8 @@ def curve_table(campaign: Campaign, choice: Choice, curves: Curves, shown: Seque
         mean_m = nothing if band is None else np.interp(seen.time_s, band.time_s, band.mean_m)
         sigma_m = nothing if band is None else np.interp(seen.time_s, band.time_s, band.sigma_m)
         columns = ("+".join(choice.effects), seen.condition, seen.name, seen.time_s, seen.growth_m)
-        rest = (motion.growth_m, motion.residual_m, mean_m, sigma_m)
-        parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, (*columns, *rest), strict=True))))
+        model_columns = (motion.growth_m, motion.residual_m, mean_m, sigma_m)
+        parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, (*columns, *model_columns), strict=True))))
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
 
 
@@ -84,7 +84,7 @@ def _compared(
             "model": "+".join(choice.effects),
             "condition": conditions,
             "condition_label": [campaign.labels[name] for name in conditions],
-            "vine": [campaign.trials[campaign.of_condition(name)[0]].item.trial.vine for name in conditions],
+            "vine": [campaign.trials[campaign.of_condition(name)[0]].data.trial.vine for name in conditions],
             "rms_position_m": rms,
             "ratio": [r / f if f > 0 else math.nan for r, f in zip(rms, floors, strict=True)],
         }

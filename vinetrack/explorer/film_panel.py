@@ -13,13 +13,14 @@ from bokeh.models import Button, Column, ColumnDataSource, LinearColorMapper, Ra
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 
-from vinetrack.explorer.campaign import Campaign, Seen
+from vinetrack.explorer.campaign import AlignedTrial, Campaign
 from vinetrack.explorer.curves import Curves
 from vinetrack.explorer.look import EARLIER_EDGE, MEASURED_EDGE, MODEL_EDGE, escaped, progress_bar, sheet, words
-from vinetrack.explorer.recording import Film, View, view_of
+from vinetrack.explorer.recording import DecodedRecording, RecordingView, view_of
 from vinetrack.results.folder_layout import Results
 
 PLAY_MS = 70
+"""Between two frames while playing; chosen: 14 a second, as fast as pictures of 960 pixels are sent."""
 NARROW = ":host { flex-wrap: wrap; gap: 6px; align-items: end; }"
 
 
@@ -30,8 +31,8 @@ class FilmPanel:
         self.campaign, self._document, self._instant = campaign, document, instant
         self._curves: Curves | None = None
         self._earlier: Curves | None = None
-        self._film: Film | None = None
-        self._view: View | None = None
+        self._film: DecodedRecording | None = None
+        self._view: RecordingView | None = None
         self._playing: Any = None
         names = [seen.name for seen in campaign.trials]
         self.choose = Select(
@@ -104,23 +105,23 @@ class FilmPanel:
             self.choose.value = name
             return
         seen = self.campaign.trial(name)
-        view = view_of(Results(self.campaign.folder), seen.item.trial)
+        view = view_of(Results(self.campaign.folder), seen.data.trial)
         self.figure.visible = False
         if isinstance(view, str):
-            last = max(seen.item.time_s.size - 1, 1)
-            self.frame.update(start=0, end=last, value=(seen.item.n_rest + last) // 2)
+            last = max(seen.data.time_s.size - 1, 1)
+            self.frame.update(start=0, end=last, value=(seen.data.n_rest + last) // 2)
             self._say_frame(int(self.frame.value), view)
             return
         self._view = view
         self.caption.text = progress_bar(0.0, f"decoding {view.path.name} …")
-        self._film = Film(view.path)
+        self._film = DecodedRecording(view.path)
         self._film.in_background(self._heard)
 
-    def _heard(self, film: Film) -> None:
+    def _heard(self, film: DecodedRecording) -> None:
         """From the decoding thread."""
         self._document.add_next_tick_callback(partial(self._decoded, film))
 
-    def _decoded(self, film: Film) -> None:
+    def _decoded(self, film: DecodedRecording) -> None:
         if film is not self._film or self._view is None:
             return
         if film.count and not self.figure.visible:
@@ -146,7 +147,7 @@ class FilmPanel:
         known = np.flatnonzero(np.isfinite(self._view.edge_px))
         return 0 if not known.size else int(min(known[known.size // 2], self._film.count - 1))
 
-    def _fit_figure(self, film: Film) -> None:
+    def _fit_figure(self, film: DecodedRecording) -> None:
         height, width = film.shape
         self.figure.x_range.update(start=-0.5, end=width - 0.5)
         self.figure.y_range.update(start=height - 0.5, end=-0.5)
@@ -162,10 +163,10 @@ class FilmPanel:
 
     def _time_s(self, frame: int) -> float:
         """When a frame was filmed, on the clock of the track."""
-        times = self._seen().item.time_s if self._view is None else self._view.time_s
+        times = self._seen().data.time_s if self._view is None else self._view.time_s
         return float(times[min(frame, times.size - 1)])
 
-    def _seen(self) -> Seen:
+    def _seen(self) -> AlignedTrial:
         return self.campaign.trial(self.choose.value)
 
     def _positions(self, frame: int) -> tuple[float, float, float]:
@@ -173,14 +174,14 @@ class FilmPanel:
         time_s, seen = self._time_s(frame), self._seen()
         place = self.campaign.trials.index(seen)
         at = np.array([time_s])
-        said = [
+        model_m = [
             math.nan if curves is None else float(curves[place].lead_position_m(at)[0])
             for curves in (self._earlier, self._curves)
         ]
         if self._view is None:
-            return float(seen.item.lead_position_m[min(frame, seen.item.time_s.size - 1)]), said[0], said[1]
+            return float(seen.data.lead_position_m[min(frame, seen.data.time_s.size - 1)]), model_m[0], model_m[1]
         known = frame < self._view.lead_position_m.size
-        return (float(self._view.lead_position_m[frame]) if known else math.nan), said[0], said[1]
+        return (float(self._view.lead_position_m[frame]) if known else math.nan), model_m[0], model_m[1]
 
     def _draw_edges(self) -> None:
         view, film = self._view, self._film
@@ -212,15 +213,15 @@ class FilmPanel:
         since_s = self._time_s(frame) - seen.release_s
         positions = zip(("tracked", "at first", "model"), self._positions(frame), strict=True)
         colours = {"tracked": MEASURED_EDGE, "at first": EARLIER_EDGE, "model": MODEL_EDGE}
-        said = [
+        positions_text = [
             f'<span style="border-bottom:3px solid {colours[name]}">{name} {1e3 * (at - seen.origin_m):.1f} mm</span>'
             for name, at in positions
             if math.isfinite(at)
         ]
         if not reason and self._view is None:
-            reason = str(view_of(Results(self.campaign.folder), seen.item.trial))
+            reason = str(view_of(Results(self.campaign.folder), seen.data.trial))
         words_ = f"<p>{escaped(reason)}</p>" if reason else ""
-        self.caption.text = f"{words_}<p>{1e3 * since_s:.1f} ms since release · {' · '.join(said)}</p>"
+        self.caption.text = f"{words_}<p>{1e3 * since_s:.1f} ms since release · {' · '.join(positions_text)}</p>"
         self._instant(seen.name, since_s)
 
     def refresh(self) -> None:

@@ -1,4 +1,4 @@
-"""Fits that a page asks for: in a thread, told of step by step, given up when something else is wanted."""
+"""Fits of the explorer, in threads: the model in use, fitted once for all open pages, and the chosen models."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import Choice, sized
+from vinetrack.explorer.choice import Choice, first_choice, sized
 from vinetrack.explorer.curves import Curves, errors_m, follow
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.optimiser import Step, Watch
+from vinetrack.inference.optimiser import SETTLED_DECREASE, Step, Watch
 
 log = logging.getLogger(__name__)
 
 FAULT = "A fault of the program, not of your data: run vinetrack explore with --log FILE to have the traceback."
-STRONGLY_TIED = 0.9
+STRONG_CORRELATION = 0.9
+"""Chosen: two numbers of this correlation have errors 1/√(1 − 0.9²) = 2.3 times those with the other one known."""
+
 CLEARLY_WORSE = 0.5
+"""Chosen: a fall of ln L by 0.5 is the limit of one standard error; two fits within it agree."""
 
 
 class GivenUp(Exception):  # noqa: N818 - nothing went wrong
@@ -52,7 +55,7 @@ class Fitted:
 def first_fit(campaign: Campaign, choice: Choice, watch: Watch | None = None) -> Fitted:
     """Fit the model in use, as the stage of the workflow does.
 
-    What that found is known, and where the first start leads there, others need not be tried.
+    Its likelihood is known from `fit.json`; where the first start reaches it, no others are tried.
 
     Raises
     ------
@@ -61,14 +64,14 @@ def first_fit(campaign: Campaign, choice: Choice, watch: Watch | None = None) ->
     """
     begun = time.perf_counter()
     model = sized(campaign, choice).model
-    # A falling body has nothing else to find.
+    # A falling body has no other parameter.
     free = ("gravity.g",) if model.names == ("gravity",) else ()
     bare = replace(model, values={})
     begin = partial(fit, bare, campaign.pairs, free=free, host=campaign.host, watch=watch, profile=False)
-    found = begin(thorough=False)
-    if not found.log_likelihood > campaign.log_likelihood - CLEARLY_WORSE:
-        found = begin()
-    return _weighed(campaign, choice, found, time.perf_counter() - begun)
+    result = begin(thorough=False)
+    if not result.log_likelihood > campaign.log_likelihood - CLEARLY_WORSE:
+        result = begin()
+    return _weighed(campaign, choice, result, time.perf_counter() - begun)
 
 
 def fit_choice(campaign: Campaign, before: Fit, choice: Choice, watch: Watch | None = None) -> Fitted:
@@ -86,23 +89,23 @@ def fit_choice(campaign: Campaign, before: Fit, choice: Choice, watch: Watch | N
     new = [effect for effect in model if effect.name not in before.model]
     values = sized(campaign, choice).model.values
     begin = {key: value for effect in new for key, value in values.items() if key.startswith(f"{effect.name}.")}
-    found = refit(before, model, start=begin, watch=watch)
+    result = refit(before, model, start=begin, watch=watch)
     grew = set(before.model.names) <= set(model.names)
-    worse = grew and found.log_likelihood < before.log_likelihood - CLEARLY_WORSE
-    if new and (worse or not found.converged):
+    worse = grew and result.log_likelihood < before.log_likelihood - CLEARLY_WORSE
+    if new and (worse or not result.converged):
         again: dict[str, Value] = {f"{e.name}.{p.name}": p.default for e in new for p in e.parameters}
         other = refit(before, model, start=again, watch=watch)
-        found = max((found, other), key=lambda one: one.log_likelihood)
-    return _weighed(campaign, choice, found, time.perf_counter() - begun)
+        result = max((result, other), key=lambda result: result.log_likelihood)
+    return _weighed(campaign, choice, result, time.perf_counter() - begun)
 
 
-def _weighed(campaign: Campaign, choice: Choice, found: Fit, seconds: float) -> Fitted:
-    """The fit held against the measurement, as `vinetrack compare` does."""
-    settled = at_numbers(choice, {number.name: number.value for number in found.numbers})
+def _weighed(campaign: Campaign, choice: Choice, result: Fit, seconds: float) -> Fitted:
+    """The fit compared with the measurement, as `vinetrack compare` does."""
+    settled = at_numbers(choice, {number.name: number.value for number in result.numbers})
     curves = follow(campaign, sized(campaign, settled))
-    table = compare(found, campaign.pairs, kinematics=campaign.kinematics).table
+    table = compare(result, campaign.pairs, kinematics=campaign.kinematics).table
     floors = dict(zip(table["condition"].astype(str), table["replicate_floor_m"].astype(float), strict=True))
-    return Fitted(settled, found, curves, errors_m(campaign, curves), floors, seconds)
+    return Fitted(settled, result, curves, errors_m(campaign, curves), floors, seconds)
 
 
 def at_numbers(choice: Choice, numbers: Mapping[str, float]) -> Choice:
@@ -111,7 +114,7 @@ def at_numbers(choice: Choice, numbers: Mapping[str, float]) -> Choice:
 
 
 def gained_words(before: Fit, after: Fit) -> str:
-    """What a larger or smaller model did to −2 ln L, in words."""
+    """Return how −2 ln L changed with a larger or smaller model, as a sentence."""
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     more = len(after.numbers) - len(before.numbers)
     numbers = f"{abs(more)} number{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
@@ -120,19 +123,19 @@ def gained_words(before: Fit, after: Fit) -> str:
     return f"−2 ln L {'fell' if gain >= 0 else 'rose'} by {abs(gain):,.1f} for {numbers}."
 
 
-def tied_words(found: Fit) -> list[str]:
-    """Pairs of fitted numbers whose errors hang together, the most tied first, in words."""
+def tied_words(result: Fit) -> list[str]:
+    """Return the pairs of fitted numbers with strongly correlated errors, largest correlation first, as text."""
     pairs = []
-    for i, one in enumerate(found.numbers):
+    for i, number in enumerate(result.numbers):
         for k in range(i):
-            scale = math.sqrt(float(found.covariance[i, i] * found.covariance[k, k]))
-            r = float(found.covariance[i, k]) / scale if scale > 0 and math.isfinite(scale) else 0.0
-            if abs(r) > STRONGLY_TIED:
-                pairs.append((abs(r), f"{found.numbers[k].title} and {one.title}: correlation {r:+.2f}"))
+            scale = math.sqrt(float(result.covariance[i, i] * result.covariance[k, k]))
+            r = float(result.covariance[i, k]) / scale if scale > 0 and math.isfinite(scale) else 0.0
+            if abs(r) > STRONG_CORRELATION:
+                pairs.append((abs(r), f"{result.numbers[k].title} and {number.title}: correlation {r:+.2f}"))
     return [words for _, words in sorted(pairs, reverse=True)]
 
 
-class Job:
+class FitJob:
     """One fit in a thread; `told`, `done` and `failed` are called from that thread."""
 
     def __init__(
@@ -164,7 +167,7 @@ class Job:
 
     def _run(self) -> None:
         try:
-            found = self._work(self._watch)
+            result = self._work(self._watch)
         except GivenUp:
             return
         except (FitError, EffectError, SimulationError) as error:
@@ -174,7 +177,7 @@ class Job:
             self._say(self._failed, FAULT)
         else:
             if not self._unwanted.is_set():
-                self._done(found)
+                self._done(result)
 
     def _say(self, whom: Callable[[str], None], words: str) -> None:
         if not self._unwanted.is_set():
@@ -184,3 +187,120 @@ class Job:
         if self._unwanted.is_set():
             raise GivenUp
         self._told(step)
+
+
+log = logging.getLogger(__name__)
+
+
+class BackgroundFit:
+    """Grows in the background, in this order: `curves` and `errors_m` of the model in use, then its fit.
+
+    `trouble` says why it got no further, blank where it did. Listeners are called from the background's thread.
+    """
+
+    def __init__(self, campaign: Campaign, choice: Choice | None = None) -> None:
+        self.campaign = campaign
+        self.start = first_choice(campaign)
+        self.opening = choice or self.start
+        self.curves: Curves | None = None
+        self.errors_m: dict[str, float] = {}
+        self.fitted: Fitted | None = None
+        self.step: Step | None = None
+        self.trouble = ""
+        self._listeners: list[Callable[[], None]] = []
+        self._thread = threading.Thread(target=self._grow, daemon=True, name="vinetrack-ground")
+
+    def begin(self) -> BackgroundFit:
+        """Start growing."""
+        self._thread.start()
+        return self
+
+    def wait(self, timeout_s: float | None = None) -> None:
+        """Until all is there, or something went wrong."""
+        self._thread.join(timeout_s)
+
+    def listen(self, heard: Callable[[], None]) -> None:
+        """Have `heard` called whenever something new is there."""
+        self._listeners.append(heard)
+
+    def forget(self, heard: Callable[[], None]) -> None:
+        """Call it no more."""
+        if heard in self._listeners:
+            self._listeners.remove(heard)
+
+    @property
+    def growing(self) -> bool:
+        """Whether more is to come."""
+        return self._thread.is_alive()
+
+    def _grow(self) -> None:
+        try:
+            self.curves = follow(self.campaign, sized(self.campaign, self.start))
+            self.errors_m = errors_m(self.campaign, self.curves)
+            self._tell()
+            self.fitted = first_fit(self.campaign, self.start, self._stepped)
+        except (FitError, EffectError, SimulationError) as error:
+            self.trouble = str(error)
+        except Exception:
+            log.exception("the model in use")
+            self.trouble = FAULT
+        self._tell()
+
+    def _stepped(self, step: Step) -> None:
+        self.step = step
+        self._tell()
+
+    def _tell(self) -> None:
+        for heard in list(self._listeners):
+            heard()
+
+
+_LEAST_SHARE = 0.04
+"""Of the bar at the begin; chosen: visible at a width of 200 pixels."""
+
+
+class FitProgress:
+    """How far a fit is, as a fraction and in words; `words` is the message where no fit runs.
+
+    The number of steps is unknown: progress is measured by the logarithm of the decrease that the next step promises,
+    from its largest value down to `SETTLED_DECREASE`, where a fit stops.
+    """
+
+    def __init__(self) -> None:
+        self.words = ""
+        self._begun = 0.0
+        self._largest = 0.0
+        self._share = _LEAST_SHARE
+        self._step: Step | None = None
+
+    def begin(self, now: float) -> None:
+        """A fit is wanted."""
+        self._begun, self._largest, self._share, self._step, self.words = now, 0.0, _LEAST_SHARE, None, ""
+
+    def reach(self, step: Step) -> None:
+        """It has come so far."""
+        self._step = step
+        if math.isfinite(step.promised) and step.promised > 0:
+            self._largest = max(self._largest, step.promised)
+            whole = math.log10(max(self._largest, 10 * SETTLED_DECREASE) / SETTLED_DECREASE)
+            done = math.log10(max(self._largest, step.promised) / max(step.promised, SETTLED_DECREASE))
+            self._share = max(self._share, min(done / whole, 0.97))
+
+    def state(self, now: float, about: str, other: Step | None = None) -> tuple[float, str]:
+        """Share done and words; `other` is the step of what has to be done first."""
+        step = other or self._step
+        where = f" · step {step.iteration}" if step is not None else ""
+        promise = ""
+        if step is not None and math.isfinite(step.promised):
+            promise = (
+                f" · the next lowers −2 ln L by {step.promised:,.2g}" if step.promised < 1e4 else " · still far off"
+            )
+        return self._share, f"{about}{where}{promise} · {now - self._begun:.1f} s"
+
+    def end(self, words: str) -> None:
+        """The fit has ended; `words` state why, blank where it succeeded."""
+        self.words = words
+
+    def say(self, words: str) -> None:
+        """State something that is no end."""
+        self.words = words

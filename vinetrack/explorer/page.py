@@ -12,32 +12,37 @@ from bokeh.models import Button, Column, CustomJS, Row
 
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.explorer.choice import Choice, changed, sized
-from vinetrack.explorer.chooser import Chooser
-from vinetrack.explorer.curves import Curves, errors_m, follow
+from vinetrack.explorer.controls import Chooser, EffectPanel, KeepPanel
+from vinetrack.explorer.curves import Curves, errors_m, follow, vine_colours
 from vinetrack.explorer.film_panel import FilmPanel
-from vinetrack.explorer.fitting import Fitted, Job, at_numbers, fit_choice
-from vinetrack.explorer.ground import Ground
-from vinetrack.explorer.keep_panel import KeepPanel
+from vinetrack.explorer.fitting import BackgroundFit, FitJob, FitProgress, Fitted, at_numbers, fit_choice
 from vinetrack.explorer.look import escaped, page_style, page_template, progress_bar, screen_script, sheet, theme, words
-from vinetrack.explorer.panel import EffectPanel
 from vinetrack.explorer.plots import Plots
-from vinetrack.explorer.series import vine_colours
-from vinetrack.explorer.sides import Rung, headline, next_panel, numbers_words, rung_of, tied_panel
-from vinetrack.explorer.story import DIAGNOSIS, Story, read_story
-from vinetrack.explorer.waiting import Waiting
+from vinetrack.explorer.sides import (
+    DIAGNOSIS,
+    DiagnosisSummary,
+    FittedRung,
+    headline,
+    next_panel,
+    numbers_words,
+    read_summary,
+    rung_of,
+    tied_panel,
+)
 from vinetrack.figures.page_tokens import follows_screen
 from vinetrack.inference.optimiser import Step
 
 COALESCE_MS = 4
-"""A redraw waits this long, so that all moves of a slider that have come in by then are drawn as one."""
+"""Chosen: a redraw waits a quarter of a screen's frame of 16 ms, so that moves of a slider come together."""
 
 WORDS_MS = 150
-"""Words follow a slider at reading speed: every change of them has the browser lay out the page anew."""
+"""Chosen: text follows a slider at reading speed, since each change makes the browser lay out the page again."""
 
 LOOK_AGAIN_MS = 2000
-"""How often the page looks whether there is a new diagnosis."""
+"""Chosen: how often the page looks for a new diagnosis."""
 
 CLOCK_MS = 200
+"""Chosen: the status line counts tenths of a second."""
 
 LET_SCROLL = """
 for (const plot of plots) {
@@ -50,21 +55,21 @@ for (const plot of plots) {
 class Page:
     """The controller of one document. Everything here runs in the document's own turn, but `_heard_…`."""
 
-    def __init__(self, ground: Ground, document: Document) -> None:
+    def __init__(self, ground: BackgroundFit, document: Document) -> None:
         self.ground, self.campaign, self.document = ground, ground.campaign, document
         self.choice: Choice = ground.opening
         self.curves: Curves | None = None
         self.errors_m: Mapping[str, float] = {}
         self.last: Fitted | None = None
-        self.rungs: list[Rung] = []
-        self.story: Story | None = read_story(self.campaign.folder)
+        self.rungs: list[FittedRung] = []
+        self.story: DiagnosisSummary | None = read_summary(self.campaign.folder)
         self._story_time = self._diagnosed_at()
         self._touched = False
         self._redraw_pending = self._words_pending = False
-        self._job: Job | None = None
+        self._job: FitJob | None = None
         self._wanted = False
         self._step: Step | None = None
-        self._waiting = Waiting()
+        self._waiting = FitProgress()
         self._build()
         ground.listen(self._heard_ground)
         document.on_session_destroyed(lambda _context: self.close())
@@ -200,7 +205,7 @@ class Page:
         self._wanted = False
         before = (self.last or ground).fit
         self._step = None
-        self._job = Job(
+        self._job = FitJob(
             partial(fit_choice, self.campaign, before, self.choice),
             told=self._heard_step,
             done=lambda fitted: self._soon(partial(self._fit_done, fitted)),
@@ -332,7 +337,7 @@ class Page:
     def _look_again(self) -> None:
         if self._diagnosed_at() != self._story_time:
             self._story_time = self._diagnosed_at()
-            self.story = read_story(self.campaign.folder)
+            self.story = read_summary(self.campaign.folder)
             self._say()
 
     def is_fitted(self) -> bool:

@@ -23,13 +23,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 WIDEST_PX = 960
+"""Chosen: as wide as the page shows a recording."""
+
 QUALITY = 88
+"""Of JPEG, 0 to 100; chosen: at 88 an edge shows no blocks; a second of 1000 frames takes some tens of megabytes."""
+
 TOLD_EVERY = 10
-"""Frames between two reports of progress."""
+"""Frames between two reports of progress; chosen: several reports a second."""
 
 
 @dataclass(frozen=True)
-class View:
+class RecordingView:
     """How positions along the growth axis lie in the picture of one recording, px of the recording.
 
     `edge_px`, shape (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and
@@ -72,7 +76,7 @@ class View:
         return (x - half * dy, x + half * dy), (y + half * dx, y - half * dx)
 
 
-def view_of(results: Results, trial: Trial) -> View | str:
+def view_of(results: Results, trial: Trial) -> RecordingView | str:
     """The view of a trial, or in words why there is none: it is a track only, or its axis was not kept."""
     if trial.video is None:
         name = trial.track.name if trial.track is not None else "a table"
@@ -89,12 +93,12 @@ def view_of(results: Results, trial: Trial) -> View | str:
     return _view(trial, axis, table)
 
 
-def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> View:
+def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> RecordingView:
     (x0, y0), (x1, y1) = axis["from_px"], axis["to_px"]
     length = float(np.hypot(x1 - x0, y1 - y0))
     width = axis.get("width_px")
     assert trial.video is not None
-    return View(
+    return RecordingView(
         trial=trial.name,
         path=trial.video,
         from_px=(float(x0), float(y0)),
@@ -108,7 +112,7 @@ def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> View:
 
 
 @dataclass
-class Film:
+class DecodedRecording:
     """Frames of one recording, decoded in the background. `shape` is that of the pictures, height and width, px.
 
     `scale` is pixels of these pictures in one of the recording. `words` say what went wrong, blank where nothing.
@@ -131,7 +135,7 @@ class Film:
         data = np.frombuffer(self._frames[frame], dtype=np.uint8)
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
-    def decode(self, told: Callable[[Film], None] | None = None) -> Film:
+    def decode(self, told: Callable[[DecodedRecording], None] | None = None) -> DecodedRecording:
         """Decode every frame; `told` hears every so often."""
         from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 
@@ -151,7 +155,7 @@ class Film:
             told(self)
         return self
 
-    def in_background(self, told: Callable[[Film], None]) -> None:
+    def in_background(self, told: Callable[[DecodedRecording], None]) -> None:
         """`decode` in a thread, from which `told` is called."""
         threading.Thread(target=self.decode, args=(told,), daemon=True, name="vinetrack-film").start()
 

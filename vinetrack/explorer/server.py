@@ -18,16 +18,21 @@ from bokeh.document import Document
 from bokeh.server.server import Server
 
 from vinetrack.explorer.command import PageError
-from vinetrack.explorer.ground import Ground
+from vinetrack.explorer.fitting import BackgroundFit
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 5070, 30
+"""Chosen: free of well-known services; 30 pages on one machine, then any free port."""
+
 QUIET = ("bokeh", "tornado")
 SWITCH_S = 1e-3
+"""Between threads; chosen: with Python's 5 ms each move of a slider waits as long while a fit runs."""
+
 KEEP_ALIVE_MS = 20_000
+"""Between two pings of an open page; chosen: a page that was closed is noticed within half a minute."""
 
 
-def application(ground: Ground) -> Application:
+def application(ground: BackgroundFit) -> Application:
     """A page for whoever opens one."""
     from vinetrack.explorer.page import Page
 
@@ -37,7 +42,7 @@ def application(ground: Ground) -> Application:
     return Application(FunctionHandler(open_page, trap_exceptions=False))
 
 
-def start_server(ground: Ground, port: int | None = None) -> Server:
+def start_server(ground: BackgroundFit, port: int | None = None) -> Server:
     """A server that is bound to the loopback address and answers no page from elsewhere.
 
     Parameters
@@ -57,17 +62,17 @@ def start_server(ground: Ground, port: int | None = None) -> Server:
     raise PageError(f"Port {port} is taken: give another with --port, or none to have one found.")
 
 
-def _serve(ground: Ground, port: int) -> Server:
+def _serve(ground: BackgroundFit, port: int) -> Server:
     # Found first, so that the port is known before it is said who may connect to it.
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind((LOOPBACK, port))
-        found = int(probe.getsockname()[1])
+        free_port = int(probe.getsockname()[1])
     server = Server(
         {"/": application(ground)},
         address=LOOPBACK,
-        port=found,
-        allow_websocket_origin=[f"{LOOPBACK}:{found}", f"localhost:{found}"],
+        port=free_port,
+        allow_websocket_origin=[f"{LOOPBACK}:{free_port}", f"localhost:{free_port}"],
         keep_alive_milliseconds=KEEP_ALIVE_MS,
         check_unused_sessions_milliseconds=5_000,
         unused_session_lifetime_milliseconds=10_000,
@@ -82,7 +87,7 @@ def address(server: Server) -> str:
     return f"http://{LOOPBACK}:{server.port}/"
 
 
-def serve(ground: Ground, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
+def serve(ground: BackgroundFit, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
     """Serve until Ctrl-C (or SIGTERM), then leave without a word more than needed.
 
     Raises

@@ -1,10 +1,11 @@
-"""What stands beside the figures, as HTML: the headline, what a fit found, what is tied, the next trial."""
+"""Text beside the figures as HTML: headline, fitted numbers, and of a diagnosis tied candidates and the next trial."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vinetrack.core.numbers import decimals
@@ -12,21 +13,27 @@ from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.choice import Choice
-from vinetrack.explorer.curves import overall_m
+from vinetrack.explorer.curves import overall_m, vine_colours
 from vinetrack.explorer.export import model_words
 from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
 from vinetrack.explorer.look import command_block, escaped, table
-from vinetrack.explorer.series import vine_colours
-from vinetrack.explorer.story import Story
+from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
+from vinetrack.results.folder_layout import ResultsError, read_json
 
 AT_THE_FLOOR = 1.15
+"""Chosen: an error within 15 % of the replicate scatter counts as equal to it; with six replicates that scatter is
+itself known to 1/√(2·5) = 32 %."""
+
 MOST_PAIRS = 6
+"""Of correlated numbers; chosen: the card holds six lines."""
+
 MOST_COMPARED = 8
+"""Candidates in the grid of cosines; chosen: eight columns fit the card of 380 pixels."""
 
 
 @dataclass(frozen=True)
-class Rung:
+class FittedRung:
     """One model fitted on this page: its effects, error over all conditions, and what the fit said."""
 
     effects: tuple[str, ...]
@@ -35,7 +42,7 @@ class Rung:
 
 
 def headline(campaign: Campaign, choice: Choice, now_m: Mapping[str, float], before_m: Mapping[str, float]) -> str:
-    """In a sentence: how far off the model is, was, and could not help being."""
+    """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
     now, before, floor = (overall_m(errors, campaign.conditions) for errors in (now_m, before_m, campaign.floors_m))
     words = model_words(choice.effects)
     model = escaped(words[:1].upper() + words[1:])
@@ -56,7 +63,7 @@ def _mm(value_m: float) -> str:
     return f"{1e3 * value_m:.3g} mm"
 
 
-def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[Rung], touched: bool) -> str:
+def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[FittedRung], touched: bool) -> str:
     """The table of fitted numbers and the models fitted so far."""
     if fitted is None:
         return "<p class='muted'>The model in use is being fitted; its numbers come here.</p>"
@@ -89,7 +96,7 @@ def _number_row(number: Number, vine: str) -> tuple[str, ...]:
     return name, vine, value, f"± {number.sigma * factor:.{digits}f}", f"{low} to {high}"
 
 
-def _ladder(campaign: Campaign, rungs: Sequence[Rung]) -> str:
+def _ladder(campaign: Campaign, rungs: Sequence[FittedRung]) -> str:
     """The models fitted on this page, one below the other, with what is left beyond the replicates."""
     if not rungs:
         return ""
@@ -98,44 +105,44 @@ def _ladder(campaign: Campaign, rungs: Sequence[Rung]) -> str:
     for rung in rungs:
         beyond = math.sqrt(max(rung.rms_m**2 - floor**2, 0.0)) if math.isfinite(floor) else math.nan
         rows.append((model_words(rung.effects), _mm(rung.rms_m), _mm(beyond) if math.isfinite(beyond) else "–"))
-    said = f"<p><small>{escaped(rungs[-1].gained)}</small></p>" if rungs[-1].gained else ""
-    return "<h3>Fitted on this page</h3>" + table(rows, ("model", "rms error", "beyond replicates"), (1, 2)) + said
+    gained = f"<p><small>{escaped(rungs[-1].gained)}</small></p>" if rungs[-1].gained else ""
+    return "<h3>Fitted on this page</h3>" + table(rows, ("model", "rms error", "beyond replicates"), (1, 2)) + gained
 
 
-def rung_of(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> Rung:
+def rung_of(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> FittedRung:
     """A line of the ladder for a fit, and what it gained over the one before."""
     gained = "" if before is None else gained_words(before.fit, fitted.fit)
-    return Rung(fitted.choice.effects, overall_m(fitted.errors_m, campaign.conditions), gained)
+    return FittedRung(fitted.choice.effects, overall_m(fitted.errors_m, campaign.conditions), gained)
 
 
-def tied_panel(campaign: Campaign, story: Story | None, fitted: Fitted | None) -> str:
-    """What the data cannot tell apart: by the diagnosis among effects, by the fit among its numbers."""
+def tied_panel(campaign: Campaign, story: DiagnosisSummary | None, fitted: Fitted | None) -> str:
+    """Return what the data cannot tell apart: effects, by the diagnosis; fitted numbers, by their correlations."""
     parts = []
     if story is None:
         parts.append(
-            "<p>No diagnosis yet: it asks every effect whether it is missing, and says which of them these trials"
-            " cannot tell apart. It appears here by itself after</p>"
+            "<p>No diagnosis yet: it tests every effect and states which of them these trials cannot tell apart. It"
+            " appears here after</p>"
         )
         parts.append(command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"]))
     else:
         parts.append(f"<p><b>{escaped(story.verdict)}</b>: {escaped(story.explanation)}</p>")
         if len(story.answer_set) > 1:
             names = ", ".join(name.replace("_", " ") for name in story.answer_set)
-            parts.append(f"<p>Not to be told apart: <b>{escaped(names)}</b>.</p>")
+            parts.append(f"<p>Cannot be told apart: <b>{escaped(names)}</b>.</p>")
         parts.append(cosine_grid(story))
     if fitted is not None:
         pairs_words = tied_words(fitted.fit)
         parts.append("<h3>In the last fit</h3>")
         parts += [f"<p>{escaped(line)}</p>" for line in pairs_words[:MOST_PAIRS]] or [
-            "<p class='muted'>No two numbers hang together by more than 0.9.</p>"
+            "<p class='muted'>No two numbers are correlated by more than 0.9.</p>"
         ]
     return "".join(parts)
 
 
-def cosine_grid(story: Story) -> str:
-    """How alike the marks of the likeliest candidates are: 1 the same, 0 nothing alike, −1 the opposite."""
+def cosine_grid(story: DiagnosisSummary) -> str:
+    """Return the cosines between the effects of the likeliest candidates as a table; blank for fewer than two."""
     names = [name for name in story.best if name in story.cosine_names]
-    names += [name for one, other, _ in story.most_tied() for name in (one, other)]
+    names += [name for *pair, _ in story.most_tied() for name in pair]
     names = list(dict.fromkeys(names))[:MOST_COMPARED]
     if len(names) < 2:
         return ""
@@ -163,14 +170,14 @@ def _spaced(name: str) -> str:
     return name.replace("_", " ")
 
 
-def next_panel(campaign: Campaign, story: Story | None) -> str:
+def next_panel(campaign: Campaign, story: DiagnosisSummary | None) -> str:
     """What to film next, as the diagnosis says."""
     if story is None:
         command = command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
-        return f"<p>A diagnosis says which trial would tell best.</p>{command}"
+        return f"<p>A diagnosis states which trial would separate the candidates best.</p>{command}"
     advice = story.next_experiment
     if not advice:
-        return "<p>The diagnosis asks for no further trial.</p>"
+        return "<p>The diagnosis proposes no further trial.</p>"
     parts = [f"<p>{escaped(advice.get('text', ''))}</p>"]
     rows = [_trial_row(trial) for trial in advice.get("trials", ())]
     if rows:
@@ -181,7 +188,7 @@ def next_panel(campaign: Campaign, story: Story | None) -> str:
         if sigma is not None
     ]
     if separations:
-        parts.append(table(separations, ("tells", "by"), (1,)))
+        parts.append(table(separations, ("separates", "by"), (1,)))
     if advice.get("calibration"):
         parts.append(f"<p>{escaped(advice['calibration'])}</p>")
     return "".join(parts)
@@ -203,3 +210,80 @@ def _trial_row(trial: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _cell(value: Any) -> str:
     return "–" if value is None else f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+DIAGNOSIS = "diagnosis.json"
+
+
+@dataclass(frozen=True)
+class RankedCandidate:
+    """A candidate of the ranking: the fall of −2 ln L with it, and whether it is in the answer set."""
+
+    effect: str
+    delta_chi2: float
+    in_answer_set: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class DiagnosisSummary:
+    """The first round of a diagnosis, and what to do next. `cosines` is a matrix in the order of `cosine_names`."""
+
+    verdict: str
+    explanation: str
+    answer_set: tuple[str, ...]
+    suspects: tuple[RankedCandidate, ...]
+    cosine_names: tuple[str, ...]
+    cosines: tuple[tuple[float, ...], ...]
+    next_experiment: Mapping[str, Any] | None
+
+    @property
+    def best(self) -> tuple[str, ...]:
+        """Effects worth trying first, best first."""
+        ranked = [candidate.effect for candidate in self.suspects if math.isfinite(candidate.delta_chi2)]
+        return tuple(dict.fromkeys([*self.answer_set, *ranked]))
+
+    def most_tied(self, least: float = TIED_COSINE) -> list[tuple[str, str, float]]:
+        """Pairs of candidates with |cosine| of `least` or more, largest first."""
+        pairs = [
+            (name, other, self.cosines[i][k])
+            for i, name in enumerate(self.cosine_names)
+            for k, other in enumerate(self.cosine_names[:i])
+            if abs(self.cosines[i][k]) >= least
+        ]
+        return sorted(pairs, key=lambda pair: -abs(pair[2]))
+
+
+def read_summary(folder: Path) -> DiagnosisSummary | None:
+    """The diagnosis of a results folder, None where there is none or it cannot be understood."""
+    path = folder / DIAGNOSIS
+    if not path.exists():
+        return None
+    try:
+        content = read_json(path)
+        rounds: Sequence[Mapping[str, Any]] = content.get("rounds") or [{}]
+        cosines = content.get("cosines") or rounds[0].get("cosines") or {}
+        return DiagnosisSummary(
+            verdict=str(content["verdict"]),
+            explanation=str(content.get("explanation", "")),
+            answer_set=tuple(content.get("answer_set", ())),
+            suspects=tuple(_suspect(entry) for entry in rounds[0].get("ranking", ())),
+            cosine_names=tuple(cosines.get("effects", ())),
+            cosines=tuple(tuple(_float_or_nan(value) for value in row) for row in cosines.get("matrix", ())),
+            next_experiment=content.get("next_experiment"),
+        )
+    except (ResultsError, KeyError, TypeError, AttributeError, ValueError):
+        return None
+
+
+def _suspect(entry: Mapping[str, Any]) -> RankedCandidate:
+    return RankedCandidate(
+        effect=str(entry["effect"]),
+        delta_chi2=_float_or_nan(entry.get("delta_chi2")),
+        in_answer_set=bool(entry.get("in_answer_set")),
+        reason=str(entry.get("reason", "")),
+    )
+
+
+def _float_or_nan(value: Any) -> float:
+    return math.nan if value is None else float(value)

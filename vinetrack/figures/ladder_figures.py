@@ -29,7 +29,10 @@ _ERRORS = {
 """Columns of `ladder.csv`: the name of each error, its colour, marker and line."""
 
 _WIDTH_IN = 5.2
+"""Chosen: both figures stand beside each other on a page of 11 in."""
+
 _STEP_IN = 1.55
+"""Of one model of the ladder; chosen: the longest name of an effect, broken after 18 letters of 10 pt."""
 
 
 def draw_ladder(ladder: pd.DataFrame) -> Figure:
@@ -129,7 +132,7 @@ BEFORE, AFTER = VERMILLION, BLUE
 """Colours of the model before and after, here and in the clips."""
 
 _BEFORE_LINE: Any = (0, (5, 2))
-_WIDTH_IN = 5.2
+"""Dashes of five line widths; chosen: a little longer than `DASHED`, since lines of replicates overlap."""
 _MAX_POINTS = 160
 """Of one trial; chosen: 160 points on 5 in are one every 2.3 pt, closer than dots of 4.5 pt can be told apart."""
 

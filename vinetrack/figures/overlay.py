@@ -30,9 +30,12 @@ TRACKED, BEFORE, AFTER = "#F0E442", VERMILLION, SKY
 """Okabe and Ito's yellow, vermillion and sky blue: told apart by anyone, and on any grey."""
 
 BAR, BAR_INK, BAR_MUTED = "#16191e", "#f2f4f7", "#9aa3b0"
-LARGEST_ZOOM = 2.0
-REACHES = (2.0, 1.4)
-"""How far from the axis the edges of the models before and after reach, in radii of the tube."""
+_LARGEST_ZOOM = 2.0
+"""Pixels of the clip for one of the recording; chosen: beyond twice, single pixels are seen and nothing else is."""
+
+_REACHES = (2.0, 1.4)
+"""Of the edges of the models before and after from the axis, in radii of the tube; chosen: outside the tube and of
+unequal length, so that all edges stay visible where they agree."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class View:
     @property
     def zoom(self) -> float:
         """Pixels of the clip for one of the recording."""
-        return min(self.width_px / self.size_px[0], LARGEST_ZOOM)
+        return min(self.width_px / self.size_px[0], _LARGEST_ZOOM)
 
     @property
     def picture_px(self) -> tuple[int, int]:
@@ -96,7 +99,7 @@ def compose(view: View, picture: NDArray[Any], frame: int, time_ms: float, edges
     bar_px = _even(1.35 * line_px * max(len(edges), 2) + 0.8 * line_px)
     small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR).convert("RGB")
     pen = ImageDraw.Draw(small)
-    for edge, reach in (*zip(edges[1:], REACHES, strict=False), *((edge, 0.0) for edge in edges[:1])):
+    for edge, reach in (*zip(edges[1:], _REACHES, strict=False), *((edge, 0.0) for edge in edges[:1])):
         _draw_edge(pen, view, edge, frame, reach)
     _scale_bar(pen, view, line_px)
     whole = Image.new("RGB", (width, height + bar_px), BAR)

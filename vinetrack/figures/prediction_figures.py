@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 MOST_CURVES = len(VINE_COLOURS)
 """As many as there are colours."""
 _PREDICTION_WIDTH_IN = 9.6
+"""Chosen: two panels of 4 in with their labels."""
+
 _LOG_AXIS_RATIO = 6.0
 """Chosen: with a larger ratio of slowest to fastest the fastest takes less than a sixth of a linear axis; then it is
 logarithmic, that of time from 1 % of the fastest on."""
@@ -172,6 +174,7 @@ def _list_conditions(ax: Axes, pictures: Sequence[PredictionPicture]) -> None:
 
 
 _EFFECT_WIDTH_IN = 7.2
+"""Chosen: one panel that fits a page of A4."""
 
 
 def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:

@@ -22,11 +22,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WIDTH_IN = 7.2
+"""Chosen: one panel that fits a page of A4."""
+
 _TEXT_COLUMNS = 106
-"""Characters of 8.8 pt in 7.2 in: a mean one is 4.1 pt wide, which makes 126; a sixth is left for wide letters."""
+"""Chosen: of 8.8 pt in 7.2 in: a mean character of 4.1 pt makes 126; a sixth is left for wide letters."""
 
 _LINE_IN = 0.175
-"""Height of a line of 8.8 pt with 1.43 spacing."""
+"""Derived: 8.8 pt · 1.43 spacing / 72 pt."""
 
 _MAX_DOTS = 600
 """Chosen: on 5.5 in, 600 dots of 3.5 pt overlap; more would enlarge the SVG of a long track by megabytes."""

@@ -94,7 +94,7 @@ def _compared(planned: Planned, inputs: Sequence[PredictiveInputs], camera: Film
         shape = (
             f"{plan.pressures} pressures × {plan.replicates}, {loads}"
             if plan.pressures
-            else "placed where the information is largest"
+            else "at most informative places"
         )
         return name, str(plan.n_trials), shape, *errors
 

@@ -107,9 +107,9 @@ def explain(finding: SelectionStep) -> str:
 
 def _with_the_fault(finding: SelectionStep) -> str:
     """Sizes of effects added before, fitted together with the fault: without it they are biased by it."""
-    found, best = finding.questions.found, finding.kept[0]
+    fit, best = finding.questions.found, finding.kept[0]
     added = [number for number in best.others if number.key.split(".")[0] not in base_model()]
-    before = {number.name: number for number in found.numbers}
+    before = {number.name: number for number in fit.numbers}
     moved = [number for number in added if number.name in before and math.isfinite(number.sigma)]
     if not moved:
         return ""

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 __all__ = ["Clip", "ReportContent", "ReportFigure", "ReportSection", "ReportTable", "build_report"]
 
 LARGEST_CLIP_BYTES = 2_500_000
-"""A larger clip is left as a file beside the report."""
+"""Chosen: of the 15 MB that a report may have; a larger clip is left as a file beside it."""
 
 
 @dataclass(frozen=True)

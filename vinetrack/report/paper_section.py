@@ -88,14 +88,16 @@ def table_two(table: pd.DataFrame, departures: pd.DataFrame) -> list[ReportTable
     for title, figure, row, column, factor, printed, note in _ERRORS:
         body = []
         for pressure_kPa in printed:
-            one = by_row.get(f"{row}_{pressure_kPa:g}kPa")
-            own = departures[(departures["figure"] == figure) & (abs(departures["pressure_kPa"] - pressure_kPa) < 1e-6)]
-            size = {str(cause.departure): factor * float(getattr(cause, column)) for cause in rows(own)}
+            result = by_row.get(f"{row}_{pressure_kPa:g}kPa")
+            causes = departures[
+                (departures["figure"] == figure) & (abs(departures["pressure_kPa"] - pressure_kPa) < 1e-6)
+            ]
+            size = {str(cause.departure): factor * float(getattr(cause, column)) for cause in rows(causes)}
             body.append(
                 (
                     f"{pressure_kPa:g}",
                     f"{printed[pressure_kPa]:g}",
-                    number(_value(one)),
+                    number(_value(result)),
                     _range(size, "depletion_slow", "depletion_fast"),
                     number(size.get("slack")),
                     _range(size, "depletion_slow_slack", "depletion_fast_slack"),
@@ -134,8 +136,8 @@ def every_row(table: pd.DataFrame) -> list[ReportTable]:
     made = []
     parts = table["where"].map(_part)
     for title in (*_PARTS, _ELSEWHERE):
-        own = table[parts == title]
-        if len(own):
+        members = table[parts == title]
+        if len(members):
             body = [
                 (
                     f"{row.quantity}{', ' if row.setting else ''}{row.setting}{_unit(row.unit)}",
@@ -144,7 +146,7 @@ def every_row(table: pd.DataFrame) -> list[ReportTable]:
                     row.mark,
                     f"{row.how}{'; ' if row.beside else ''}{row.beside}",
                 )
-                for row in rows(own)
+                for row in rows(members)
             ]
             made.append(ReportTable(f"{title}, every number", head, body, frozenset({1, 2})))
     return made
@@ -205,6 +207,8 @@ def _range(size: Mapping[str, float], low: str, high: str) -> str:
     """Two sizes as a range, the smaller first."""
     pair = [size.get(name) for name in (low, high)]
     first, last = (
-        (number(one) for one in sorted(one for one in pair if one is not None)) if None not in pair else ("", "")
+        (number(value) for value in sorted(value for value in pair if value is not None))
+        if None not in pair
+        else ("", "")
     )
     return f"{first} to {last}" if first != last else first or "–"

@@ -26,7 +26,7 @@ _PICTURE_QUALITY = 45
 """Of WebP, 0 to 100; chosen: strips are noise with one edge in it, and the edge survives what the noise does not."""
 
 _SHORT_MARKER = 8
-"""Filled shapes of so few commands are markers, which look the same drawn as one path: a diamond has 5, a cross 8."""
+"""Commands; chosen: filled shapes of so few are markers, which look the same drawn as one path (a diamond has 5)."""
 
 _LONGEST_PATH = 20_000
 """Commands of a merged path; chosen: browsers slow down on paths of several hundred thousand."""

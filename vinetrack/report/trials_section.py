@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from vinetrack.report.build import ReportContent
 
 LARGEST_SVG_BYTES = 1_500_000
-"""A larger picture is left as a file beside the report."""
+"""Chosen: a tenth of the 15 MB that a report may have; a larger picture is left as a file beside it."""
 
 KINDS = {
     "charuco": "ChArUco board",
@@ -89,22 +89,30 @@ def calibration_table(recordings: Mapping[str, Recording]) -> list[dict[str, Any
     """One row a calibration, with what it found and the trials that rest on it."""
     groups: dict[tuple[Any, ...], list[tuple[str, Mapping[str, Any]]]] = {}
     for name, recording in recordings.items():
-        found = recording.calibration
-        if found is not None:
-            key = (found["kind"], found["image"], found["n_corners"], found["reprojection_px"], *found["notes"])
-            if found["kind"] == "sheet":
-                key = (*key, found["mm_per_px"])
-            groups.setdefault(key, []).append((name, found))
+        calibration = recording.calibration
+        if calibration is not None:
+            key = (
+                calibration["kind"],
+                calibration["image"],
+                calibration["n_corners"],
+                calibration["reprojection_px"],
+                *calibration["notes"],
+            )
+            if calibration["kind"] == "sheet":
+                key = (*key, calibration["mm_per_px"])
+            groups.setdefault(key, []).append((name, calibration))
     return [_calibration_row(members) for members in groups.values()]
 
 
 def _calibration_row(members: Sequence[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
     first = members[0][1]
-    scales = [found["mm_per_px"] for _, found in members]
+    scales = [calibration["mm_per_px"] for _, calibration in members]
     spread = f"{number(min(scales), 6)}"
     if max(scales) - min(scales) > 1e-5 * max(scales):
         spread += f" to {number(max(scales), 6)}"
-    errors = [found["scale_rel_sigma"] for _, found in members if _is_number(found["scale_rel_sigma"])]
+    errors = [
+        calibration["scale_rel_sigma"] for _, calibration in members if _is_number(calibration["scale_rel_sigma"])
+    ]
     has_target = bool(first["n_corners"]) and _is_number(first["reprojection_px"])
     return {
         "kind": KINDS.get(first["kind"], first["kind"]),
@@ -123,10 +131,10 @@ def _is_number(value: Any) -> bool:
 
 
 PICTURES_BYTES = 10_000_000
-"""What the pictures of single trials may weigh together; the rest of 200 trials stays below 5 MB."""
+"""Of the pictures of single trials together; derived: 15 MB of a report less 5 MB for all else of 200 trials."""
 
 MOST_ROWS, MOST_ROWS_IN_ALL = 240, 24_000
-"""Of motion as data to download, of one trial and of all: what figures show; the whole is in the results folder."""
+"""Rows of motion to download, of one trial and of all; chosen: as many as figures show; files have all."""
 
 
 def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:

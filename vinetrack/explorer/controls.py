@@ -1,0 +1,362 @@
+"""The controls of one page: the trials shown, the effects in the model with their sizes, and the exports."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from bokeh.models import (
+    Button,
+    Checkbox,
+    CheckboxButtonGroup,
+    Column,
+    ColumnDataSource,
+    CustomJS,
+    Div,
+    PrintfTickFormatter,
+    Row,
+    Slider,
+    Toggle,
+)
+
+from vinetrack.core.problems import ExperimentError, format_problems
+from vinetrack.core.tables import TableError
+from vinetrack.effects import Effect
+from vinetrack.explorer.campaign import Campaign
+from vinetrack.explorer.choice import Choice, Size, can_leave, sizes_of, slider_range
+from vinetrack.explorer.export import commands, exported, model_words
+from vinetrack.explorer.fitting import Fitted
+from vinetrack.explorer.look import command_block, escaped, sheet, words
+from vinetrack.pipeline.source_experiment import save_model
+
+if TYPE_CHECKING:
+    from vinetrack.explorer.page import Page
+
+STEPS = 400
+"""Of a slider from end to end; chosen: about one a pixel."""
+HEADING = """
+:host { margin-top: .5rem; }
+.bk-btn { text-align: left; border: 0 !important; border-bottom: 1px solid var(--grid) !important; border-radius: 0; }
+.bk-btn { background: none !important; box-shadow: none !important; font-weight: 650; padding: .3rem 0; width: 100%; }
+.bk-btn, .bk-btn.bk-active { color: var(--ink) !important; }
+.bk-btn::before { content: "▸ "; color: var(--muted); } .bk-btn.bk-active::before { content: "▾ "; }
+"""
+TICK = """
+:host { font-weight: 600; }
+input { accent-color: var(--accent); width: 1rem; height: 1rem; margin-right: .4rem; }
+"""
+
+
+class EffectRow:
+    """One effect: its tick, its sliders, and words."""
+
+    def __init__(self, campaign: Campaign, effect: Effect, choice: Choice) -> None:
+        self.effect, self.sizes = effect, sizes_of(campaign, effect, choice.numbers)
+        unusable = campaign.unusable.get(effect.name, "")
+        self.tick = Checkbox(
+            label=effect.name.replace("_", " "),
+            active=effect.name in choice,
+            disabled=bool(unusable) or not can_leave(effect.name),
+            name=f"tick_{effect.name}",
+            stylesheets=[sheet(TICK)],
+            margin=(6, 0, 0, 0),
+        )
+        self.sliders = [_slider(size, choice, bool(unusable)) for size in self.sizes]
+        self.found = [words(visible=False, name=f"found_{size.name}") for size in self.sizes]
+        about = f"<small>{escaped(unusable or effect.formula)}</small>"
+        pairs = [part for pair in zip(self.sliders, self.found, strict=True) for part in pair]
+        self.root = Column(children=[self.tick, words(about), *pairs], sizing_mode="stretch_width", margin=(0, 0, 4, 0))
+
+    def value(self, k: int) -> float:
+        """SI value of a slider."""
+        return float(self.sliders[k].value) / self.sizes[k].shown[1]
+
+
+def _slider(size: Size, choice: Choice, disabled: bool) -> Slider:
+    unit, factor = size.shown
+    low, high = factor * size.low, factor * size.high
+    slider = Slider(
+        start=low,
+        end=high,
+        value=factor * choice.numbers.get(size.name, size.parameter.default),
+        step=_step(low, high),
+        title=_title(size),
+        format=PrintfTickFormatter(format=f"%.4g {unit}".rstrip()),
+        sizing_mode="stretch_width",
+        disabled=disabled,
+        name=f"size_{size.name}",
+        stylesheets=[sheet(":host { padding: 0 10px 0 4px; }")],
+        margin=(2, 0, 6, 0),
+    )
+    return slider
+
+
+def _title(size: Size) -> str:
+    what = size.vine or size.parameter.meaning
+    return f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol
+
+
+def _step(low: float, high: float) -> float:
+    return (high - low) / STEPS or 1.0
+
+
+class EffectPanel:
+    """All effects in groups. `ticked(effect, wanted)` and `moved(effect, number, value)` hear what a person does."""
+
+    def __init__(
+        self,
+        campaign: Campaign,
+        choice: Choice,
+        suspects: Sequence[str],
+        ticked: Callable[[str, bool], None],
+        moved: Callable[[str, str, float], None],
+    ) -> None:
+        self.campaign, self._ticked, self._moved = campaign, ticked, moved
+        self._quiet = False
+        self.rows = {name: EffectRow(campaign, effect, choice) for name, effect in campaign.effects.items()}
+        for name, row in self.rows.items():
+            row.tick.on_change("active", self._on_tick(name))
+            for k, slider in enumerate(row.sliders):
+                slider.on_change("value", self._on_size(name, k))
+        self.root = Column(
+            children=self._groups(choice, suspects), sizing_mode="stretch_width", name="effects", margin=0
+        )
+
+    def _groups(self, choice: Choice, suspects: Sequence[str]) -> list[Column]:
+        in_use = [name for name in self.rows if name in choice]
+        likely = [name for name in suspects if name in self.rows and name not in in_use][:6]
+        others = [name for name in self.rows if name not in in_use and name not in likely]
+        kinds = {name: self.campaign.effects[name].kind for name in others}
+        groups = [
+            ("Suspected by the diagnosis", likely, True),
+            ("Physical effects", [name for name in others if kinds[name] != "measurement"], not likely),
+            ("Measurement effects", [name for name in others if kinds[name] == "measurement"], False),
+            ("In the model in use", in_use, True),
+        ]
+        return [self._group(title, names, shown) for title, names, shown in groups if names]
+
+    def _group(self, title: str, names: Sequence[str], shown: bool) -> Column:
+        inside = Column(
+            children=[self.rows[name].root for name in names], sizing_mode="stretch_width", visible=shown, margin=0
+        )
+        head = Toggle(label=title, active=shown, sizing_mode="stretch_width", stylesheets=[sheet(HEADING)], margin=0)
+        head.js_on_change("active", CustomJS(args={"inside": inside}, code="inside.visible = cb_obj.active"))
+        return Column(children=[head, inside], sizing_mode="stretch_width", margin=0)
+
+    def _on_tick(self, name: str) -> Callable[[str, bool, bool], None]:
+        def heard(_attr: str, _old: bool, new: bool) -> None:
+            if not self._quiet:
+                self._ticked(name, new)
+
+        return heard
+
+    def _on_size(self, name: str, k: int) -> Callable[[str, float, float], None]:
+        def heard(_attr: str, _old: float, _new: float) -> None:
+            if not self._quiet:
+                row = self.rows[name]
+                self._moved(name, row.sizes[k].name, row.value(k))
+
+        return heard
+
+    def show(self, choice: Choice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
+        """Set ticks and, where wanted, sliders to a choice; beside each number what a fit found of it."""
+        self._quiet = True
+        try:
+            for name, row in self.rows.items():
+                if row.tick.active != (name in choice):
+                    row.tick.active = name in choice
+                for k, size in enumerate(row.sizes):
+                    if sliders:
+                        _set_slider(row.sliders[k], size, choice.numbers.get(size.name, size.parameter.default))
+                    _say_found(row.found[k], size, fitted if name in choice else None)
+        finally:
+            self._quiet = False
+
+
+def _set_slider(slider: Slider, size: Size, value: float) -> None:
+    low, high = slider_range(size.key, size.parameter, value)
+    low, high = (bound * size.shown[1] for bound in (min(low, size.low), max(high, size.high)))
+    shown = value * size.shown[1]
+    if (slider.start, slider.end) != (low, high):
+        slider.update(start=low, end=high, step=_step(low, high))
+    if slider.value != shown:
+        slider.value = shown
+
+
+def _say_found(div: Div, size: Size, fitted: Fitted | None) -> None:
+    number = None if fitted is None else fitted.number(size.name)
+    if number is None:
+        div.visible = False
+        return
+    unit, factor = size.shown
+    low, high, value = (factor * x for x in (number.low, number.high, number.value))
+    error = f" ± {factor * number.sigma:.2g}" if math.isfinite(number.sigma) else ""
+    at_bound = " · at its bound" if math.isfinite(number.bound) else ""
+    text = f"<small>fitted: <b>{value:.4g}{error}</b> {escaped(unit)} · 95 %: {low:.4g} to {high:.4g}{at_bound}</small>"
+    div.update(text=text, visible=True)
+
+
+SMALL = ".bk-btn { font-size: 12px; padding: 2px 9px; }"
+CHIPS = """
+:host { max-height: 10.5rem; overflow-y: auto; }
+.bk-btn-group { display: flex; flex-wrap: wrap; gap: 4px; }
+.bk-btn-group > .bk-btn { flex: 0 1 auto; border-radius: 999px !important; margin: 0 !important; padding: 3px 10px; }
+.bk-btn-group > .bk-btn { border: 1px solid var(--grid); background: var(--card); color: var(--muted); }
+.bk-btn-group > .bk-btn.bk-active { background: var(--chosen); border-color: var(--accent); color: var(--ink); }
+.bk-btn-group > .bk-btn.bk-active { box-shadow: none; }
+"""
+
+
+class Chooser:
+    """Buttons; `heard` is called when the selection has changed."""
+
+    def __init__(self, campaign: Campaign, heard: Callable[[], None]) -> None:
+        self.campaign, self._heard = campaign, heard
+        everything = list(range(len(campaign.conditions)))
+        self._conditions = CheckboxButtonGroup(
+            labels=[campaign.labels[name] for name in campaign.conditions],
+            active=everything,
+            name="conditions",
+            stylesheets=[sheet(CHIPS)],
+            margin=(0, 0, 4, 0),
+        )
+        self._trials = CheckboxButtonGroup(
+            labels=[seen.name for seen in campaign.trials],
+            active=list(range(len(campaign.trials))),
+            name="trials",
+            visible=False,
+            stylesheets=[sheet(CHIPS + SMALL)],
+            margin=(4, 0, 0, 0),
+        )
+        self._conditions.on_change("active", lambda _attr, _old, _new: self._heard())
+        self._trials.on_change("active", lambda _attr, _old, _new: self._heard())
+        self.root = Column(
+            children=[self._conditions, self._tools(), self._trials],
+            sizing_mode="stretch_width",
+            name="choose",
+            margin=0,
+        )
+
+    def _tools(self) -> Row:
+        single = Toggle(
+            label="single trials …", active=False, stylesheets=[sheet(SMALL)], margin=0, name="single_trials"
+        )
+        single.js_on_change("active", CustomJS(args={"t": self._trials}, code="t.visible = cb_obj.active"))
+        return Row(
+            children=[self._button("all", self._all), self._button("none", self._none), single],
+            margin=0,
+            stylesheets=[sheet(":host { gap: 4px; }")],
+        )
+
+    def _button(self, label: str, does: Callable[[], None]) -> Any:
+        button = Button(label=label, stylesheets=[sheet(SMALL)], margin=0, name=f"choose_{label}")
+        button.on_click(does)
+        return button
+
+    def _all(self) -> None:
+        self._trials.active = list(range(len(self.campaign.trials)))
+        self._conditions.active = list(range(len(self.campaign.conditions)))
+
+    def _none(self) -> None:
+        self._conditions.active = []
+
+    def toggle(self, condition: str) -> None:
+        """Choose this condition alone; where it is alone already, all of them again."""
+        place = self.campaign.conditions.index(condition)
+        alone = self._conditions.active == [place]
+        self._conditions.active = list(range(len(self.campaign.conditions))) if alone else [place]
+
+    @property
+    def conditions(self) -> list[str]:
+        """Names of the conditions chosen."""
+        return [self.campaign.conditions[k] for k in sorted(self._conditions.active)]
+
+    @property
+    def shown(self) -> list[int]:
+        """Places of the trials to draw: those ticked, of the conditions chosen."""
+        wanted = set(self.conditions)
+        return [i for i in sorted(self._trials.active) if self.campaign.trials[i].condition in wanted]
+
+
+MIME = {"csv": "text/csv", "svg": "image/svg+xml", "png": "image/png"}
+DOWNLOAD = """
+const [name, mime, body] = ["name", "mime", "body"].map((key) => cb_obj.data[key][0]);
+if (!name) return;
+const bytes = Uint8Array.from(atob(body), (char) => char.charCodeAt(0));
+const link = document.createElement("a");
+link.href = URL.createObjectURL(new Blob([bytes], {type: mime}));
+link.download = name;
+link.click();
+setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+"""
+_GAP = ":host { gap: 6px; flex-wrap: wrap; }"
+
+
+class KeepPanel:
+    """Buttons of one page."""
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+        self.save = Button(label="Save the model to experiment.yaml", name="save", stylesheets=[sheet()], margin=0)
+        self.save.on_click(self._save)
+        self.said = words(name="saved")
+        self._download = ColumnDataSource({"name": [""], "mime": [""], "body": [""]}, name="download")
+        self._download.js_on_change("data", CustomJS(code=DOWNLOAD))
+        forms = {"svg": "Figure (SVG)", "png": "Figure (PNG)", "csv": "Data (CSV)"}
+        buttons = [self._button(form, label) for form, label in forms.items()]
+        self.root = Column(
+            children=[
+                Row(children=[self.save], margin=0),
+                self.said,
+                Row(children=buttons, margin=0, stylesheets=[sheet(_GAP)]),
+                words("<small>Figure and data hold the trials that are shown, as the model has them now.</small>"),
+            ],
+            sizing_mode="stretch_width",
+            name="keep",
+            margin=0,
+            tags=[self._download],
+        )
+
+    def _button(self, form: str, label: str) -> Button:
+        button = Button(label=label, name=f"export_{form}", stylesheets=[sheet()], margin=0)
+        button.on_click(self._exporter(form))
+        return button
+
+    def _exporter(self, form: str) -> Callable[[], None]:
+        def give() -> None:
+            page = self._page
+            if page.curves is None:
+                return
+            data = exported(page.campaign, page.choice, page.curves, page.chooser.shown, form)
+            body = base64.b64encode(data).decode("ascii")
+            name = f"{page.campaign.name}_explorer.{form}"
+            self._download.data = {"name": [name], "mime": [MIME[form]], "body": [body]}
+
+        return give
+
+    def _save(self) -> None:
+        page = self._page
+        folder = page.campaign.experiment.folder
+        try:
+            path = save_model(folder, page.choice.effects)
+        except (ExperimentError, TableError, OSError) as error:
+            lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
+            self.said.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'
+            return
+        rerun = f"snakemake --cores 2 --config experiment={folder.as_posix()}"
+        self.said.text = (
+            f'<p><span class="good">Saved.</span> {escaped(path.as_posix())} now has the'
+            f" {escaped(model_words(page.choice.effects))}. The same:</p>"
+            f"{command_block(self._lines(save=True))}<p>New tables and report by</p>{command_block([rerun])}"
+        )
+
+    def _lines(self, *, save: bool = False) -> list[str]:
+        page = self._page
+        start = page.ground.start
+        return commands(page.campaign, start, page.choice, fitted=page.is_fitted(), save=save)
+
+    def commands(self) -> str:
+        """What to type for what is on the page."""
+        return command_block(self._lines())
