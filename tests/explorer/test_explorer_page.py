@@ -220,7 +220,7 @@ def test_a_diagnosis_appears_by_itself(campaign: Campaign, ground: BackgroundFit
     assert "Cannot be told apart: <b>reservoir depletion, leak</b>" in page.text("tied")
     assert "+0.97" in page.text("tied")
     assert "chamber of 4 L" in page.text("next")
-    assert "a chamber of 4 l" in page.text("next")
+    assert "a chamber of 4 litres" in page.text("next")
     assert "reservoir depletion from leak" in page.text("next")
     page.page.close()
     again = Browser(own)
