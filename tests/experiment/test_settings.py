@@ -69,7 +69,7 @@ def test_every_column_may_be_shared(tmp_path: Path) -> None:
 
 
 def test_settings_cover_exactly_the_columns_of_the_sheet() -> None:
-    assert set(SHARED) == set(COLUMNS) - {"trial", "video", "track", "order"}
+    assert set(SHARED) == set(COLUMNS) - {"trial", "video", "track", "order", "axis", "frames_used", "point_mass"}
     assert set(SHARED) <= set(ExperimentSettings.model_fields)
 
 

@@ -32,6 +32,15 @@ friction was lost. At half of it such an error counts as 2 σ; at twice, errors 
 
 
 @dataclass(frozen=True)
+class PictureAxis:
+    """A line in the picture along which a trial moves: (x, y) of its ends, px; `width_m` is NaN where not given."""
+
+    from_px: tuple[float, float]
+    to_px: tuple[float, float]
+    width_m: float = math.nan
+
+
+@dataclass(frozen=True)
 class Bend:
     """A bend of the path: where it starts along the growth axis, its arc length and its radius, in metres."""
 
@@ -82,6 +91,9 @@ class Trial:
     specimen: str = ""
     day: str = ""
     order: float = math.nan
+    axis: PictureAxis | None = None
+    frames_used: tuple[int, int] | None = None
+    point_mass: str = ""
 
     @property
     def area_m2(self) -> float:

@@ -6,12 +6,17 @@ the column's own unit until a trial is made of them.
 
 from __future__ import annotations
 
-from vinetrack.core.records import Bend
+import math
+
+from vinetrack.core.records import Bend, PictureAxis
 from vinetrack.core.tables import TableError, parse_number
 from vinetrack.core.units import UNITS, convert, split_unit
 from vinetrack.experiment.schema import Column
 
-Value = float | bool | str | tuple[float, float] | tuple[Bend, ...]
+Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
+
+LEAST_AXIS_PX = 10
+"""Chosen: an axis shorter than this has no direction to speak of; as `vinetrack.video.axis` has it."""
 
 YES_NO = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
 
@@ -50,6 +55,10 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
         return _read_window(text, decimal)
     if column.kind == "bends":
         return _read_bends(text, decimal)
+    if column.kind == "axis":
+        return _read_axis(text)
+    if column.kind == "frames":
+        return _read_frames(text)
     if column.kind in ("text", "path"):
         return text
     return check_number(column, _number(text, decimal, column.allowed))
@@ -103,6 +112,34 @@ def _read_window(text: str, decimal: str) -> tuple[float, float]:
     if start >= end:
         raise CellError("ends before it starts", allowed)
     return start, end
+
+
+def _read_axis(text: str) -> PictureAxis:
+    """`x,y:x,y[:width_mm]`: two points of the picture, and how wide a strip along them is looked at."""
+    allowed = "x,y:x,y or x,y:x,y:width_mm, such as 161,40:151,799:20; in a sheet with commas between quotes"
+    points, width = text.split(":"), math.nan
+    if len(points) not in (2, 3) or any(point.count(",") != 1 for point in points[:2]):
+        raise CellError("is no axis", allowed)
+    from_px, to_px = (tuple(_number(part, ".", allowed) for part in point.split(",")) for point in points[:2])
+    if math.dist(from_px, to_px) < LEAST_AXIS_PX:
+        raise CellError(f"is shorter than {LEAST_AXIS_PX} pixels", allowed, "give two points far apart")
+    if len(points) == 3:
+        width = _number(points[2], ".", allowed) / 1000
+        if width <= 0:
+            raise CellError("has a width that is not positive", allowed)
+    return PictureAxis((from_px[0], from_px[1]), (to_px[0], to_px[1]), width)
+
+
+def _read_frames(text: str) -> tuple[int, int]:
+    """`from:to`, whole numbers from 0, both included."""
+    allowed = "from:to, such as 12:80"
+    parts = [part.strip() for part in text.split(":")]
+    if len(parts) != 2 or not all(part.isascii() and part.isdigit() for part in parts):
+        raise CellError("is no range of frames", allowed)
+    first, last = int(parts[0]), int(parts[1])
+    if first >= last:
+        raise CellError("ends before it starts", allowed)
+    return first, last
 
 
 def _read_bends(text: str, decimal: str) -> tuple[Bend, ...]:

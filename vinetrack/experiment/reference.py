@@ -25,6 +25,8 @@ _KIND_ALLOWED = {
     "path": "a path inside the folder",
     "bends": "start_mm:arc_mm:radius_mm;…",
     "window": "from_s:to_s",
+    "axis": "x,y:x,y[:width_mm]",
+    "frames": "from:to",
     "yes_no": "yes, no",
     "choice": "1, 2",
 }

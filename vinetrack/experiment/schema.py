@@ -337,6 +337,30 @@ COLUMNS: dict[str, Column] = {
             measured="Count trials as they are made.",
             default="the order of the rows",
         ),
+        Column(
+            name="axis",
+            field="axis",
+            kind="axis",
+            shared=False,
+            meaning="Growth axis in the picture for this trial alone: x,y:x,y[:width_mm], in pixels.",
+            default="the axis of all trials, or found from the motion",
+        ),
+        Column(
+            name="frames_used",
+            field="frames_used",
+            kind="frames",
+            shared=False,
+            meaning="First and last frame used of this trial: from:to, counted from 0 (rows of a table of positions).",
+            default="all",
+        ),
+        Column(
+            name="point_mass",
+            field="point_mass",
+            kind="text",
+            shared=False,
+            meaning="Which point mass of a Physics Tracker file this trial is, by its name.",
+            default="the one with the most points",
+        ),
     )
 }
 """Every column of `trials.csv`, in the order of the documentation."""

@@ -14,7 +14,7 @@ import numpy as np
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import Table, TableError, parse_table, read_text
 from vinetrack.tracks.physics_tracker import is_export_header, read_export, read_project
-from vinetrack.tracks.track_checks import TrackError, check_pressure, check_times, new_track
+from vinetrack.tracks.track_checks import FEWEST_POINTS, TrackError, check_pressure, check_times, new_track
 
 __all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
 
@@ -32,7 +32,7 @@ def load_track(trial: Trial) -> Track:
     """
     if trial.track is None:
         raise TrackError("is blank: this trial has a video, not a track")
-    track = read_track(trial.track)
+    track = read_track(trial.track, point_mass=trial.point_mass, frames_used=trial.frames_used)
     if trial.pressure_trace is None:
         return track
     try:
@@ -41,12 +41,19 @@ def load_track(trial: Trial) -> Track:
         raise TrackError(f"pressure_trace {trial.pressure_trace.name} {error}") from None
 
 
-def read_track(path: Path) -> Track:
+def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
     """Read positions measured elsewhere; the kind of file is found from its content.
 
     Understood are a CSV with `time_s, position_m[, sigma_m][, pressure_kPa]`, a Physics Tracker project (`.trk`) and
     Tracker's text export (columns t, x, y or t and one coordinate, with or without a title above). Points in a plane
     are projected on the principal axis of their motion. `flag` is blank throughout; `edge_px` NaN except in a project.
+
+    Parameters
+    ----------
+    point_mass
+        Name of the point mass of a project; the one with the most points where blank.
+    frames_used
+        First and last frame of a project, or row of a table counted from 0, that are used.
 
     Raises
     ------
@@ -59,15 +66,36 @@ def read_track(path: Path) -> Track:
     try:
         text = read_text(path)
         if path.suffix.lower() == ".trk" or text.lstrip("\ufeff \n").startswith("<?xml"):
-            return read_project(text)
+            return read_project(text, point_mass, frames_used)
+        if point_mass:
+            raise TrackError("has no point masses to choose from: leave point_mass blank, or name a .trk file")
         lines = text.split("\n")[:HEADER_WITHIN_LINES]
         skip = next((i for i, line in enumerate(lines) if is_export_header(line)), None)
         table = parse_table(text, skip or 0)
         if skip is not None and "position_m" not in table.columns:
-            return read_export(table)
-        return _read_positions(table)
+            return _only_frames(read_export(table), frames_used)
+        return _only_frames(_read_positions(table), frames_used)
     except TableError as error:
         raise TrackError(str(error)) from None
+
+
+def _only_frames(track: Track, frames_used: tuple[int, int] | None) -> Track:
+    """The track with the rows before and after those used flagged.
+
+    Raises
+    ------
+    TrackError
+        If fewer than 5 points are left.
+    """
+    if frames_used is None:
+        return track
+    rows = np.arange(track.time_s.size)
+    before, after = rows < frames_used[0], rows > frames_used[1]
+    if np.count_nonzero(~before & ~after) < FEWEST_POINTS:
+        raise TrackError(f"has fewer than {FEWEST_POINTS} of its {rows.size} rows in frames_used: widen it")
+    flag = track.flag.astype("<U64")
+    flag = np.where(before, "rejected", np.where(after, "after_end", flag))
+    return replace(track, flag=flag)
 
 
 def _read_positions(table: Table) -> Track:

@@ -37,8 +37,10 @@ class _Axes:
     px_per_unit: tuple[float, float]
 
 
-def read_project(text: str) -> Track:
-    """Track of a `.trk` project: the point mass with the most marks, projected on the axis of its motion.
+def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] | None = None) -> Track:
+    """Track of a `.trk` project: one point mass, projected on the axis of its motion.
+
+    That is the one named `point_mass`, else the one with the most marks; marks outside `frames_used` are left aside.
 
     Raises
     ------
@@ -46,12 +48,16 @@ def read_project(text: str) -> Track:
         If it is no project, holds no point mass or was never calibrated.
     """
     panel = _parse_panel(text)
-    name, marks, others = _choose_mass(panel)
+    name, marks, others = _choose_mass(panel, point_mass)
+    first, last = frames_used or (0, max(marks))
+    marks = {frame: place for frame, place in marks.items() if first <= frame <= last}
+    if not marks:
+        raise TrackError(f"holds no marks of {name!r} in frames {first} to {last}: widen frames_used")
     frames = np.array(sorted(marks))
     pixels = np.array([marks[frame] for frame in sorted(marks)])
     frame_s, start_s, start_frame = _clock(panel)
     notes = []
-    if others:
+    if others and not point_mass:
         notes.append(f"Taken from the point mass {name!r}, which has the most points; left aside: {', '.join(others)}.")
     unit = (_text(panel, "length_unit") or "").strip()
     if unit and unit not in METRES:
@@ -84,8 +90,8 @@ def _parse_panel(text: str) -> Element:
     return panels[0]
 
 
-def _choose_mass(panel: Element) -> tuple[str, dict[int, tuple[float, ...]], list[str]]:
-    """Name and marks (frame → px) of the first point mass with the most marks, and the names of the others."""
+def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[float, ...]], list[str]]:
+    """Name and marks (frame → px) of the point mass wanted, or with the most marks, and the names of the others."""
     masses: list[tuple[str, dict[int, tuple[float, ...]]]] = []
     for node in panel.iter("object"):
         if node.get("class", "").endswith(".PointMass"):
@@ -95,6 +101,13 @@ def _choose_mass(panel: Element) -> tuple[str, dict[int, tuple[float, ...]], lis
     if not marked:
         raise TrackError("holds no point mass with marks: mark the leading edge as a point mass in Tracker")
     best = max(range(len(marked)), key=lambda i: len(marked[i][1]))
+    if wanted:
+        named = [i for i, (name, _) in enumerate(marked) if name.casefold() == wanted.strip().casefold()]
+        if len(named) != 1:
+            names = ", ".join(repr(name) for name, _ in marked)
+            many = "several point masses" if named else "no point mass"
+            raise TrackError(f"holds {many} named {wanted!r}: point_mass is one of {names}")
+        best = named[0]
     name, marks = marked[best]
     return name, marks, [other for i, (other, _) in enumerate(marked) if i != best]
 

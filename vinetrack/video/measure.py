@@ -42,7 +42,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     trial
         Its `video`, frame rate, exposure and diameter; its `m_per_px` overrides the calibration.
     settings
-        `calibration` and `axis` are used.
+        `calibration` and, where the trial has none of its own, `axis` are used.
     folder
         The experiment's folder, from which the calibration's picture counts.
 
@@ -62,7 +62,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
         )
     frames = read_frames(recording)
     m_per_px, rel_sigma, position_m = trial.m_per_px, math.nan, None
-    axis = _given_axis(settings, m_per_px if calibration is None else calibration.m_per_px)
+    axis = _given_axis(trial, settings, m_per_px if calibration is None else calibration.m_per_px)
     if calibration is not None:
         axis = axis or _found_axis(frames.luma, trial)
         along = calibration.along(axis.from_px, axis.to_px)
@@ -86,7 +86,9 @@ def _calibration(
         raise RecordingError(f"calibration: {error}") from error
 
 
-def _given_axis(settings: ExperimentSettings, m_per_px: float) -> Axis | None:
+def _given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
+    if trial.axis is not None:
+        return Axis(trial.axis.from_px, trial.axis.to_px, trial.axis.width_m / m_per_px)
     if settings.axis is None:
         return None
     given = settings.axis

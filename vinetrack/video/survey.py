@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import Problem
-from vinetrack.core.records import Trial
+from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.terminal import progress
 from vinetrack.experiment.settings import Axis, ExperimentSettings
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
@@ -106,8 +106,14 @@ def _judge_scale(settings: ExperimentSettings, folder: Path, opened: dict[Trial,
         problems.append(Problem(message=message, file=SETTINGS, column="calibration", remedy=remedy))
     elif unscaled:
         problems += _judge_calibration(settings, folder, sizes)
+    for trial, recording in opened.items():
+        if trial.axis is not None and not _inside(trial.axis, recording):
+            message = f"leaves the picture of {recording.path.name}, {recording.width} × {recording.height} pixels"
+            remedy = "give two points inside it"
+            problems.append(Problem(message=message, trial=trial.name, column="axis", remedy=remedy))
     if settings.axis is not None:
-        outside = [recording for recording in opened.values() if not _inside(settings.axis, recording)]
+        shared = [recording for trial, recording in opened.items() if trial.axis is None]
+        outside = [recording for recording in shared if not _inside(settings.axis, recording)]
         if outside:
             message = f"leaves the picture of {outside[0].path.name}, {outside[0].width} × {outside[0].height} pixels"
             remedy = "give two points inside it"
@@ -135,7 +141,7 @@ def _judge_calibration(settings: ExperimentSettings, folder: Path, sizes: list[t
     return [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
 
 
-def _inside(axis: Axis, recording: Recording) -> bool:
+def _inside(axis: Axis | PictureAxis, recording: Recording) -> bool:
     ends = (axis.from_px, axis.to_px)
     return all(-0.5 <= x <= recording.width - 0.5 and -0.5 <= y <= recording.height - 0.5 for x, y in ends)
 

@@ -117,7 +117,13 @@ def track_frames(
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
     rejected = odd_frames(frames.luma)
-    kept = np.flatnonzero(~rejected)
+    first, last = trial.frames_used or (0, len(frames) - 1)
+    number = np.arange(len(frames))
+    used = (number >= first) & (number <= last)
+    if used.sum() < FEWEST_FRAMES:
+        raise RecordingError(f"{name}: frames_used leaves {int(used.sum())} of {len(frames)} frames; widen it")
+    rejected &= used
+    kept = np.flatnonzero(used & ~rejected)
     luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
     try:
         axis, orderly = _whereabouts(luma, axis, trial, m_per_px)
