@@ -46,6 +46,10 @@ def draw_candidates(rounds: Sequence[tuple[str, pd.DataFrame]]) -> Figure:
     ----------
     rounds : of each the question in words, and a table with a row a candidate, best first: `effect, kind, status,
         delta_chi2, sigma, in_answer_set, plausible, size` (fitted numbers in words, blank where there are none).
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -141,6 +145,10 @@ def draw_cosines(effects: Sequence[str], matrix: Sequence[Sequence[float]]) -> F
     ----------
     effects : names, the best candidate first.
     matrix : cosines in their order, shape (n_effects, n_effects).
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
@@ -202,6 +210,10 @@ def draw_drift(groups: pd.DataFrame, added: str = "") -> Figure:
     groups : one row a group: `model` (`before` or `after`), `parameter, vine, symbol, against, level, ratio,
         ratio_sigma, n_trials`; SI, `level` NaN where the groups are vines. Panels in order of first appearance.
     added : the effects that were added, in words.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

@@ -177,6 +177,10 @@ def draw_exponents(damping: dict[str, Any], published: dict[str, Any] | None = N
     ----------
     damping : as in `damping.json`.
     published : numbers drawn beside them: `{"n": …, "B": {vine: …}, "source": …}`; None where there are none.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

@@ -26,6 +26,10 @@ def draw_campaign(points: Sequence[PlannedPoint], n_error: float, B_errors: Mapp
     ----------
     points : one a trial.
     n_error, B_errors : expected standard errors, of B relative and by vine.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -88,6 +92,10 @@ def draw_choice(films: Sequence[FilmChoice], name: str, y_over_L: float) -> Figu
     ----------
     films : fastest first.
     name, y_over_L : name of the speed, and the fraction of the growth at which it is taken.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -141,6 +149,10 @@ def draw_reservoir(
     loss : share of the gauge pressure that may be lost.
     swept_m3 : volume of the grown vine.
     chosen_m3 : volume of the chamber in question; None for none.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

@@ -41,6 +41,10 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure:
     Parameters
     ----------
     ladder : as in `ladder.csv`.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -146,6 +150,10 @@ def draw_before_after(title: str, trials: pd.DataFrame, added: str = "") -> Figu
     trials : `trial, time_s, lead_position_m, model_before_m, model_after_m`, time since release and positions from the
         origin; `model_after_m` NaN where nothing was added.
     added : the effects that were added, in words.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

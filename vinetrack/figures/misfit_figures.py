@@ -40,6 +40,10 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
         the way), `misfit_before_m, misfit_after_m` (mean of measured minus model; the latter NaN where nothing was
         added) and `scatter_m` (by which that mean may be off by chance, one standard error).
     added : the effects that were added, in words.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -123,6 +127,10 @@ def draw_missing_force(table: pd.DataFrame) -> Figure:
     ----------
     table : one row a point: `against` (a key of `AXES`), `value` (SI), `force_N, sigma_N` (one standard error, NaN
         where unknown) and `condition`, blank for the mean over all.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

@@ -38,12 +38,25 @@ def draw_model_comparison(comparison: pd.DataFrame, trajectories: Mapping[str, p
     comparison : one row a condition with `condition, condition_label, vine, rms_position_m, ratio`.
     trajectories : by condition, `trial, time_s, lead_position_m, model_position_m, replicates_mean_m,
         replicates_sigma_m`, and where effects were added `model_after_m`.
+
+    Returns
+    -------
+    Figure
     """
     return _panels(comparison, trajectories, _draw_positions, "time since release (ms)", "growth (mm)")
 
 
 def draw_model_residuals(comparison: pd.DataFrame, trajectories: Mapping[str, pd.DataFrame]) -> Figure:
-    """Draw measurement minus model against growth; parameters as for `draw_model_comparison`."""
+    """Draw measurement minus model against growth; parameters as for `draw_model_comparison`.
+
+    Parameters
+    ----------
+    comparison, trajectories : as of `draw_model_comparison`.
+
+    Returns
+    -------
+    Figure
+    """
     return _panels(comparison, trajectories, _draw_residuals, "growth (mm)", "measurement − model (mm)")
 
 

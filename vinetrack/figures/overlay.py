@@ -91,6 +91,10 @@ def compose(view: View, picture: NDArray[Any], frame: int, time_ms: float, edges
     frame : its number, which the edges count by.
     time_ms : since release.
     edges : the tracked one first, then those of the models before and after.
+
+    Returns
+    -------
+    array, uint8, shape (height, width, 3)
     """
     from PIL import Image, ImageDraw
 
@@ -199,6 +203,16 @@ def _numbers(pen: ImageDraw, view: View, edges: list[Edge], frame: int, time_ms:
 
 
 def levels(picture: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:
-    """Grey levels stretched so that `low` is black and `high` white, uint8."""
+    """Grey levels stretched so that `low` is black and `high` white, uint8.
+
+    Parameters
+    ----------
+    picture : luma of a frame, any integer type, shape (height, width).
+    low, high : values shown as black and as white.
+
+    Returns
+    -------
+    array, uint8, shape (height, width)
+    """
     stretched = (picture.astype(np.float32) - low) * (255.0 / max(high - low, 1e-9))
     return np.clip(np.round(stretched), 0, 255).astype(np.uint8)

@@ -58,6 +58,10 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
     trials : one row a trial with `trial, vine, condition, condition_label, pressure_kPa, status, steady_from_s,
         steady_to_s`.
     kinematics : table of each trial that has one, by its name.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

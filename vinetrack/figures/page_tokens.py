@@ -26,6 +26,14 @@ def page_tokens() -> str:
 def follows_screen(colour: str) -> str:
     """CSS of a figure's colour, where a page may change it.
 
+    Parameters
+    ----------
+    colour : hexadecimal code of a colour of figures.
+
+    Returns
+    -------
+    str
+
     >>> follows_screen("#0072B2"), follows_screen("#CC79A7")
     ('var(--blue)', '#CC79A7')
     """

@@ -44,12 +44,31 @@ def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list
 
 
 def page_columns(n_panels: int, most: int) -> int:
-    """Return how many of these panels stand in a row, so that the page is about 1.3 times as high as it is wide."""
+    """Return how many of these panels stand in a row, so that the page is about 1.3 times as high as it is wide.
+
+    Parameters
+    ----------
+    n_panels : panels of the figure.
+    most : panels in a row at most.
+
+    Returns
+    -------
+    int
+    """
     return min(max(math.ceil(math.sqrt(1.3 * n_panels)), 1), most) if n_panels > 3 else n_panels
 
 
 def panel_font(n_columns: int) -> float:
-    """Return the size of letters in panels of a page of 11 inches, pt: the narrower the panel, the smaller."""
+    """Return the size of letters in panels of a page of 11 inches, pt: the narrower the panel, the smaller.
+
+    Parameters
+    ----------
+    n_columns : panels in a row.
+
+    Returns
+    -------
+    float, pt
+    """
     return 10.5 if n_columns <= 4 else 9.0 if n_columns <= 6 else 7.8
 
 
@@ -59,6 +78,10 @@ def line_key(label: str, **style: Any) -> Line2D:
     Parameters
     ----------
     style : properties of `matplotlib.lines.Line2D`.
+
+    Returns
+    -------
+    Line2D
     """
     from matplotlib.lines import Line2D
 
@@ -87,6 +110,10 @@ def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) 
     Parameters
     ----------
     width_pt : the room there is.
+
+    Returns
+    -------
+    float, pt
     """
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
@@ -97,7 +124,13 @@ def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) 
 
 
 def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
-    """Put the legend over the axes, where no datum can lie under it; keywords as of `Axes.legend`."""
+    """Put the legend over the axes, where no datum can lie under it; keywords as of `Axes.legend`.
+
+    Parameters
+    ----------
+    n_columns : entries beside each other.
+    keywords : of `Axes.legend`; `handles` replace those of the axes.
+    """
     handles, labels = ax.get_legend_handles_labels()
     handles = keywords.pop("handles", handles)
     if handles:
@@ -115,7 +148,12 @@ def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
 
 
 def note_below(fig: Figure, note: str) -> None:
-    """Put a sentence under the whole figure, wrapped to its width; nothing where it is blank."""
+    """Put a sentence under the whole figure, wrapped to its width; nothing where it is blank.
+
+    Parameters
+    ----------
+    note : one or more sentences; blank for none.
+    """
     if note:
         fig.supxlabel(textwrap.fill(note, int(fig.get_figwidth() * _CHARACTERS_PER_IN)), fontsize=10)
 
@@ -124,6 +162,10 @@ def up_from_zero(ax: Axes, *, x: bool = False) -> None:
     """Let the axes begin at zero and end a little above all that is drawn, however near to each other the values are.
 
     A margin in proportion to the range of the data would vanish where two points of nearly one value are all there is.
+
+    Parameters
+    ----------
+    x : whether the horizontal axis begins at zero too.
     """
     ax.set_ylim(0, _HEADROOM * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
     if x:
@@ -132,6 +174,15 @@ def up_from_zero(ax: Axes, *, x: bool = False) -> None:
 
 def counted(low: int, high: int, noun: str) -> str:
     """Return a count with its noun, or the range of counts.
+
+    Parameters
+    ----------
+    low, high : the smallest and the largest count.
+    noun : in the singular.
+
+    Returns
+    -------
+    str
 
     >>> counted(1, 1, "trial"), counted(2, 3, "trial")
     ('1 trial', '2–3 trials')

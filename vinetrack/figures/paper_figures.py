@@ -46,6 +46,10 @@ def draw_paper_damping(
     points : as in `damping_points.csv`.
     damping : as in `damping.json`.
     printed, exponent : published B by scale, and n.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -127,6 +131,10 @@ def draw_paper_position(
     means : `pressure_kPa, time_s, lead_position_m, lead_position_sigma_m, n_trials`, since release; may be empty.
     errors : `pressure_kPa, rms_mean_m`; may be empty.
     printed_cm : published root mean square by pressure in kPa.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -210,6 +218,10 @@ def draw_paper_reservoir(pressures: pd.DataFrame) -> Figure:
     Parameters
     ----------
     pressures : `pressure_kPa, departure, lead_position_m, gauge_left`; `departure` is `depletion_slow` or `…_fast`.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -265,6 +277,10 @@ def draw_paper_rms(paper: pd.DataFrame, departures: pd.DataFrame) -> Figure:
     ----------
     paper : as in `paper.csv`.
     departures : as in `paper_departures.csv`.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

@@ -57,6 +57,10 @@ def draw_foresight(pictures: Sequence[PredictionPicture], at_fraction: float) ->
     ----------
     pictures : the conditions; the first six are drawn and the number of the others is stated.
     at_fraction : y/L at which final speeds are taken.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -186,6 +190,10 @@ def draw_effect(name: str, size: str, vine: str, table: pd.DataFrame) -> Figure:
     size : its parameters as text, such as `C_D = 1`; blank where it has none.
     vine : the vine and the trial as text.
     table : columns as of `vinetrack.dynamics.effect_motion.effect_motion`.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

@@ -131,6 +131,10 @@ def draw(name: str, *inputs: Any, **options: Any) -> Figure:
     ----------
     inputs, options : what the drawing function of that figure takes.
 
+    Returns
+    -------
+    Figure
+
     Raises
     ------
     KeyError

@@ -42,6 +42,10 @@ def draw_scaling(scaling: dict[str, Any], published: dict[str, Any] | None = Non
     scaling : as in `scaling.json`.
     published : printed values to draw beside it, `{"B": {vine: …}, "source": …}`; None for none.
     note : a sentence below the figure.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -121,6 +125,10 @@ def draw_speed_scaling(scaling: dict[str, Any], note: str = "") -> Figure:
     ----------
     scaling : as in `scaling.json`; its `steady_speed`.
     note : a sentence below the figure, such as a published value.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -189,6 +197,10 @@ def draw_efficiency(scaling: dict[str, Any], note: str = "") -> Figure:
     ----------
     scaling : as in `scaling.json`; its `efficiency`.
     note : a sentence below the figure, such as a published value.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -265,6 +277,10 @@ def draw_payload_speed(
     model : the same along payloads, without `n_final`; may be empty.
     note : a sentence below the figure, such as a published value.
     line : name of the model's curve.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

@@ -33,6 +33,10 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     title : name of the trial.
     tracking : the tracker's result.
     m_per_px : scale along the axis, for the axis in millimetres.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 
@@ -82,7 +86,17 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
-    """Return a picture of at most `largest_px` pixels a side, each the mean of those it replaces that are not NaN."""
+    """Return a picture of at most `largest_px` pixels a side, each the mean of those it replaces that are not NaN.
+
+    Parameters
+    ----------
+    picture : shape (height, width), NaN where nothing is known.
+    largest_px : pixels of the longer side at most.
+
+    Returns
+    -------
+    array, shape (≤ largest_px, ≤ largest_px)
+    """
     for axis in (0, 1):
         step = -(-picture.shape[axis] // largest_px)
         if step > 1:
@@ -95,7 +109,16 @@ def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
 
 
 def flagged(flag: Any) -> np.ndarray:
-    """Return a mask, shape (n_frames,), of the frames with any flag but `before_release`."""
+    """Return a mask, shape (n_frames,), of the frames with any flag but `before_release`.
+
+    Parameters
+    ----------
+    flag : flags of every frame, separated by semicolons, shape (n_frames,).
+
+    Returns
+    -------
+    array of bool, shape (n_frames,)
+    """
     return np.array([bool(set(str(entry).split(";")) - _UNREMARKABLE - {""}) for entry in flag], dtype=bool)
 
 

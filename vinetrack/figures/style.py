@@ -93,7 +93,16 @@ def look() -> Iterator[None]:
 
 
 def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
-    """Give each vine, in the order of first appearance, a colour and a marker; 42 pairs before one repeats."""
+    """Give each vine, in the order of first appearance, a colour and a marker; 42 pairs before one repeats.
+
+    Parameters
+    ----------
+    vines : names, in any number of repetitions.
+
+    Returns
+    -------
+    dict, a style by name
+    """
     names = list(dict.fromkeys(vines))
     n_colours, n_markers = len(VINE_COLOURS), len(VINE_MARKERS)
     return {
@@ -103,12 +112,31 @@ def vine_styles(vines: Iterable[str]) -> dict[str, VineStyle]:
 
 
 def rows(table: pd.DataFrame) -> Iterator[Any]:
-    """Rows of a table with its columns as attributes; pandas' own type of them fits no number."""
+    """Rows of a table with its columns as attributes; pandas' own type of them fits no number.
+
+    Parameters
+    ----------
+    table : any table with names of columns that are Python names.
+
+    Returns
+    -------
+    iterator of named tuples
+    """
     return iter(table.itertuples(index=False))
 
 
 def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure:
-    """Return a figure that says why there is nothing to draw; the place of a missing picture is never left empty."""
+    """Return a figure that says why there is nothing to draw; the place of a missing picture is never left empty.
+
+    Parameters
+    ----------
+    message : the reason, one or more sentences.
+    width_in, height_in : size of the figure, inches.
+
+    Returns
+    -------
+    Figure
+    """
     from matplotlib.figure import Figure
 
     with look():
@@ -119,7 +147,17 @@ def blank(message: str, width_in: float = 7.0, height_in: float = 1.6) -> Figure
 
 
 def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 150) -> dict[str, bytes]:
-    """Return the figure in each format, the same bytes for the same figure; PNG on white, the others transparent."""
+    """Return the figure in each format, the same bytes for the same figure; PNG on white, the others transparent.
+
+    Parameters
+    ----------
+    formats : of `png`, `svg`, `pdf`.
+    dpi : pixels an inch of a PNG.
+
+    Returns
+    -------
+    dict, the file by its format
+    """
     details: dict[str, dict[str, Any]] = {
         "png": {"facecolor": "white", "metadata": {"Software": None}},
         "svg": {"metadata": {"Date": None, "Creator": None}},

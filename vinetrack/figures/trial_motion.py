@@ -45,6 +45,10 @@ def draw_trial_motion(
     track, kinematics : tables as in `tracks/<trial>.csv` and `kinematics/<trial>.csv`.
     windows : rows of `steady.csv` for this trial.
     travel_ratio : tail speed over that of the leading edge, for the axis on the right.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure
 

@@ -31,6 +31,8 @@ def campaign_lines(
     inputs : predictive inputs of each vine.
     n_error : standard error of n that is wanted.
     B_error : relative standard error of B that is wanted.
+    most_trials : trials that a campaign may have.
+    camera : the plan of filming, for frame rate and noise.
     """
     spread_P, spread_B = inputs[0].spreads
     yield (
@@ -125,6 +127,10 @@ def rehearsal_lines(planned: Planned, rehearsal: SimulatedCampaigns) -> list[str
     ----------
     planned : the campaign, with its expected errors.
     rehearsal : simulated campaigns, fitted.
+
+    Returns
+    -------
+    list of str
     """
     from vinetrack.core.terminal import table
 

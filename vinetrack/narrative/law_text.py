@@ -69,6 +69,10 @@ def headline(damping: Mapping[str, Any]) -> str:
     Parameters
     ----------
     damping : content of `damping.json`.
+
+    Returns
+    -------
+    str
     """
     fit = damping.get(PREFERRED) or {}
     if fit.get("refused") or fit.get("n") is None or not fit.get("vines"):
@@ -91,6 +95,10 @@ def tally(trials: pd.DataFrame) -> str:
     Parameters
     ----------
     trials : `trials.csv`; its column `status`.
+
+    Returns
+    -------
+    str
     """
     counts = trials["status"].value_counts()
     parts = [f"{counts[status]} {_STATUS_WORDS[status]}" for status in _STATUSES if counts.get(status, 0)]
@@ -98,7 +106,16 @@ def tally(trials: pd.DataFrame) -> str:
 
 
 def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return size, B, its intervals, R² and N by vine and method of `damping.json` as text, smallest vine first."""
+    """Return size, B, its intervals, R² and N by vine and method of `damping.json` as text, smallest vine first.
+
+    Parameters
+    ----------
+    damping : content of `damping.json`.
+
+    Returns
+    -------
+    list of dict, one a vine and method
+    """
     table, sizes = [], []
     for method, method_name in _TABLE_METHODS.items():
         for vine, law in ((damping.get(method) or {}).get("vines") or {}).items():
@@ -120,7 +137,16 @@ def vine_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return n and its intervals by every method of `damping.json` as text, or why a method has none."""
+    """Return n and its intervals by every method of `damping.json` as text, or why a method has none.
+
+    Parameters
+    ----------
+    damping : content of `damping.json`.
+
+    Returns
+    -------
+    list of dict, one a method
+    """
     table = []
     for method, method_name in _TABLE_METHODS.items():
         fit = damping.get(method)
@@ -139,13 +165,31 @@ def exponent_table(damping: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def without_law(damping: Mapping[str, Any]) -> list[str]:
-    """Return the vines that the preferred fit of `damping.json` left out, each with the reason."""
+    """Return the vines that the preferred fit of `damping.json` left out, each with the reason.
+
+    Parameters
+    ----------
+    damping : content of `damping.json`.
+
+    Returns
+    -------
+    list of str, `vine: reason`
+    """
     left_out = (damping.get(PREFERRED) or {}).get("left_out") or {}
     return [f"{vine}: {reason}" for vine, reason in left_out.items()]
 
 
 def methods(settings: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return how the results were computed, as (heading, paragraph) pairs, with the numbers of the run's settings."""
+    """Return how the results were computed, as (heading, paragraph) pairs, with the numbers of the run's settings.
+
+    Parameters
+    ----------
+    settings : of the run, as in `provenance.json`.
+
+    Returns
+    -------
+    list of (heading, paragraph)
+    """
     velocity, steady, damping = (settings.get(key) or {} for key in ("velocity", "steady", "damping"))
     return [
         (

@@ -25,7 +25,16 @@ _WITH_TRACE = (
 
 
 def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]]:
-    """Return the effects that only the first model has, and those that only the second has."""
+    """Return the effects that only the first model has, and those that only the second has.
+
+    Parameters
+    ----------
+    first, second : two fits to the same trials.
+
+    Returns
+    -------
+    only_first, only_second : list of Effect
+    """
     return (
         [effect for effect in first.model if effect.name not in second.model],
         [effect for effect in second.model if effect.name not in first.model],
@@ -33,7 +42,16 @@ def effects_between(first: Fit, second: Fit) -> tuple[list[Effect], list[Effect]
 
 
 def only_measurement(tied: Sequence[Fit]) -> bool:
-    """Return whether the hypotheses differ in effects of the measurement alone."""
+    """Return whether the hypotheses differ in effects of the measurement alone.
+
+    Parameters
+    ----------
+    tied : fits of the hypotheses.
+
+    Returns
+    -------
+    bool
+    """
     common = set.intersection(*(set(fit.model.names) for fit in tied))
     differ = [effect for fit in tied for effect in fit.model if effect.name not in common]
     return bool(differ) and all(effect.kind == "measurement" for effect in differ)
@@ -43,6 +61,14 @@ def calibration_for(pairs: Sequence[tuple[Fit, Fit]]) -> str:
     """Return what to measure so that one of each pair can be ruled out, as the effects' own files state it.
 
     Where an effect of the measurement is among them, a calibration decides, and only that is returned.
+
+    Parameters
+    ----------
+    pairs : fits of hypotheses that the data cannot tell apart.
+
+    Returns
+    -------
+    str, blank where the effects state nothing
     """
     sentences: list[str] = []
     effects: dict[str, Effect] = {}
@@ -85,6 +111,10 @@ def outlook(
     if_true : by pair (`a | b`) the significance if the one or the other is true; the smaller is stated, the larger
         only where it is much more.
     simulated : mean and standard deviation of simulated significances by pair.
+
+    Returns
+    -------
+    str
     """
     parts = []
     for pair, ways in if_true.items():
@@ -105,6 +135,10 @@ def entries(every: Sequence[Condition], design: Sequence[int]) -> tuple[dict[str
     ----------
     every : all feasible conditions.
     design : places in `every`, one for each trial.
+
+    Returns
+    -------
+    tuple of dict
     """
     return tuple(
         _entry(every[place], int(count))
@@ -142,6 +176,10 @@ def in_words(
     left : pairs that the trials do not separate.
     advice : the text of `calibration_for`.
     worth_it : whether the best design separates a pair by `least`, in standard deviations.
+
+    Returns
+    -------
+    str
     """
     if not worth_it:
         return (

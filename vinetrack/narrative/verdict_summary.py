@@ -63,17 +63,45 @@ class Fact:
 
 
 def plain(effect: str) -> str:
-    """Return the name of an effect with blanks for its underscores."""
+    """Return the name of an effect with blanks for its underscores.
+
+    Parameters
+    ----------
+    effect : name with underscores.
+
+    Returns
+    -------
+    str
+    """
     return str(effect).replace("_", " ")
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:
-    """Return names of effects as a sentence lists them, with blanks for underscores: `air drag, leak or gravity`."""
+    """Return names of effects as a sentence lists them, with blanks for underscores: `air drag, leak or gravity`.
+
+    Parameters
+    ----------
+    names : with underscores.
+    last : the conjunction before the last name.
+
+    Returns
+    -------
+    str
+    """
     return joined([plain(name) for name in names], last)
 
 
 def joined(names: Sequence[str], last: str = "and") -> str:
     """Return names as a sentence lists them; blank for none.
+
+    Parameters
+    ----------
+    names : any texts.
+    last : the conjunction before the last one.
+
+    Returns
+    -------
+    str
 
     >>> joined(["leak", "air_drag", "gravity"], "or")
     'leak, air_drag or gravity'
@@ -87,6 +115,10 @@ def sentence(diagnosis: Mapping[str, Any]) -> str:
     Parameters
     ----------
     diagnosis : content of `diagnosis.json`.
+
+    Returns
+    -------
+    str
     """
     verdict, answers = diagnosis.get("verdict"), list(diagnosis.get("answer_set") or [])
     added = list(diagnosis.get("effects") or [])
@@ -111,6 +143,10 @@ def meaning(diagnosis: Mapping[str, Any]) -> str:
     Parameters
     ----------
     diagnosis : content of `diagnosis.json`.
+
+    Returns
+    -------
+    str
     """
     text = MEANINGS.get(str(diagnosis.get("verdict")), str(diagnosis.get("refused") or ""))
     if diagnosis.get("verdict") == "artefact" and trials_differ(list(diagnosis.get("answer_set") or [])):
@@ -127,6 +163,10 @@ def facts(diagnosis: Mapping[str, Any], ladder: pd.DataFrame | None) -> list[Fac
     ----------
     diagnosis : content of `diagnosis.json`.
     ladder : `ladder.csv`; None where there is none.
+
+    Returns
+    -------
+    list of Fact
     """
     first = (diagnosis.get("rounds") or [{}])[0]
     ranking = list(first.get("ranking") or [])
@@ -141,7 +181,16 @@ def facts(diagnosis: Mapping[str, Any], ladder: pd.DataFrame | None) -> list[Fac
 
 
 def known(value: Any) -> bool:
-    """Return whether a value of a JSON file is a finite number."""
+    """Return whether a value of a JSON file is a finite number.
+
+    Parameters
+    ----------
+    value : of any type.
+
+    Returns
+    -------
+    bool
+    """
     return isinstance(value, int | float) and math.isfinite(value)
 
 
@@ -187,6 +236,10 @@ def size(entry: Mapping[str, Any]) -> str:
     Parameters
     ----------
     entry : a number of `diagnosis.json` or `fit.json`: `symbol, value, sigma, unit` (SI) and `vine` where it has one.
+
+    Returns
+    -------
+    str
     """
     unit, factor = display_unit(entry["unit"])
     sigma = factor * float(entry["sigma"]) if known(entry.get("sigma")) else None
@@ -195,7 +248,16 @@ def size(entry: Mapping[str, Any]) -> str:
 
 
 def sizes(row: Mapping[str, Any]) -> str:
-    """Return all fitted numbers of an entry of a ranking."""
+    """Return all fitted numbers of an entry of a ranking.
+
+    Parameters
+    ----------
+    row : an entry of `ranking` in `diagnosis.json`.
+
+    Returns
+    -------
+    str, blank where it has no fitted number
+    """
     return ", ".join(size(entry) for entry in row.get("numbers") or [] if known(entry.get("value")))
 
 

@@ -43,7 +43,16 @@ _SHOWN_CANDIDATES = 8
 
 
 def size_in_words(number: Number) -> str:
-    """Return `γ = 1.170 ± 0.004` in its display unit; without error where the fit could not state one."""
+    """Return `γ = 1.170 ± 0.004` in its display unit; without error where the fit could not state one.
+
+    Parameters
+    ----------
+    number : SI.
+
+    Returns
+    -------
+    str
+    """
     unit, factor = display_unit(number.unit)
     tail = f" {unit}" if unit else ""
     if not (math.isfinite(number.sigma) and number.sigma > 0):
@@ -54,12 +63,30 @@ def size_in_words(number: Number) -> str:
 
 
 def sizes_in_words(numbers: Sequence[Number]) -> str:
-    """Return all sizes of a hypothesis; blank where it has none."""
+    """Return all sizes of a hypothesis; blank where it has none.
+
+    Parameters
+    ----------
+    numbers : SI.
+
+    Returns
+    -------
+    str
+    """
     return ", ".join(map(size_in_words, numbers))
 
 
 def explain(finding: SelectionStep) -> str:
-    """Return the explanation of one round: its verdict with the reasons."""
+    """Return the explanation of one round: its verdict with the reasons.
+
+    Parameters
+    ----------
+    finding : the selection step of the round.
+
+    Returns
+    -------
+    str
+    """
     questions = finding.questions
     model = " + ".join(questions.found.model.names)
     count = len(questions.found.trials)
@@ -156,7 +183,16 @@ def _runner_up(finding: SelectionStep) -> str:
 
 
 def dropped_in_words(trials: Sequence[str]) -> str:
-    """Return the explanation of a diagnosis where frames are missing from these recordings."""
+    """Return the explanation of a diagnosis where frames are missing from these recordings.
+
+    Parameters
+    ----------
+    trials : names of the recordings.
+
+    Returns
+    -------
+    str
+    """
     some = joined(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
     return (
         f"Frames are missing from {len(trials)} recording{'s' if len(trials) > 1 else ''} ({some}): the step of one "
@@ -166,7 +202,16 @@ def dropped_in_words(trials: Sequence[str]) -> str:
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """Return what the terminal prints: verdict, rounds with their candidates, ladder, next experiment."""
+    """Return what the terminal prints: verdict, rounds with their candidates, ladder, next experiment.
+
+    Parameters
+    ----------
+    diagnosis : as `vinetrack.diagnosis.diagnose` returns it.
+
+    Returns
+    -------
+    str, lines separated by line feeds
+    """
     lines = [f"{diagnosis.verdict}: {_headline(diagnosis)}", "", diagnosis.explanation]
     for step in diagnosis.rounds:
         if step.ranking:
@@ -240,6 +285,11 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
     ----------
     table : the ladder of errors, `before` and `after`.
     numbers : one row a number and model: `symbol, vine, unit, added, value, sigma` (SI).
+    before, after : fits without and with the effect.
+
+    Returns
+    -------
+    list of str
     """
     from vinetrack.core.terminal import table as aligned
 

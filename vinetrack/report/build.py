@@ -85,6 +85,10 @@ def build_report(content: ReportContent) -> str:
     Parameters
     ----------
     content : see `ReportContent`; `trial_figures` holds an SVG per trial that is to be shown in full.
+
+    Returns
+    -------
+    str, an HTML document
     """
     from jinja2 import Environment, FunctionLoader, StrictUndefined
     from markupsafe import Markup
@@ -125,7 +129,16 @@ def build_report(content: ReportContent) -> str:
 
 
 def figure_caption(name: str) -> str:
-    """Return the caption of a figure of `vinetrack.figures.registry` as one line of text."""
+    """Return the caption of a figure of `vinetrack.figures.registry` as one line of text.
+
+    Parameters
+    ----------
+    name : of the figure in the registry.
+
+    Returns
+    -------
+    str
+    """
     path = files("vinetrack.report") / "captions" / f"{name}.rst"
     return " ".join(path.read_text(encoding="utf-8").split())
 

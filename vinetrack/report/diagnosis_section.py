@@ -38,7 +38,16 @@ class DiagnosisResult:
 
 
 def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
-    """Return the section on the diagnosis as text for the template; None where there is no diagnosis."""
+    """Return the section on the diagnosis as text for the template; None where there is no diagnosis.
+
+    Parameters
+    ----------
+    result : None where the results folder has no diagnosis.
+
+    Returns
+    -------
+    dict for the template, or None
+    """
     if result is None:
         return None
     content = result.content
@@ -76,7 +85,16 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
 
 
 def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
-    """Return the errors of every model of `ladder.csv`, mm; None where there is no ladder."""
+    """Return the errors of every model of `ladder.csv`, mm; None where there is no ladder.
+
+    Parameters
+    ----------
+    ladder : as in `ladder.csv`.
+
+    Returns
+    -------
+    ReportTable or None
+    """
     if ladder is None or not len(ladder):
         return None
     keys = ("rms_in_sample_m", "rms_left_out_m", "rms_highest_pressure_m", "floor_m", "excess_left_out_m")
@@ -129,7 +147,16 @@ def _round(index: int, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def round_question(entry: Mapping[str, Any]) -> str:
-    """Return the question of a round."""
+    """Return the question of a round.
+
+    Parameters
+    ----------
+    entry : an entry of `rounds` in `diagnosis.json`.
+
+    Returns
+    -------
+    str
+    """
     return f"which effect is missing from {listed(list(entry.get('model') or []))}?"
 
 
@@ -142,7 +169,17 @@ def _hidden(content: Mapping[str, Any], units: Mapping[str, tuple[str, str]]) ->
 def hidden_table(
     ranking: Sequence[Mapping[str, Any]], units: Mapping[str, tuple[str, str]] | None = None
 ) -> ReportTable | None:
-    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None where there are none."""
+    """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None where there are none.
+
+    Parameters
+    ----------
+    ranking : of a round.
+    units : symbol and SI unit by `effect.parameter`, for candidates without fitted numbers.
+
+    Returns
+    -------
+    ReportTable or None
+    """
     rows = []
     for row in ranking:
         of = {str(n["parameter"]).split(".")[-1]: (str(n["symbol"]), str(n["unit"])) for n in row.get("numbers") or []}
@@ -171,7 +208,16 @@ def _blind(ranking: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def tied_pairs(cosines: Mapping[str, Any]) -> list[str]:
-    """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first."""
+    """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first.
+
+    Parameters
+    ----------
+    cosines : `cosines` of `diagnosis.json`: names and matrix.
+
+    Returns
+    -------
+    list of str
+    """
     names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
     pairs = [
         (abs(float(matrix[i][j])), names[i], names[j], float(matrix[i][j]))
@@ -183,7 +229,16 @@ def tied_pairs(cosines: Mapping[str, Any]) -> list[str]:
 
 
 def next_experiment(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the next experiment for the template: text, trials, and the expected significances; None for none."""
+    """Return the next experiment for the template: text, trials, and the expected significances; None for none.
+
+    Parameters
+    ----------
+    content : `next_experiment` of `diagnosis.json`.
+
+    Returns
+    -------
+    dict for the template, or None
+    """
     if not content:
         return None
     trials = [dict(trial) for trial in content.get("trials") or []]
@@ -218,7 +273,16 @@ def _simulated(entry: Mapping[str, Any]) -> str:
 
 
 def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the missing force for the template: a sentence, and simple laws compared with it; None for none."""
+    """Return the missing force for the template: a sentence, and simple laws compared with it; None for none.
+
+    Parameters
+    ----------
+    content : `missing_force` of `diagnosis.json`.
+
+    Returns
+    -------
+    dict for the template, or None
+    """
     if not content:
         return None
     rows = [
@@ -235,7 +299,16 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 
 def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
-    """Return how fitted numbers changed as effects were added: a row a number, a column a model; None without any."""
+    """Return how fitted numbers changed as effects were added: a row a number, a column a model; None without any.
+
+    Parameters
+    ----------
+    moved : as in `diagnosis/moved.csv`: one row a number and model, SI.
+
+    Returns
+    -------
+    ReportTable or None
+    """
     if moved is None or not len(moved):
         return None
     steps = list(dict.fromkeys(moved["added"].fillna("").astype(str)))
@@ -252,7 +325,16 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
 
 
 def law_table(laws: pd.DataFrame | None) -> ReportTable | None:
-    """Return the damping law from steady speeds with the pressure at the vine that each model gives; None without."""
+    """Return the damping law from steady speeds with the pressure at the vine that each model gives; None without.
+
+    Parameters
+    ----------
+    laws : as in `diagnosis/damping_laws.csv`.
+
+    Returns
+    -------
+    ReportTable or None
+    """
     if laws is None or not len(laws):
         return None
     chosen = laws[laws["method"] == PREFERRED] if (laws["method"] == PREFERRED).any() else laws

@@ -32,7 +32,16 @@ class ModelResult:
 
 
 def model_section(result: ModelResult | None) -> dict[str, Any] | None:
-    """Return the section on the model in use as text for the template; None where no model was fitted or refused."""
+    """Return the section on the model in use as text for the template; None where no model was fitted or refused.
+
+    Parameters
+    ----------
+    result : None where no model was fitted.
+
+    Returns
+    -------
+    dict for the template, or None
+    """
     if result is None:
         return None
     fit = result.fit
@@ -57,6 +66,10 @@ def verdict(comparison: pd.DataFrame) -> str:
     Parameters
     ----------
     comparison : as in `comparison.csv`.
+
+    Returns
+    -------
+    str
     """
     if not len(comparison):
         return ""

@@ -23,6 +23,10 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
     table : as in `paper.csv`.
     departures : as in `paper_departures.csv`.
     figures : the pictures, in order.
+
+    Returns
+    -------
+    ReportSection
     """
     from vinetrack.paper.rows import MARKS
 
@@ -44,7 +48,16 @@ def paper_section(table: pd.DataFrame, departures: pd.DataFrame, figures: Sequen
 
 
 def tally(table: pd.DataFrame) -> str:
-    """How many rows there are of each kind, as a sentence."""
+    """How many rows there are of each kind, as a sentence.
+
+    Parameters
+    ----------
+    table : as in `paper.csv`.
+
+    Returns
+    -------
+    str
+    """
     from vinetrack.paper.rows import MARKS
 
     counts = table["mark"].value_counts()
@@ -53,7 +66,16 @@ def tally(table: pd.DataFrame) -> str:
 
 
 def table_one(table: pd.DataFrame) -> ReportTable:
-    """Table I of the paper, with what Fig. 6 found and what we did."""
+    """Table I of the paper, with what Fig. 6 found and what we did.
+
+    Parameters
+    ----------
+    table : as in `paper.csv`.
+
+    Returns
+    -------
+    ReportTable
+    """
     by_row = _by_row(table)
     body = [
         (
@@ -81,7 +103,17 @@ def table_one(table: pd.DataFrame) -> ReportTable:
 
 
 def table_two(table: pd.DataFrame, departures: pd.DataFrame) -> list[ReportTable]:
-    """Table II of the paper, positions and speeds, with ours and with what departures from Eq. (2) would cause."""
+    """Table II of the paper, positions and speeds, with ours and with what departures from Eq. (2) would cause.
+
+    Parameters
+    ----------
+    table : as in `paper.csv`.
+    departures : as in `paper_departures.csv`.
+
+    Returns
+    -------
+    list of ReportTable, of positions and of speeds
+    """
     by_row = _by_row(table)
     head = ("pressure, kPa", "printed", "here", "chamber not refilled", "tail that cannot push", "both")
     made = []
@@ -131,7 +163,16 @@ _ERRORS = (
 
 
 def every_row(table: pd.DataFrame) -> list[ReportTable]:
-    """All of `paper.csv`, a table for each part of the paper."""
+    """All of `paper.csv`, a table for each part of the paper.
+
+    Parameters
+    ----------
+    table : as in `paper.csv`.
+
+    Returns
+    -------
+    list of ReportTable, one a part of the paper
+    """
     head = ("what", "printed", "here (95 %)", "kind", "how, and what stands beside it")
     made = []
     parts = table["where"].map(_part)

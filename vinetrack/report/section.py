@@ -49,7 +49,16 @@ class ReportSection:
 
 
 def figure_entry(figure: ReportFigure) -> dict[str, Any]:
-    """A picture for the template."""
+    """A picture for the template.
+
+    Parameters
+    ----------
+    figure : its SVG as matplotlib wrote it.
+
+    Returns
+    -------
+    dict for the template
+    """
     from markupsafe import Markup
 
     return {
@@ -63,7 +72,16 @@ def figure_entry(figure: ReportFigure) -> dict[str, Any]:
 
 
 def section_entry(section: ReportSection, largest_svg_bytes: int) -> dict[str, Any]:
-    """A section for the template; pictures too large for a page are left as files beside it."""
+    """A section for the template; pictures too large for a page are left as files beside it.
+
+    Parameters
+    ----------
+    largest_svg_bytes : of a picture in the page.
+
+    Returns
+    -------
+    dict for the template
+    """
     return {
         "key": section.key,
         "title": section.title,
@@ -74,7 +92,17 @@ def section_entry(section: ReportSection, largest_svg_bytes: int) -> dict[str, A
 
 
 def data_uri(name: str, text: str) -> str:
-    """A file to download that is part of the page itself, written whichever way is shorter."""
+    """A file to download that is part of the page itself, written whichever way is shorter.
+
+    Parameters
+    ----------
+    name : of the file; its ending gives the type.
+    text : its content.
+
+    Returns
+    -------
+    str, a data address
+    """
     kind = "application/json" if name.endswith(".json") else "text/csv"
     escaped = quote(text, safe=_PLAIN)
     encoded = "base64," + base64.b64encode(text.encode("utf-8")).decode("ascii")

@@ -65,6 +65,10 @@ def inline_svg(svg: str, prefix: str, description: str) -> str:
     svg : a file as matplotlib writes it.
     prefix : put before every identifier, since several pictures share one page.
     description : for readers who cannot see the picture.
+
+    Returns
+    -------
+    str, an `svg` element
     """
     body, width_pt, height_pt = compact_svg(svg, prefix, _THEMED)
     label, box = escape(description, quote=True), f"0 0 {width_pt:g} {height_pt:g}"
@@ -78,6 +82,11 @@ def compact_svg(svg: str, prefix: str, colours: Mapping[str, str]) -> tuple[str,
     ----------
     svg, prefix : as of `inline_svg`.
     colours : what to write in place of a colour, by its hexadecimal code in lower case.
+
+    Returns
+    -------
+    body : str
+    width, height : float, pt
 
     Raises
     ------
@@ -174,7 +183,16 @@ def _marker(shape: ElementTree.Element, style: dict[str, str], place: Mapping[st
 
 
 def recoded(href: str) -> str:
-    """Return a PNG in a data address as WebP; unchanged where that is no smaller, or where it is no PNG."""
+    """Return a PNG in a data address as WebP; unchanged where that is no smaller, or where it is no PNG.
+
+    Parameters
+    ----------
+    href : a data address.
+
+    Returns
+    -------
+    str, a data address
+    """
     from PIL import Image
 
     head, _, data = href.partition("base64,")
@@ -242,6 +260,14 @@ def _short_style(style: Mapping[str, str], colours: Mapping[str, str]) -> str:
 def parse_path(d: str) -> list[Command]:
     """Return the commands of a path in absolute coordinates, as matplotlib writes them: M, L, Q, C and Z.
 
+    Parameters
+    ----------
+    d : attribute `d` of a path.
+
+    Returns
+    -------
+    list of Command, pt
+
     >>> parse_path("M 1 2 L 3 4 z")
     [('M', (1.0, 2.0)), ('L', (3.0, 4.0)), ('Z', ())]
 
@@ -267,7 +293,16 @@ def parse_path(d: str) -> list[Command]:
 
 
 def moved(commands: Sequence[Command], x: float, y: float) -> list[Command]:
-    """Return the commands with every point moved by (x, y), pt."""
+    """Return the commands with every point moved by (x, y), pt.
+
+    Parameters
+    ----------
+    x, y : the shift, pt.
+
+    Returns
+    -------
+    list of Command, pt
+    """
     return [(letter, tuple(v + (x, y)[i % 2] for i, v in enumerate(numbers))) for letter, numbers in commands]
 
 
@@ -276,6 +311,14 @@ def write_path(commands: Sequence[Command]) -> str:
 
     Every step begins where the rounded one before it ended, so that rounding does not add up. Steps of no length are
     left out, but for those that make a dot.
+
+    Parameters
+    ----------
+    commands : absolute coordinates, pt.
+
+    Returns
+    -------
+    str, attribute `d` of a path
 
     >>> write_path([("M", (10.04, 20.0)), ("L", (10.04, 25.5)), ("L", (12.0, 25.5)), ("Z", ())])
     'M10 20v5.5h2z'
@@ -305,7 +348,16 @@ def write_path(commands: Sequence[Command]) -> str:
 
 
 def circle_diameter(commands: Sequence[Command]) -> float | None:
-    """Return the diameter of a circle about the origin as matplotlib draws its round markers, pt; None for others."""
+    """Return the diameter of a circle about the origin as matplotlib draws its round markers, pt; None for others.
+
+    Parameters
+    ----------
+    commands : absolute coordinates, pt.
+
+    Returns
+    -------
+    float, pt, or None
+    """
     ends = [numbers[-2:] for letter, numbers in commands if letter == "C"]
     if len(ends) != 8 or any(letter not in "MCZ" for letter, _ in commands):
         return None

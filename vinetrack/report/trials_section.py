@@ -76,6 +76,14 @@ class Recording:
 def count_frames(flags: Iterable[str]) -> str:
     """How many frames there are, and how many of them carry which flag, in words.
 
+    Parameters
+    ----------
+    flags : of every frame, separated by semicolons; blank for none.
+
+    Returns
+    -------
+    str
+
     >>> count_frames(["before_release", "", "", "doubtful", "lost;gap"])
     '5 frames: 1 before release, 1 doubtful, 1 without the edge, 1 gap'
     """
@@ -86,7 +94,16 @@ def count_frames(flags: Iterable[str]) -> str:
 
 
 def calibration_table(recordings: Mapping[str, Recording]) -> list[dict[str, Any]]:
-    """One row a calibration, with what it found and the trials that rest on it."""
+    """One row a calibration, with what it found and the trials that rest on it.
+
+    Parameters
+    ----------
+    recordings : by name of trial.
+
+    Returns
+    -------
+    list of dict for the template, one a calibration
+    """
     groups: dict[tuple[Any, ...], list[tuple[str, Mapping[str, Any]]]] = {}
     for name, recording in recordings.items():
         calibration = recording.calibration
@@ -138,7 +155,17 @@ MOST_ROWS, MOST_ROWS_IN_ALL = 240, 24_000
 
 
 def trial_entries(content: ReportContent) -> tuple[list[dict[str, Any]], int]:
-    """All trials for the template, and of how many the pictures were too much for one page."""
+    """All trials for the template, and of how many the pictures were too much for one page.
+
+    Parameters
+    ----------
+    content : of the report.
+
+    Returns
+    -------
+    entries : list of dict for the template
+    n_left_out : int, trials whose pictures exceed `PICTURES_BYTES` together
+    """
     entries, left_out, weight = [], 0, 0
     for row in rows(content.trials):
         entry = _trial_numbers(row, content)
@@ -227,7 +254,18 @@ def speed_sparkline(
     width_px: int = 132,
     height_px: int = 30,
 ) -> str:
-    """Speed against time as a small SVG, the steady stretch thick; blank where there is nothing to draw."""
+    """Speed against time as a small SVG, the steady stretch thick; blank where there is nothing to draw.
+
+    Parameters
+    ----------
+    time_s, speed_m_s : shape (n_points,), NaN where unknown.
+    steady_s : begin and end of the steady window, NaN for none.
+    width_px, height_px : size of the picture.
+
+    Returns
+    -------
+    str, an `svg` element
+    """
     good = np.isfinite(time_s) & np.isfinite(speed_m_s)
     time_s, speed_m_s = time_s[good], speed_m_s[good]
     if time_s.size < 2 or np.ptp(time_s) <= 0:
