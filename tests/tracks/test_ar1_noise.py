@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinetrack.tracks.noise import ar1_noise
+from vinetrack.tracks.position_noise import ar1_noise
 
 
 @pytest.mark.parametrize("correlation", [-0.4, 0.0, 0.6, 0.9])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from vine_truth import Vine, ar1, make_track, record
 
-from vinetrack.tracks.noise import rest_points, track_noise
+from vinetrack.tracks.position_noise import rest_points, track_noise
 
 FRAMES = np.arange(300) / 1069
 

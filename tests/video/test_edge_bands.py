@@ -7,7 +7,7 @@ import pytest
 from scipy.special import ndtr
 
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge_bands import BANDS, band_fits, disagreement
+from vinetrack.video.edge_repair import BANDS, band_fits, disagreement
 from vinetrack.video.edge_state import EdgeState
 from vinetrack.video.strip import Strip
 

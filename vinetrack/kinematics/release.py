@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack.core.records import Floats, Kinematics, Track, join_flags
-from vinetrack.tracks.noise import rest_points
+from vinetrack.tracks.position_noise import rest_points
 
 FEWEST_REST_POINTS = 3
 LIFTED_SIGMAS = 5.0

@@ -13,7 +13,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.kinematics.windows import Indices, Mask, WindowFits, fit_all_windows
-from vinetrack.tracks.noise import track_noise
+from vinetrack.tracks.position_noise import track_noise
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)
 """Widths tried, in points; each about 1.45 times the one before."""

@@ -20,7 +20,7 @@ from vinetrack.dynamics.force_terms import pressure_along
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.laboratory.ground_truth import Nature
-from vinetrack.tracks.noise import ar1_noise
+from vinetrack.tracks.position_noise import ar1_noise
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
 from vinetrack.kinematics.damping import fit_laws
 from vinetrack.kinematics.efficiency import lead_velocity_at
 from vinetrack.kinematics.force import paper_force_N
-from vinetrack.kinematics.paper_rule import paper_window
+from vinetrack.kinematics.steady import paper_window
 from vinetrack.paper.departures import NONE, Departure, paper_trial
 from vinetrack.planning.scaling_priors import damping_prior
 

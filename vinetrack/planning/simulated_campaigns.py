@@ -20,7 +20,7 @@ from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.planning.campaign_information import REST_FRAMES, FilmingPlan
-from vinetrack.tracks.noise import ar1_noise
+from vinetrack.tracks.position_noise import ar1_noise
 
 
 @dataclass(frozen=True)

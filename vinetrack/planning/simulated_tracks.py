@@ -16,7 +16,7 @@ from vinetrack.inference.parameters import DAMPING, EXPONENT
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Job, Predictor
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis
-from vinetrack.tracks.noise import ar1_noise
+from vinetrack.tracks.position_noise import ar1_noise
 
 LONGEST = 1.5
 """A recording lasts no longer than this many times the longest that was used."""

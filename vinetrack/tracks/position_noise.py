@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Floats, Track
 
 ENOUGH_REST_FRAMES = 60
 REST_MARGIN = 3  # the corner between rest and motion is found to within about two frames
@@ -210,3 +210,44 @@ def _vertex(x: Floats, score: Floats, best: int) -> float:
         return float(x[best])
     left, middle, right = score[best - 1 : best + 2]
     return float(x[best] + 0.5 * (x[1] - x[0]) * (left - right) / (left - 2 * middle + right))
+
+
+def track_noise(track: Track) -> tuple[float, float]:
+    """Standard deviation and lag-one correlation of the random error of a single position.
+
+    Parameters
+    ----------
+    track
+        A track; only its usable points are read.
+
+    Returns
+    -------
+    noise_m
+        Standard deviation, m. 0 where the positions are exact or too few (under 5) to tell.
+    correlation
+        Lag-one correlation, 0 to 0.95; pulled to 0 where the track is too short to tell.
+    """
+    usable = track.usable
+    return position_noise(track.time_s[usable], track.lead_position_m[usable])
+
+
+def ar1_noise(count: int, sd: float, correlation: float, draw: np.random.Generator) -> Floats:
+    """Draw stationary autoregressive noise of first order, as simulated tracks have it.
+
+    Parameters
+    ----------
+    count : number of positions.
+    sd : standard deviation of each, m.
+    correlation : lag-one correlation, above -1 and below 1.
+    draw : random numbers; `count` normal deviates are taken.
+
+    Returns
+    -------
+    array, shape (count,), m: the first is a draw from the stationary distribution, every other one is `correlation`
+    times its predecessor plus an innovation of variance (1 − correlation²)·sd².
+    """
+    from scipy.signal import lfilter
+
+    white = draw.standard_normal(count)
+    white[1:] *= math.sqrt(1 - correlation**2)
+    return sd * np.asarray(lfilter([1.0], [1.0, -correlation], white))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.video.frames import RecordingError
@@ -206,8 +207,6 @@ def _line_near(
 
     All in the small pictures. Lines that leave the middle of the given width count less, to a half at its border.
     """
-    from vinetrack.video.axis_kernels import fan
-
     band = float(np.clip(0.25 * reach, 2.0, 6.0))
     start = float(np.arctan2(given.direction[1], given.direction[0]))
     middle = np.asarray(given.points(np.array(given.length_px / 2)))
@@ -288,8 +287,6 @@ def _best_line(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, band: float, diagonal: float
 ) -> tuple[float, Floats]:
     """Direction (rad, x towards y) and a point of the line along which most change is collected in order."""
-    from vinetrack.video.axis_kernels import fan
-
     middle = np.array([x.mean(), y.mean()])
     bins = int(np.ceil(2 * diagonal / band)) + 3
     best, chosen = -1.0, (0.0, middle)
@@ -309,8 +306,6 @@ def _agreeing(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
 ) -> tuple[NDArray[np.bool_], Floats, Floats]:
     """Pixels that change when the best ordered path along a line passes them; and their places along and across."""
-    from vinetrack.video.axis_kernels import ordered_path
-
     along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
     across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
     place = ((along - float(along.min())) / 2).astype(int)
@@ -362,3 +357,48 @@ def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
     start, stop = max(start, low), min(stop, high)
     first, last = centre + start * along, centre + stop * along
     return Axis((float(first[0]), float(first[1])), (float(last[0]), float(last[1])), 2 * line.half * factor)
+
+
+@njit(cache=True)
+def fan(
+    along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
+) -> np.ndarray:
+    """What monotone paths collect in each band of two bins across, shape (bins − 1,)."""
+    table = np.zeros((bins, n_times, length // 4 + 1), np.float32)
+    for i in range(len(along)):
+        b = min(max(int(across[i]), 0), bins - 1)
+        table[b, int(time[i]), min(max(int(along[i] / 4), 0), length // 4)] += weight[i]
+    out = np.zeros(bins - 1)
+    best = np.zeros(length // 4 + 2)
+    for b in range(bins - 1):
+        best[:] = 0.0
+        for t in range(n_times):
+            for s in range(1, len(best)):
+                best[s] = max(best[s], best[s - 1] + table[b, t, s - 1] + table[b + 1, t, s - 1])
+        out[b] = best[-1]
+    return out
+
+
+@njit(cache=True)
+def ordered_path(table: np.ndarray) -> np.ndarray:
+    """Time at which a monotone path passes each place, for a table (n_times, n_places); NaN beyond its ends."""
+    n, places = table.shape
+    best = np.zeros((n, places + 1))
+    came = np.zeros((n, places + 1), np.uint8)
+    for t in range(n):
+        for s in range(places + 1):
+            best[t, s] = best[t - 1, s] if t > 0 else 0.0
+            if s > 0 and best[t, s - 1] + table[t, s - 1] > best[t, s]:
+                best[t, s] = best[t, s - 1] + table[t, s - 1]
+                came[t, s] = 1
+    passed = np.full(places, np.nan)
+    t, s = n - 1, places
+    while s > 0 and t >= 0:
+        if came[t, s] == 1:
+            passed[s - 1] = t
+            s -= 1
+        elif t > 0:
+            t -= 1
+        else:
+            break
+    return passed

@@ -14,14 +14,17 @@ from numpy.typing import NDArray
 
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
-from vinetrack.video.edge_bands import disagreement
-from vinetrack.video.edge_repair import ASTRAY_PX, FAINTEST, mend_jumps
+from vinetrack.video.edge_repair import ASTRAY_PX, FAINTEST, disagreement, mend_jumps
 from vinetrack.video.edge_state import (
+    ASSUMED_EXPOSURE,
     CLEAR_PX,
+    OPTICAL_BLUR_PX,
     EdgeState,
     blur_lengths,
     clear_of_start,
     core_frames,
+    find_exposure,
+    find_shape,
     fit_edges,
     moving_frames,
     repicture,
@@ -29,7 +32,6 @@ from vinetrack.video.edge_state import (
 )
 from vinetrack.video.growth_end import growth_end
 from vinetrack.video.strip import Strip
-from vinetrack.video.tip_shape import ASSUMED_EXPOSURE, OPTICAL_BLUR_PX, find_exposure, find_shape
 
 Floats = NDArray[np.float64]
 

@@ -211,7 +211,7 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
 
     try:
         if not orderly:
-            from vinetrack.video.arrival import track_arrival
+            from vinetrack.video.kymograph import track_arrival
 
             strip = cut_strip(luma, axis, min(8 * half, 0.3 * max(luma.shape[1:])))
             edge, sigma = track_arrival(strip)
