@@ -15,6 +15,7 @@ groups pays for each of them; a drift has one coefficient, fixed. All are compar
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -168,8 +169,18 @@ def between_fits(
         if fit is None:
             continue
         ratio = likelihood_ratio(found, (effect_of(one),), fit)
-        fitted.append(BetweenRatio(**{**vars(ratio), "difference": one}))
+        fitted.append(BetweenRatio(**{**vars(ratio), "difference": one, **_without_scatter(one, ratio)}))
     return fitted
+
+
+def _without_scatter(one: Difference, ratio: LikelihoodRatio) -> dict[str, float]:
+    """Significance and inflation of random effects of groups, which the scatter of trials cannot widen.
+
+    A coefficient that only the few trials of its group feel has a robust error that says nothing.
+    """
+    if not any(math.isfinite(term.prior_sd) for term in one.terms):
+        return {}
+    return {"sigma": math.copysign(math.sqrt(abs(ratio.delta_chi2)), ratio.delta_chi2), "inflation": 1.0}
 
 
 def effect_of(one: Difference) -> Effect:
@@ -259,7 +270,10 @@ def _forms(
 
 
 def _changes(found: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
-    """Where specimens are not stated: another tube of each vine from some trial on, where that gains most."""
+    """Where specimens are not stated: another tube of each vine from some trial on, or for each condition.
+
+    A tube for each condition can only be where replicates were made one after the other.
+    """
     if all(trial.specimen for trial in trials) or len(trials) < FEWEST_TRIALS:
         return []
     ranks, _ = trial_order(trials)
@@ -275,9 +289,18 @@ def _changes(found: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differ
             ways.append((gain, way))
         if ways:
             groups = max(ways, key=lambda one: one[0])[1]
-    if not any(groups):
-        return []
-    return _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
+    conditions = [trial.condition for trial in trials]
+    changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
+    if _in_turn(ranks, conditions):
+        changes += _forms(SPECIMEN, conditions, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
+    return changes
+
+
+def _in_turn(ranks: Floats, conditions: Sequence[str]) -> bool:
+    """Whether the replicates of every condition were made one after the other."""
+    ordered = [conditions[i] for i in np.argsort(ranks)]
+    changes = sum(one != other for one, other in itertools.pairwise(ordered))
+    return 1 < len(set(conditions)) == changes + 1 < len(conditions)
 
 
 def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
