@@ -1,0 +1,161 @@
+"""How much a difference between trials would gain, by the linear mixed model of a fit: no trajectory is simulated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.result import N_BY_VINE
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, deviance, estimate_spreads, marginal
+from vinetrack.inference.optimiser import Solution, make_problem
+from vinetrack.inference.parameters import BetweenTerm, ParameterMap, make_layout
+from vinetrack.inference.position_errors import with_shapes
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, Predictor
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One hypothesis that trials differ.
+
+    Parameters
+    ----------
+    name
+        Of `result.BETWEEN_SUMMARIES`.
+    terms, shared
+        What is fitted along, and parameters that are shared otherwise.
+    stated
+        Whether the sheet has the columns it goes by.
+    confounded
+        Whether it follows the conditions so closely that replicates cannot tell it from an effect of the conditions.
+    gain, p
+        Fall of −2 ln L by the linear estimate, and its chance where trials do not differ.
+    """
+
+    name: str
+    terms: tuple[BetweenTerm, ...] = ()
+    shared: Mapping[str, str] = field(default_factory=dict)
+    stated: bool = True
+    confounded: bool = True
+    gain: float = 0.0
+    p: float = 1.0
+
+
+def chance_of_gain(found: Fit, one: Difference, gain: float) -> float:
+    """Chance of such a gain where trials do not differ.
+
+    Of fixed coefficients by the F test with as many degrees of freedom as trials leave, LR = N ln(1 + q F / dof):
+    χ² would call too often where trials are few. Of random effects exp(gain / 2) is a Bayes factor B, and
+    P(B > 1/α) ≤ α by Markov's inequality.
+
+    Parameters
+    ----------
+    found
+        The fit without the difference.
+    one
+        The difference.
+    gain
+        Fall of −2 ln L.
+
+    Returns
+    -------
+    float
+        0 to 1.
+    """
+    from scipy.stats import f as fisher
+
+    if gain <= 0:
+        return 1.0
+    if any(math.isfinite(term.prior_sd) for term in one.terms):
+        return min(1.0, math.exp(-0.5 * gain))
+    trials = len(found.trials)
+    vines = len({trial.trial.vine for trial in found.trials})
+    extra = vines - 1 if one.name == N_BY_VINE else len(one.terms)
+    spare = max(trials - int(np.count_nonzero(found.predictor.layout.prior_precision == 0)) - extra, 1)
+    return float(fisher.sf(math.expm1(min(gain / trials, 500.0)) * spare / extra, extra, spare))
+
+
+def linear_gain(found: Fit, base: Solution, one: Difference, spread: tuple[float, float] | None = None) -> float:
+    """Fall of −2 ln L with a difference, from the sensitivities of the fit: no trajectory is simulated.
+
+    The deviation of a trial is a column of the linear mixed model already, so the columns of the coefficients are
+    multiples of it.
+
+    Parameters
+    ----------
+    found
+        The fit without the difference.
+    base
+        Its solution, smooth errors of position among its numbers where there are any.
+    one
+        The difference.
+    spread
+        Standard deviations of pressure and B from trial to trial; None to estimate them anew.
+
+    Returns
+    -------
+    float
+        Fall of −2 ln L.
+    """
+    grams, frame, state = _widened(found, base, one)
+    before = marginal(base.grams, base.frame, base.state)
+    part = marginal(grams, frame, state)
+    if spread is None:
+        old = estimate_spreads(before, base.frame, base.state, base.estimable, restricted=False)
+        new = estimate_spreads(part, frame, state, base.estimable, restricted=False)
+    else:
+        old = new = spread
+    plain = deviance(before, base.frame, base.state, old, restricted=False)
+    return plain - deviance(part, frame, state, new, restricted=False)
+
+
+def _widened(found: Fit, base: Solution, one: Difference) -> tuple[Floats, MixedProblem, FitState]:
+    """Cross products, problem and state of a solution with the coefficients of a difference added, all zero."""
+    old, state = found.predictor.layout, base.state
+    data, options = found.predictor.data, found.options
+    layout = make_layout(
+        old.model, data, fixed=options["fixed"], free=options["free"],
+        shared={**options["shared"], **one.shared}, between=(*old.between, *one.terms),
+    )  # fmt: skip
+    frame = make_problem(Predictor(layout, data, found.predictor.host), state.own)
+    frame = replace(frame, own_centre=base.frame.own_centre)
+    theta = layout.start
+    known = {number.name: number.outside(float(at)) for number, at in zip(old.free, state.theta, strict=False)}
+    for k, number in enumerate(layout.free):
+        value = known.get(number.name, known.get(number.key))
+        theta[k] = theta[k] if value is None else number.inside(value)
+    shapes = base.frame.index.shape[1] - len(old.keys)
+    if shapes:
+        frame, theta = with_shapes(frame, shapes), np.append(theta, state.theta[len(old.free) :])
+    turn = _turn(old, layout, shapes)
+    grams = np.einsum("nka,nckl,nlb->ncab", turn, base.grams, turn, optimize=True)
+    return grams, frame, replace(state, theta=theta)
+
+
+def _turn(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:
+    """What makes the columns of one layout those of another, shape (n_trials, n_columns before, n_columns after).
+
+    Columns are those of the trials' own numbers, the keys, the shapes of smooth errors, the residual.
+    """
+    count, size = len(old.keys), OWN + len(layout.keys) + shapes + 1
+    turn = np.zeros((len(layout.index), OWN + count + shapes + 1, size))
+    turn[:, range(OWN), range(OWN)] = 1.0
+    behind = np.arange(shapes + 1)
+    turn[:, OWN + count + behind, OWN + len(layout.keys) + behind] = 1.0
+    before_scale = np.array([number.scale for number in old.free] + [1.0])
+    scale = np.array([number.scale for number in layout.free] + [0.0])
+    logarithmic = np.array([number.logarithmic for number in layout.free] + [False])
+    for column, key in enumerate(layout.keys):
+        term, place = layout.term(key), layout.index[:, column]
+        if term is not None and key not in old.keys:
+            source = PRESSURE if term.pressure else DAMPING_DEVIATION
+            turn[:, source, OWN + column] = np.where(place >= 0, term.scale * term.regressor, 0.0)
+            continue
+        former = old.keys.index(key)
+        ratio = scale[place] / before_scale[old.index[:, former]]
+        turn[:, OWN + former, OWN + column] = np.where(logarithmic[place], 1.0, ratio)
+    return turn
