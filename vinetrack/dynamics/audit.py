@@ -27,6 +27,9 @@ DRAG_SHARE = 0.05
 PRESSURE_SHARE = 0.05
 LONG_M = 0.30
 BENT_RAD = math.radians(30)
+"""Published: the rules by which Alvarez et al. (2025) leave out drag, the fall of the reservoir's pressure, friction
+along the length and bends. They set which warnings are printed, and no fitted number; at half there are more, at
+twice fewer."""
 
 TENSION = "tail_tension"
 COLUMNS = (

@@ -28,14 +28,21 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FEWEST_PER_VINE = 3
+"""Points of a vine that enters the fit of a shared exponent. Derived: two fix its line exactly and show no scatter."""
+
 LEAST_FORCE_RATIO = 1.2
-"""Largest over smallest force that a vine must span for its slope to mean anything: below, 1 % of P is 0.1 of n."""
+"""Largest over smallest force that a vine must span. Derived: an error of 1 % in one force changes the slope d ln
+F/d ln v, n, by about 0.01 n/ln 1.2 = 0.05 n at each end, together 0.1 n; at 1.1 it would be 0.2 n, at 1.4 0.06 n."""
 
 LEAST_STEADY_SHARE = 0.5
-"""Part of a condition's trials that must be steady for any of them to enter a fit."""
+"""Part of a condition's trials that must be steady for any of them to enter a fit. Chosen: the majority; a condition
+where most trials are not steady has its steady ones by selection. At 0.25 such conditions count, at 1 every trial
+must be steady."""
 
 FEWEST_FOR_RESAMPLING = 10
-"""Below, resamples repeat so few points that their spread says little: intervals come from Student's t."""
+"""Below, resamples repeat so few points that their scatter says little: intervals come from Student's t. Chosen; at
+5 the bootstrap of few points is too narrow (its variance is (N − p)/N of the true one), at 20 more intervals are
+Student's."""
 
 
 @dataclass(frozen=True)

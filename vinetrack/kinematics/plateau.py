@@ -253,6 +253,8 @@ def trim(
 
 
 TRIM_SIGMAS = 2.5
+"""Standard errors by which an end of a window must leave its line of speed to be cut off. Chosen: 1.2 % by chance;
+at half steady windows are shortened by noise, at twice a start-up of twice the size stays in."""
 
 
 def _untidy_ends(

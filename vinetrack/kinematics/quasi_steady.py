@@ -22,23 +22,28 @@ from vinetrack.kinematics.release import Release
 INERTIA_LIMIT = 0.1
 """Largest part of the force that inertia may take, with its 95 % interval.
 
-It is counted in the force; but the mass of film is known to a few per cent, which leaves 0.3 % of the force at this
-limit.
-"""
+Chosen: it is counted in the force; but the mass of film is known to a few per cent, which leaves 0.3 % of the force
+at this limit."""
 
 LARGEST_CHANGE = 0.3
 """Largest change of speed across a window.
 
-It puts the mean of ẋⁿ off the power of the mean by n(n−1)/24 of its square, 0.09 %.
+Derived: it puts the mean of ẋⁿ off the power of the mean by n(n−1)/24 of its square, 0.09 %.
 """
 
 LAST_FRACTION = 0.95
-"""Part of the length up to which the mass of a bare vine is known well enough."""
+"""Part of the length up to which the mass of a bare vine is known well enough. Chosen: its film weighs 5 % of the whole
+there, and the gas, which is known less well, up to 10 %; nearer to the end the gas would outweigh the film."""
 
 PARTS = 3
+"""Parts of a window in each of which inertia is fitted. Chosen: beginning, middle and end."""
+
 FEWEST_POINTS = 4 * PARTS
-"""A quadratic in each part, with a point to spare."""
+"""Derived: a quadratic in each part, with a point to spare."""
+
 TRIED = 6
+"""Parts between whose ends all windows are tried. Chosen: 21 windows; at 3 a window may be a third shorter than it
+could be, at 12 there are 78 to fit."""
 
 
 def quasi_steady_window(

@@ -11,9 +11,19 @@ from vinetrack.core.records import Floats, Kinematics, Track, join_flags
 from vinetrack.tracks.position_noise import rest_points
 
 FEWEST_REST_POINTS = 3
+"""Points at rest that make a level. Chosen: two frames alike may be a slow start."""
+
 LIFTED_SIGMAS = 5.0
+"""Standard deviations of a position by which the track must leave its start to count as moving. Chosen: 6e-7 by
+chance for one point; at half it is 1 %, at twice only small creeping motions are called rest."""
+
 CLEAR_SIGMAS = 15.0
+"""Travel, in standard deviations of a position, at which motion is clear and from where its onset is sought backwards.
+Chosen: three times `LIFTED_SIGMAS`, so that points lie between; half and twice were not tried."""
+
 LONGEST_EXTRAPOLATION_FRAMES = 20
+"""Frames before the first that an extrapolated release may lie. Chosen: beyond, the first acceleration says little
+about what came before; at half and at twice fewer or more tracks without rest get an onset, all are marked so."""
 
 
 @dataclass(frozen=True)

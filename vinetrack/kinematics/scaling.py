@@ -16,10 +16,14 @@ import numpy as np
 from vinetrack.core.records import Floats
 
 ISOMETRIC_WITHIN = 0.05
-"""Vines whose t/D agree within this fraction count as scaled copies of each other: films are sold to ±5 %."""
+"""Vines whose t/D agree within this fraction count as scaled copies of each other. Chosen: films are sold to ±5 %."""
 
 SAME_WITHIN = 0.02
+"""Vines whose diameters agree within this fraction count as of one diameter. Chosen: well below the
+steps between sizes; half and twice were not tried."""
+
 FEWEST_VINES = 3
+"""Vines of a regression that states an error. Derived: two fix a line exactly."""
 
 
 def fit_scaling(damping: Mapping[str, Mapping[str, Any]], method: str = "both_axes") -> dict[str, Any]:

@@ -22,25 +22,27 @@ from vinetrack.kinematics.plateau import RangeExtremes, WindowMoments, chord_bou
 __all__ = ["gated_window", "paper_window", "user_window"]
 
 STEPS = 56
-"""Starts and ends tried in the first pass; the best is then moved point by point."""
+"""Starts and ends tried in the first pass; the best is then moved point by point. Chosen: all pairs of 56 are 1500
+windows; at half a short window may be missed, at twice it takes four times as long."""
 
 BAND = 0.5
-"""Half-width of the band that holds every velocity, in drift limits: a drift of the limit is half that each side."""
+"""Half-width of the band that holds every velocity, in drift limits. Derived: a drift of the limit is half that each
+side."""
 
 SHORTEST_SHARE = 0.1
-"""Least part of the motion that counts as steady. What speeds up evenly changes by 3 % within 3–4 % of its run: short
-enough a piece of anything looks steady."""
+"""Least part of the motion that counts as steady. Derived: what speeds up evenly changes by 3 % within 3–4 % of its
+run: short enough a piece of anything looks steady."""
 
 SHORTEST_FALL, FALLING = 0.02, 1 / 3
-"""Least part where the speed falls by more than a third of the limit: a vine slowing down with its supply or weight is
-in balance all the while, one that speeds up is not."""
+"""Least part where the speed falls by more than a third of the limit. Chosen: a vine slowing down with its supply or
+weight is in balance all the while, one that speeds up is not."""
 
 TRIM_BAND = 1 / 6
-"""The ends of a window keep to its line of speed within this many drift limits: a start-up of 1.5 % that decays over a
-tenth of the window would put the mean 0.15 % off the line."""
+"""The ends of a window keep to its line of speed within this many drift limits. Derived: a start-up of 1.5 % that
+decays over a tenth of the window would put the mean 0.15 % off the line."""
 
 BAND_SIGMAS = 4.0
-"""How many standard errors a single velocity may lie outside the band: 1 in 16 000 by chance."""
+"""How many standard errors a single velocity may lie outside the band. Chosen: 1 in 16 000 by chance."""
 
 
 def gated_window(

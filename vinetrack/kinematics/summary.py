@@ -26,6 +26,7 @@ from vinetrack.kinematics.velocity import estimate_kinematics
 from vinetrack.tracks.frame_timing import correct_frames
 
 FEWEST_POINTS = 5
+"""Points of a track from which motion is computed: the narrowest window of `vinetrack.kinematics.velocity`, derived."""
 
 
 class TrialError(ValueError):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SAME_SETTING_WITHIN = 0.01
-"""Pressures and payloads that agree within this fraction count as the same: gauges are read to a per cent."""
+"""Pressures and payloads that agree within this fraction count as the same. Chosen: gauges are read to a per cent."""
 
 SIZES = {"thickness_um": "wall", "diameter_mm": "diameter"}
 EFFICIENCIES = ("efficiency", "efficiency_payload", "efficiency_with_weight")

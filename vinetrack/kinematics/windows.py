@@ -18,10 +18,11 @@ Indices = NDArray[np.int_]
 Mask = NDArray[np.bool_]
 
 EVEN_TOLERANCE = 0.01
-"""Spacings within this fraction of their median count as even: printed times are rounded."""
+"""Spacings within this fraction of their median count as even. Chosen: printed times are rounded."""
 
 MISFIT_TERMS = 4
-"""Further orthogonal polynomials that must be absent from the residuals: what a corner or an unseen wave leaves."""
+"""Further orthogonal polynomials that must be absent from the residuals. Chosen: what a corner or an unseen wave
+leaves."""
 
 
 @dataclass(frozen=True)
