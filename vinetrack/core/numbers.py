@@ -16,12 +16,31 @@ _MOST_DECIMALS = 12
 
 
 def decimals(sigma: float) -> int:
-    """Return how many decimals show two digits of an error, at most 12; 0 for an error that is 0 or NaN."""
+    """Return how many decimals show two digits of an error, at most 12; 0 for an error that is 0 or NaN.
+
+    Parameters
+    ----------
+    sigma : an error, in the unit in which it is shown.
+
+    Returns
+    -------
+    decimals : int, 0 to 12.
+    """
     return min(max(1 - math.floor(math.log10(sigma)), 0), _MOST_DECIMALS) if 0 < sigma < math.inf else 0
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Return `value` to `digits` significant digits, without exponent from 0.0001 to 999999; "–" for None and NaN."""
+    """Return `value` to `digits` significant digits, without exponent from 0.0001 to 999999; "–" for None and NaN.
+
+    Parameters
+    ----------
+    value : what is shown; None and NaN are unknown.
+    digits : significant digits.
+
+    Returns
+    -------
+    text
+    """
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -34,6 +53,14 @@ def number(value: float | None, digits: int = 3) -> str:
 
 def with_error(value: float | None, sigma: float | None) -> str:
     """Return `value ± sigma`, the error to two significant digits and the value to the same decimal.
+
+    Parameters
+    ----------
+    value, sigma : a number and its standard error, in the same unit; None and NaN are unknown.
+
+    Returns
+    -------
+    text : the value alone where the error is unknown or 0.
 
     >>> with_error(0.36981, 0.0123)
     '0.370 ± 0.012'
@@ -49,7 +76,16 @@ def with_error(value: float | None, sigma: float | None) -> str:
 
 
 def interval(bounds: Sequence[float | None] | None) -> str:
-    """Return `(low, high)` as "low to high", both to the decimal that its width allows; "–" where unknown."""
+    """Return `(low, high)` as "low to high", both to the decimal that its width allows; "–" where unknown.
+
+    Parameters
+    ----------
+    bounds : low and high, in the same unit; None where unknown.
+
+    Returns
+    -------
+    text
+    """
     if bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
         return "–"
     low, high = (float(bound) for bound in bounds if bound is not None)
@@ -59,7 +95,16 @@ def interval(bounds: Sequence[float | None] | None) -> str:
 
 
 def half_width(bounds: Sequence[float | None] | None) -> float:
-    """Return half the width of an interval, NaN where it is unknown."""
+    """Return half the width of an interval, NaN where it is unknown.
+
+    Parameters
+    ----------
+    bounds : low and high, in the same unit; None where unknown.
+
+    Returns
+    -------
+    half the width, in that unit; NaN where unknown.
+    """
     if bounds is None or any(bound is None for bound in bounds):
         return math.nan
     low, high = (float(bound) for bound in bounds if bound is not None)

@@ -68,6 +68,15 @@ class ExperimentError(UserError):
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     """Say the problems in at most `limit` lines, errors first; where there are more, the last line says how many.
 
+    Parameters
+    ----------
+    problems : in any order.
+    limit : lines at most.
+
+    Returns
+    -------
+    lines : errors first.
+
     >>> format_problems([Problem(message="is blank", column=f"c{i}") for i in range(4)], limit=3)
     ['error: c0 is blank', 'error: c1 is blank', '… and 2 more (2 errors, 0 warnings)']
     """

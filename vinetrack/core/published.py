@@ -93,6 +93,14 @@ PSI_KPA = 6.894757293168361
 def scale_of(diameter_mm: float, thickness_um: float) -> int | None:
     """Scale R of the vine of Table I of this size, to one per cent; None for any other.
 
+    Parameters
+    ----------
+    diameter_mm, thickness_um : of the vine.
+
+    Returns
+    -------
+    R, or None.
+
     >>> scale_of(12.0, 100.0), scale_of(12.0, 50.0)
     (2, None)
     """

@@ -115,7 +115,16 @@ class Trial:
         return self.linear_density_kg_m * (self.travel_ratio - 1) / self.travel_ratio
 
     def moving_mass_kg(self, lead_travel_m: Floats | float) -> Floats:
-        """Mass of tail and payload m = λL + m_pay − c·x after `lead_travel_m` of growth (x = r·y), never negative."""
+        """Mass of tail and payload m = λL + m_pay − c·x after `lead_travel_m` of growth (x = r·y), never negative.
+
+        Parameters
+        ----------
+        lead_travel_m : array of any shape, m: growth since release.
+
+        Returns
+        -------
+        array of that shape, kg.
+        """
         length_m = self.length_m if math.isfinite(self.length_m) else 0.0
         film_kg = self.linear_density_kg_m * length_m
         tail_travel_m = self.travel_ratio * np.asarray(lead_travel_m, dtype=float)

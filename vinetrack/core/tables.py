@@ -63,6 +63,15 @@ class Table:
     def numbers(self, column: str, *, blank_is_nan: bool = False) -> NDArray[np.float64]:
         """A column as numbers, shape (n_rows,); blank cells are NaN if `blank_is_nan`, else refused.
 
+        Parameters
+        ----------
+        column : its name in the header.
+        blank_is_nan : whether blank cells are NaN, not errors.
+
+        Returns
+        -------
+        array, shape (n_rows,), in the unit of the column.
+
         Raises
         ------
         TableError
@@ -92,6 +101,15 @@ def parse_number(text: str, decimal: str = ".") -> float:
     """Read one number strictly: ASCII digits, at most one decimal mark (point or comma), an exponent, nothing else.
 
     `decimal` ("." or ",", or "" for unknown) only settles what 1,069 and 1.069 are.
+
+    Parameters
+    ----------
+    text : one cell.
+    decimal : the decimal mark of the file, or blank where it is unknown.
+
+    Returns
+    -------
+    the number.
 
     Raises
     ------
@@ -125,6 +143,14 @@ def parse_number(text: str, decimal: str = ".") -> float:
 def decode_text(data: bytes) -> str:
     r"""Text of a file in UTF-8, UTF-16 or UTF-32 with BOM, UTF-8 without, or else cp1252; line ends become `\n`.
 
+    Parameters
+    ----------
+    data : the bytes of a file.
+
+    Returns
+    -------
+    its text.
+
     >>> decode_text("µ\r\n".encode("cp1252")), decode_text("µ".encode("utf-16"))
     ('µ\n', 'µ')
     """
@@ -144,6 +170,14 @@ def decode_text(data: bytes) -> str:
 
 def read_text(path: Path) -> str:
     """Decoded text of a file of at most `LARGEST_TABLE_BYTES`.
+
+    Parameters
+    ----------
+    path : the file.
+
+    Returns
+    -------
+    its text, decoded; see `decode_text`.
 
     Raises
     ------
@@ -166,6 +200,14 @@ def read_text(path: Path) -> str:
 def read_table(path: Path) -> Table:
     """Read a CSV file whose first line (after blank ones) is the header.
 
+    Parameters
+    ----------
+    path : the file.
+
+    Returns
+    -------
+    table : cells as text.
+
     Raises
     ------
     TableError
@@ -176,6 +218,15 @@ def read_table(path: Path) -> Table:
 
 def parse_table(text: str, skip_lines: int = 0) -> Table:
     r"""Read the text of a CSV; `skip_lines` lines stand before its header.
+
+    Parameters
+    ----------
+    text : content of a CSV.
+    skip_lines : lines that stand before the header.
+
+    Returns
+    -------
+    table : cells as text.
 
     >>> table = parse_table("trial; pressure_kPa\n a ;28,5\n;\n\n")
     >>> table.rows, table.lines, table.decimal
@@ -256,6 +307,15 @@ def safe_join(folder: Path, relative: str) -> Path:
 
     Windows' backslashes count as slashes.
 
+    Parameters
+    ----------
+    folder : the folder that must not be left.
+    relative : what the sheet or the settings say.
+
+    Returns
+    -------
+    the path, inside `folder` by its text.
+
     Raises
     ------
     TableError
@@ -291,6 +351,16 @@ def safe_join(folder: Path, relative: str) -> Path:
 def result_file(folder: Path, name: str, suffix: str) -> Path:
     """Path of a result named after a trial, vine or condition; a name that could leave `folder` is refused.
 
+    Parameters
+    ----------
+    folder : where the file goes.
+    name : of a trial, vine or condition.
+    suffix : with its dot.
+
+    Returns
+    -------
+    the path.
+
     >>> result_file(Path("results/demo/tracks"), "v1-a", ".csv").as_posix()
     'results/demo/tracks/v1-a.csv'
     """
@@ -315,13 +385,25 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a whole file or none."""
+    """Write a whole file or none.
+
+    Parameters
+    ----------
+    path : the file; its folder is made where it is missing.
+    data : the whole content.
+    """
     with replacing(path) as temporary:
         temporary.write_bytes(data)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a whole file or none, in UTF-8; line ends stay as they are."""
+    """Write a whole file or none, in UTF-8; line ends stay as they are.
+
+    Parameters
+    ----------
+    path : the file.
+    text : the whole content.
+    """
     write_bytes(path, text.encode("utf-8"))
 
 
@@ -329,6 +411,11 @@ def write_csv(path: Path, frame: pd.DataFrame) -> None:
     """Write a table with its header as first line; missing numbers are `NaN`, missing text is blank.
 
     Floats are written with all digits needed to read back the same value.
+
+    Parameters
+    ----------
+    path : the file.
+    frame : the table, units in the names of its columns.
     """
     text_columns = frame.columns[[dtype.kind not in "fiub" for dtype in frame.dtypes]]
     filled = frame.astype(dict.fromkeys(text_columns, object))
@@ -337,7 +424,13 @@ def write_csv(path: Path, frame: pd.DataFrame) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON with NaN and infinities as `null`, arrays as lists and paths as text."""
+    """Write JSON with NaN and infinities as `null`, arrays as lists and paths as text.
+
+    Parameters
+    ----------
+    path : the file.
+    content : mappings, lists, numbers, text, arrays and paths.
+    """
     write_text(path, json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 

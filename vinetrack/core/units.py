@@ -103,6 +103,14 @@ def display_unit(unit: str, table: Mapping[str, tuple[str, float]] = DISPLAY_UNI
 def split_unit(name: str) -> tuple[str, str]:
     """Split a name into what it names and the key of its unit, which is blank where it ends in none.
 
+    Parameters
+    ----------
+    name : of a column, key or option.
+
+    Returns
+    -------
+    quantity, unit : the unit as a key of `UNITS`.
+
     >>> split_unit("yield_pressure_kPa"), split_unit("film_density_kg_m3"), split_unit("bends")
     (('yield_pressure', 'kPa'), ('film_density', 'kg_m3'), ('bends', ''))
     """
@@ -115,6 +123,15 @@ def split_unit(name: str) -> tuple[str, str]:
 
 def convert(value: float, unit: str, to: str) -> float:
     """Return a value in another unit of the same quantity.
+
+    Parameters
+    ----------
+    value : a number in `unit`.
+    unit, to : keys of `UNITS`.
+
+    Returns
+    -------
+    the number in `to`.
 
     Raises
     ------

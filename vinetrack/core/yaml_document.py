@@ -50,6 +50,14 @@ _Loader.add_constructor("tag:vinetrack,number", _construct_number)
 def read_yaml(path: Path) -> YamlDocument:
     """Read a YAML file that holds one mapping; an empty file is an empty mapping.
 
+    Parameters
+    ----------
+    path : the file.
+
+    Returns
+    -------
+    document : its content, and the line of every key.
+
     Raises
     ------
     ExperimentError
@@ -65,6 +73,15 @@ def read_yaml(path: Path) -> YamlDocument:
 
 def parse_yaml(text: str, file: str) -> YamlDocument:
     r"""Parse YAML text; see `read_yaml`.
+
+    Parameters
+    ----------
+    text : YAML.
+    file : its name, for messages.
+
+    Returns
+    -------
+    document : its content, and the line of every key.
 
     >>> parse_yaml("steady: 10:20\ncapture_fps: 1e3", "experiment.yaml").content
     {'steady': '10:20', 'capture_fps': 1000.0}
@@ -129,6 +146,17 @@ def with_list(text: str, key: str, values: Sequence[str], file: str = "experimen
 
     A list that stands in brackets on one line stays so, one with a line for each value too; a comment behind the value
     or between its lines stays. The key is added at the end where there is none.
+
+    Parameters
+    ----------
+    text : YAML.
+    key : a key of the first level.
+    values : words of letters, digits and underscores.
+    file : its name, for messages.
+
+    Returns
+    -------
+    the text, changed.
 
     Raises
     ------

@@ -32,6 +32,16 @@ class CellError(ValueError):
 def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
     """Value of a cell that is not blank, in the unit of its column.
 
+    Parameters
+    ----------
+    column : what the cell is in.
+    text : the cell, without blanks around it.
+    decimal : the decimal mark of the file.
+
+    Returns
+    -------
+    a number, a pair, bends in metres, a truth value or text, by the kind of the column.
+
     Raises
     ------
     CellError
@@ -39,6 +49,7 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
 
     Examples
     --------
+    >>> from vinetrack.experiment.schema import COLUMNS
     >>> read_cell(COLUMNS["pressure_kPa"], "28"), read_cell(COLUMNS["steady"], "0.05:0.2")
     (28.0, (0.05, 0.2))
     >>> try:
@@ -65,7 +76,17 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
 
 
 def check_number(column: Column, value: float) -> float:
-    """The value itself, if its column allows it; see `read_cell`."""
+    """The value itself, if its column allows it; see `read_cell`.
+
+    Parameters
+    ----------
+    column : what the number is in.
+    value : in the unit of the column.
+
+    Returns
+    -------
+    the value, if it is allowed.
+    """
     if column.kind == "choice":
         if value not in (column.low, column.high):
             raise CellError("is not a travel ratio", "2 for eversion, 1 for a body that moves as a whole")
@@ -78,7 +99,17 @@ def check_number(column: Column, value: float) -> float:
 
 
 def oddity(column: Column, value: float) -> str:
-    """Why a legal value is suspicious, or blank. Zero never is: it is written on purpose."""
+    """Why a legal value is suspicious, or blank. Zero never is: it is written on purpose.
+
+    Parameters
+    ----------
+    column : what the number is in.
+    value : in the unit of the column.
+
+    Returns
+    -------
+    the hint of the column, or blank.
+    """
     return "" if value == 0 or column.usual[0] <= value <= column.usual[1] else column.unusual_hint
 
 

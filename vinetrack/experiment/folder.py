@@ -82,6 +82,10 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     strict
         Whether a fault of one row is a fault of the whole; None leaves it to `strict` in the settings.
 
+    Returns
+    -------
+    experiment : trials in SI units, those that failed, and every problem that was found.
+
     Raises
     ------
     ExperimentError
@@ -275,6 +279,15 @@ def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> l
     """Every problem of an experiment that can be found in seconds: sheet, settings, tracks, and that videos exist.
 
     `open_videos` may look into the recordings that are there, and the calibration; see `vinetrack.video.survey`.
+
+    Parameters
+    ----------
+    folder : the experiment's folder.
+    open_videos : looks into the recordings and the calibration; None leaves them closed.
+
+    Returns
+    -------
+    problems : of the sheet first, in the order of its rows.
     """
     try:
         experiment = read_experiment(folder, strict=False)

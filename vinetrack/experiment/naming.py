@@ -19,6 +19,14 @@ def with_names(trials: Sequence[Trial]) -> tuple[Trial, ...]:
     Pressure and payload are always part of a condition's name; other physical settings only where they differ within
     the experiment (the yield pressure, which belongs to a vine, where it differs within one vine). Settings that agree
     to six digits count as the same.
+
+    Parameters
+    ----------
+    trials : all of an experiment.
+
+    Returns
+    -------
+    the trials, in the same order.
     """
     shown = [further for further in _FURTHER if len({further(trial) for trial in trials}) > 1]
     yields: dict[str, set[str]] = {}

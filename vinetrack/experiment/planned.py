@@ -54,6 +54,16 @@ def planned_trial(
 
     A yield pressure that is not given is NaN. What is wrong is said of the option.
 
+    Parameters
+    ----------
+    values : texts by column, in the unit of the column.
+    settings : what the trial shares with others; None for the defaults.
+    needed : columns without which nothing can be predicted.
+
+    Returns
+    -------
+    planned : the one trial, and warnings.
+
     Raises
     ------
     ExperimentError
@@ -73,6 +83,14 @@ def planned_sheet(path: Path) -> Planned:
     """The conditions of an experiment folder, or of a sheet by itself, whether filmed or not.
 
     Rows of the same nominal settings are one condition, named after the first; rows with `use: no` are passed over.
+
+    Parameters
+    ----------
+    path : an experiment's folder, or a sheet.
+
+    Returns
+    -------
+    planned : a trial for each condition, and warnings.
 
     Raises
     ------

@@ -375,6 +375,14 @@ LIMITED = {kind: tuple(name for name in COLUMNS if COLUMNS[name].limit == kind) 
 def column_in_other_unit(name: str) -> tuple[Column, str] | None:
     """The column that a name in another unit stands for, and that unit; None where it stands for none.
 
+    Parameters
+    ----------
+    name : of a column that no sheet has.
+
+    Returns
+    -------
+    column, unit : the unit as a key of `UNITS`; or None.
+
     >>> column, unit = column_in_other_unit("pressure_psi")
     >>> column.name, unit
     ('pressure_kPa', 'psi')
@@ -389,6 +397,14 @@ def column_in_other_unit(name: str) -> tuple[Column, str] | None:
 
 def option(column: str) -> str:
     """The command line's option for a column of the sheet.
+
+    Parameters
+    ----------
+    column : its name.
+
+    Returns
+    -------
+    the option, with its dashes.
 
     >>> option("pressure_kPa")
     '--pressure-kPa'

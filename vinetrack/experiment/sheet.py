@@ -64,7 +64,18 @@ class Row:
 
 
 def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
-    """Read one row of the sheet, shared settings filled in where its cells are blank, and judge every cell."""
+    """Read one row of the sheet, shared settings filled in where its cells are blank, and judge every cell.
+
+    Parameters
+    ----------
+    table : the sheet, in the units of its columns.
+    index : of the row.
+    settings : what all trials share.
+
+    Returns
+    -------
+    row : values in the unit of each column, and problems.
+    """
     cells, line = table.rows[index], table.lines[index]
     row = Row(cells.get("trial", f"line-{line}"), line)
     _judge_name(row)
@@ -91,6 +102,11 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
 
 def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
     """Columns in other units, such as `pressure_psi` or `diameter_in`, as the columns that they stand for.
+
+    Parameters
+    ----------
+    table : the sheet as it is written.
+    file : its name, for messages.
 
     Returns
     -------
@@ -138,7 +154,17 @@ def _converted(cell: str, unit: str, column: Column, decimal: str) -> str:
 
 
 def unknown_columns(table: Table, file: str) -> list[Problem]:
-    """A warning for every column that no trial sheet has, with the nearest that it may have meant."""
+    """A warning for every column that no trial sheet has, with the nearest that it may have meant.
+
+    Parameters
+    ----------
+    table : the sheet.
+    file : its name, for messages.
+
+    Returns
+    -------
+    problems : warnings, one a column.
+    """
     problems = []
     for name in table.columns:
         if name not in COLUMNS:
@@ -249,7 +275,18 @@ def judge_pressures(row: Row) -> None:
 
 
 def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
-    """The trial of a row that has no errors and a pressure, in SI units, with the defaults of the documentation."""
+    """The trial of a row that has no errors and a pressure, in SI units, with the defaults of the documentation.
+
+    Parameters
+    ----------
+    row : without errors.
+    folder : of the experiment, for its paths.
+    settings : what all trials share.
+
+    Returns
+    -------
+    trial : SI units; NaN where the sheet is blank and nothing else is stated.
+    """
     values: dict[str, Any] = dict(row.values)
     pressure_kPa = values.setdefault("pressure_kPa", 0.0)
     values.setdefault("pressure_sigma_kPa", PRESSURE_SIGMA * pressure_kPa)

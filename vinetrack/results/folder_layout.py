@@ -254,6 +254,14 @@ class Results:
 def read_result(path: Path) -> pd.DataFrame:
     """Read a table that a stage wrote: text stays text, numbers are floats, truth values are bool.
 
+    Parameters
+    ----------
+    path : a CSV of a results folder.
+
+    Returns
+    -------
+    table : in the units of its columns.
+
     Raises
     ------
     ResultsError
@@ -281,7 +289,16 @@ def read_result(path: Path) -> pd.DataFrame:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON file that a stage wrote; see `read_result`."""
+    """Read a JSON file that a stage wrote; see `read_result`.
+
+    Parameters
+    ----------
+    path : a JSON file of a results folder.
+
+    Returns
+    -------
+    content : SI units; None where a number is not known.
+    """
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -292,7 +309,16 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def empty_table(columns: tuple[str, ...]) -> pd.DataFrame:
-    """A table with its header alone."""
+    """A table with its header alone.
+
+    Parameters
+    ----------
+    columns : names, in order.
+
+    Returns
+    -------
+    table : without rows, text and numbers typed as `read_result` has them.
+    """
     import pandas as pd
 
     return pd.DataFrame({column: pd.Series(dtype=object if column in TEXT_COLUMNS else float) for column in columns})
