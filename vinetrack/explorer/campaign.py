@@ -64,7 +64,16 @@ class AlignedTrial:
         return self.data.lead_position_m - self.origin_m
 
     def counts_from(self, release_s: float) -> int:
-        """Return the first frame where a model with this release or the measurement moves: rest dilutes an error."""
+        """Return the first frame where a model with this release or the measurement moves: rest dilutes an error.
+
+        Parameters
+        ----------
+        release_s : of the model, on the clock of the track.
+
+        Returns
+        -------
+        int, place among the frames of the trial
+        """
         released = int(np.searchsorted(self.data.time_s, release_s))
         return min(released, max(self.data.n_rest - 1, 0), self.data.time_s.size - 1)
 
@@ -132,11 +141,29 @@ class Campaign:
         return host_for(Model(()), self.effects.values())
 
     def of_condition(self, condition: str) -> list[int]:
-        """Places of the trials of a condition among `trials`."""
+        """Places of the trials of a condition among `trials`.
+
+        Parameters
+        ----------
+        condition : its name.
+
+        Returns
+        -------
+        list of int
+        """
         return [i for i, seen in enumerate(self.trials) if seen.condition == condition]
 
     def trial(self, name: str) -> AlignedTrial:
-        """The trial of that name; KeyError where there is none."""
+        """The trial of that name; KeyError where there is none.
+
+        Parameters
+        ----------
+        name : of the trial.
+
+        Returns
+        -------
+        AlignedTrial
+        """
         return {seen.name: seen for seen in self.trials}[name]
 
 
@@ -147,6 +174,10 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     ----------
     user_effects
         The user's own effects, see `vinetrack.pipeline.effects_stage.effects_of`.
+
+    Returns
+    -------
+    Campaign
 
     Raises
     ------
@@ -242,6 +273,14 @@ def _unusable(effects: Any, trials: list[Trial]) -> dict[str, str]:
 
 def condition_labels(conditions: Mapping[str, Trial]) -> dict[str, str]:
     """A label for each condition, of those settings in which the trials of the experiment differ.
+
+    Parameters
+    ----------
+    conditions : one trial of each condition, by its name.
+
+    Returns
+    -------
+    dict, the label by the name of the condition
 
     >>> a, b = Trial(name="a", diameter_m=0.012, pressure_Pa=24e3), Trial(name="b", diameter_m=0.012, pressure_Pa=30e3)
     >>> condition_labels({"one": a, "two": b})

@@ -59,19 +59,48 @@ class Choice:
         return effect in self.effects
 
     def with_effect(self, effect: str, wanted: bool = True) -> Choice:
-        """With an effect put in (at the end) or taken out; its sizes are kept for when it comes back."""
+        """With an effect put in (at the end) or taken out; its sizes are kept for when it comes back.
+
+        Parameters
+        ----------
+        effect : its name.
+        wanted : False takes it out.
+
+        Returns
+        -------
+        Choice
+        """
         if wanted == (effect in self.effects):
             return self
         kept = tuple(name for name in self.effects if name != effect)
         return replace(self, effects=(*kept, effect) if wanted else kept)
 
     def with_size(self, name: str, value: float) -> Choice:
-        """With one number, SI, at another size."""
+        """With one number, SI, at another size.
+
+        Parameters
+        ----------
+        name : `effect.parameter`, with `[vine]` where each vine has its own.
+        value : SI.
+
+        Returns
+        -------
+        Choice
+        """
         return replace(self, numbers={**self.numbers, name: value})
 
 
 def first_choice(campaign: Campaign) -> Choice:
-    """The model in use at the sizes that were fitted, everything else at its default."""
+    """The model in use at the sizes that were fitted, everything else at its default.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+
+    Returns
+    -------
+    Choice
+    """
     numbers = {
         size.name: size.parameter.default
         for effect in campaign.effects.values()
@@ -81,7 +110,18 @@ def first_choice(campaign: Campaign) -> Choice:
 
 
 def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[Size]:
-    """The sliders of an effect: one a number, or one a vine where each has its own; ranges hold the present value."""
+    """The sliders of an effect: one a number, or one a vine where each has its own; ranges hold the present value.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    effect : whose parameters are listed.
+    numbers : present values by name, SI.
+
+    Returns
+    -------
+    list of Size
+    """
     sizes = []
     for parameter in effect.parameters:
         for vine in campaign.vines if parameter.shared == "vine" else ("",):
@@ -93,6 +133,15 @@ def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -
 
 def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, float]:
     """From where to where a slider goes: what is plausible, the size at which it vanishes, and the value it has.
+
+    Parameters
+    ----------
+    key : `effect.parameter`.
+    value : present value, SI.
+
+    Returns
+    -------
+    low, high : float, SI
 
     >>> slider_range("x.k", Parameter("k", "k", "1", 1.0, bounds=(0.0, 9.0), plausible=(0.0, 3.0)), 5.0)
     (0.0, 6.25)
@@ -108,7 +157,17 @@ def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, f
 
 
 def sized(campaign: Campaign, choice: Choice) -> SizedModel:
-    """The model that was chosen, ready to be followed."""
+    """The model that was chosen, ready to be followed.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    choice : effects and sizes.
+
+    Returns
+    -------
+    SizedModel
+    """
     effects = tuple(campaign.effects[name] for name in choice.effects)
     values: dict[str, Value] = {}
     for effect in effects:
@@ -124,12 +183,31 @@ def sized(campaign: Campaign, choice: Choice) -> SizedModel:
 
 
 def can_leave(effect: str) -> bool:
-    """Whether an effect may be taken out: the base effects are what all others are added to."""
+    """Whether an effect may be taken out: the base effects are what all others are added to.
+
+    Parameters
+    ----------
+    effect : its name.
+
+    Returns
+    -------
+    bool
+    """
     return effect not in BASE_EFFECTS
 
 
 def changed(campaign: Campaign, choice: Choice) -> tuple[list[str], list[str]]:
-    """Effects added to the model in use, and those taken out of it."""
+    """Effects added to the model in use, and those taken out of it.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    choice : effects and sizes.
+
+    Returns
+    -------
+    added, dropped : list of str, against the model in use
+    """
     added = [name for name in choice.effects if name not in campaign.in_use]
     dropped = [name for name in campaign.in_use if name not in choice.effects]
     return added, dropped
@@ -146,6 +224,10 @@ def chosen(
         Names of effects.
     sizes
         `effect.parameter=value` or `effect.parameter[vine]=value`, SI; the effect is put in.
+
+    Returns
+    -------
+    Choice
 
     Raises
     ------

@@ -41,6 +41,15 @@ class ExploreOptions:
 def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
     """A results folder with the experiment it was made from.
 
+    Parameters
+    ----------
+    folder : the results.
+    experiment : its folder where it has moved.
+
+    Returns
+    -------
+    Campaign
+
     Raises
     ------
     ResultsError
@@ -58,6 +67,13 @@ def open_campaign(folder: Path, experiment: Path | None = None) -> Campaign:
 
 def explore(folder: Path, experiment: Path | None, wanted: ExploreOptions, say: Callable[[str], None]) -> None:
     """Serve the page, or do what was asked for and say what came of it.
+
+    Parameters
+    ----------
+    folder : the results.
+    experiment : its folder where it has moved.
+    wanted : the options of the command.
+    say : prints a line.
 
     Raises
     ------
@@ -113,7 +129,18 @@ def _without_a_page(
 
 
 def error_lines(campaign: Campaign, choice: Choice, now: dict[str, float], before: dict[str, float]) -> list[str]:
-    """The error of every condition before and now beside what replicates differ by, aligned, with units."""
+    """The error of every condition before and now beside what replicates differ by, aligned, with units.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    choice : effects and sizes.
+    now, before : errors by condition, m.
+
+    Returns
+    -------
+    list of str
+    """
     from vinetrack.core.terminal import table
     from vinetrack.explorer.curves import overall_m
     from vinetrack.explorer.export import model_words

@@ -70,7 +70,16 @@ class EffectRow:
         self.root = Column(children=[self.tick, words(about), *pairs], sizing_mode="stretch_width", margin=(0, 0, 4, 0))
 
     def value(self, k: int) -> float:
-        """SI value of a slider."""
+        """SI value of a slider.
+
+        Parameters
+        ----------
+        k : place of the slider.
+
+        Returns
+        -------
+        float, SI
+        """
         return float(self.sliders[k].value) / self.sizes[k].shown[1]
 
 
@@ -161,7 +170,14 @@ class EffectPanel:
         return heard
 
     def show(self, choice: Choice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
-        """Set ticks and, where wanted, sliders to a choice; beside each number what a fit found of it."""
+        """Set ticks and, where wanted, sliders to a choice; beside each number what a fit found of it.
+
+        Parameters
+        ----------
+        choice : effects and sizes.
+        fitted : the fit whose numbers stand beside the sliders; None for none.
+        sliders : whether they are moved too.
+        """
         self._quiet = True
         try:
             for name, row in self.rows.items():
@@ -263,7 +279,12 @@ class Chooser:
         self._conditions.active = []
 
     def toggle(self, condition: str) -> None:
-        """Choose this condition alone; where it is alone already, all of them again."""
+        """Choose this condition alone; where it is alone already, all of them again.
+
+        Parameters
+        ----------
+        condition : its name.
+        """
         place = self.campaign.conditions.index(condition)
         alone = self._conditions.active == [place]
         self._conditions.active = list(range(len(self.campaign.conditions))) if alone else [place]

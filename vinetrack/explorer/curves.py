@@ -71,7 +71,16 @@ class ModelCurves:
         return math.sqrt(self.mean_square_m2)
 
     def lead_position_m(self, time_s: Floats) -> Floats:
-        """Position on the track's ruler at instants of the track's clock; NaN beyond what was simulated."""
+        """Position on the track's ruler at instants of the track's clock; NaN beyond what was simulated.
+
+        Parameters
+        ----------
+        time_s : instants, any shape.
+
+        Returns
+        -------
+        array of the same shape, m
+        """
         since = time_s - self.release_s
         return self.origin_m + np.interp(since, self.path_s, self.path_m, right=math.nan)
 
@@ -87,6 +96,12 @@ def follow(campaign: Campaign, sized: SizedModel, before: Curves | None = None) 
     ----------
     before
         Curves whose releases the alignment starts from; by default those of the comparison.
+    campaign : the trials.
+    sized : model, sizes and yield pressures.
+
+    Returns
+    -------
+    tuple of ModelCurves, one a trial
 
     Raises
     ------
@@ -112,7 +127,17 @@ def follow(campaign: Campaign, sized: SizedModel, before: Curves | None = None) 
 
 
 def with_yield(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
-    """The trial with the yield pressure that a fit found for its vine, where it found one."""
+    """The trial with the yield pressure that a fit found for its vine, where it found one.
+
+    Parameters
+    ----------
+    trial : as the sheet has it.
+    yield_Pa : fitted yield pressures by name of trial.
+
+    Returns
+    -------
+    Trial
+    """
     return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
 
 
@@ -164,7 +189,17 @@ def _step(slope: Floats, left: Floats, *, free_origin: bool) -> tuple[float, flo
 
 
 def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
-    """Root mean square position error by condition, m; its trials count alike, however many frames they have."""
+    """Root mean square position error by condition, m; its trials count alike, however many frames they have.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    curves : of the model.
+
+    Returns
+    -------
+    dict, m by condition
+    """
     return {
         condition: math.sqrt(float(np.mean([curves[i].mean_square_m2 for i in campaign.of_condition(condition)])))
         for condition in campaign.conditions
@@ -172,13 +207,33 @@ def errors_m(campaign: Campaign, curves: Curves) -> dict[str, float]:
 
 
 def overall_m(errors: Mapping[str, float], conditions: Sequence[str]) -> float:
-    """Root mean square over conditions, m; NaN over none. Conditions whose error is not known are passed over."""
+    """Root mean square over conditions, m; NaN over none. Conditions whose error is not known are passed over.
+
+    Parameters
+    ----------
+    errors : m by condition; NaN where unknown.
+    conditions : those that count.
+
+    Returns
+    -------
+    float, m
+    """
     known = [errors[name] for name in conditions if math.isfinite(errors.get(name, math.nan))]
     return math.sqrt(float(np.mean(np.square(known)))) if known else math.nan
 
 
 def yields_of(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, float]:
-    """Yield pressures, Pa, by trial, from those that a fit gives by vine (and stated value, where it has several)."""
+    """Yield pressures, Pa, by trial, from those that a fit gives by vine (and stated value, where it has several).
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    numbers : values by name, SI.
+
+    Returns
+    -------
+    dict, Pa by name of trial
+    """
     yields_Pa = {}
     for seen in campaign.trials:
         trial = seen.data.trial
@@ -196,13 +251,31 @@ Columns = dict[str, list[Any]]
 
 
 def colours(campaign: Campaign) -> dict[str, str]:
-    """Colour of each condition: that of its vine, as in every figure."""
+    """Colour of each condition: that of its vine, as in every figure.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+
+    Returns
+    -------
+    dict, hexadecimal code by condition
+    """
     styles = vine_styles(campaign.vines)
     return {seen.condition: styles[seen.data.trial.vine].colour for seen in campaign.trials}
 
 
 def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
-    """Each vine, by what tells it from the others, with its colour."""
+    """Each vine, by what tells it from the others, with its colour.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+
+    Returns
+    -------
+    list of (label, hexadecimal code)
+    """
     styles = vine_styles(campaign.vines)
     first = {seen.data.trial.vine: seen.data.trial for seen in reversed(campaign.trials)}
     bare = {vine: replace(trial, pressure_Pa=math.nan, payload_kg=0.0) for vine, trial in first.items()}
@@ -211,13 +284,33 @@ def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
 
 
 def thinned(count: int, first: int) -> slice:
-    """Rows to draw of a track: from a little before the motion, no more than can be seen."""
+    """Rows to draw of a track: from a little before the motion, no more than can be seen.
+
+    Parameters
+    ----------
+    count : points of the track.
+    first : the first that moves.
+
+    Returns
+    -------
+    slice
+    """
     begin = max(first - max((count - first) // 20, 2), 0)
     return slice(begin, None, max(math.ceil((count - begin) / MOST_POINTS), 1))
 
 
 def measured(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`, `condition`."""
+    """Lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`, `condition`.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    shown : places of the trials to draw.
+
+    Returns
+    -------
+    dict, lists by column
+    """
     colour = colours(campaign)
     columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
     for i in shown:
@@ -240,7 +333,17 @@ def _broken(seen: AlignedTrial, rows: slice, values: Floats) -> Floats:
 
 
 def bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Outlines of one standard deviation of the replicates about their mean, ms and mm."""
+    """Outlines of one standard deviation of the replicates about their mean, ms and mm.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    shown : places of the trials to draw.
+
+    Returns
+    -------
+    dict, lists by column
+    """
     colour = colours(campaign)
     columns: Columns = {"xs": [], "ys": [], "colour": []}
     for condition in _conditions(campaign, shown):
@@ -256,7 +359,18 @@ def bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
 
 
 def modelled(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
-    """A line a condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth."""
+    """A line a condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    curves : of the model.
+    shown : places of the trials to draw.
+
+    Returns
+    -------
+    dict, lists by column
+    """
     columns: Columns = {"xs": [], "ys": []}
     for condition in _conditions(campaign, shown):
         members = [i for i in shown if campaign.trials[i].condition == condition]
@@ -269,7 +383,18 @@ def modelled(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Column
 
 
 def residuals(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
-    """Lines of measurement minus model, `ys` mm, along the growth, `xs` mm."""
+    """Lines of measurement minus model, `ys` mm, along the growth, `xs` mm.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    curves : of the model.
+    shown : places of the trials to draw.
+
+    Returns
+    -------
+    dict, lists by column
+    """
     colour = colours(campaign)
     columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
     for i in shown:
@@ -290,7 +415,18 @@ def error_bars(
     floors_m: Mapping[str, float],
     shown: Sequence[str],
 ) -> Columns:
-    """A row a condition, the first at the bottom: `label`, `now`, `before`, `floor`, mm, `colour` and how opaque."""
+    """A row a condition, the first at the bottom: `label`, `now`, `before`, `floor`, mm, `colour` and how opaque.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    now_m, before_m, floors_m : errors of the model now and as the page opened, and replicate scatter, m by condition.
+    shown : conditions that are not drawn faint.
+
+    Returns
+    -------
+    dict, lists by column
+    """
     colour = colours(campaign)
     names = list(reversed(campaign.conditions))
     return {
@@ -305,7 +441,17 @@ def error_bars(
 
 
 def extent(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Ranges that hold all lines with a little room: (left, right), (bottom, top)."""
+    """Ranges that hold all lines with a little room: (left, right), (bottom, top).
+
+    Parameters
+    ----------
+    columns : lines, `xs` and `ys`.
+    share : margin, as a fraction of the range.
+
+    Returns
+    -------
+    (left, right), (bottom, top)
+    """
     if not columns["xs"]:
         return (0.0, 1.0), (0.0, 1.0)
     ranges = []
@@ -318,7 +464,17 @@ def extent(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], 
 
 
 def symmetric(columns: Columns, least_mm: float = 0.1) -> tuple[float, float]:
-    """A range about zero for residuals, in round steps so that it does not twitch while a slider moves."""
+    """A range about zero for residuals, in round steps so that it does not twitch while a slider moves.
+
+    Parameters
+    ----------
+    columns : lines, `ys` in mm.
+    least_mm : smallest half of the range.
+
+    Returns
+    -------
+    low, high : float, mm
+    """
     parts: list[Floats] = columns["ys"]
     largest = max((float(np.nanmax(np.abs(part))) for part in parts), default=least_mm)
     step = 10 ** math.floor(math.log10(max(largest, least_mm)))

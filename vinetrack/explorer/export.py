@@ -34,7 +34,19 @@ CURVE_COLUMNS = (
 
 
 def curve_table(campaign: Campaign, choice: Choice, curves: Curves, shown: Sequence[int]) -> pd.DataFrame:
-    """Measurement and model at every frame used, since release and from the origin; columns `CURVE_COLUMNS`."""
+    """Measurement and model at every frame used, since release and from the origin; columns `CURVE_COLUMNS`.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    choice : effects and sizes.
+    curves : of that model.
+    shown : places of the trials to write.
+
+    Returns
+    -------
+    table with the columns `CURVE_COLUMNS`
+    """
     import pandas as pd
 
     parts = []
@@ -52,6 +64,18 @@ def curve_table(campaign: Campaign, choice: Choice, curves: Curves, shown: Seque
 
 def exported(campaign: Campaign, choice: Choice, curves: Curves, shown: Sequence[int], form: str) -> bytes:
     """The curves as `csv`, or the figure of the report as `svg`, `png` or `pdf`.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    choice : effects and sizes.
+    curves : of that model.
+    shown : places of the trials to draw.
+    form : one of `FORMATS`.
+
+    Returns
+    -------
+    bytes of the file
 
     Raises
     ------
@@ -94,6 +118,13 @@ def _compared(
 def write_export(campaign: Campaign, choice: Choice, curves: Curves, path: Path) -> None:
     """Everything in one file whose ending says in which form, whole or not at all.
 
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    choice : effects and sizes.
+    curves : of that model.
+    path : of the file; its ending gives the format.
+
     Raises
     ------
     ChoiceError
@@ -114,6 +145,13 @@ def commands(campaign: Campaign, start: Choice, choice: Choice, *, fitted: bool,
         The choice the page opened with.
     fitted
         Whether the sizes are those of a fit: else they are said one by one.
+    campaign : as `read_campaign` returns it.
+    choice : effects and sizes.
+    save : whether the model is to be saved.
+
+    Returns
+    -------
+    list of str
     """
     folder = shlex.quote(campaign.folder.as_posix())
     added, dropped = changed(campaign, choice)
@@ -139,7 +177,16 @@ def _moved(campaign: Campaign, start: Choice, choice: Choice) -> dict[str, float
 
 
 def model_words(names: Sequence[str]) -> str:
-    """A model in words: the base effects by one name, the others by theirs."""
+    """A model in words: the base effects by one name, the others by theirs.
+
+    Parameters
+    ----------
+    names : of the effects.
+
+    Returns
+    -------
+    str
+    """
     others = [name.replace("_", " ") for name in names if name not in BASE_EFFECTS]
     lacking = [name for name in BASE_EFFECTS if name not in names]
     base = "base model" if not lacking else " + ".join(name for name in names if name in BASE_EFFECTS)

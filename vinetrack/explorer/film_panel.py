@@ -91,12 +91,22 @@ class FilmPanel:
         return fig
 
     def set_curves(self, curves: Curves | None, earlier: Curves | None) -> None:
-        """What the model says now, and said when the page opened."""
+        """What the model says now, and said when the page opened.
+
+        Parameters
+        ----------
+        curves, earlier : of the model now and as the page opened; None where not yet known.
+        """
         self._curves, self._earlier = curves, earlier
         self._draw_edges()
 
     def show_trial(self, name: str) -> None:
-        """Begin with another trial: decode its recording, or say that there is none."""
+        """Begin with another trial: decode its recording, or say that there is none.
+
+        Parameters
+        ----------
+        name : of the trial.
+        """
         self._stop()
         if self._film is not None:
             self._film.give_up()

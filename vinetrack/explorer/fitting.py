@@ -48,7 +48,16 @@ class Fitted:
     seconds: float
 
     def number(self, name: str) -> Number | None:
-        """The fitted number of that name, None where it was not fitted."""
+        """The fitted number of that name, None where it was not fitted.
+
+        Parameters
+        ----------
+        name : `effect.parameter`, with `[vine]` where each vine has its own.
+
+        Returns
+        -------
+        Number or None
+        """
         return next((number for number in self.fit.numbers if number.name == name), None)
 
 
@@ -56,6 +65,16 @@ def first_fit(campaign: Campaign, choice: Choice, watch: Watch | None = None) ->
     """Fit the model in use, as the stage of the workflow does.
 
     Its likelihood is known from `fit.json`; where the first start reaches it, no others are tried.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    choice : the model in use.
+    watch : called after every step.
+
+    Returns
+    -------
+    Fitted
 
     Raises
     ------
@@ -78,6 +97,17 @@ def fit_choice(campaign: Campaign, before: Fit, choice: Choice, watch: Watch | N
     """Fit what was chosen, from where a fit ended and the sizes that were chosen for what is new.
 
     Where that ends worse than without the new effects, or does not settle, it is tried once more from their defaults.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    before : the fit to start from.
+    choice : effects and sizes.
+    watch : called after every step.
+
+    Returns
+    -------
+    Fitted
 
     Raises
     ------
@@ -109,12 +139,31 @@ def _weighed(campaign: Campaign, choice: Choice, result: Fit, seconds: float) ->
 
 
 def at_numbers(choice: Choice, numbers: Mapping[str, float]) -> Choice:
-    """The same effects at these sizes."""
+    """The same effects at these sizes.
+
+    Parameters
+    ----------
+    choice : effects and sizes.
+    numbers : SI, by name.
+
+    Returns
+    -------
+    Choice
+    """
     return replace(choice, numbers={**choice.numbers, **numbers})
 
 
 def gained_words(before: Fit, after: Fit) -> str:
-    """Return how −2 ln L changed with a larger or smaller model, as a sentence."""
+    """Return how −2 ln L changed with a larger or smaller model, as a sentence.
+
+    Parameters
+    ----------
+    before, after : fits of two models to the same trials.
+
+    Returns
+    -------
+    str
+    """
     gain = 2 * (after.log_likelihood - before.log_likelihood)
     more = len(after.numbers) - len(before.numbers)
     numbers = f"{abs(more)} number{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'fewer'}"
@@ -124,7 +173,16 @@ def gained_words(before: Fit, after: Fit) -> str:
 
 
 def tied_words(result: Fit) -> list[str]:
-    """Return the pairs of fitted numbers with strongly correlated errors, largest correlation first, as text."""
+    """Return the pairs of fitted numbers with strongly correlated errors, largest correlation first, as text.
+
+    Parameters
+    ----------
+    result : a fit with its covariance.
+
+    Returns
+    -------
+    list of str
+    """
     pairs = []
     for i, number in enumerate(result.numbers):
         for k in range(i):
@@ -162,7 +220,12 @@ class FitJob:
         self._unwanted.set()
 
     def wait(self, timeout_s: float | None = None) -> None:
-        """Until it has ended."""
+        """Until it has ended.
+
+        Parameters
+        ----------
+        timeout_s : None for no limit.
+        """
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
@@ -216,15 +279,30 @@ class BackgroundFit:
         return self
 
     def wait(self, timeout_s: float | None = None) -> None:
-        """Until all is there, or something went wrong."""
+        """Until all is there, or something went wrong.
+
+        Parameters
+        ----------
+        timeout_s : None for no limit.
+        """
         self._thread.join(timeout_s)
 
     def listen(self, heard: Callable[[], None]) -> None:
-        """Have `heard` called whenever something new is there."""
+        """Have `heard` called whenever something new is there.
+
+        Parameters
+        ----------
+        heard : takes no argument.
+        """
         self._listeners.append(heard)
 
     def forget(self, heard: Callable[[], None]) -> None:
-        """Call it no more."""
+        """Call it no more.
+
+        Parameters
+        ----------
+        heard : as given to `listen`.
+        """
         if heard in self._listeners:
             self._listeners.remove(heard)
 
@@ -274,11 +352,21 @@ class FitProgress:
         self._step: Step | None = None
 
     def begin(self, now: float) -> None:
-        """A fit is wanted."""
+        """A fit is wanted.
+
+        Parameters
+        ----------
+        now : monotonic clock, s.
+        """
         self._begun, self._largest, self._share, self._step, self.words = now, 0.0, _LEAST_SHARE, None, ""
 
     def reach(self, step: Step) -> None:
-        """It has come so far."""
+        """It has come so far.
+
+        Parameters
+        ----------
+        step : the last one of the fit.
+        """
         self._step = step
         if math.isfinite(step.promised) and step.promised > 0:
             self._largest = max(self._largest, step.promised)
@@ -287,7 +375,18 @@ class FitProgress:
             self._share = max(self._share, min(done / whole, 0.97))
 
     def state(self, now: float, about: str, other: Step | None = None) -> tuple[float, str]:
-        """Share done and words; `other` is the step of what has to be done first."""
+        """Share done and words; `other` is the step of what has to be done first.
+
+        Parameters
+        ----------
+        now : monotonic clock, s.
+        about : what is fitted.
+
+        Returns
+        -------
+        share : float, 0 to 1
+        text : str
+        """
         step = other or self._step
         where = f" · step {step.iteration}" if step is not None else ""
         promise = ""
@@ -298,9 +397,19 @@ class FitProgress:
         return self._share, f"{about}{where}{promise} · {now - self._begun:.1f} s"
 
     def end(self, words: str) -> None:
-        """The fit has ended; `words` state why, blank where it succeeded."""
+        """The fit has ended; `words` state why, blank where it succeeded.
+
+        Parameters
+        ----------
+        words : blank where the fit succeeded.
+        """
         self.words = words
 
     def say(self, words: str) -> None:
-        """State something that is no end."""
+        """State something that is no end.
+
+        Parameters
+        ----------
+        words : the message.
+        """
         self.words = words

@@ -57,7 +57,16 @@ def page_style() -> str:
 
 
 def screen_script(figures: Sequence[figure]) -> CustomJS:
-    """Has these figures follow a light or dark screen."""
+    """Has these figures follow a light or dark screen.
+
+    Parameters
+    ----------
+    figures : that change their colours.
+
+    Returns
+    -------
+    CustomJS
+    """
     code = (TEMPLATES / "screen.js").read_text(encoding="utf-8")
     return CustomJS(args={"plots": list(figures), "tokens": TOKENS}, code=code)
 
@@ -69,17 +78,48 @@ def vine_colour() -> dict[str, Any]:
 
 
 def sheet(more: str = "") -> InlineStyleSheet:
-    """CSS inside a widget, which the page's does not reach."""
+    """CSS inside a widget, which the page's does not reach.
+
+    Parameters
+    ----------
+    more : CSS added to `widgets.css`.
+
+    Returns
+    -------
+    InlineStyleSheet
+    """
     return InlineStyleSheet(css=(TEMPLATES / "widgets.css").read_text(encoding="utf-8") + more)
 
 
 def words(text: str = "", name: str | None = None, **keywords: Any) -> Div:
-    """A piece of HTML."""
+    """A piece of HTML.
+
+    Parameters
+    ----------
+    text : HTML.
+    name : by which the document finds it.
+    keywords : of `bokeh.models.Div`.
+
+    Returns
+    -------
+    Div
+    """
     return Div(text=text, name=name, sizing_mode="stretch_width", stylesheets=[sheet()], margin=0, **keywords)
 
 
 def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
-    """An empty figure as wide as its card."""
+    """An empty figure as wide as its card.
+
+    Parameters
+    ----------
+    height : pixels.
+    x_label, y_label : with units.
+    keywords : of `bokeh.plotting.figure`.
+
+    Returns
+    -------
+    figure
+    """
     fig = figure(
         height=height,
         sizing_mode="stretch_width",
@@ -100,12 +140,32 @@ def plot(height: int, x_label: str, y_label: str, **keywords: Any) -> figure:
 
 
 def escaped(text: object) -> str:
-    """Text that may hold anything, for HTML."""
+    """Text that may hold anything, for HTML.
+
+    Parameters
+    ----------
+    text : shown by `str`.
+
+    Returns
+    -------
+    str, HTML
+    """
     return html.escape(str(text))
 
 
 def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequence[int] = ()) -> str:
-    """A table in HTML; cells are escaped, columns `numeric` stand to the right."""
+    """A table in HTML; cells are escaped, columns `numeric` stand to the right.
+
+    Parameters
+    ----------
+    rows : cells of each row.
+    header : names of the columns.
+    numeric : places of the columns set to the right.
+
+    Returns
+    -------
+    str, HTML
+    """
     kinds = [' class="n"' if k in numeric else "" for k in range(len(header))]
     head = "".join(f"<th{kind}>{escaped(cell)}</th>" for kind, cell in zip(kinds, header, strict=True))
     body = "".join(
@@ -116,13 +176,32 @@ def table(rows: Iterable[Sequence[object]], header: Sequence[str], numeric: Sequ
 
 
 def progress_bar(share: float, text: str) -> str:
-    """A bar filled to a share between 0 and 1, with words below it."""
+    """A bar filled to a share between 0 and 1, with words below it.
+
+    Parameters
+    ----------
+    share : 0 to 1.
+    text : below the bar.
+
+    Returns
+    -------
+    str, HTML
+    """
     percent = 100 * min(max(share, 0.02), 1.0)
     return f'<div class="bar"><i style="width:{percent:.0f}%"></i></div><small>{escaped(text)}</small>'
 
 
 def command_block(lines: Sequence[str]) -> str:
-    """Commands to copy."""
+    """Commands to copy.
+
+    Parameters
+    ----------
+    lines : one a command.
+
+    Returns
+    -------
+    str, HTML
+    """
     return f"<pre><code>{escaped(chr(10).join(lines))}</code></pre>"
 
 

@@ -105,7 +105,13 @@ class Plots:
         self._chosen(names[new[0]])
 
     def set_shown(self, shown: Sequence[int], earlier: Curves | None) -> None:
-        """Trials to draw; of the earlier curves those of their conditions."""
+        """Trials to draw; of the earlier curves those of their conditions.
+
+        Parameters
+        ----------
+        shown : places of the trials to draw.
+        earlier : curves as the page opened; None where they are the present ones.
+        """
         lines = measured(self.campaign, shown)
         (left, right), (bottom, top) = extent(lines)
         self.motion.x_range.update(start=left, end=right)
@@ -117,7 +123,13 @@ class Plots:
         self._band.data = bands(self.campaign, shown if few else [])
 
     def set_earlier(self, earlier: Curves | None, shown: Sequence[int]) -> None:
-        """The curves to compare with, where they are others."""
+        """The curves to compare with, where they are others.
+
+        Parameters
+        ----------
+        earlier : curves as the page opened; None where they are the present ones.
+        shown : places of the trials to draw.
+        """
         key = (id(earlier), tuple(shown))
         if key != self._earlier_drawn:
             self._earlier_drawn = key
@@ -126,11 +138,22 @@ class Plots:
             )
 
     def set_instant(self, since_s: float | None) -> None:
-        """Mark an instant, s since release, or none."""
+        """Mark an instant, s since release, or none.
+
+        Parameters
+        ----------
+        since_s : None for no mark.
+        """
         self.instant.update(visible=since_s is not None, location=1e3 * (since_s or 0.0))
 
     def set_curves(self, curves: Curves, shown: Sequence[int]) -> None:
-        """What the model says now; of lines that are drawn already only what has moved is sent."""
+        """What the model says now; of lines that are drawn already only what has moved is sent.
+
+        Parameters
+        ----------
+        curves : of the model now.
+        shown : places of the trials to draw.
+        """
         lines, left = modelled(self.campaign, curves, shown), residuals(self.campaign, curves, shown)
         low, high = symmetric(left)
         if high != self.residual.y_range.end:
@@ -149,7 +172,13 @@ class Plots:
         floors_m: Mapping[str, float],
         conditions: Sequence[str],
     ) -> None:
-        """The error of every condition; those not among `conditions` are drawn faint."""
+        """The error of every condition; those not among `conditions` are drawn faint.
+
+        Parameters
+        ----------
+        now_m, before_m, floors_m : m by condition.
+        conditions : names.
+        """
         rows = error_bars(self.campaign, now_m, before_m, floors_m, conditions)
         known = [value for key in ("now", "before", "floor") for value in rows[key] if math.isfinite(value)]
         end = round_up(1.04 * max(known, default=1.0))
@@ -162,6 +191,14 @@ class Plots:
 
 def round_up(value: float) -> float:
     """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten, so that an axis does not twitch.
+
+    Parameters
+    ----------
+    value : largest value of an axis.
+
+    Returns
+    -------
+    float
 
     >>> round_up(0.42), round_up(7.1)
     (0.5, 8.0)

@@ -55,6 +55,14 @@ class RecordingView:
         """Where positions on the track's ruler lie along the axis; beyond the track, in a straight line.
 
         NaN where the track has fewer than two points.
+
+        Parameters
+        ----------
+        lead_position_m : any shape.
+
+        Returns
+        -------
+        array of the same shape, px
         """
         known = np.isfinite(self.edge_px) & np.isfinite(self.lead_position_m)
         if np.count_nonzero(known) < 2:
@@ -68,7 +76,17 @@ class RecordingView:
         return np.where(outside, offset + scale * lead_position_m, inside)
 
     def across(self, along_px: float, frame: int | None = None) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Ends, x and y, of a line across the vine at a place along the axis; with `frame` in the picture as it is."""
+        """Ends, x and y, of a line across the vine at a place along the axis; with `frame` in the picture as it is.
+
+        Parameters
+        ----------
+        along_px : place along the axis.
+        frame : number of the picture; None for the axis itself.
+
+        Returns
+        -------
+        xs, ys : of both ends, px
+        """
         if frame is not None and frame < self.shake_px.size:
             along_px += float(self.shake_px[frame])
         (x0, y0), (dx, dy), half = self.from_px, self.direction, self.half_width_px
@@ -77,7 +95,17 @@ class RecordingView:
 
 
 def view_of(results: Results, trial: Trial) -> RecordingView | str:
-    """The view of a trial, or in words why there is none: it is a track only, or its axis was not kept."""
+    """The view of a trial, or in words why there is none: it is a track only, or its axis was not kept.
+
+    Parameters
+    ----------
+    results : the folder.
+    trial : of the experiment.
+
+    Returns
+    -------
+    RecordingView, or str with the reason
+    """
     if trial.video is None:
         name = trial.track.name if trial.track is not None else "a table"
         return f"{trial.name} came as a track ({name}): there is no recording to show, only where its edge was."
@@ -129,14 +157,32 @@ class DecodedRecording:
     _unwanted: bool = False
 
     def picture(self, frame: int) -> NDArray[np.uint8]:
-        """Grey levels of one frame, shape `shape`."""
+        """Grey levels of one frame, shape `shape`.
+
+        Parameters
+        ----------
+        frame : its number.
+
+        Returns
+        -------
+        array, uint8, shape `shape`
+        """
         import cv2
 
         data = np.frombuffer(self._frames[frame], dtype=np.uint8)
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
     def decode(self, told: Callable[[DecodedRecording], None] | None = None) -> DecodedRecording:
-        """Decode every frame; `told` hears every so often."""
+        """Decode every frame; `told` hears every so often.
+
+        Parameters
+        ----------
+        told : called every `TOLD_EVERY` frames and at the end.
+
+        Returns
+        -------
+        DecodedRecording, itself
+        """
         from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 
         try:
@@ -156,7 +202,12 @@ class DecodedRecording:
         return self
 
     def in_background(self, told: Callable[[DecodedRecording], None]) -> None:
-        """`decode` in a thread, from which `told` is called."""
+        """`decode` in a thread, from which `told` is called.
+
+        Parameters
+        ----------
+        told : as of `decode`.
+        """
         threading.Thread(target=self.decode, args=(told,), daemon=True, name="vinetrack-film").start()
 
     def give_up(self) -> None:

@@ -33,7 +33,16 @@ KEEP_ALIVE_MS = 20_000
 
 
 def application(ground: BackgroundFit) -> Application:
-    """A page for whoever opens one."""
+    """A page for whoever opens one.
+
+    Parameters
+    ----------
+    ground : the background that all pages share.
+
+    Returns
+    -------
+    Application
+    """
     from vinetrack.explorer.page import Page
 
     def open_page(document: Document) -> None:
@@ -49,6 +58,11 @@ def start_server(ground: BackgroundFit, port: int | None = None) -> Server:
     ----------
     port
         The port to take, 0 for any that is free; None looks for the first free one from `FIRST_PORT`.
+    ground : the background that all pages share.
+
+    Returns
+    -------
+    Server
 
     Raises
     ------
@@ -83,12 +97,28 @@ def _serve(ground: BackgroundFit, port: int) -> Server:
 
 
 def address(server: Server) -> str:
-    """Where the page is."""
+    """Where the page is.
+
+    Parameters
+    ----------
+    server : that runs.
+
+    Returns
+    -------
+    str
+    """
     return f"http://{LOOPBACK}:{server.port}/"
 
 
 def serve(ground: BackgroundFit, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
     """Serve until Ctrl-C (or SIGTERM), then leave without a word more than needed.
+
+    Parameters
+    ----------
+    ground : the background that all pages share.
+    say : prints a line.
+    port : as of `start_server`.
+    browser : whether a browser is opened.
 
     Raises
     ------

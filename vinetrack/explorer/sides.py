@@ -42,7 +42,18 @@ class FittedRung:
 
 
 def headline(campaign: Campaign, choice: Choice, now_m: Mapping[str, float], before_m: Mapping[str, float]) -> str:
-    """Return the error of the model now and as the page opened, with the replicate scatter, as a heading."""
+    """Return the error of the model now and as the page opened, with the replicate scatter, as a heading.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    choice : effects and sizes.
+    now_m, before_m : errors by condition, m.
+
+    Returns
+    -------
+    str, HTML
+    """
     now, before, floor = (overall_m(errors, campaign.conditions) for errors in (now_m, before_m, campaign.floors_m))
     words = model_words(choice.effects)
     model = escaped(words[:1].upper() + words[1:])
@@ -64,7 +75,19 @@ def _mm(value_m: float) -> str:
 
 
 def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[FittedRung], touched: bool) -> str:
-    """The table of fitted numbers and the models fitted so far."""
+    """The table of fitted numbers and the models fitted so far.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    fitted : the last fit; None before the first.
+    rungs : models fitted on this page.
+    touched : whether sizes were moved since.
+
+    Returns
+    -------
+    str, HTML
+    """
     if fitted is None:
         return "<p class='muted'>The model in use is being fitted; its numbers come here.</p>"
     vines = dict(zip(campaign.vines, (label for label, _ in vine_colours(campaign)), strict=True))
@@ -110,13 +133,35 @@ def _ladder(campaign: Campaign, rungs: Sequence[FittedRung]) -> str:
 
 
 def rung_of(campaign: Campaign, fitted: Fitted, before: Fitted | None) -> FittedRung:
-    """A line of the ladder for a fit, and what it gained over the one before."""
+    """A line of the ladder for a fit, and what it gained over the one before.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    fitted : the fit.
+    before : the fit before it; None for the first.
+
+    Returns
+    -------
+    FittedRung
+    """
     gained = "" if before is None else gained_words(before.fit, fitted.fit)
     return FittedRung(fitted.choice.effects, overall_m(fitted.errors_m, campaign.conditions), gained)
 
 
 def tied_panel(campaign: Campaign, story: DiagnosisSummary | None, fitted: Fitted | None) -> str:
-    """Return what the data cannot tell apart: effects, by the diagnosis; fitted numbers, by their correlations."""
+    """Return what the data cannot tell apart: effects, by the diagnosis; fitted numbers, by their correlations.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    story : the diagnosis; None where there is none.
+    fitted : the last fit; None before the first.
+
+    Returns
+    -------
+    str, HTML
+    """
     parts = []
     if story is None:
         parts.append(
@@ -140,7 +185,16 @@ def tied_panel(campaign: Campaign, story: DiagnosisSummary | None, fitted: Fitte
 
 
 def cosine_grid(story: DiagnosisSummary) -> str:
-    """Return the cosines between the effects of the likeliest candidates as a table; blank for fewer than two."""
+    """Return the cosines between the effects of the likeliest candidates as a table; blank for fewer than two.
+
+    Parameters
+    ----------
+    story : the diagnosis.
+
+    Returns
+    -------
+    str, HTML
+    """
     names = [name for name in story.best if name in story.cosine_names]
     names += [name for *pair, _ in story.most_tied() for name in pair]
     names = list(dict.fromkeys(names))[:MOST_COMPARED]
@@ -171,7 +225,17 @@ def _spaced(name: str) -> str:
 
 
 def next_panel(campaign: Campaign, story: DiagnosisSummary | None) -> str:
-    """What to film next, as the diagnosis says."""
+    """What to film next, as the diagnosis says.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    story : the diagnosis; None where there is none.
+
+    Returns
+    -------
+    str, HTML
+    """
     if story is None:
         command = command_block([f"vinetrack diagnose {campaign.folder.as_posix()}"])
         return f"<p>A diagnosis states which trial would separate the candidates best.</p>{command}"
@@ -244,7 +308,16 @@ class DiagnosisSummary:
         return tuple(dict.fromkeys([*self.answer_set, *ranked]))
 
     def most_tied(self, least: float = TIED_COSINE) -> list[tuple[str, str, float]]:
-        """Pairs of candidates with |cosine| of `least` or more, largest first."""
+        """Pairs of candidates with |cosine| of `least` or more, largest first.
+
+        Parameters
+        ----------
+        least : smallest |cosine|.
+
+        Returns
+        -------
+        list of (effect, effect, cosine)
+        """
         pairs = [
             (name, other, self.cosines[i][k])
             for i, name in enumerate(self.cosine_names)
@@ -255,7 +328,16 @@ class DiagnosisSummary:
 
 
 def read_summary(folder: Path) -> DiagnosisSummary | None:
-    """The diagnosis of a results folder, None where there is none or it cannot be understood."""
+    """The diagnosis of a results folder, None where there is none or it cannot be understood.
+
+    Parameters
+    ----------
+    folder : the results.
+
+    Returns
+    -------
+    DiagnosisSummary or None
+    """
     path = folder / DIAGNOSIS
     if not path.exists():
         return None

@@ -24,29 +24,56 @@ REMEDIES = {
 
 
 def trials_differ(names: Sequence[str]) -> bool:
-    """Whether every name of an answer set is a difference between trials."""
+    """Whether every name of an answer set is a difference between trials.
+
+    Parameters
+    ----------
+    names : an answer set.
+
+    Returns
+    -------
+    bool, False for an empty one
+    """
     return bool(names) and all(name in BETWEEN_SUMMARIES for name in names)
 
 
 def difference_headline(names: Sequence[str]) -> str:
-    """What an answer set of differences between trials says."""
+    """What an answer set of differences between trials says.
+
+    Parameters
+    ----------
+    names : an answer set of differences between trials.
+
+    Returns
+    -------
+    str
+    """
     return " or ".join(BETWEEN_SUMMARIES[name] for name in names)
 
 
-def difference_in_words(one: LikelihoodRatio) -> str:
-    """The size of one difference between trials: `order_drift: ln B changes by 0.021 ± 0.001 a trial`."""
-    name = one.names[-1]
+def difference_in_words(result: LikelihoodRatio) -> str:
+    """The size of one difference between trials: `order_drift: ln B changes by 0.021 ± 0.001 a trial`.
+
+    Parameters
+    ----------
+    result : the likelihood-ratio result of the difference.
+
+    Returns
+    -------
+    str
+    """
+    name = result.names[-1]
     if name == N_BY_VINE:
         return "n differs between the vines: " + ", ".join(
-            f"{_value(number.value, number.sigma)} ({number.vine})" for number in one.numbers
+            f"{_value(number.value, number.sigma)} ({number.vine})" for number in result.numbers
         )
     if name == ORDER_DRIFT:
-        slope = one.numbers[0]
+        slope = result.numbers[0]
         way = "rises" if slope.value > 0 else "falls"
         return f"B {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % with every trial of a tube"
     parts = []
-    in_B = [number for number in one.numbers if number.key.endswith(".B")]
-    in_P = [number for number in one.numbers if number.key.endswith(".P")]
+    in_B = [number for number in result.numbers if number.key.endswith(".B")]
+    in_P = [number for number in result.numbers if number.key.endswith(".P")]
     if in_B:
         parts.append(f"in B by {_range(in_B, 100, '%')}")
     if in_P:
@@ -55,8 +82,18 @@ def difference_in_words(one: LikelihoodRatio) -> str:
 
 
 def remedies_in_words(kept: Sequence[LikelihoodRatio], trials: Sequence[Trial]) -> str:
-    """What to do about the differences of an answer set; blank where there are none."""
-    names = [one.names[-1] for one in kept if one.effects[-1].kind == BETWEEN_TRIALS]
+    """What to do about the differences of an answer set; blank where there are none.
+
+    Parameters
+    ----------
+    kept : results of the answer set.
+    trials : all trials of the experiment.
+
+    Returns
+    -------
+    str
+    """
+    names = [result.names[-1] for result in kept if result.effects[-1].kind == BETWEEN_TRIALS]
     if not names:
         return ""
     text = "".join(f" {REMEDIES[name]}." for name in names)

@@ -33,6 +33,10 @@ def campaign_lines(
     B_error : relative standard error of B that is wanted.
     most_trials : trials that a campaign may have.
     camera : the plan of filming, for frame rate and noise.
+
+    Yields
+    ------
+    str, a line
     """
     spread_P, spread_B = inputs[0].spreads
     yield (

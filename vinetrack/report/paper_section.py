@@ -80,7 +80,10 @@ def table_one(table: pd.DataFrame) -> ReportTable:
     body = [
         (
             str(scale),
-            *(_shown(published_of(by_row, f"{name}_R{scale}")) for name in ("thickness", "diameter", "press", "laser")),
+            *(
+                _shown(_published_of(by_row, f"{name}_R{scale}"))
+                for name in ("thickness", "diameter", "press", "laser")
+            ),
             f"{published.DAMPING_B[scale]:g}",
             _ours(by_row.get(f"B_R{scale}")),
             f"{published.DAMPING_R2[scale]:g}",
@@ -222,7 +225,7 @@ def _by_row(table: pd.DataFrame) -> Mapping[str, Any]:
     return {row.row: row for row in rows(table)}
 
 
-def published_of(by_row: Mapping[str, Any], row: str) -> float | None:
+def _published_of(by_row: Mapping[str, Any], row: str) -> float | None:
     """The published value of a row; None where there is no such row."""
     return float(by_row[row].published) if row in by_row else None
 
