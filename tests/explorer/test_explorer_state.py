@@ -19,20 +19,9 @@ from vinetrack.effects import Parameter
 from vinetrack.explorer.campaign import AlignedTrial, Campaign, condition_labels
 from vinetrack.explorer.choice import ChoiceError, changed, chosen, first_choice, sized, slider_range
 from vinetrack.explorer.command import open_campaign
-from vinetrack.explorer.curves import (
-    bands,
-    error_bars,
-    errors_m,
-    follow,
-    measured,
-    modelled,
-    overall_m,
-    residuals,
-    symmetric,
-    thinned,
-    vine_colours,
-)
+from vinetrack.explorer.curves import errors_m, follow, overall_m
 from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, exported, model_words
+from vinetrack.explorer.series import bands, error_bars, measured, modelled, residuals, symmetric, thinned, vine_colours
 from vinetrack.laboratory.ground_truth import read_nature
 from vinetrack.laboratory.tracks import grow
 from vinetrack.results.folder_layout import ResultsError

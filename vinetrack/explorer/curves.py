@@ -1,9 +1,9 @@
-"""Curves of a model at given sizes for every trial, fast enough to follow a slider, and the columns that are drawn.
+"""Curves of a model at given sizes for every trial, fast enough to follow a slider.
 
 As in a comparison, a prediction is aligned by the trial's own release and origin alone: the origin is where the vine is
 seen at rest; the release, and the origin where no rest was filmed, minimise the mean square. Each trial is simulated
 once on a grid and shifted there. A motion that follows a pressure measured along with it has the clock of that pressure
-and cannot be shifted: its release stays that of the comparison. Drawn columns are in milliseconds and millimetres.
+and cannot be shifted: its release stays that of the comparison.
 """
 
 from __future__ import annotations
@@ -11,15 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trace, Trajectory, simulate_many
-from vinetrack.explorer.campaign import AlignedTrial, Campaign, condition_labels
-from vinetrack.figures.style import vine_styles
+from vinetrack.explorer.campaign import AlignedTrial, Campaign
 from vinetrack.inference.left_out import TOLD_APART, told_apart
 from vinetrack.inference.parameters import YIELD_PRESSURE
 
@@ -242,250 +240,3 @@ def yields_of(campaign: Campaign, numbers: Mapping[str, float]) -> dict[str, flo
             if value is not None:
                 yields_Pa[trial.name] = value
     return yields_Pa
-
-
-MOST_POINTS = 250
-"""Points of a line on the page; chosen: one every three or four pixels; more take longer to send than to compute."""
-
-Columns = dict[str, list[Any]]
-
-
-def colours(campaign: Campaign) -> dict[str, str]:
-    """Colour of each condition: that of its vine, as in every figure.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-
-    Returns
-    -------
-    dict, hexadecimal code by condition
-    """
-    styles = vine_styles(campaign.vines)
-    return {seen.condition: styles[seen.data.trial.vine].colour for seen in campaign.trials}
-
-
-def vine_colours(campaign: Campaign) -> list[tuple[str, str]]:
-    """Each vine, by what tells it from the others, with its colour.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-
-    Returns
-    -------
-    list of (label, hexadecimal code)
-    """
-    styles = vine_styles(campaign.vines)
-    first = {seen.data.trial.vine: seen.data.trial for seen in reversed(campaign.trials)}
-    bare = {vine: replace(trial, pressure_Pa=math.nan, payload_kg=0.0) for vine, trial in first.items()}
-    labels = condition_labels(bare) if len(bare) > 1 else dict.fromkeys(bare, "measured")
-    return [(labels[vine], styles[vine].colour) for vine in campaign.vines]
-
-
-def thinned(count: int, first: int) -> slice:
-    """Rows to draw of a track: from a little before the motion, no more than can be seen.
-
-    Parameters
-    ----------
-    count : points of the track.
-    first : the first that moves.
-
-    Returns
-    -------
-    slice
-    """
-    begin = max(first - max((count - first) // 20, 2), 0)
-    return slice(begin, None, max(math.ceil((count - begin) / MOST_POINTS), 1))
-
-
-def measured(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Lines of the measured positions: `xs` ms since release, `ys` mm of growth, `colour`, `trial`, `condition`.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    shown : places of the trials to draw.
-
-    Returns
-    -------
-    dict, lists by column
-    """
-    colour = colours(campaign)
-    columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
-    for i in shown:
-        seen = campaign.trials[i]
-        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
-        columns["xs"].append(1e3 * seen.time_s[rows])
-        columns["ys"].append(1e3 * _broken(seen, rows, seen.growth_m[rows]))
-        columns["colour"].append(colour[seen.condition])
-        columns["trial"].append(seen.name)
-        columns["condition"].append(campaign.labels[seen.condition])
-    return columns
-
-
-def _broken(seen: AlignedTrial, rows: slice, values: Floats) -> Floats:
-    """Values with NaN where frames are left out, so that no line is drawn over frames that were not compared."""
-    stretch = np.cumsum(seen.data.first)[rows]
-    out = values.copy()
-    out[np.flatnonzero(np.diff(stretch) > 0) + 1] = math.nan
-    return out
-
-
-def bands(campaign: Campaign, shown: Sequence[int]) -> Columns:
-    """Outlines of one standard deviation of the replicates about their mean, ms and mm.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    shown : places of the trials to draw.
-
-    Returns
-    -------
-    dict, lists by column
-    """
-    colour = colours(campaign)
-    columns: Columns = {"xs": [], "ys": [], "colour": []}
-    for condition in _conditions(campaign, shown):
-        band = campaign.bands.get(condition)
-        if band is None or band.time_s.size < 2:
-            continue
-        rows = thinned(band.time_s.size, int(np.searchsorted(band.time_s, 0.0)))
-        time_ms, mean_mm, sigma_mm = (1e3 * part[rows] for part in (band.time_s, band.mean_m, band.sigma_m))
-        columns["xs"].append(np.concatenate([time_ms, time_ms[::-1]]))
-        columns["ys"].append(np.concatenate([mean_mm - sigma_mm, (mean_mm + sigma_mm)[::-1]]))
-        columns["colour"].append(colour[condition])
-    return columns
-
-
-def modelled(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
-    """A line a condition, of its longest trial that is shown: `xs` ms since release, `ys` mm of growth.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    curves : of the model.
-    shown : places of the trials to draw.
-
-    Returns
-    -------
-    dict, lists by column
-    """
-    columns: Columns = {"xs": [], "ys": []}
-    for condition in _conditions(campaign, shown):
-        members = [i for i in shown if campaign.trials[i].condition == condition]
-        longest = max(members, key=lambda i: campaign.trials[i].time_s[-1])
-        seen = campaign.trials[longest]
-        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
-        columns["xs"].append(1e3 * seen.time_s[rows])
-        columns["ys"].append(1e3 * curves[longest].growth_m[rows])
-    return columns
-
-
-def residuals(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Columns:
-    """Lines of measurement minus model, `ys` mm, along the growth, `xs` mm.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    curves : of the model.
-    shown : places of the trials to draw.
-
-    Returns
-    -------
-    dict, lists by column
-    """
-    colour = colours(campaign)
-    columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
-    for i in shown:
-        seen, motion = campaign.trials[i], curves[i]
-        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
-        columns["xs"].append(1e3 * seen.growth_m[rows])
-        columns["ys"].append(1e3 * _broken(seen, rows, motion.residual_m[rows]))
-        columns["colour"].append(colour[seen.condition])
-        columns["trial"].append(seen.name)
-        columns["condition"].append(campaign.labels[seen.condition])
-    return columns
-
-
-def error_bars(
-    campaign: Campaign,
-    now_m: Mapping[str, float],
-    before_m: Mapping[str, float],
-    floors_m: Mapping[str, float],
-    shown: Sequence[str],
-) -> Columns:
-    """A row a condition, the first at the bottom: `label`, `now`, `before`, `floor`, mm, `colour` and how opaque.
-
-    Parameters
-    ----------
-    campaign : as `read_campaign` returns it.
-    now_m, before_m, floors_m : errors of the model now and as the page opened, and replicate scatter, m by condition.
-    shown : conditions that are not drawn faint.
-
-    Returns
-    -------
-    dict, lists by column
-    """
-    colour = colours(campaign)
-    names = list(reversed(campaign.conditions))
-    return {
-        "condition": names,
-        "label": [campaign.labels[name] for name in names],
-        "now": [_mm(now_m.get(name)) for name in names],
-        "before": [_mm(before_m.get(name)) for name in names],
-        "floor": [_mm(floors_m.get(name)) for name in names],
-        "colour": [colour[name] for name in names],
-        "alpha": [0.95 if name in shown else 0.3 for name in names],
-    }
-
-
-def extent(columns: Columns, share: float = 0.05) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Ranges that hold all lines with a little room: (left, right), (bottom, top).
-
-    Parameters
-    ----------
-    columns : lines, `xs` and `ys`.
-    share : margin, as a fraction of the range.
-
-    Returns
-    -------
-    (left, right), (bottom, top)
-    """
-    if not columns["xs"]:
-        return (0.0, 1.0), (0.0, 1.0)
-    ranges = []
-    for key in ("xs", "ys"):
-        low = min(float(np.nanmin(part)) for part in columns[key])
-        high = max(float(np.nanmax(part)) for part in columns[key])
-        room = share * ((high - low) or 1.0)
-        ranges.append((low - room, high + room))
-    return ranges[0], ranges[1]
-
-
-def symmetric(columns: Columns, least_mm: float = 0.1) -> tuple[float, float]:
-    """A range about zero for residuals, in round steps so that it does not twitch while a slider moves.
-
-    Parameters
-    ----------
-    columns : lines, `ys` in mm.
-    least_mm : smallest half of the range.
-
-    Returns
-    -------
-    low, high : float, mm
-    """
-    parts: list[Floats] = columns["ys"]
-    largest = max((float(np.nanmax(np.abs(part))) for part in parts), default=least_mm)
-    step = 10 ** math.floor(math.log10(max(largest, least_mm)))
-    reach = next(step * k for k in (1.2, 2, 3, 5, 7, 10) if step * k >= 1.05 * max(largest, least_mm) or k == 10)
-    return -reach, reach
-
-
-def _conditions(campaign: Campaign, shown: Sequence[int]) -> list[str]:
-    present = {campaign.trials[i].condition for i in shown}
-    return [name for name in campaign.conditions if name in present]
-
-
-def _mm(value: float | None) -> float:
-    return math.nan if value is None else 1e3 * value

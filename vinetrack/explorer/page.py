@@ -13,11 +13,12 @@ from bokeh.models import Button, Column, CustomJS, Row
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.explorer.choice import Choice, changed, sized
 from vinetrack.explorer.controls import Chooser, EffectPanel, KeepPanel
-from vinetrack.explorer.curves import Curves, errors_m, follow, vine_colours
+from vinetrack.explorer.curves import Curves, errors_m, follow
 from vinetrack.explorer.film_panel import FilmPanel
 from vinetrack.explorer.fitting import BackgroundFit, FitJob, FitProgress, Fitted, at_numbers, fit_choice
 from vinetrack.explorer.look import escaped, page_style, page_template, progress_bar, screen_script, sheet, theme, words
 from vinetrack.explorer.plots import Plots
+from vinetrack.explorer.series import vine_colours
 from vinetrack.explorer.sides import (
     DIAGNOSIS,
     DiagnosisSummary,

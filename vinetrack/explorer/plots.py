@@ -9,8 +9,9 @@ from typing import Any
 from bokeh.models import ColumnDataSource, CustomJSTickFormatter, HoverTool, Range1d, Span, TapTool
 
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.curves import Curves, bands, error_bars, extent, measured, modelled, residuals, symmetric
+from vinetrack.explorer.curves import Curves
 from vinetrack.explorer.look import GRID, INK, MUTED, plot, vine_colour
+from vinetrack.explorer.series import bands, error_bars, extent, measured, modelled, residuals, symmetric
 
 ROW_PX = 25
 """Height of a bar of the errors; chosen: a label of 12 pixels and a gap as high."""

@@ -13,10 +13,11 @@ from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.choice import Choice
-from vinetrack.explorer.curves import overall_m, vine_colours
+from vinetrack.explorer.curves import overall_m
 from vinetrack.explorer.export import model_words
 from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
 from vinetrack.explorer.look import command_block, escaped, table
+from vinetrack.explorer.series import vine_colours
 from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
 from vinetrack.results.folder_layout import ResultsError, read_json
