@@ -1,0 +1,299 @@
+"""Kinds of laboratory: what is wrong in each, and what is right to say of it.
+
+A row with `_unknown` at its end holds the same data as the one without, but its sheet says neither specimen, day nor
+order: its rows then stand in the order of the trials.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hidden import laboratories as faults
+from hidden.balls import drops
+from hidden.designs import Setting, Wants
+from hidden.kinds import EFFECTS
+from hidden.shots import Camera, Campaign, Draw, Fault, Laboratory, careful, film, plan
+from hidden.verdicts import DAY, N_BY_VINE, ORDER, SPECIMEN, Should
+
+TRIALS = (24, 48)
+WHO, WHEN = ("specimen", "order"), ("specimen", "day", "order")
+
+Accept = Callable[[list[Setting]], bool]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One kind of laboratory.
+
+    `family` seeds the numbers: rows of one family are the same data. `faults` come one after the other; `quiet` is a
+    factor on the noise and scatter of a careful laboratory; `columns` are those of the sheet that say who and when.
+    """
+
+    name: str
+    family: str
+    should: Should
+    faults: tuple[Fault, ...] = ()
+    wants: Wants = Wants(payload=False)
+    accept: Accept = lambda settings: True  # noqa: ARG005
+    quiet: float = 1.0
+    columns: tuple[str, ...] = ()
+    model: tuple[str, ...] = ()
+
+
+def _vines(settings: list[Setting]) -> int:
+    return len({one.vine for one in settings})
+
+
+def _levels(settings: list[Setting]) -> int:
+    return len({one.pressure_kPa for one in settings}) // _vines(settings)
+
+
+def _one_or_two(settings: list[Setting]) -> bool:
+    return _vines(settings) <= 2 and _levels(settings) >= 4
+
+
+def _two(settings: list[Setting]) -> bool:
+    return _vines(settings) == 2
+
+
+def _one(settings: list[Setting]) -> bool:
+    return _vines(settings) == 1
+
+
+def _down(settings: list[Setting]) -> bool:
+    return settings[0].angle_deg == 0
+
+
+def _from_12_kPa(settings: list[Setting]) -> bool:
+    return min(one.pressure_kPa for one in settings) >= 12
+
+
+ADEQUATE = Should(("adequate",))
+NAMED = ("artefact", "ambiguous", "missing")
+
+
+def _names(*names: str, adequate: bool = False, verdicts: tuple[str, ...] = NAMED) -> Should:
+    """One of these names, which are all true, alone or with others."""
+    return Should((*verdicts, *(("adequate",) if adequate else ())), any_of=names, true=names)
+
+
+def _twice(row: Row, unknown: Should | None = None, columns: tuple[str, ...] = WHO) -> tuple[Row, Row]:
+    """A row whose sheet says who, when and in which order, and one whose sheet does not."""
+    silent = replace(row, name=f"{row.name}_unknown", should=unknown or row.should)
+    return replace(row, columns=columns), silent
+
+
+def _order_rows() -> list[Row]:
+    between = ("artefact", "ambiguous")
+    tied = _names(*ORDER, verdicts=between)
+    tubes = _names(*SPECIMEN, verdicts=between)
+    # Without the columns a step from tube to tube may pass for a drift, or stay in the scatter.
+    unlike = (*ORDER, *SPECIMEN, *DAY)
+    guessed = _names(*unlike, verdicts=between, adequate=True)
+    quietly = replace(_names(*unlike, verdicts=("artefact",), adequate=True), only=unlike)
+    rising, any_order = faults.in_rising_order, faults.by_vine
+    some = {"wants": Wants(payload=False), "accept": _one_or_two}
+    several = (faults.new_tubes(7, 0.03), faults.worn(0.005, 0.005), faults.zero_by_day(0.2))
+    rows = [
+        *_twice(
+            Row("wear_ordered", "wear_ordered", tied, (rising, faults.worn(0.01, 0.03)), **some), columns=("order",)
+        ),
+        *_twice(
+            Row("wear_random", "wear_random", quietly, (any_order, faults.worn(0.01, 0.03)), **some), columns=("order",)
+        ),
+        *_twice(Row("day_zeros_rising", "day_zeros_rising", guessed, (rising, *several), **some), columns=WHEN),
+        *_twice(Row("day_zeros_random", "day_zeros_random", guessed, (any_order, *several), **some), columns=WHEN),
+        *_twice(
+            Row("specimen_high", "specimen_high", tubes, (rising, faults.another_for_high_pressures), **some), guessed
+        ),
+        *_twice(Row("specimen_each", "specimen_each", tubes, (rising, faults.tube_each_condition), **some), guessed),
+        *_twice(
+            Row("specimen_mixed", "specimen_mixed", quietly, (any_order, faults.two_tubes_mixed), **some), ADEQUATE
+        ),
+        *_twice(
+            Row("specimen_replicate", "specimen_replicate", quietly, (any_order, faults.tube_each_replicate), **some),
+            ADEQUATE,
+        ),
+    ]
+    return rows
+
+
+def _camera_rows() -> list[Row]:
+    two = {"wants": Wants(payload=False, vines=2), "accept": _two}
+    return [
+        Row("wild_1pct", "wild_1pct", ADEQUATE, (faults.wild_points(0.01, 1, 10),)),
+        Row("wild_2pct_3mm", "wild_2pct_3mm", ADEQUATE, (faults.wild_points(0.02, 3, 3),)),
+        Row(
+            "n_by_vine_03",
+            "n_by_vine_03",
+            _names(*N_BY_VINE, adequate=True),
+            (faults.exponents_apart(0.03),),
+            quiet=0.6,
+            **two,
+        ),
+        Row("n_by_vine_06", "n_by_vine_06", _names(*N_BY_VINE), (faults.exponents_apart(0.06),), quiet=0.6, **two),
+        Row("lens_small", "lens_small", _names("lens", adequate=True), (faults.lens(0.08, 0.13),), quiet=0.5),
+        Row("lens_strong", "lens_strong", _names("lens"), (faults.lens(2, 6, quintic=True),), quiet=0.7),
+        Row("rolling_shutter", "rolling_shutter", _names("rolling_shutter"), (faults.rolling,), quiet=0.7),
+        Row("speed_noise", "speed_noise", ADEQUATE, (faults.blur(60e-6),), Wants(payload=False, fast=True)),
+        Row(
+            "trace_clock",
+            "trace_clock",
+            _names("*clock*", "*trace*", adequate=True),
+            (faults.physics(gamma=1.3), faults.trace_off(2, 6)),
+            Wants(payload=False, chamber=True),
+        ),
+    ]
+
+
+def _rig_rows() -> list[Row]:
+    both = Should(
+        ("missing", "ambiguous"), none_of=(), true=("air_drag", "inlet_loss"), any_of=("inlet_loss", "air_drag")
+    )
+    both = replace(both, all_of=("air_drag", "inlet_loss"), holds=("inlet_loss.K", "air_drag.C_D"))
+    supply = _names("supply_rise")
+    no_gauge = Should(("missing", "ambiguous"), none_of=("pressure_gauge",))
+    return [
+        Row("valve_6ms", "valve_6ms", supply, (faults.valve("exponential", 5, 7),), quiet=0.7),
+        Row("valve_smooth", "valve_smooth", supply, (faults.valve("smooth", 5, 8),), quiet=0.7),
+        Row(
+            "slack_tail",
+            "slack_tail",
+            _names("*slack*"),
+            (faults.slack_tail,),
+            Wants(payload=True),
+            _down,
+        ),
+        Row(
+            "drag_and_inlet",
+            "drag_and_inlet",
+            both,
+            (faults.inlet_half, faults.drag_beside_inlet),
+            Wants(payload=False, fast=True, inlet=True),
+            _one,
+            quiet=0.5,
+        ),
+        Row("gauge_off_by_nothing", "gauge_off_by_nothing", ADEQUATE, (), Wants(payload=False), _from_12_kPa),
+        *(
+            Row(
+                f"gauge_beside_{name}",
+                f"gauge_beside_{name}",
+                replace(no_gauge, any_of=(name,), true=(name,)),
+                (faults.effect(name),),
+                replace(EFFECTS[name][1], wide_chamber=False),
+                _from_12_kPa,
+                quiet=0.5,
+            )
+            for name in ("linear_damping", "inlet_loss", "tail_friction")
+        ),
+    ]
+
+
+CLEAN_EFFECTS = (
+    "reservoir_depletion",
+    "tail_friction",
+    "air_drag",
+    "inlet_loss",
+    "fold_inertia",
+    "linear_damping",
+    "payload_friction",
+    "latch_release",
+    "pressure_damping",
+    "wall_stretch",
+    "length_scale",
+)
+
+
+def _clean_rows() -> list[Row]:
+    drag = Should(("missing",), any_of=("air_drag",), only=("air_drag",), true=("air_drag",), holds=("air_drag.C_D",))
+    rows = [
+        Row("clean", "clean", ADEQUATE, (), Wants()),
+        Row("few_trials", "few_trials", ADEQUATE, (faults.few(2, 7),), Wants(payload=False)),
+        Row("falling_ball", "falling_ball", drag, model=("gravity",)),
+        Row("falling_ball_payload_friction", "falling_ball", drag, model=("gravity", "payload_friction")),
+    ]
+    for name in CLEAN_EFFECTS:
+        should = Should(("artefact", "ambiguous") if name == "length_scale" else ("missing", "ambiguous"))
+        should = replace(should, any_of=(name,), true=(name,))
+        wants = replace(EFFECTS[name][1], wide_chamber=False)
+        rows.append(Row(f"clean_{name}", f"clean_{name}", should, (faults.effect(name),), wants, quiet=0.5))
+    return rows
+
+
+ROWS: Mapping[str, Row] = {row.name: row for row in (*_clean_rows(), *_camera_rows(), *_rig_rows(), *_order_rows())}
+
+
+def campaign(name: str, seed: int, trials: tuple[int, int] = TRIALS) -> Campaign:
+    """The campaign of this row and seed, with as many trials; the same ones give the same numbers.
+
+    Raises
+    ------
+    KeyError
+        If there is no such row; see `ROWS`.
+    """
+    row = ROWS[name]
+    for attempt in range(50):
+        draw = np.random.default_rng([zlib.crc32(row.family.encode()), seed, attempt])
+        found = _falling(row, seed, draw) if row.model else _growing(row, seed, draw, trials)
+        if found is not None:
+            return found
+    raise RuntimeError(f"No campaign of row {name} moves with seed {seed}.")
+
+
+def _growing(row: Row, seed: int, draw: Draw, trials: tuple[int, int]) -> Campaign | None:
+    laboratory = careful(plan(draw, replace(row.wants, trials=trials), row.accept), draw, row.quiet)
+    laboratory = faults.together(*row.faults)(laboratory, draw)
+    laboratory = replace(laboratory, columns=row.columns)
+    recordings = film(laboratory, draw)
+    if recordings is None:
+        return None
+    return Campaign(recordings, {"ambient_pressure_kPa": 101.325}, _truth(row, seed, laboratory, len(recordings)))
+
+
+def _truth(row: Row, seed: int, laboratory: Laboratory, count: int) -> dict[str, object]:
+    vines = dict.fromkeys(shot.setting.vine for shot in laboratory.shots)
+    settings = [shot.setting for shot in laboratory.shots]
+    truths = dict(laboratory.truths)
+    exponents = {shot.physics.n for shot in laboratory.shots}
+    if len(exponents) == 1:
+        truths["eversion_damping.n"] = exponents.pop()
+    camera: Camera = laboratory.camera
+    return {
+        "row": row.name,
+        "seed": seed,
+        "should": row.should.to_json(),
+        "truths": truths,
+        "vines": [{**vars(vine), "B": vine.B, "n": vine.n} for vine in vines],
+        "n_trials": count,
+        "pressures_kPa": sorted({one.pressure_kPa for one in settings}),
+        "camera": {name: None if isinstance(v, float) and math.isnan(v) else v for name, v in vars(camera).items()},
+        "trials": [
+            {
+                "order": k + 1,
+                "specimen": shot.specimen,
+                "day": shot.day,
+                "B": shot.physics.B,
+                "n": shot.physics.n,
+                "pressure_Pa": shot.tube.pressure,
+                "yield_pressure_Pa": shot.tube.yield_pressure,
+            }
+            for k, shot in enumerate(laboratory.shots)
+        ],
+    }
+
+
+def _falling(row: Row, seed: int, draw: Draw) -> Campaign:
+    recordings = drops(draw, (8, 12), C_D=0.5, noise_m=2e-3)
+    truth = {
+        "row": row.name,
+        "seed": seed,
+        "should": row.should.to_json(),
+        "truths": {"air_drag.C_D": 0.5, "noise_m": 2e-3},
+        "n_trials": len(recordings),
+    }
+    return Campaign(recordings, {"ambient_pressure_kPa": 101.325, "model": list(row.model)}, truth)
