@@ -9,9 +9,16 @@ Every campaign follows from its kind and its seed alone. Seeds 0–899 are for t
 the tests; seeds from 10000 on score, and nothing may be tuned on those.
 """
 
-from hidden.campaigns import Hidden, Truth, make
-from hidden.folder import write_folder
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from hidden.kinds import EFFECTS, KINDS, NULLS, OUTSIDERS, PAIRS, kinds
+
+if TYPE_CHECKING:
+    from hidden.campaigns import Hidden, Truth, make
+    from hidden.folder import write_folder
 
 FIRST_SCORING_SEED = 10_000
 
@@ -28,3 +35,12 @@ __all__ = [
     "make",
     "write_folder",
 ]
+
+_LATER = {"Hidden": "campaigns", "Truth": "campaigns", "make": "campaigns", "write_folder": "folder"}
+
+
+def __getattr__(name: str) -> object:
+    """What needs the package's records is imported when asked for: laboratories are made without them."""
+    if name in _LATER:
+        return getattr(import_module(f"hidden.{_LATER[name]}"), name)
+    raise AttributeError(name)

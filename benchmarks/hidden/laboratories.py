@@ -187,7 +187,7 @@ def _changed(shot: Shot, B: float = 1.0, yield_Pa: float = 0.0) -> Shot:
 
 
 def wild_points(share: float, low_mm: float, high_mm: float) -> Fault:
-    """This share of the points are off by so much, either way."""
+    """So many of the points, as a part of all, are off by so much, either way."""
 
     def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG001
         camera = replace(laboratory.camera, wild_share=share, wild_m=(low_mm / 1e3, high_mm / 1e3))

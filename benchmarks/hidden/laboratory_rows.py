@@ -21,6 +21,7 @@ from hidden.shots import Camera, Campaign, Draw, Fault, Laboratory, careful, fil
 from hidden.verdicts import DAY, N_BY_VINE, ORDER, SPECIMEN, Should
 
 TRIALS = (24, 48)
+BARE = Wants(payload=False)
 WHO, WHEN = ("specimen", "order"), ("specimen", "day", "order")
 
 Accept = Callable[[list[Setting]], bool]
@@ -38,7 +39,7 @@ class Row:
     family: str
     should: Should
     faults: tuple[Fault, ...] = ()
-    wants: Wants = Wants(payload=False)
+    wants: Wants = BARE
     accept: Accept = lambda settings: True  # noqa: ARG005
     quiet: float = 1.0
     columns: tuple[str, ...] = ()
@@ -97,7 +98,7 @@ def _order_rows() -> list[Row]:
     guessed = _names(*unlike, verdicts=between, adequate=True)
     quietly = replace(_names(*unlike, verdicts=("artefact",), adequate=True), only=unlike)
     rising, any_order = faults.in_rising_order, faults.by_vine
-    some = {"wants": Wants(payload=False), "accept": _one_or_two}
+    some = {"wants": BARE, "accept": _one_or_two}
     several = (faults.new_tubes(7, 0.03), faults.worn(0.005, 0.005), faults.zero_by_day(0.2))
     rows = [
         *_twice(
@@ -178,7 +179,7 @@ def _rig_rows() -> list[Row]:
             _one,
             quiet=0.5,
         ),
-        Row("gauge_off_by_nothing", "gauge_off_by_nothing", ADEQUATE, (), Wants(payload=False), _from_12_kPa),
+        Row("gauge_off_by_nothing", "gauge_off_by_nothing", ADEQUATE, (), BARE, _from_12_kPa),
         *(
             Row(
                 f"gauge_beside_{name}",
@@ -213,7 +214,7 @@ def _clean_rows() -> list[Row]:
     drag = Should(("missing",), any_of=("air_drag",), only=("air_drag",), true=("air_drag",), holds=("air_drag.C_D",))
     rows = [
         Row("clean", "clean", ADEQUATE, (), Wants()),
-        Row("few_trials", "few_trials", ADEQUATE, (faults.few(2, 7),), Wants(payload=False)),
+        Row("few_trials", "few_trials", ADEQUATE, (faults.few(2, 7),), BARE),
         Row("falling_ball", "falling_ball", drag, model=("gravity",)),
         Row("falling_ball_payload_friction", "falling_ball", drag, model=("gravity", "payload_friction")),
     ]
