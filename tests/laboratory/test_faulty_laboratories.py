@@ -1,0 +1,265 @@
+"""Campaigns of laboratories with faults are what they say; an answer about one is judged by what is right to say.
+
+They live in `benchmarks/hidden`, share no code with the package's own laboratory, and are scored by
+`benchmarks/laboratories.py`. Seeds from 20900 on are these tests'.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hidden import laboratories as faults
+from hidden.balls import fallen
+from hidden.designs import Wants
+from hidden.laboratory_folder import write_experiment, write_truth
+from hidden.laboratory_rows import BARE, ROWS, campaign
+from hidden.motion import AIR, G, Physics, Tube, follow
+from hidden.shots import Camera, Laboratory, _seen, careful, film, opened, plan
+from hidden.slack import follow_slack
+from hidden.verdicts import Answer, Should, judge
+from scipy.integrate import solve_ivp
+
+from vinetrack.experiment import read_experiment
+
+SEED = 20_900
+FEW = (18, 24)
+TUBE = Tube(pressure=20e3, yield_pressure=3e3, diameter=0.024, thickness=2e-4, length=0.28, payload=0.0, cosine=0.0)
+B, N = 6.44, 0.37
+
+
+def drawn(seed: int = SEED, wants: Wants = BARE) -> tuple[Laboratory, np.random.Generator]:
+    draw = np.random.default_rng(seed)
+    return careful(plan(draw, replace(wants, trials=FEW), lambda settings: True), draw), draw  # noqa: ARG005
+
+
+# Campaigns.
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_every_row_makes_a_campaign_that_moves(name):
+    made = campaign(name, SEED, FEW)
+    fewest = 2 if name == "few_trials" else 8 if name.startswith("falling") else 16
+    assert fewest <= len(made.recordings) <= 24
+    for one in made.recordings:
+        assert one.time_s.shape == one.position_m.shape
+        assert np.all(np.isfinite(one.position_m))
+        assert np.ptp(one.position_m) > 0.01
+    json.dumps(made.truth, allow_nan=False)
+
+
+def test_the_same_seed_gives_the_same_numbers_and_another_seed_others():
+    one, again, other = (campaign("wear_random", seed, FEW).recordings[3] for seed in (SEED, SEED, SEED + 1))
+    assert one.cells == again.cells
+    assert np.array_equal(one.position_m, again.position_m)
+    assert other.position_m.size != one.position_m.size or not np.array_equal(one.position_m, other.position_m)
+
+
+@pytest.mark.parametrize("name", [name for name in ROWS if f"{name}_unknown" in ROWS])
+def test_a_silent_sheet_differs_in_its_columns_and_order_alone(name):
+    told, silent = campaign(name, SEED, FEW), campaign(f"{name}_unknown", SEED, FEW)
+    tracks = {one.cells["trial"]: one.position_m for one in told.recordings}
+    assert [one.cells["trial"] for one in silent.recordings] == sorted(tracks)
+    for one in silent.recordings:
+        assert np.array_equal(one.position_m, tracks[one.cells["trial"]])
+        assert not {"specimen", "day", "order"} & set(one.cells)
+    orders = [int(one.cells["order"]) for one in told.recordings]
+    assert sorted(orders) == [int(str(trial)[1:]) for trial in sorted(tracks)]
+
+
+def test_a_folder_is_one_that_the_package_reads(tmp_path):
+    made = campaign("trace_clock", SEED, FEW)
+    write_experiment(made, tmp_path / "one")
+    write_truth(made, tmp_path / "truth" / "one.json")
+    read = read_experiment(tmp_path / "one")
+    assert len(read.trials) == len(made.recordings)
+    first = made.recordings[0]
+    assert read.trials[0].pressure_Pa == pytest.approx(1e3 * float(first.cells["pressure_kPa"]))
+    header = (tmp_path / "one" / str(first.cells["track"])).read_text().splitlines()[0]
+    assert header == "time_s,position_m,pressure_kPa"
+    assert json.loads((tmp_path / "truth" / "one.json").read_text())["row"] == "trace_clock"
+
+
+def test_a_ball_needs_neither_wall_nor_length(tmp_path):
+    write_experiment(campaign("falling_ball", SEED), tmp_path / "balls")
+    read = read_experiment(tmp_path / "balls")
+    assert read.settings.model == ("gravity",) or list(read.settings.model) == ["gravity"]
+    assert all(trial.travel_ratio == 1 for trial in read.trials)
+
+
+# Order, specimens, days.
+
+
+def test_wear_follows_the_order_of_each_vine():
+    laboratory, draw = drawn()
+    before = faults.in_rising_order(laboratory, draw)
+    after = faults.worn(0.02, 0.02)(before, draw)
+    for vine in {shot.setting.vine for shot in before.shots}:
+        pairs = [(a, b) for a, b in zip(before.shots, after.shots, strict=True) if a.setting.vine == vine]
+        assert [b.physics.B / a.physics.B for a, b in pairs] == pytest.approx([1 + 0.02 * k for k in range(len(pairs))])
+        pressures = [a.setting.pressure_kPa for a, _ in pairs]
+        assert pressures == sorted(pressures)
+
+
+def test_the_high_pressures_have_a_tube_of_their_own():
+    laboratory, draw = drawn()
+    after = faults.another_for_high_pressures(laboratory, draw)
+    for vine in {shot.setting.vine for shot in after.shots}:
+        low = [s.setting.pressure_kPa for s in after.shots if s.setting.vine == vine and s.specimen == "a"]
+        high = [s.setting.pressure_kPa for s in after.shots if s.setting.vine == vine and s.specimen == "b"]
+        assert max(low) < min(high)
+    shots = list(zip(laboratory.shots, after.shots, strict=True))
+    assert {round(b.physics.B / a.physics.B, 6) for a, b in shots} == {1.0, 1.08}
+    assert {round(b.tube.yield_pressure - a.tube.yield_pressure) for a, b in shots} == {0, 300}
+
+
+def test_a_tube_a_condition_is_shared_by_its_replicates_and_by_no_other():
+    laboratory, draw = drawn()
+    after = faults.tube_each_condition(laboratory, draw)
+    tubes: dict[object, set[object]] = {}
+    for shot in after.shots:
+        key = shot.setting.vine, shot.setting.pressure_kPa
+        tubes.setdefault(key, set()).add((shot.setting.vine, shot.specimen))
+    assert all(len(own) == 1 for own in tubes.values())
+    assert len(set().union(*tubes.values())) == len(tubes)
+
+
+def test_a_day_has_one_zero():
+    laboratory, draw = drawn()
+    after = faults.zero_by_day(0.2)(laboratory, draw)
+    shifts: dict[str, set[float]] = {}
+    for a, b in zip(laboratory.shots, after.shots, strict=True):
+        shifts.setdefault(b.day, set()).add(round(b.tube.pressure - a.tube.pressure, 6))
+    assert 3 <= len(shifts) <= 5
+    assert all(len(own) == 1 for own in shifts.values())
+    assert [shot.day for shot in after.shots] == sorted(shot.day for shot in after.shots)
+
+
+# Camera, valve, tail.
+
+
+def test_a_row_that_is_read_late_shows_what_was_there_then():
+    laboratory, draw = drawn()
+    shot = laboratory.shots[0]
+    camera = faults.rolling(laboratory, draw).camera
+    since = np.arange(-5, 60) / shot.setting.capture_hz
+    y, _, _ = _seen(shot, camera, since)
+    moment = since + camera.row_delay_s_m * (y - camera.lens_centre_m)
+    order = np.argsort(moment)
+    out, _ = follow(moment[order], shot.tube, shot.physics, np.empty((0, 3)))
+    assert y[order] == pytest.approx(out[:, 0], abs=2e-6)
+
+
+def test_a_lens_shifts_the_ends_by_as_much_as_it_says():
+    laboratory, draw = drawn()
+    after = faults.lens(2, 6, quintic=True)(laboratory, draw)
+    half = 0.5 * max(shot.tube.length for shot in after.shots)
+    camera = after.camera
+    assert camera.lens_k3 * half**3 + camera.lens_k5 * half**5 == pytest.approx(after.truths["lens_shift_m"])
+    assert -6e-3 <= after.truths["lens_shift_m"] <= -2e-3
+
+
+def test_wild_points_are_as_many_and_as_far_off_as_said():
+    laboratory, _ = drawn()
+    quiet = replace(laboratory, camera=Camera(noise_m=0.0))
+    spoilt = faults.wild_points(0.02, 3, 3)(quiet, np.random.default_rng(1))
+    clean, wild = film(quiet, np.random.default_rng(2)), film(spoilt, np.random.default_rng(2))
+    assert clean is not None
+    assert wild is not None
+    off = wild[0].position_m - clean[0].position_m
+    assert set(np.round(np.abs(off), 9)) <= {0.0, 3e-3}
+    # The draws part after the first recording: the rest tells how many there are.
+    jumps = [np.abs(np.diff(one.position_m, 2)) > 3e-3 for one in wild]
+    assert 0.005 < np.mean(np.concatenate(jumps)) / 3 < 0.04
+
+
+@pytest.mark.parametrize("law", ["exponential", "smooth"])
+def test_a_valve_opens_from_nothing_to_all(law):
+    part = np.linspace(0, 12, 500)
+    share = opened(part, law)
+    assert share[0] == 0
+    assert share[-1] == pytest.approx(1, abs=1e-5)
+    assert np.all(np.diff(share) >= 0)
+
+
+def test_a_tail_that_is_never_slack_moves_as_it_always_did():
+    times = np.arange(-3, 400) * 5e-4
+    expected, _ = follow(times, TUBE, Physics(B=B, n=N), np.empty((0, 3)))
+    found = follow_slack(times, TUBE, B, N)
+    assert found[:, 2] == pytest.approx(0, abs=1e-12)
+    # Up to 98 %: there the other simulator lets the gas of the tube have mass too, and this one lets it have none.
+    inside = expected[:, 1] < 0.98 * TUBE.length
+    assert found[inside, 0] == pytest.approx(expected[inside, 1], abs=2e-5)
+
+
+def test_a_slack_payload_falls_free_while_the_tip_goes_its_own_pace():
+    tube = TUBE._replace(pressure=7e3, payload=0.0356, cosine=1.0)
+    times = np.linspace(0, 0.25, 500)
+    out = follow_slack(times, tube, B, N)
+    slack = (out[:, 2] > 1e-6) & (out[:, 0] < tube.length)
+    assert np.count_nonzero(slack) > 100
+    own = 0.5 * ((tube.pressure - tube.yield_pressure) * math.pi * tube.diameter**2 / 4 / B) ** (1 / N)
+    assert np.diff(out[slack, 0]) / np.diff(times[slack]) == pytest.approx(own, rel=1e-6)
+    assert np.diff(out[slack, 1]) / np.diff(times[slack]) == pytest.approx(G, rel=1e-6)
+
+
+def test_half_the_step_changes_nothing_that_a_camera_sees():
+    tube = TUBE._replace(pressure=28e3, payload=0.0356, cosine=1.0)
+    times = np.linspace(0, 0.1, 100)
+    coarse, fine = (follow_slack(times, tube, B, N, longest_s=step)[:, 0] for step in (2e-5, 1e-5))
+    assert coarse == pytest.approx(fine, abs=1e-6)
+
+
+def test_a_ball_falls_as_the_equation_of_motion_has_it():
+    mass, diameter, C_D = 2.7e-3, 0.04, 0.5
+    drag = 0.5 * AIR * math.pi * diameter**2 / 4 * C_D
+    times = np.linspace(0, 0.8, 50)
+    found = solve_ivp(
+        lambda t, s: (s[1], G - drag * s[1] ** 2 / mass),  # noqa: ARG005
+        (0, 0.8),
+        (0.0, 0.0),
+        t_eval=times,
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    assert fallen(times, mass, diameter, C_D) == pytest.approx(found.y[0], abs=1e-8)
+    assert np.all(fallen(np.array([-1.0, 0.0]), mass, diameter, C_D) == 0)
+
+
+# Judgement.
+
+LENS = Should(("artefact", "ambiguous", "adequate"), any_of=("lens",), true=("lens",))
+WORN = Should(("artefact",), any_of=("*order*",), only=("*order*",), true=("*order*",))
+BOTH = Should(("missing", "ambiguous"), ("drag",), all_of=("drag", "inlet"), true=("drag", "inlet"), holds=("drag.C",))
+
+
+def answer(verdict: str, *names: str, size: tuple[float, float] | None = None) -> Answer:
+    sizes = {"drag.C": {"value": sum(size) / 2, "low_95": size[0], "high_95": size[1]}} if size else {}
+    return Answer(verdict, names, names[:1] if verdict == "missing" else (), numbers=sizes)
+
+
+@pytest.mark.parametrize(
+    ("said", "should", "right", "wrong_name"),
+    [
+        (answer("adequate"), LENS, True, False),
+        (answer("ambiguous", "lens", "latch_release"), LENS, True, False),
+        (answer("ambiguous", "latch_release", "leak"), LENS, False, False),
+        (answer("missing", "latch_release"), LENS, False, True),
+        (answer("artefact", "length_scale"), LENS, False, True),
+        (answer("unexplained"), LENS, False, False),
+        (answer("adequate"), WORN, False, False),
+        (answer("artefact", "drift_with_order"), WORN, True, False),
+        (answer("artefact", "drift_with_order", "pressure_gain"), WORN, False, False),
+        (answer("ambiguous", "drag", "inlet"), BOTH, True, False),
+        (answer("ambiguous", "drag", "leak"), BOTH, False, False),
+        (answer("missing", "drag", size=(0.9, 1.1)), BOTH, True, False),
+        (answer("missing", "drag", size=(1.1, 1.2)), BOTH, False, False),
+    ],
+)
+def test_an_answer_is_judged_by_what_is_right_to_say(said, should, right, wrong_name):
+    judged = judge(said, should, {"drag.C": 1.0})
+    assert (judged.right, judged.wrong_name) == (right, wrong_name)
+    assert bool(judged.why) != right
