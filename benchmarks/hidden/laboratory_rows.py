@@ -22,6 +22,7 @@ from hidden.verdicts import DAY, N_BY_VINE, ORDER, SPECIMEN, Should
 
 TRIALS = (24, 48)
 BARE = Wants(payload=False)
+FAST = Wants(payload=False, fast=True)
 WHO, WHEN = ("specimen", "order"), ("specimen", "day", "order")
 
 Accept = Callable[[list[Setting]], bool]
@@ -68,6 +69,11 @@ def _one(settings: list[Setting]) -> bool:
 
 def _down(settings: list[Setting]) -> bool:
     return settings[0].angle_deg == 0
+
+
+def _very_fast(settings: list[Setting]) -> bool:
+    """One vine, thin enough to reach tens of metres a second."""
+    return _one(settings) and settings[0].vine.thickness_um <= 100 and max(one.pressure_kPa for one in settings) > 45
 
 
 def _from_12_kPa(settings: list[Setting]) -> bool:
@@ -140,28 +146,27 @@ def _camera_rows() -> list[Row]:
         Row("n_by_vine_06", "n_by_vine_06", _names(*N_BY_VINE), (faults.exponents_apart(0.06),), quiet=0.6, **two),
         Row("lens_small", "lens_small", _names("lens", adequate=True), (faults.lens(0.08, 0.13),), quiet=0.5),
         Row("lens_strong", "lens_strong", _names("lens"), (faults.lens(2, 6, quintic=True),), quiet=0.7),
-        Row("rolling_shutter", "rolling_shutter", _names("rolling_shutter"), (faults.rolling,), quiet=0.7),
-        Row("speed_noise", "speed_noise", ADEQUATE, (faults.blur(60e-6),), Wants(payload=False, fast=True)),
+        Row("rolling_shutter", "rolling_shutter", _names("rolling_shutter"), (faults.rolling,), FAST, quiet=0.7),
+        Row("speed_noise", "speed_noise", ADEQUATE, (faults.blur(60e-6),), FAST, _very_fast, quiet=0.5),
         Row(
             "trace_clock",
             "trace_clock",
             _names("*clock*", "*trace*", adequate=True),
-            (faults.physics(gamma=1.3), faults.trace_off(2, 6)),
+            (faults.physics(gamma=1.3), faults.trace_off(5, 15)),
             Wants(payload=False, chamber=True),
         ),
     ]
 
 
 def _rig_rows() -> list[Row]:
-    both = Should(
-        ("missing", "ambiguous"), none_of=(), true=("air_drag", "inlet_loss"), any_of=("inlet_loss", "air_drag")
-    )
-    both = replace(both, all_of=("air_drag", "inlet_loss"), holds=("inlet_loss.K", "air_drag.C_D"))
+    losses = ("air_drag", "inlet_loss")
+    sizes = ("inlet_loss.K", "air_drag.C_D")
+    both = Should(("missing", "ambiguous"), any_of=losses, all_of=losses, true=losses, holds=sizes)
     supply = _names("supply_rise")
     no_gauge = Should(("missing", "ambiguous"), none_of=("pressure_gauge",))
     return [
         Row("valve_6ms", "valve_6ms", supply, (faults.valve("exponential", 5, 7),), quiet=0.7),
-        Row("valve_smooth", "valve_smooth", supply, (faults.valve("smooth", 5, 8),), quiet=0.7),
+        Row("valve_smooth", "valve_smooth", supply, (faults.valve("smooth", 5, 8),), FAST, quiet=0.5),
         Row(
             "slack_tail",
             "slack_tail",
@@ -222,7 +227,16 @@ def _clean_rows() -> list[Row]:
         should = Should(("artefact", "ambiguous") if name == "length_scale" else ("missing", "ambiguous"))
         should = replace(should, any_of=(name,), true=(name,))
         wants = replace(EFFECTS[name][1], wide_chamber=False)
-        rows.append(Row(f"clean_{name}", f"clean_{name}", should, (faults.effect(name),), wants, quiet=0.5))
+        rows.append(
+            Row(
+                f"clean_{name}",
+                f"clean_{name}",
+                should,
+                (faults.effect(name),),
+                wants,
+                quiet=0.2 if wants.quiet else 0.5,
+            )
+        )
     return rows
 
 
