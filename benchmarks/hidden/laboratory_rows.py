@@ -19,8 +19,12 @@ from hidden.designs import Setting, Wants
 from hidden.kinds import EFFECTS
 from hidden.shots import Camera, Campaign, Draw, Fault, Laboratory, careful, film, plan
 from hidden.verdicts import DAY, N_BY_VINE, ORDER, SPECIMEN, Should
+from hidden.visibility import visible_sigma
 
 TRIALS = (24, 48)
+CLEAR = 12.0
+"""Standard deviations at which there is no excuse for not seeing a fault; the bar asks for what lies above 8."""
+
 BARE = Wants(payload=False)
 FAST = Wants(payload=False, fast=True)
 WHO, WHEN = ("specimen", "order"), ("specimen", "day", "order")
@@ -34,6 +38,7 @@ class Row:
 
     `family` seeds the numbers: rows of one family are the same data. `faults` come one after the other; `quiet` is a
     factor on the noise and scatter of a careful laboratory; `columns` are those of the sheet that say who and when.
+    With `least_sigma` it is measured how visible the fault is, and campaigns where it is less so are drawn again.
     """
 
     name: str
@@ -44,6 +49,7 @@ class Row:
     accept: Accept = lambda settings: True  # noqa: ARG005
     quiet: float = 1.0
     columns: tuple[str, ...] = ()
+    least_sigma: float | None = None
     model: tuple[str, ...] = ()
 
 
@@ -138,22 +144,54 @@ def _camera_rows() -> list[Row]:
         Row(
             "n_by_vine_03",
             "n_by_vine_03",
-            _names(*N_BY_VINE, adequate=True),
+            _names(*N_BY_VINE),
             (faults.exponents_apart(0.03),),
             quiet=0.6,
+            least_sigma=0.0,
             **two,
         ),
-        Row("n_by_vine_06", "n_by_vine_06", _names(*N_BY_VINE), (faults.exponents_apart(0.06),), quiet=0.6, **two),
-        Row("lens_small", "lens_small", _names("lens", adequate=True), (faults.lens(0.08, 0.13),), quiet=0.5),
-        Row("lens_strong", "lens_strong", _names("lens"), (faults.lens(2, 6, quintic=True),), quiet=0.7),
-        Row("rolling_shutter", "rolling_shutter", _names("rolling_shutter"), (faults.rolling,), FAST, quiet=0.7),
+        Row(
+            "n_by_vine_06",
+            "n_by_vine_06",
+            _names(*N_BY_VINE),
+            (faults.exponents_apart(0.06),),
+            quiet=0.6,
+            least_sigma=CLEAR,
+            **two,
+        ),
+        Row(
+            "lens_small",
+            "lens_small",
+            _names("lens", adequate=True),
+            (faults.lens(0.08, 0.13),),
+            quiet=0.5,
+            least_sigma=0.0,
+        ),
+        Row(
+            "lens_strong",
+            "lens_strong",
+            _names("lens"),
+            (faults.lens(2, 6, quintic=True),),
+            quiet=0.7,
+            least_sigma=CLEAR,
+        ),
+        Row(
+            "rolling_shutter",
+            "rolling_shutter",
+            _names("rolling_shutter"),
+            (faults.rolling,),
+            FAST,
+            quiet=0.7,
+            least_sigma=CLEAR,
+        ),
         Row("speed_noise", "speed_noise", ADEQUATE, (faults.blur(60e-6),), FAST, _very_fast, quiet=0.5),
         Row(
             "trace_clock",
             "trace_clock",
-            _names("*clock*", "*trace*", adequate=True),
+            _names("*clock*", "*trace*"),
             (faults.physics(gamma=1.3), faults.trace_off(5, 15)),
             Wants(payload=False, chamber=True),
+            least_sigma=CLEAR,
         ),
     ]
 
@@ -163,10 +201,11 @@ def _rig_rows() -> list[Row]:
     sizes = ("inlet_loss.K", "air_drag.C_D")
     both = Should(("missing", "ambiguous"), any_of=losses, all_of=losses, true=losses, holds=sizes)
     supply = _names("supply_rise")
+    opening, smooth = faults.valve("exponential", 5, 7), faults.valve("smooth", 5, 8)
     no_gauge = Should(("missing", "ambiguous"), none_of=("pressure_gauge",))
     return [
-        Row("valve_6ms", "valve_6ms", supply, (faults.valve("exponential", 5, 7),), quiet=0.7),
-        Row("valve_smooth", "valve_smooth", supply, (faults.valve("smooth", 5, 8),), FAST, quiet=0.5),
+        Row("valve_6ms", "valve_6ms", supply, (opening,), quiet=0.7, least_sigma=CLEAR),
+        Row("valve_smooth", "valve_smooth", supply, (smooth,), FAST, quiet=0.5, least_sigma=CLEAR),
         Row(
             "slack_tail",
             "slack_tail",
@@ -174,6 +213,7 @@ def _rig_rows() -> list[Row]:
             (faults.slack_tail,),
             Wants(payload=True),
             _down,
+            least_sigma=CLEAR,
         ),
         Row(
             "drag_and_inlet",
@@ -194,6 +234,7 @@ def _rig_rows() -> list[Row]:
                 replace(EFFECTS[name][1], wide_chamber=False),
                 _from_12_kPa,
                 quiet=0.5,
+                least_sigma=CLEAR,
             )
             for name in ("linear_damping", "inlet_loss", "tail_friction")
         ),
@@ -235,6 +276,7 @@ def _clean_rows() -> list[Row]:
                 (faults.effect(name),),
                 wants,
                 quiet=0.2 if wants.quiet else 0.5,
+                least_sigma=CLEAR,
             )
         )
     return rows
@@ -243,8 +285,10 @@ def _clean_rows() -> list[Row]:
 ROWS: Mapping[str, Row] = {row.name: row for row in (*_clean_rows(), *_camera_rows(), *_rig_rows(), *_order_rows())}
 
 
-def campaign(name: str, seed: int, trials: tuple[int, int] = TRIALS) -> Campaign:
+def campaign(name: str, seed: int, trials: tuple[int, int] = TRIALS, *, weighed: bool = True) -> Campaign:
     """The campaign of this row and seed, with as many trials; the same ones give the same numbers.
+
+    Unless it is `weighed`, the fault may be one that does not show.
 
     Raises
     ------
@@ -254,19 +298,23 @@ def campaign(name: str, seed: int, trials: tuple[int, int] = TRIALS) -> Campaign
     row = ROWS[name]
     for attempt in range(50):
         draw = np.random.default_rng([zlib.crc32(row.family.encode()), seed, attempt])
-        found = _falling(row, seed, draw) if row.model else _growing(row, seed, draw, trials)
+        found = _falling(row, seed, draw) if row.model else _growing(row, seed, draw, trials, weighed)
         if found is not None:
             return found
     raise RuntimeError(f"No campaign of row {name} moves with seed {seed}.")
 
 
-def _growing(row: Row, seed: int, draw: Draw, trials: tuple[int, int]) -> Campaign | None:
+def _growing(row: Row, seed: int, draw: Draw, trials: tuple[int, int], weighed: bool) -> Campaign | None:
     laboratory = careful(plan(draw, replace(row.wants, trials=trials), row.accept), draw, row.quiet)
     laboratory = faults.together(*row.faults)(laboratory, draw)
     laboratory = replace(laboratory, columns=row.columns)
     recordings = film(laboratory, draw)
     if recordings is None:
         return None
+    if weighed and row.least_sigma is not None:
+        laboratory = laboratory.known(visible_sigma=visible_sigma(laboratory))
+        if laboratory.truths["visible_sigma"] < row.least_sigma:
+            return None
     return Campaign(recordings, {"ambient_pressure_kPa": 101.325}, _truth(row, seed, laboratory, len(recordings)))
 
 

@@ -197,7 +197,7 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
     length = shot.tube.length
     times = np.arange(MOST_FRAMES) * step_s
     since = (times - release_s) / (1 + camera.clock)
-    y, speed, gauge_Pa = _seen(shot, camera, since)
+    y, speed, gauge_Pa = seen(shot, camera, since)
     stop = int(np.searchsorted(y, part * length))
     if camera.sees_end and y[-1] >= length:
         stop = min(int(np.searchsorted(y, length)) + after, times.size)
@@ -205,20 +205,37 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
     if np.count_nonzero(speed[:stop] > 0) < FEWEST_MOVING or y[stop - 1] < 0.25 * length:
         return None
     y, speed = y[:stop], speed[:stop]
-    u = y - camera.lens_centre_m
-    position = (y + camera.lens_k3 * u**3 + camera.lens_k5 * u**5) * (1 + camera.scale)
-    position = position + float(draw.uniform(-0.05, 0.05)) + camera.noise_m * _correlated(draw, camera.rho, stop)
+    position = (
+        imaged(y, camera) + float(draw.uniform(-0.05, 0.05)) + camera.noise_m * _correlated(draw, camera.rho, stop)
+    )
     position += camera.blur_s * speed * draw.standard_normal(stop)
     wild = draw.uniform(size=stop) < camera.wild_share
     position[wild] += draw.choice([-1, 1], int(wild.sum())) * draw.uniform(*camera.wild_m, int(wild.sum()))
     trace = None
     if math.isfinite(camera.trace_late_s):
-        trace = np.interp(times[:stop] + camera.trace_late_s, times, gauge_Pa)
+        trace = gauge(times, gauge_Pa, camera.trace_late_s)[:stop]
         trace = (trace + camera.trace_sigma_Pa * draw.standard_normal(stop)) / 1e3
     return times[:stop], position, trace
 
 
-def _seen(shot: Shot, camera: Camera, since: Floats) -> tuple[Floats, Floats, Floats]:
+def imaged(y: Floats, camera: Camera) -> Floats:
+    """Positions, m, as lens and scale have them; the zero is arbitrary."""
+    u = y - camera.lens_centre_m
+    return (y + camera.lens_k3 * u**3 + camera.lens_k5 * u**5) * (1 + camera.scale)
+
+
+def gauge(times: Floats, pressure_Pa: Floats, late_s: float) -> Floats:
+    """Pressure as a gauge tells it whose clock is ahead."""
+    return np.interp(times + late_s, times, pressure_Pa)
+
+
+def reported(shot: Shot, camera: Camera, since: Floats) -> tuple[Floats, Floats, Floats]:
+    """What camera and gauge say without noise at times since release: position, m, lead speed, m/s, pressure, Pa."""
+    y, speed, gauge_Pa = seen(shot, camera, since / (1 + camera.clock))
+    return imaged(y, camera), speed, gauge_Pa
+
+
+def seen(shot: Shot, camera: Camera, since: Floats) -> tuple[Floats, Floats, Floats]:
     """Lead position, m, lead speed, m/s, and pressure, Pa, as the rows of each frame catch them."""
     if camera.row_delay_s_m == 0:
         return _moved(shot, since)

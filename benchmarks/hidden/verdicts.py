@@ -14,6 +14,9 @@ DAY = ("*day*", "*batch*")
 N_BY_VINE = ("*n_by_vine*", "*exponent*", "n_*vine*")
 """Patterns of names: what differs between trials has no formula, and no one name."""
 
+FAINT = 8.0
+"""Standard deviations of a whole campaign below which a fault need not be seen: `adequate` is right then."""
+
 
 @dataclass(frozen=True)
 class Should:
@@ -95,15 +98,17 @@ def judge(answer: Answer, should: Should, truths: Mapping[str, float]) -> Judgem
     names = answer.answer_set
     alone = len(names) == 1 and answer.verdict in ("missing", "artefact", "ambiguous")
     wrong_name = alone and not matches(names[0], should.true)
-    why = _wrong(answer, should) or _missed_size(answer, should, truths)
+    why = _wrong(answer, should, truths.get("visible_sigma", math.inf)) or _missed_size(answer, should, truths)
     if wrong_name and not why:
         why = f"{names[0]} is not what it is"
     return Judgement(not why, wrong_name, why)
 
 
-def _wrong(answer: Answer, should: Should) -> str:
+def _wrong(answer: Answer, should: Should, visible: float) -> str:
     """What is wrong with verdict and names, in words; blank if nothing."""
     names = answer.answer_set
+    if answer.verdict == "adequate" and visible < FAINT:
+        return ""
     if answer.verdict not in should.verdicts:
         return f"said {answer.verdict}"
     barred = [name for name in names if matches(name, should.none_of)]

@@ -18,9 +18,10 @@ from hidden.designs import Wants
 from hidden.laboratory_folder import write_experiment, write_truth
 from hidden.laboratory_rows import BARE, ROWS, campaign
 from hidden.motion import AIR, G, Physics, Tube, follow
-from hidden.shots import Camera, Laboratory, _seen, careful, film, opened, plan
+from hidden.shots import Camera, Laboratory, Shot, careful, film, opened, plan, seen
 from hidden.slack import follow_slack
 from hidden.verdicts import Answer, Should, judge
+from hidden.visibility import _filmed, _fitted, visible_sigma
 from scipy.integrate import solve_ivp
 
 from vinetrack.experiment import read_experiment
@@ -29,6 +30,10 @@ SEED = 20_900
 FEW = (18, 24)
 TUBE = Tube(pressure=20e3, yield_pressure=3e3, diameter=0.024, thickness=2e-4, length=0.28, payload=0.0, cosine=0.0)
 B, N = 6.44, 0.37
+
+
+def _with_B(shot: Shot, factor: float) -> Shot:
+    return replace(shot, physics=shot.physics._replace(B=factor * shot.physics.B))
 
 
 def drawn(seed: int = SEED, wants: Wants = BARE) -> tuple[Laboratory, np.random.Generator]:
@@ -41,7 +46,7 @@ def drawn(seed: int = SEED, wants: Wants = BARE) -> tuple[Laboratory, np.random.
 
 @pytest.mark.parametrize("name", ROWS)
 def test_every_row_makes_a_campaign_that_moves(name):
-    made = campaign(name, SEED, FEW)
+    made = campaign(name, SEED, FEW, weighed=False)
     fewest = 2 if name == "few_trials" else 8 if name.startswith("falling") else 16
     assert fewest <= len(made.recordings) <= 24
     for one in made.recordings:
@@ -71,7 +76,7 @@ def test_a_silent_sheet_differs_in_its_columns_and_order_alone(name):
 
 
 def test_a_folder_is_one_that_the_package_reads(tmp_path):
-    made = campaign("trace_clock", SEED, FEW)
+    made = campaign("trace_clock", SEED, FEW, weighed=False)
     write_experiment(made, tmp_path / "one")
     write_truth(made, tmp_path / "truth" / "one.json")
     read = read_experiment(tmp_path / "one")
@@ -146,7 +151,7 @@ def test_a_row_that_is_read_late_shows_what_was_there_then():
     shot = laboratory.shots[0]
     camera = faults.rolling(laboratory, draw).camera
     since = np.arange(-5, 60) / shot.setting.capture_hz
-    y, _, _ = _seen(shot, camera, since)
+    y, _, _ = seen(shot, camera, since)
     moment = since + camera.row_delay_s_m * (y - camera.lens_centre_m)
     order = np.argsort(moment)
     out, _ = follow(moment[order], shot.tube, shot.physics, np.empty((0, 3)))
@@ -263,3 +268,34 @@ def test_an_answer_is_judged_by_what_is_right_to_say(said, should, right, wrong_
     judged = judge(said, should, {"drag.C": 1.0})
     assert (judged.right, judged.wrong_name) == (right, wrong_name)
     assert bool(judged.why) != right
+
+
+def test_a_fault_that_hardly_shows_need_not_be_named():
+    should = Should(("artefact",), any_of=("lens",), true=("lens",))
+    assert judge(answer("adequate"), should, {"visible_sigma": 3.0}).right
+    assert not judge(answer("adequate"), should, {"visible_sigma": 30.0}).right
+
+
+# Visibility.
+
+
+def test_where_nothing_is_wrong_nothing_is_visible():
+    laboratory, _ = drawn()
+    assert visible_sigma(laboratory) == pytest.approx(0, abs=1e-3)
+
+
+def test_a_fault_is_as_visible_as_the_noise_lets_it_be():
+    laboratory, draw = drawn()
+    strong = faults.lens(2, 2)(laboratory, draw)
+    # Errors of B and pressure can hide some of it, and noise rules how much of the rest shows.
+    louder = replace(strong, camera=replace(strong.camera, noise_m=4 * strong.camera.noise_m))
+    assert visible_sigma(strong) > 20
+    assert 2 < visible_sigma(strong) / visible_sigma(louder) < 4.4
+
+
+def test_what_b_can_take_up_is_not_visible():
+    laboratory, _ = drawn()
+    vine = laboratory.shots[0].setting.vine
+    same = replace(laboratory, shots=tuple(s for s in laboratory.shots if s.setting.vine == vine))
+    apart = [replace(_filmed(s, same.camera), shot=_with_B(s, 1.02)) for s in same.shots]
+    assert _fitted(apart, [0] * len(apart), 1, 0.01, 0.005) < 0.3
