@@ -2,6 +2,7 @@
 
     python benchmarks/laboratories.py [--rows all|NAME,…] [--campaigns 5] [--first-seed 20000] [--jobs 1]
     python benchmarks/laboratories.py --folder DIR …      only writes the experiments, and their truth beside them
+    python benchmarks/laboratories.py --written DIR …     diagnoses those written there
 
 Every campaign comes from a simulator that shares no code with the package (`benchmarks/hidden/`), is written as an
 experiment folder, and goes to `vinetrack.diagnose` as that folder. A row is one kind of laboratory
@@ -29,7 +30,7 @@ from hidden.laboratory_rows import ROWS, TRIALS, campaign
 from hidden.verdicts import Answer, judge
 from tqdm import tqdm
 
-Task = tuple[str, int, tuple[int, int]]
+Task = tuple[str, int, tuple[int, int], Path | None]
 Line = dict[str, object]
 FIRST_TUNING_SEED, FIRST_SCORING_SEED = 20_000, 30_000
 COLUMNS = (
@@ -40,12 +41,15 @@ COLUMNS = (
 
 def ask(task: Task) -> Line:
     """Write one campaign, have it diagnosed, judge the answer; one that breaks is an answer too."""
-    name, seed, trials = task
-    made = campaign(name, seed, trials)
-    line: Line = {"row": name, "seed": seed, "n_trials": len(made.recordings)}
+    name, seed, trials, written = task
+    line: Line = {"row": name, "seed": seed}
     with tempfile.TemporaryDirectory() as holder:
-        folder = Path(holder) / f"{name}_{seed}"
-        write_experiment(made, folder)
+        place = written or Path(holder)
+        if written is None:
+            write_both(place, name, seed, trials)
+        folder = place / f"{name}_{seed}"
+        truth = json.loads(truth_of(place, name, seed).read_text(encoding="utf-8"))
+        line["n_trials"] = truth["n_trials"]
         begun, work = time.perf_counter(), time.process_time()
         try:
             said = diagnosed(folder)
@@ -53,7 +57,7 @@ def ask(task: Task) -> Line:
             return line | {"right": False, "wrong_name": False, "failed": f"{type(error).__name__}: {error}"[:300]}
         line |= {"seconds": time.perf_counter() - begun, "processor_s": time.process_time() - work}
     answer = Answer.of(said)
-    truths = made.truth["truths"]
+    truths = truth["truths"]
     judgement = judge(answer, ROWS[name].should, truths)
     held = held_intervals(answer, truths)
     return line | {
@@ -68,6 +72,19 @@ def ask(task: Task) -> Line:
         "covered": sum(held),
         "intervals": len(held),
     }
+
+
+def truth_of(place: Path, name: str, seed: int) -> Path:
+    """Where the truth of a campaign is written: not in its folder."""
+    return place / "truth" / f"{name}_{seed}.json"
+
+
+def write_both(place: Path, name: str, seed: int, trials: tuple[int, int]) -> int:
+    """Make one campaign and write its experiment and its truth; how many trials it has."""
+    made = campaign(name, seed, trials)
+    write_experiment(made, place / f"{name}_{seed}")
+    write_truth(made, truth_of(place, name, seed))
+    return len(made.recordings)
 
 
 def diagnosed(folder: Path) -> dict[str, object]:
@@ -177,19 +194,17 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--trials", default=":".join(map(str, TRIALS)), help="fewest and most trials, as 24:48")
     parser.add_argument("--folder", type=Path, help="only write the experiments here")
+    parser.add_argument("--written", type=Path, help="take the experiments that were written here")
     parser.add_argument("--answers", type=Path, help="CSV that keeps every answer")
     given = parser.parse_args()
     low, high = (int(part) for part in given.trials.split(":"))
     seeds = range(given.first_seed, given.first_seed + given.campaigns)
-    tasks: list[Task] = [(name, seed, (low, high)) for seed in seeds for name in chosen(given.rows)]
+    tasks: list[Task] = [(name, seed, (low, high), given.written) for seed in seeds for name in chosen(given.rows)]
     if given.folder is None:
         report(gather(tasks, given.answers, given.jobs))
         return
-    for name, seed, trials in tasks:
-        made = campaign(name, seed, trials)
-        write_experiment(made, given.folder / f"{name}_{seed}")
-        write_truth(made, given.folder / "truth" / f"{name}_{seed}.json")
-        print(f"{name}_{seed}: {len(made.recordings)} trials")
+    for name, seed, trials, _ in tasks:
+        print(f"{name}_{seed}: {write_both(given.folder, name, seed, trials)} trials", flush=True)
 
 
 if __name__ == "__main__":

@@ -325,6 +325,8 @@ def _truth(row: Row, seed: int, laboratory: Laboratory, count: int) -> dict[str,
     exponents = {shot.physics.n for shot in laboratory.shots}
     if len(exponents) == 1:
         truths["eversion_damping.n"] = exponents.pop()
+    if len(vines) == 1 and not {"wear", "specimen_sigma", "specimen_B"} & set(truths):
+        truths["eversion_damping.B"] = settings[0].vine.B
     camera: Camera = laboratory.camera
     return {
         "row": row.name,
