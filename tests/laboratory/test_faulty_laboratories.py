@@ -24,7 +24,7 @@ from hidden.verdicts import Answer, Should, judge
 from hidden.visibility import _filmed, _fitted, visible_sigma
 from scipy.integrate import solve_ivp
 
-from vinetrack.experiment import read_experiment
+from vinetrack.experiment.folder import read_experiment
 
 SEED = 20_900
 FEW = (18, 24)
