@@ -156,7 +156,7 @@ def test_smaller_tubes_of_the_same_shape_with_matched_connectors_never_do(dragge
     assert found.trials == ()
     assert found.separation_sigma["air_drag | inlet_loss"] < 3
     assert "second gauge behind the connector" in str(found.calibration)
-    assert found.text.startswith("No trials within the limits separate what is tied by 3 σ")
+    assert found.text.startswith("No trials within the limits separate the tied hypotheses by 3 σ")
 
 
 def test_every_limit_is_kept(dragged: tuple[Pairs, list[Fit]]) -> None:
