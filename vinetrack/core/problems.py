@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 LONGEST_VALUE = 60
-"""A value quoted in a message is cut here: a whole paragraph pasted in one cell would hide the rest."""
+"""Of a value quoted in a message; chosen: half a line, as a paragraph pasted in a cell would hide the message."""
 
 
 @dataclass(frozen=True, kw_only=True)
