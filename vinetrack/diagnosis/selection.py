@@ -28,6 +28,7 @@ from vinetrack.diagnosis.misfit_tests import (
 )
 from vinetrack.diagnosis.multi_start import from_other_starts, without
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED
+from vinetrack.diagnosis.slack_hypothesis import slack_fit
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit
 
@@ -79,6 +80,8 @@ def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, aga
     differ = bool(called(among, FIRST_LEVEL))
     if not questions.something and not questions.suspect and not differ:
         return [SelectionStep(ADEQUATE, questions)]
+    if questions.something and (slack := _slack(questions, effects, report)) is not None:
+        return slack
     search = CandidateFits(questions, report)
     tried = search.singles()
     between = between_fits(found, among, max((one.delta_chi2 for one in tried), default=0.0), report)
@@ -108,6 +111,19 @@ def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, aga
         return [SelectionStep(verdict, questions, tried=tuple(tried), search=search)]
     report("two effects together")
     return _together(questions, search, tried, effects, report)
+
+
+def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:
+    """Findings where a tail that may go slack explains what a tail that pushes does not; None where it does not.
+
+    It is asked first: a tail cannot push, and the rule brings no number that could make up for something else.
+    """
+    slack = slack_fit(questions.found)
+    if slack is None or slack.sigma < questions.threshold:
+        return None
+    report("letting the tail go slack")
+    first = SelectionStep(MISSING, questions, (slack,), (slack,), (), slack.names)
+    return [first, *select_effects(slack.fit, effects, report, again=MOST_AGAIN)]
 
 
 def best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:

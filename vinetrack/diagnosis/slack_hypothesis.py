@@ -1,0 +1,79 @@
+"""The rule that a tail cannot push, as a hypothesis: the same model with `tail_slack: free`.
+
+Eq. (2) holds while the tail's tension T₁ = ½(P − P_y)A − ½Bẋⁿ − … is positive. A payload that falls faster than the tip
+everts makes it negative: then the true tail goes slack, and the model as written pushes. The rule brings no number to
+fit, so that a likelihood which rises by it is no matter of taste.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
+from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.effects import Effect, EffectError
+from vinetrack.inference.fit import refit
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.sensitivity import Predictor
+
+TAIL_SLACK = Effect(
+    name="tail_slack",
+    kind="physical",
+    summary="Tail slack: a tail cannot push.",
+    text="Tail slack: a tail cannot push.\n\n    tension ≥ 0\n\nReduce it with a lighter payload or a higher pressure.",
+    parameters=(),
+    functions=MappingProxyType({}),
+    needs=(),
+    easily_taken_for=(),
+    worked=(),
+    path=Path(__file__).resolve(),
+)
+"""Stands for the rule in answer sets. It is no term of a model: `tail_slack: free` in `experiment.yaml` puts it there."""
+
+PUSHES = 0.01
+"""Part of the drive ½PA by which a tail must push to count. Chosen: the numbers of a fit are good to about 1 %; at half
+of it rounding asks for a fit in vain, at twice a push of 2 % of the drive goes untried."""
+
+
+def pushes(found: Fit) -> bool:
+    """Whether the fitted model has the tail of some trial push, where the trial does not let it go slack."""
+    return any(_pushes(found, trial) for trial in found.trials)
+
+
+def _pushes(found: Fit, trial: TrialFit) -> bool:
+    if trial.trial.tail_slack == "free" or trial.trial.travel_ratio == 1:
+        return False
+    moving = trial.time_s > trial.release_s
+    if not moving.any():
+        return False
+    since_s = trial.time_s[moving] - trial.release_s
+    trace = next(item.trace for item in found.predictor.data if item.trial is trial.trial)
+    measured_Pa = None if trace is None else np.interp(trial.time_s[moving], *trace)
+    position_m = trial.predicted_position_m[moving] - trial.origin_m
+    try:
+        terms = evaluate(
+            found.model, trial.trial, since_s, position_m, trial.predicted_velocity_m_s[moving], measured_Pa=measured_Pa
+        )
+    except EffectError:
+        return False
+    drive_N = terms.pressure_Pa * terms.area_m2 / trial.trial.travel_ratio
+    return bool(np.any(terms.tension_N < -PUSHES * drive_N))
+
+
+def slack_fit(found: Fit) -> LikelihoodRatio | None:
+    """The model refitted with tails that may go slack; None where no tail pushes or the fit does not get through."""
+    if not pushes(found):
+        return None
+    data = [replace(item, trial=replace(item.trial, tail_slack="free")) for item in found.predictor.data]
+    predictor = Predictor(found.predictor.layout, data, found.predictor.host)
+    try:
+        after = refit(replace(found, predictor=predictor), thorough=False)
+    except (FitError, SimulationError, np.linalg.LinAlgError):
+        return None
+    return likelihood_ratio(found, (TAIL_SLACK,), after)

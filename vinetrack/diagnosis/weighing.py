@@ -1,0 +1,96 @@
+"""Hypotheses weighed with what an experimenter expects of their sizes: priors from plausible ranges.
+
+A parameter whose plausible range is (a, b) has a normal prior of mean (a + b)/2 and standard deviation τ = (b − a)/4, so
+that the range holds 95 % of it. With a likelihood that is normal about its best value θ̂ with covariance Σ, the marginal
+likelihood of a hypothesis is
+
+    ln Z = ln L̂ + ½ ln det(2πΣ) + ln N(θ̂; m, Σ + T),   T = diag(τ²)
+
+which is Laplace's approximation with the prior integrated exactly (Kass & Raftery, JASA 90, 773, 1995). A hypothesis pays
+for every number it brings, by ln(σ/τ), and for sizes beyond its range. The numbers that all hypotheses share cancel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.candidates import plausible_range
+from vinetrack.effects import Parameter
+from vinetrack.inference.fit_result import Fit
+
+EXPECTED = 4.0
+"""Squared distance from the middle of a plausible range, in standard deviations of its prior, that is no surprise:
+the edge of the range."""
+
+
+def prior_of(parameter: Parameter) -> tuple[float, float]:
+    """Mean and standard deviation of the prior that a plausible range stands for, in the parameter's unit."""
+    low, high = plausible_range(parameter)
+    return 0.5 * (low + high), 0.25 * (high - low)
+
+
+def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
+    """By how much sizes lie beyond what is plausible, on the scale of −2 ln L; 0 inside the plausible ranges.
+
+    Parameters
+    ----------
+    parameters
+        Those of the effects that a hypothesis adds, by `effect.parameter`.
+
+    Notes
+    -----
+    Each size's squared distance from the middle of its range over σ² + τ², less that at the edge of the range. A size
+    that is hardly known (σ ≫ τ) is no surprise wherever it lies.
+    """
+    total = 0.0
+    for number in fit.numbers:
+        parameter = parameters.get(number.key)
+        if parameter is None or not math.isfinite(number.sigma) or number.value == parameter.zero:
+            continue
+        mean, sd = prior_of(parameter)
+        variance = number.sigma**2 + sd**2
+        if variance > 0:
+            total += max((number.value - mean) ** 2 / variance - EXPECTED, 0.0)
+    return total
+
+
+def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
+    """ln Z of a hypothesis, up to a constant that hypotheses about the same trials share; see the module.
+
+    Numbers that no trajectory answers to, or whose error is open, keep their prior: they cost nothing.
+    """
+    places, means, sds = [], [], []
+    for k, number in enumerate(fit.numbers):
+        parameter = parameters.get(number.key)
+        if parameter is not None and math.isfinite(number.sigma) and number.sigma > 0:
+            mean, sd = prior_of(parameter)
+            if sd > 0:
+                places.append(k)
+                means.append(mean)
+                sds.append(sd)
+    if not places:
+        return fit.log_likelihood
+    values = np.array([fit.numbers[k].value for k in places])
+    scale = np.array(sds)
+    covariance = fit.covariance[np.ix_(places, places)] / scale[:, None] / scale
+    away = (values - np.array(means)) / scale
+    wide = covariance + np.eye(len(places))
+    occam = 0.5 * (_log_det(covariance) - _log_det(wide))
+    return float(fit.log_likelihood + occam - 0.5 * away @ np.linalg.solve(wide, away))
+
+
+def _log_det(matrix: Floats) -> float:
+    return float(np.linalg.slogdet(matrix + 1e-300 * np.eye(len(matrix)))[1])
+
+
+def posterior_weights(log_evidences: Sequence[float]) -> list[float]:
+    """Posterior probabilities of hypotheses that were equally likely beforehand; they add up to 1."""
+    if not log_evidences:
+        return []
+    values = np.array(log_evidences)
+    weights = np.exp(values - values.max())
+    return [float(one) for one in weights / weights.sum()]
