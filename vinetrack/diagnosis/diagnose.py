@@ -18,6 +18,7 @@ import numpy as np
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import candidates_of, host_for, testable
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, weights_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -34,6 +35,7 @@ from vinetrack.diagnosis.result import (
     Round,
 )
 from vinetrack.diagnosis.selection import SelectionStep, select_effects
+from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK
 from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -240,7 +242,8 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
     questions = finding.questions
     aside = dict(finding.aside)
     singles = {one.names[0]: one for one in finding.tried if len(one.names) == 1}
-    rows = []
+    weights = weights_of(list(singles.values()))
+    rows = [_rule(one, finding) for one in finding.kept if one.effects[-1] is TAIL_SLACK]
     for effect in questions.effects:
         largest, shows = questions.largest(effect)
         if effect.name in questions.answers.silent:
@@ -262,6 +265,7 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     aside.get(effect.name, one.reason),
                     largest,
                     one.others if effect.name in finding.answer else (),
+                    weights[effect.name],
                 )
             )
         elif finding.verdict == ADEQUATE and not shows and z < questions.threshold:
@@ -288,6 +292,12 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
     ]
     order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
     return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_known(row.delta_chi2)))
+
+
+def _rule(one: LikelihoodRatio, finding: SelectionStep) -> Candidate:
+    """The rule that a tail cannot push, as a candidate without a size."""
+    name = one.names[-1]
+    return Candidate(name, "physical", REFITTED, one.delta_chi2, one.sigma, (), True, name in finding.answer)
 
 
 def _promised(finding: SelectionStep, name: str, z: float) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from vinetrack.diagnosis.candidates import is_plausible
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
+from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_surprise
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
@@ -24,6 +25,11 @@ Chosen: at half fewer differences count as scatter, at twice weak effects are mi
 CREDIBLE = 3.0
 """How many times beyond its plausible range a size is still an explanation: a drag that needs C_D 17 is no drag.
 Chosen: plausible ranges are wide already; at half a true effect just outside is refused, at twice C_D 17 passes."""
+
+LEAST_SIGMAS = 1.0
+"""A size below this many of its own errors is none. Chosen: an effect that a likelihood ratio finds at 4 σ has a size
+of about 4 errors, unless its size and shape cannot be told apart; at half, C = 0.0000057 ± 0.0000095 N would pass, at
+twice, effects whose size and shape are correlated would be lost."""
 
 LIMIT_DISTANCE = 4.0
 """Squared distance, in units of the noise, below which what two hypotheses predict is the same curve. Derived: two
@@ -48,6 +54,8 @@ class LikelihoodRatio:
     reason: str
     credible: bool = True
     inflation: float = 1.0
+    surprise: float = 0.0  #: by how much its sizes lie beyond what is plausible, on the scale of −2 ln L
+    log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.weighing`
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,16 +87,36 @@ def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> Like
     fall = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = _robust_ratio(after, [effect.name for effect in effects])
     plausible, reason = belief(effects, after)
+    parameters = {f"{effect.name}.{one.name}": one for effect in effects for one in effect.parameters}
+    nothing = compatible_with_nothing(effects, after)
     return LikelihoodRatio(
         effects=tuple(effects),
         fit=after,
         delta_chi2=fall,
         sigma=math.copysign(math.sqrt(abs(fall)), fall) / ratio,
         plausible=plausible,
-        reason=reason,
-        credible=belief(effects, after, CREDIBLE)[0],
+        reason=nothing or reason,
+        credible=not nothing and belief(effects, after, CREDIBLE)[0],
         inflation=min(ratio**2, MOST_INFLATION),
+        surprise=prior_surprise(after, parameters),
+        log_evidence=log_evidence(after, parameters),
     )
+
+
+def compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
+    """That a size is smaller than its own error, in words; blank where none is.
+
+    Such a fit is better by the shape that its other numbers give it, not by an effect of which anything is known.
+    """
+    for effect in effects:
+        for parameter in effect.parameters[:1]:
+            for number in after.numbers:
+                known = number.key == f"{effect.name}.{parameter.name}" and math.isfinite(number.sigma)
+                if known and 0 < abs(number.value - parameter.zero) < LEAST_SIGMAS * number.sigma:
+                    return (
+                        f"its size, {number.symbol} = {number.value:.2g} ± {number.sigma:.2g}, is compatible with none"
+                    )
+    return ""
 
 
 def belief(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:
@@ -139,14 +167,24 @@ def complexity(one: LikelihoodRatio) -> int:
 def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, str]]:
     """Hypotheses that cannot be excluded, best first, and for those set aside the reason in words, by their names.
 
-    Set aside are those that hold a simpler one as a limit and are no better by 9 than it, and those that need a size
-    beyond belief where another does not.
+    Excluded is what is worse by 9 than the best, in −2 ln L as far as the scatter of trials bears it out plus what its
+    sizes lie beyond the plausible (`prior_surprise`). Set aside are those that hold a simpler one as a limit and are no
+    better by 9 than it, and those that need a size beyond belief where another does not.
     """
-    first = max(hypotheses, key=lambda one: one.fit.log_likelihood)
-    best, reach = first.fit.log_likelihood, ANSWER_SET * first.inflation
-    near = [one for one in hypotheses if 2 * (best - one.fit.log_likelihood) <= reach]
-    near.sort(key=lambda one: -one.fit.log_likelihood)
-    aside: dict[str, str] = {}
+    highest = max(hypotheses, key=lambda one: one.fit.log_likelihood)
+    likely = [
+        one
+        for one in hypotheses
+        if 2 * (highest.fit.log_likelihood - one.fit.log_likelihood) <= ANSWER_SET * highest.inflation
+    ]
+    likely.sort(key=lambda one: -one.fit.log_likelihood)
+
+    def misfit(one: LikelihoodRatio) -> float:
+        return -2 * one.fit.log_likelihood / highest.inflation + one.surprise
+
+    lowest = min(misfit(one) for one in likely)
+    near = [one for one in likely if misfit(one) - lowest <= ANSWER_SET]
+    aside = {one.label: one.reason or "its size lies beyond what is plausible" for one in likely if one not in near}
     kept = []
     for one in near:
         simpler = [
@@ -173,6 +211,18 @@ def _comparable(one: LikelihoodRatio, other: LikelihoodRatio) -> bool:
     With the deviation of B and pressure that every trial has, all hypotheses about levels of trials predict one curve.
     """
     return all(one.effects[-1].kind != BETWEEN_TRIALS for one in (one, other))
+
+
+def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
+    """Posterior weights of hypotheses by label; they add up to 1 over these.
+
+    The likelihood counts as far as the scatter of trials bears it out: ln L over the best one's inflation.
+    """
+    if not hypotheses:
+        return {}
+    inflation = max(hypotheses, key=lambda one: one.fit.log_likelihood).inflation
+    tempered = [one.log_evidence - one.fit.log_likelihood + one.fit.log_likelihood / inflation for one in hypotheses]
+    return dict(zip((one.label for one in hypotheses), posterior_weights(tempered), strict=True))
 
 
 def _contains(one: LikelihoodRatio, other: LikelihoodRatio) -> bool:

@@ -54,7 +54,8 @@ class Candidate:
     `sigma` what that is worth in standard deviations for the numbers it brings. `numbers` are its sizes with errors
     and 95 % intervals, `along` those of all else that is fitted with it, where it is in the answer set. `largest` maps
     each parameter to the largest size that could still hide, one-sided 95 %.
-    `reason` says in words why it is not testable, or not plausible, or another's limit.
+    `reason` says in words why it is not testable, or not plausible, or another's limit. `posterior_weight` is its
+    probability among all that were refitted, had they been equally likely beforehand, with plausible ranges as priors.
     """
 
     effect: str
@@ -68,6 +69,7 @@ class Candidate:
     reason: str = ""
     largest: Mapping[str, float] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
+    posterior_weight: float = math.nan
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
@@ -82,6 +84,7 @@ class Candidate:
             "in_answer_set": self.in_answer_set,
             "reason": self.reason,
             "largest": dict(self.largest),
+            "posterior_weight": self.posterior_weight,
             "along": [number.to_json() for number in self.along],
         }
 

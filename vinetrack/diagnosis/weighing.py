@@ -1,13 +1,13 @@
 """Hypotheses weighed with what an experimenter expects of their sizes: priors from plausible ranges.
 
-A parameter whose plausible range is (a, b) has a normal prior of mean (a + b)/2 and standard deviation τ = (b − a)/4, so
-that the range holds 95 % of it. With a likelihood that is normal about its best value θ̂ with covariance Σ, the marginal
+A parameter whose plausible range is (a, b) has a normal prior of mean (a + b)/2 and standard deviation τ = (b − a)/4:
+the range holds 95 % of it. With a likelihood that is normal about its best value θ̂ with covariance Σ, the marginal
 likelihood of a hypothesis is
 
     ln Z = ln L̂ + ½ ln det(2πΣ) + ln N(θ̂; m, Σ + T),   T = diag(τ²)
 
-which is Laplace's approximation with the prior integrated exactly (Kass & Raftery, JASA 90, 773, 1995). A hypothesis pays
-for every number it brings, by ln(σ/τ), and for sizes beyond its range. The numbers that all hypotheses share cancel.
+which is Laplace's approximation with the prior integrated exactly (Kass & Raftery, JASA 90, 773, 1995). A hypothesis
+pays for every number it brings, by ln(σ/τ), and for sizes beyond its range. What all hypotheses share cancels.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
 
 
 def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
-    """ln Z of a hypothesis, up to a constant that hypotheses about the same trials share; see the module.
+    """Logarithm of the marginal likelihood Z of a hypothesis, up to a constant that all about the same trials share.
 
     Numbers that no trajectory answers to, or whose error is open, keep their prior: they cost nothing.
     """

@@ -16,6 +16,7 @@ from vinetrack.diagnosis.result import (
     DROPPED_FRAMES,
     MISSING,
     NOT_TESTABLE,
+    Candidate,
     Diagnosis,
     Round,
 )
@@ -103,13 +104,18 @@ def explain(finding: SelectionStep) -> str:
         )
         if finding.note:
             return f"{text} {finding.note[0].upper()}{finding.note[1:]} ({' and '.join(best.names)} together do)."
+        if best.names[-1] == "tail_slack":
+            text += (
+                " The model has the tail push, which it cannot: `tail_slack: free` in experiment.yaml lets it go slack."
+            )
+            return text
         text += " With it in the model, no other candidate and no smooth force improves the fit."
         return text + _runner_up(finding)
     names = list(finding.answer)
     if finding.verdict == AMBIGUOUS:
         return (
             f"{model} lacks an effect, and these data cannot tell which: {joined(names, 'or')}. "
-            f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other.{_remedies(finding)}"
+            f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other.{_weights(kept)}{_remedies(finding)}"
         )
     if finding.verdict == ARTEFACT and trials_differ(names):
         return (
@@ -130,6 +136,15 @@ def explain(finding: SelectionStep) -> str:
     for name, why in finding.aside:
         text += f" The nearest is {name.replace('+', ' with ')}: {why}."
     return text
+
+
+def _weights(kept: Sequence[LikelihoodRatio]) -> str:
+    """Posterior weights of the hypotheses in the answer set, the heaviest first."""
+    from vinetrack.diagnosis.likelihood_ratio import weights_of
+
+    weights = sorted(weights_of(kept).items(), key=lambda pair: -pair[1])
+    each = ", ".join(f"{label.replace('+', ' with ')} {100 * weight:.0f} %" for label, weight in weights)
+    return f" Posterior weights, with plausible sizes as priors: {each}."
 
 
 def _with_the_fault(finding: SelectionStep) -> str:
@@ -254,12 +269,18 @@ def _ranking(step: Round) -> list[str]:
                 f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
                 f"{candidate.sigma:.1f}",
                 sizes_in_words(candidate.numbers) or "",
-                candidate.status if not candidate.reason else candidate.reason,
+                candidate.reason or _status(candidate),
             )
         )
     lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
     blind = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
     return lines + ([f"not testable here: {', '.join(blind)}"] if blind else [])
+
+
+def _status(candidate: Candidate) -> str:
+    """How much is known of a candidate, with its posterior weight where it shares the answer set."""
+    shared = candidate.in_answer_set and candidate.posterior_weight < 0.995
+    return f"{candidate.status}, weight {100 * candidate.posterior_weight:.0f} %" if shared else candidate.status
 
 
 def _ladder_table(ladder: pd.DataFrame) -> list[str]:

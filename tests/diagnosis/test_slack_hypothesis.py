@@ -1,0 +1,40 @@
+"""A tail that goes slack under a model whose tail pushes is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from hidden_truth import Pairs, sheet
+
+import vinetrack as vt
+from vinetrack.diagnosis.slack_hypothesis import pushes, slack_fit
+from vinetrack.inference.fit import fit
+from vinetrack.laboratory.campaign import damping_values
+from vinetrack.laboratory.ground_truth import BASE, Nature
+from vinetrack.laboratory.tracks import grow
+
+
+def grown(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -> Pairs:
+    """Trials of two vines, grown with a tail that may go slack or not, stated as taut."""
+    sheets = [replace(one, growth_angle_rad=angle_rad, tail_slack=tail_slack) for one in sheet()]
+    trials = [replace(one, payload_kg=1e-3 * payload_g) for one in sheets]
+    nature = Nature(effects=BASE, values=damping_values(trials), noise_m=5e-5, seed=4)
+    return [(replace(one.stated, tail_slack="taut"), one.track) for one in grow(trials, nature)]
+
+
+def test_a_slack_tail_is_found_where_the_model_has_it_push():
+    found = fit(vt.base_model(), grown(60.0, "free"), profile=False)
+    assert pushes(found)
+    slack = slack_fit(found)
+    assert slack is not None
+    assert slack.names == ("tail_slack",)
+    assert slack.sigma > 5
+    assert all(trial.trial.tail_slack == "free" for trial in slack.fit.trials)
+    assert all(trial.trial.tail_slack == "taut" for trial in found.trials)
+
+
+def test_a_bare_vine_on_the_level_pulls_its_tail():
+    found = fit(vt.base_model(), grown(0.0, "taut", np.pi / 2), profile=False)
+    assert not pushes(found)
+    assert slack_fit(found) is None
