@@ -76,11 +76,14 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     ]
 
 
-def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> SmoothErrors | None:
+def smooth_errors(
+    predictor: Predictor, solution: Solution, plain: float, held: FixedTerms | None = None
+) -> SmoothErrors | None:
     """Fit the smooth errors of position beside the numbers of a fit, to first order; None where there are none.
 
     Parameters
     ----------
+    plain : ln L of the fit without them
     held : spreads and noise that the fit was told instead of estimating them
 
     Returns
@@ -103,33 +106,49 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
         np.column_stack([columns[:, :-1], shape, columns[:, -1]])
         for columns, shape in zip(solution.columns, shapes, strict=True)
     ]
-    grams = predictor.products(wide)
-    problem = with_shapes(solution.frame, count)
-    state = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
     held = held or FixedTerms()
-    moved = np.zeros((len(grown), grams.shape[-1] - 1))
-    state = _variances(predictor, problem, grams, state, solution.estimable, held)
-    for _ in range(MOST_STEPS):
-        step, own_step, promised = newton_step(grams, problem, state, 0.0)
-        theta = np.clip(state.theta + step, problem.lower, problem.upper)
-        change = np.column_stack([own_step, np.append(theta - state.theta, 0.0)[problem.index]])
-        grams, moved = _moved(grams, change), moved + change
-        state = replace(state, theta=theta, own=state.own + own_step)
-        before, state = state, _variances(predictor, problem, grams, state, solution.estimable, held)
-        if promised < SETTLED and variances_moved(before, state) < SETTLED_SPREAD:
-            break
-    part = marginal(grams, problem, state)
-    spread = estimate_spreads(part, problem, state, solution.estimable, restricted=False)
+    problem = with_shapes(solution.frame, count)
+    start = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
+    state, grams, moved, level = _iterated(predictor, solution, wide, problem, start, held)
+    # A fit far off is not at its minimum, and a straight line promises more than there is: that part is the same
+    # without the shapes, and is not theirs.
+    bare = _iterated(predictor, solution, solution.columns, solution.frame, solution.state, held)[3]
     left = [one[:, -1] - one[:, :-1] @ change for one, change in zip(wide, moved, strict=True)]
     return SmoothErrors(
         solution=replace(solution, state=state, frame=problem, grams=grams, columns=tuple(_with_residual(wide, left))),
-        log_likelihood=-0.5 * deviance(part, problem, state, spread, restricted=False),
+        log_likelihood=plain + max(level - bare, 0.0),
         whitened=tuple(
             whiten(one, item.first, state.rho, item.relative_sd) / np.sqrt(variance)
             for one, item, variance in zip(left, predictor.data, state.variance, strict=True)
         ),
         displacement_m=tuple(shape @ state.theta[-count:] for shape in shapes),
     )
+
+
+def _iterated(
+    predictor: Predictor,
+    solution: Solution,
+    columns: Sequence[Floats],
+    problem: MixedProblem,
+    state: FitState,
+    held: FixedTerms,
+) -> tuple[FitState, Floats, Floats, float]:
+    """Newton steps on columns that stay: the state, the products there, the way of each trial's unknowns, ln L."""
+    grams = predictor.products(columns)
+    moved = np.zeros((len(grams), grams.shape[-1] - 1))
+    state = _variances(predictor, problem, grams, state, solution, held)
+    for _ in range(MOST_STEPS):
+        step, own_step, promised = newton_step(grams, problem, state, 0.0)
+        theta = np.clip(state.theta + step, problem.lower, problem.upper)
+        change = np.column_stack([own_step, np.append(theta - state.theta, 0.0)[problem.index]])
+        grams, moved = _moved(grams, change), moved + change
+        before = replace(state, theta=theta, own=state.own + own_step)
+        state = _variances(predictor, problem, grams, before, solution, held)
+        if promised < SETTLED and variances_moved(before, state) < SETTLED_SPREAD:
+            break
+    part = marginal(grams, problem, state)
+    spread = estimate_spreads(part, problem, state, solution.estimable, restricted=False)
+    return state, grams, moved, -0.5 * deviance(part, problem, state, spread, restricted=False)
 
 
 def _with_residual(columns: Sequence[Floats], residual: Sequence[Floats]) -> list[Floats]:
@@ -158,12 +177,19 @@ def _variances(
     problem: MixedProblem,
     grams: Floats,
     state: FitState,
-    estimable: tuple[bool, bool],
+    solution: Solution,
     held: FixedTerms,
 ) -> FitState:
-    """Noise and spreads anew, where the fit was not told them."""
+    """Noise and spreads anew, where the fit was not told them.
+
+    What smooth errors leave cannot be slower than what there was before: noise of a correlation near 1, which a fit far
+    off was kept from, would make anything likely.
+    """
+    estimable = solution.estimable
     if held.noise is None:
         rho, variance = estimate_noise(grams, problem, state, held.correlation)
+        if rho > solution.state.rho:
+            rho, variance = estimate_noise(grams, problem, state, solution.state.rho)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
     if any(estimable):
         state = replace(state, spread=estimate_spreads(marginal(grams, problem, state), problem, state, estimable))
