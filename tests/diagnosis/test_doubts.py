@@ -117,7 +117,7 @@ def test_a_lens_of_a_tenth_of_a_millimetre_is_no_physics_where_that_much_is_allo
 def test_the_smooth_error_of_position_is_found_along_with_n_and_b():
     model = vt.base_model()
     found = fit(model, through_a_lens(1e-4), profile=False)
-    smooth = smooth_errors(found.predictor, found.solution, found.log_likelihood)
+    smooth = smooth_errors(found.predictor, found.solution)
     assert smooth is not None
     trial = max(found.trials, key=lambda one: float(np.ptp(one.lead_position_m)))
     place = found.trials.index(trial)

@@ -50,7 +50,7 @@ def assemble(
     """Everything that is said about a fit."""
     layout, state = predictor.layout, solution.state
     plain = log_likelihood(solution)
-    smooth = smooth_errors(predictor, solution, plain, options.get("held"))
+    smooth = smooth_errors(predictor, solution, options.get("held"))
     wide = smooth.solution if smooth else solution
     by_noise = precision(wide)
     trials = _trial_fits(predictor, solution, among_first(by_noise, len(layout.free)))
@@ -75,7 +75,7 @@ def assemble(
         noise_m=math.sqrt(variance),
         noise_correlation=state.rho,
         chi2_per_dof=chi2,
-        log_likelihood=smooth.log_likelihood if smooth else plain,
+        log_likelihood=plain + smooth.gain if smooth else plain,
         trials=trials,
         messages=(*_messages(layout, solution, numbers, known, chi2), *_weighted(predictor.data)),
         left_out=dict(left_out),

@@ -46,13 +46,13 @@ class SmoothErrors:
     """A fit with smooth errors of position beside it.
 
     `solution` holds the free numbers of the fit and behind them the sizes of the errors in standard deviations of their
-    priors. `log_likelihood` is ln L with those priors, `whitened`, arrays of shape (n_points,), what is left of each
-    trial, freed of its correlation, in standard deviations; `displacement_m`, arrays of shape (n_points,), the smooth
-    error itself.
+    priors. `gain` is by how much ln L rises, their priors counted; `whitened`, of shape (n_points,), what is left
+    of each trial, freed of its correlation, in standard deviations; `displacement_m`, arrays of shape (n_points,), the
+    smooth error itself.
     """
 
     solution: Solution
-    log_likelihood: float
+    gain: float
     whitened: tuple[Floats, ...]
     displacement_m: tuple[Floats, ...]
 
@@ -76,14 +76,11 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     ]
 
 
-def smooth_errors(
-    predictor: Predictor, solution: Solution, plain: float, held: FixedTerms | None = None
-) -> SmoothErrors | None:
+def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | None = None) -> SmoothErrors | None:
     """Fit the smooth errors of position beside the numbers of a fit, to first order; None where there are none.
 
     Parameters
     ----------
-    plain : ln L of the fit without them
     held : spreads and noise that the fit was told instead of estimating them
 
     Returns
@@ -116,7 +113,7 @@ def smooth_errors(
     left = [one[:, -1] - one[:, :-1] @ change for one, change in zip(wide, moved, strict=True)]
     return SmoothErrors(
         solution=replace(solution, state=state, frame=problem, grams=grams, columns=tuple(_with_residual(wide, left))),
-        log_likelihood=plain + max(level - bare, 0.0),
+        gain=max(level - bare, 0.0),
         whitened=tuple(
             whiten(one, item.first, state.rho, item.relative_sd) / np.sqrt(variance)
             for one, item, variance in zip(left, predictor.data, state.variance, strict=True)
