@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Floats, Trial
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.intervals import Precision
 from vinetrack.inference.mixed_effects import cross_products, inverse_among, trial_effects_eliminated
@@ -63,7 +63,8 @@ def widened_covariance(
     spare = len(trials) - np.count_nonzero(live)
     if len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
         ratio[live] = np.sqrt(np.maximum(np.diag(robust)[live] / diagonal[live], 1.0))
-        few = np.full(diagonal.size, float(spare))
+        clusters = len(set(coarsest_groups([item.trial for item in predictor.data])))
+        few = np.full(diagonal.size, float(min(spare, clusters - 1)))
     else:
         variance, few = _few_trials(wide or solution, plain)
         ratio[live] = np.sqrt(np.maximum(variance[live] / diagonal[live], 1.0))
@@ -160,8 +161,60 @@ def _sandwich(predictor: Predictor, solution: Solution, doubts: Sequence[Floats]
     single = _scores(blocks[:, :p, p], frame.index, size)
     trials = len(blocks)
     # The prior's information does not scatter from trial to trial, yet it is uncertain all the same.
-    meat = single.T @ single * trials / max(trials - live.size, 1) + np.diag(frame.prior_precision)
+    prior = np.diag(frame.prior_precision)
+    meat = single.T @ single * trials / max(trials - live.size, 1) + prior
+    robust = plain @ meat @ plain
+    groups = coarsest_groups([item.trial for item in predictor.data])
+    if len(set(groups)) < trials:
+        by_group = plain @ (group_scatter(single, groups, live.size) + prior) @ plain
+        np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
     cross = np.zeros((size + 1, doubts[0].shape[1]))
     np.add.at(cross, frame.index, blocks[:, :p, p + 1 :])
     lever = plain @ cross[:size]
-    return plain, plain @ meat @ plain, lever @ lever.T
+    return plain, robust, lever @ lever.T
+
+
+def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
+    """The clusters of trials whose errors may be alike: specimens, else days, else single trials.
+
+    Parameters
+    ----------
+    trials
+        In the order of the fit.
+
+    Returns
+    -------
+    list
+        A name for each trial. Fewer than `FEWEST_CLUSTERS` specimens or days say too little of their scatter: then the
+        next finer groups are taken.
+    """
+    for column in ("specimen", "day"):
+        names = [f"{trial.vine}, {trial.specimen}" if column == "specimen" else trial.day for trial in trials]
+        if all(getattr(trial, column) for trial in trials) and len(set(names)) >= FEWEST_CLUSTERS:
+            return names
+    return [trial.name for trial in trials]
+
+
+def group_scatter(single: Floats, groups: Sequence[str], fitted: int) -> Floats:
+    """Variance of the sum of scores from how the sums of groups scatter, corrected for few groups.
+
+    The correction is G/(G − 1) · (N − 1)/(N − p), CR1 of Cameron & Miller, Journal of Human Resources 50, 317 (2015).
+
+    Parameters
+    ----------
+    single
+        Scores of single trials, shape (n_trials, n_free), their mean taken out.
+    groups
+        Name of the group of each trial.
+    fitted
+        How many numbers were fitted, p.
+
+    Returns
+    -------
+    array, shape (n_free, n_free)
+    """
+    names = list(dict.fromkeys(groups))
+    sums = np.array([single[[group == name for group in groups]].sum(axis=0) for name in names])
+    count, trials = len(names), len(single)
+    factor = count / max(count - 1, 1) * (trials - 1) / max(trials - fitted, 1)
+    return np.asarray(sums.T @ sums * factor)
