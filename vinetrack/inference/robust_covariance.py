@@ -64,7 +64,7 @@ def widened_covariance(
     if len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
         ratio[live] = np.sqrt(np.maximum(np.diag(robust)[live] / diagonal[live], 1.0))
         clusters = len(set(coarsest_groups([item.trial for item in predictor.data])))
-        few = np.full(diagonal.size, float(min(spare, clusters - 1)))
+        few = np.full(diagonal.size, float(min(int(spare), clusters - 1)))
     else:
         variance, few = _few_trials(wide or solution, plain)
         ratio[live] = np.sqrt(np.maximum(variance[live] / diagonal[live], 1.0))
