@@ -62,7 +62,18 @@ class AuditedMotion:
     pressure_Pa: Floats | None = None
 
     def thinned(self, most: int = 200) -> AuditedMotion:
-        """Every so-many-th point, at most `most`."""
+        """The same motion at fewer points.
+
+        Parameters
+        ----------
+        most
+            Number of points that is not exceeded.
+
+        Returns
+        -------
+        AuditedMotion
+            Every k-th point.
+        """
         every = slice(None, None, max(1, math.ceil(self.time_s.size / most)))
         pressure = None if self.pressure_Pa is None else self.pressure_Pa[every]
         return AuditedMotion(
@@ -84,21 +95,51 @@ class Audit:
 
 
 def simulated_motion(model: Model, trial: Trial, until_s: float, trace: Trace | None = None) -> AuditedMotion:
-    """What the model says of a trial up to the end of its growth or to `until_s`, at 200 times, dense at first."""
+    """Motion of a trial as a model simulates it.
+
+    Parameters
+    ----------
+    model, trial
+        The sum of effects; the vine and its settings.
+    until_s
+        End of the motion, s since release, where growth does not end before.
+    trace
+        Times since release, s, and gauge pressures measured there, Pa.
+
+    Returns
+    -------
+    AuditedMotion
+        At 200 times, denser at first.
+    """
     spread = np.linspace(0.0, 1.0, 200) ** 2
     times = until_s * spread
-    found = simulate(model, trial, times, trace=trace)
-    if found.status == "ended":
-        times = found.end_time_s * spread[:-1]
-        found = simulate(model, trial, times, trace=trace)
+    motion = simulate(model, trial, times, trace=trace)
+    if motion.status == "ended":
+        times = motion.end_time_s * spread[:-1]
+        motion = simulate(model, trial, times, trace=trace)
     pressure = None if trace is None else np.interp(times, *trace)
-    return AuditedMotion(trial, times, found.lead_position_m, found.lead_velocity_m_s, pressure)
+    return AuditedMotion(trial, times, motion.lead_position_m, motion.lead_velocity_m_s, pressure)
 
 
 def measured_motion(
     trial: Trial, kinematics: Kinematics, release_s: float, trace: Trace | None = None
 ) -> AuditedMotion:
-    """What was filmed of a trial, from its release on; `trace` holds times since release."""
+    """Motion of a trial as it was filmed, from its release on.
+
+    Parameters
+    ----------
+    trial, kinematics
+        The trial and its measured motion.
+    release_s
+        Time of release on the clock of `kinematics`, s.
+    trace
+        Times since release, s, and gauge pressures measured there, Pa.
+
+    Returns
+    -------
+    AuditedMotion
+        Position and velocity not below zero.
+    """
     k = kinematics
     moving = (k.time_s >= release_s) & np.isfinite(k.lead_position_m) & np.isfinite(k.lead_velocity_m_s)
     origin_m = np.interp(release_s, k.time_s, k.lead_position_m)

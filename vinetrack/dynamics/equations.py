@@ -120,7 +120,20 @@ TAUT: a slack tail has pulled tight and the integrator goes on."""
 
 @compiled
 def trace_at(time, trial):
-    """The measured pressure, Pa: linear between its samples, constant before the first and after the last."""
+    """The measured pressure: linear between its samples, constant before the first and after the last.
+
+    Parameters
+    ----------
+    time
+        Since release, s.
+    trial
+        The `TrialArrays` of a trial with a measured pressure.
+
+    Returns
+    -------
+    float
+        Gauge pressure, Pa.
+    """
     last = trial.trace_time.size - 1
     if time <= trial.trace_time[0]:
         return trial.trace_pressure[0]
@@ -135,7 +148,21 @@ def trace_at(time, trial):
 def next_slope_change(k, time, trial):
     """Index of the first sample of the measured pressure after `time`, from index k on, where its slope changes.
 
-    No step of the integrator is accurate across such a sample. The number of samples where there is none.
+    No step of the integrator is accurate across such a sample.
+
+    Parameters
+    ----------
+    k
+        Index from which to search.
+    time
+        Since release, s.
+    trial
+        The `TrialArrays` of the trial.
+
+    Returns
+    -------
+    int
+        The index; the number of samples where there is none.
     """
     trace_time, trace_pressure = trial.trace_time, trial.trace_pressure
     last = trace_time.size - 1
@@ -154,7 +181,20 @@ def next_slope_change(k, time, trial):
 
 @compiled
 def angle_passed(y, trial):
-    """Angle of the bends that the tip has passed at y, rad."""
+    """Angle of the bends that the tip has passed.
+
+    Parameters
+    ----------
+    y
+        Position of the leading edge, m.
+    trial
+        The `TrialArrays` of the trial.
+
+    Returns
+    -------
+    float
+        Sum of the angles, rad.
+    """
     angle = 0.0
     for k in range(trial.bends.shape[0]):
         angle += min(max(y - trial.bends[k, 0], 0.0), trial.bends[k, 1]) / trial.bends[k, 2]

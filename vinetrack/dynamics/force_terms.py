@@ -55,6 +55,11 @@ def evaluate(
     time_s, lead_position_m, lead_velocity_m_s : arrays of one shape (n,), since release and from rest
     measured_Pa : array (n,), gauge pressure measured along with it, in place of the set pressure
 
+    Returns
+    -------
+    Terms
+        Forces, pressure, area, mass and acceleration along the motion.
+
     Raises
     ------
     EffectError
@@ -213,5 +218,16 @@ def _chamber(ask: _Asker, state: State, rig: TrialInputs) -> Any:
 def pressure_along(
     model: Model, trial: Trial, time_s: Floats, lead_position_m: Floats, lead_velocity_m_s: Floats
 ) -> Floats:
-    """Gauge pressure that a model says drove a motion that was measured, Pa, shape as given; see `evaluate`."""
+    """Gauge pressure that, by a model, drove a measured motion.
+
+    Parameters
+    ----------
+    model, trial, time_s, lead_position_m, lead_velocity_m_s
+        As those of `evaluate`.
+
+    Returns
+    -------
+    array, shape (n,)
+        Pa.
+    """
     return evaluate(model, trial, time_s, lead_position_m, lead_velocity_m_s).pressure_Pa

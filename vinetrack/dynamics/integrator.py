@@ -189,9 +189,27 @@ def integrate_trials(
 ):
     """`_integrate` for many trials.
 
-    Trial i has times[starts[i]:starts[i+1]], on[i], inputs[i], thetas[i], breakpoints[i] (padded with infinity), and
-    the trace and the bends between its own starts. Fills `out` (n_times, 4) and `ends` (n_trials, 5): status, end time,
-    end speed, number of steps, time of slack.
+    Parameters
+    ----------
+    equations
+        The compiled functions of the model.
+    starts, times
+        Trial i has times[starts[i]:starts[i + 1]], s since release; shapes (n_trials + 1,) and (n_times,).
+    on, inputs, thetas
+        Which effects act, fields of `TrialInputs` and parameters: a row for each trial.
+    trace_starts, trace_time, trace_pressure
+        Measured pressures, s and Pa, laid end to end like the times.
+    bend_starts, bends
+        Bends laid end to end: rows of start, arc and radius, m.
+    breakpoints, stops
+        As those of `_integrate`, m: shapes (n_trials, n_breakpoints), padded with infinity, and (n_trials,).
+    rtol
+        Local tolerance on the speed, relative.
+    out, ends
+        Filled, shapes (n_times, 4) and (n_trials, 5): the latter status, end time, end speed, number of steps, time of
+        slack.
+    work
+        Array (7, 4), overwritten.
     """
     for i in range(starts.size - 1):
         trace = slice(trace_starts[i], trace_starts[i + 1])

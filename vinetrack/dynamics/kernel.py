@@ -164,6 +164,18 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     """Python text of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects.
 
     Mass that effects add moves like the tail but has no weight of its own: it is counted after the forces.
+
+    Parameters
+    ----------
+    effects
+        Effects of the model, in its order.
+    tail_free
+        Whether tails may go slack.
+
+    Returns
+    -------
+    str
+        The text; `kernel` writes it to a file and imports it.
     """
     write = _Writer(effects)
     both = [*write.mass(), *write.pressure(), *write.forces()]
@@ -230,7 +242,23 @@ def _cache_folder() -> Path:
 def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     """The compiled module for these effects; its `integrate_many` is described in `vinetrack.dynamics.integrator`.
 
-    Only one for tails that may go slack (`tail_free`) compiles `vinetrack.dynamics.slack_tail`: it takes longer.
+    Parameters
+    ----------
+    effects
+        Effects of the model, in its order.
+    tail_free
+        Whether tails may go slack; only then `vinetrack.dynamics.slack_tail` is compiled, which takes longer.
+
+    Returns
+    -------
+    module
+        With `integrate_many`, whose arguments are those of `vinetrack.dynamics.integrator.integrate_trials` behind the
+        equations, and the functions of the model.
+
+    Raises
+    ------
+    OSError
+        If no folder can be written to.
     """
     import numba
 

@@ -82,11 +82,32 @@ class Model:
         return iter(self.effects)
 
     def with_values(self, values: Mapping[str, Value]) -> Model:
-        """The same sum with these parameter values in place of its own."""
+        """The same sum of effects with other parameter values.
+
+        Parameters
+        ----------
+        values
+            By `effect.parameter`, SI; parameters that are not named keep their values.
+
+        Returns
+        -------
+        Model
+            A new model.
+        """
         return replace(self, values={**self.values, **values})
 
     def parameters_for(self, vine: str) -> Floats:
-        """Values of all parameters for one vine, shape (n_parameters,), in the order of `parameter_names`.
+        """Values of all parameters for one vine.
+
+        Parameters
+        ----------
+        vine
+            Name of the vine, for values that are given per vine.
+
+        Returns
+        -------
+        array, shape (n_parameters,)
+            SI, in the order of `parameter_names`.
 
         Raises
         ------
@@ -119,10 +140,22 @@ class Model:
 
 
 def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
-    """Which effects act, shape (n_trials, n_effects), for parameters of shape (n_trials, n_parameters).
+    """Which effects act.
 
     An effect of no size (every parameter at its `zero`) does not act, nor one that an acting effect replaces: so one
     compiled model serves all the smaller ones in it.
+
+    Parameters
+    ----------
+    model
+        The sum of effects.
+    parameters
+        Shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`.
+
+    Returns
+    -------
+    array of bool, shape (n_trials, n_effects)
+        In the order of the effects.
     """
     on = np.ones((len(parameters), len(model.effects)), dtype=bool)
     places = _places(model)
@@ -138,9 +171,21 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
 
 
 def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
-    """Parameters of a model as those of a larger one that holds it, shape (n_trials, n_parameters of the host).
+    """Parameters of a model as those of a larger one that holds it.
 
-    What the model lacks stands at its `zero`.
+    Parameters
+    ----------
+    host
+        The larger model.
+    model
+        The smaller one.
+    parameters
+        Shape (n_trials, n_parameters of the model), SI.
+
+    Returns
+    -------
+    array, shape (n_trials, n_parameters of the host)
+        What the model lacks stands at its `zero`.
 
     Raises
     ------
@@ -158,13 +203,26 @@ def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
 
 
 def asked(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]]:
-    """The functions of a hook in the order in which they are asked: place of the effect, function, its parameters."""
-    found = [
+    """The functions of a hook, in the order in which they are called.
+
+    Parameters
+    ----------
+    model
+        The sum of effects.
+    hook
+        One of `vinetrack.effects.HOOKS`.
+
+    Returns
+    -------
+    list of (int, callable, slice)
+        Index of the effect, its function, and where its parameters stand among those of the model.
+    """
+    functions = [
         (effect.order, i, effect.functions[hook], place)
         for i, (effect, place) in enumerate(zip(model.effects, _places(model), strict=True))
         if hook in effect.functions
     ]
-    return [(i, function, place) for _, i, function, place in sorted(found, key=lambda entry: entry[0])]
+    return [(i, function, place) for _, i, function, place in sorted(functions, key=lambda entry: entry[0])]
 
 
 def _places(model: Model) -> list[slice]:
@@ -174,7 +232,19 @@ def _places(model: Model) -> list[slice]:
 
 
 def make_model(names: Iterable[str] = BASE_EFFECTS, own: Mapping[str, Effect] | None = None) -> Model:
-    """The model with these effects, looked up among the user's `own` and in the catalogue.
+    """The model with these effects, at their default values.
+
+    Parameters
+    ----------
+    names
+        Names of effects, in the order of the sum.
+    own
+        The user's effects by name; they are looked up before the catalogue.
+
+    Returns
+    -------
+    Model
+        The sum.
 
     Raises
     ------

@@ -81,6 +81,20 @@ def first_stages(point, h, before):
     """Starting values of the Newton iterations: the last step's cubic, continued beyond its end.
 
     Without an earlier step, the acceleration at the start. No stage is let below a tenth of the speed at the start.
+
+    Parameters
+    ----------
+    point
+        The `Point` from which the step starts.
+    h
+        Size of the step, s.
+    before
+        The `Stages` of the last accepted step, or `NO_STAGES`.
+
+    Returns
+    -------
+    Stages
+        Size of the step and speeds gained at its three stages, m/s.
     """
     lowest = -0.9 * point.v
     if before.h > 0:
@@ -221,7 +235,22 @@ def _end_of_step(point, stages, chamber):
 
 @inlined
 def quintic(s, h, start, end):
-    """Position, speed and acceleration at the fraction s of a step h, from those at its ends (Hermite, order 6)."""
+    """Motion within a step from that at its ends: the Hermite polynomial of degree 5.
+
+    Parameters
+    ----------
+    s
+        Fraction of the step.
+    h
+        Size of the step, s.
+    start, end
+        The `Point` at either end.
+
+    Returns
+    -------
+    (x, v, a)
+        Position, speed and acceleration of the tail, SI.
+    """
     d = end.x - start.x - h * start.v - 0.5 * h * h * start.slope
     e = h * (end.v - start.v - h * start.slope)
     f = h * h * (end.slope - start.slope)

@@ -80,8 +80,16 @@ def simulate(
 
     Parameters
     ----------
+    model : the sum of effects with its values
+    trial : the vine and its settings
     times_s : array, shape (n_times,), s since release, increasing; before 0 the vine is at rest
     trace : measured gauge pressure, which then takes the place of the set pressure and of what happens in the chamber
+    relative_tolerance : local tolerance on the speed
+
+    Returns
+    -------
+    Trajectory
+        At `times_s`.
 
     Raises
     ------
@@ -105,9 +113,20 @@ def simulate_many(
 ) -> list[Trajectory]:
     """`simulate` for many trials in one call of the compiled kernel.
 
-    `parameters`, shape (n_trials, n_parameters) in the order of `model.parameter_names`, gives every trial values of
-    its own in place of the model's. A `host` is a larger model whose compiled form serves this one: its other effects
-    rest.
+    Parameters
+    ----------
+    model, trials, times_s, traces, relative_tolerance
+        As those of `simulate`, a list with an entry for each trial.
+    parameters
+        Shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`: values by trial in place of those
+        of the model.
+    host
+        A larger model whose compiled form serves this one; its other effects do not act.
+
+    Returns
+    -------
+    list of Trajectory
+        One for each trial.
     """
     batch = prepare(model, trials, times_s, traces=traces, parameters=parameters, host=host)
     ratios = [trial.travel_ratio for trial in trials]
@@ -117,7 +136,21 @@ def simulate_many(
 def trajectories(
     batch: Batch, ratios: Sequence[float], names: Sequence[str], relative_tolerance: float = RELATIVE_TOLERANCE
 ) -> list[Trajectory]:
-    """Run a batch; travel ratios and names by trial.
+    """Run a batch.
+
+    Parameters
+    ----------
+    batch
+        As `prepare` or `lay_out` return it.
+    ratios, names
+        Travel ratio and name of each trial.
+    relative_tolerance
+        Local tolerance on the speed.
+
+    Returns
+    -------
+    list of Trajectory
+        One for each trial.
 
     Raises
     ------
@@ -176,10 +209,10 @@ class Batch:
         if threads == 1:
             self._part(0, count, relative_tolerance, out, ends)
         else:
-            rest = relative_tolerance, out, ends
+            shared = relative_tolerance, out, ends
             (begin, end), *others = itertools.pairwise(edges)
-            shares = [_pool(os.getpid(), threads).submit(self._part, a, b, *rest) for a, b in others]
-            self._part(begin, end, *rest)
+            shares = [_pool(os.getpid(), threads).submit(self._part, a, b, *shared) for a, b in others]
+            self._part(begin, end, *shared)
             for share in shares:
                 share.result()
         return out, ends
@@ -221,7 +254,17 @@ def prepare(
     parameters: Floats | None = None,
     host: Model | None = None,
 ) -> Batch:
-    """Lay out trials for the compiled kernel; arguments as those of `simulate_many`.
+    """Lay out trials for the compiled kernel.
+
+    Parameters
+    ----------
+    model, trials, times_s, traces, parameters, host
+        As those of `simulate_many`.
+
+    Returns
+    -------
+    Batch
+        Ready to be run, as often as needed.
 
     Raises
     ------
@@ -240,7 +283,18 @@ def prepare(
 
 
 def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
-    """Start, arc and radius of a trial's bends, m."""
+    """The bends of a trial as numbers.
+
+    Parameters
+    ----------
+    trial
+        The vine and its settings.
+
+    Returns
+    -------
+    list of (start, arc, radius)
+        m, one for each bend.
+    """
     return [(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]
 
 
@@ -254,7 +308,22 @@ def lay_out(
     parameters: Floats,
     host: Model | None = None,
 ) -> Batch:
-    """As `prepare`, for trials that are rows of rigs already, shape (n_trials, n_fields of `TrialInputs`)."""
+    """As `prepare`, for trials that are rows of numbers already.
+
+    Parameters
+    ----------
+    model, times_s, traces, parameters, host
+        As those of `simulate_many`.
+    rigs
+        Shape (n_trials, n_fields of `TrialInputs`), SI.
+    bends
+        By trial, as `bends_of` returns them.
+
+    Returns
+    -------
+    Batch
+        Ready to be run.
+    """
     count = len(rigs)
     traces = traces or [None] * count
     thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
@@ -317,15 +386,15 @@ def _limits(
     cornered = [i for i, effect in enumerate(model.effects) if effect.corners is not None and on[:, i].any()]
     if not cornered and not any(bends):
         return floor[:, None].copy(), end
-    found = [[edge for start, arc, _ in rows for edge in (start, start + arc)] for rows in bends]
+    positions_m = [[edge for start, arc, _ in rows for edge in (start, start + arc)] for rows in bends]
     for i in cornered:
         corners = model.effects[i].corners
         assert corners is not None
         for k in np.flatnonzero(on[:, i]).tolist():
-            found[k] += corners(TrialInputs(*rigs[k]))
-    kinks = np.full((len(rigs), 1 + max(map(len, found), default=0)), math.inf)
+            positions_m[k] += corners(TrialInputs(*rigs[k]))
+    kinks = np.full((len(rigs), 1 + max(map(len, positions_m), default=0)), math.inf)
     kinks[:, 0] = floor
-    for k, positions in enumerate(found):
+    for k, positions in enumerate(positions_m):
         kinks[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
     return np.sort(kinks, axis=1), end
 
@@ -334,26 +403,26 @@ def _true_times(
     model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], times_s: Sequence[Floats]
 ) -> list[Floats]:
     """When what the camera stamps `times_s` really happened, by trial."""
-    found = list(times_s)
+    true_times = list(times_s)
     for effect, function, place in asked(model, "true_time"):
         for i in np.flatnonzero(on[:, effect]):
-            state = _NOTHING._replace(time=found[i])  # type: ignore[arg-type]
-            found[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float)
-    return found
+            state = _NOTHING._replace(time=true_times[i])  # type: ignore[arg-type]
+            true_times[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float)
+    return true_times
 
 
 def _true_traces(
     model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], traces: Sequence[Trace | None]
 ) -> list[Trace | None]:
     """Measured pressures at the times at which they were really measured, by trial."""
-    found = list(traces)
+    true_traces = list(traces)
     for effect, function, place in asked(model, "trace_time"):
         for i in np.flatnonzero(on[:, effect]).tolist():
-            if (trace := found[i]) is None:
+            if (trace := true_traces[i]) is None:
                 continue
             state = _NOTHING._replace(time=trace[0])  # type: ignore[arg-type]
-            found[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float), trace[1]
-    return found
+            true_traces[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float), trace[1]
+    return true_traces
 
 
 def _trajectory(name: str, r: float, times_s: Floats, out: Floats, end: Sequence[float]) -> Trajectory:

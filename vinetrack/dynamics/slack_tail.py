@@ -50,7 +50,20 @@ class SlackState(NamedTuple):
 
 @compiled
 def slack_at_rest(equations, trial, time, x, chamber):
-    """Whether the tail of a vine at rest would have to push."""
+    """Whether the tail of a vine at rest would have to push.
+
+    Parameters
+    ----------
+    equations, trial
+        The compiled functions of the model, and the arrays of the trial.
+    time, x, chamber
+        Time since release, s; position of the tail, m; gauge pressure of the chamber, Pa.
+
+    Returns
+    -------
+    bool
+        False for every trial whose tail may not go slack.
+    """
     if trial.inputs[FREE] <= 0:
         return False
     tension, _rate = equations.tip_tension(time, x, 0.0, chamber, True, trial)
@@ -59,7 +72,22 @@ def slack_at_rest(equations, trial, time, x, chamber):
 
 @compiled
 def slack_fraction(equations, trial, h, start, end):
-    """Fraction of a step at which the tail's tension comes to nothing, by bisection; 2 where it is taut at the end."""
+    """Fraction of a step at which the tail's tension falls to zero, by bisection.
+
+    Parameters
+    ----------
+    equations, trial
+        The compiled functions of the model, and the arrays of the trial.
+    h
+        Size of the step, s.
+    start, end
+        The `Point` at either end.
+
+    Returns
+    -------
+    float
+        2 where the tail is taut at the end.
+    """
     if trial.inputs[FREE] <= 0:
         return 2.0
     tension, _rate = equations.tip_tension(end.time, end.x, end.v, end.chamber, False, trial)
@@ -215,8 +243,20 @@ def _write_slack(equations, trial, times, row, time, fraction, h, s, end, k, u, 
 def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
     """From the moment the tail goes slack until it is taut again, growth ends or the last time is filled in.
 
-    Fills rows of `out` from `row` on as the integrator does, with r·y, r·ẏ and r·ÿ of the tip. `stop` is r·L; k is an
-    array (7, 4) for the rates at the stages of a step.
+    Parameters
+    ----------
+    equations, trial
+        The compiled functions of the model, and the arrays of the trial.
+    times, row, out
+        As those of the integrator; rows of `out` are filled from `row` on with r·y, r·ẏ and r·ÿ of the tip.
+    start
+        The `Point` at which the tail goes slack.
+    stop
+        Tail travel r·L at the end of growth, m.
+    rtol
+        Local tolerance, relative.
+    k
+        Array (7, 4) for the rates at the stages of a step.
 
     Returns
     -------

@@ -14,7 +14,18 @@ from vinetrack.experiment.schema import COLUMNS
 
 
 def trial_inputs(trial: Trial) -> TrialInputs:
-    """What the effects see of a trial, in SI."""
+    """What the effects see of a trial.
+
+    Parameters
+    ----------
+    trial
+        The vine and its settings; of a body that moves as a whole what is blank counts as zero.
+
+    Returns
+    -------
+    TrialInputs
+        SI; NaN where the sheet is blank.
+    """
     whole_body = trial.travel_ratio == 1
     length = trial.length_m if math.isfinite(trial.length_m) else 0.0
     area = trial.area_m2 if math.isfinite(trial.diameter_m) else 0.0
@@ -49,9 +60,19 @@ def trial_inputs(trial: Trial) -> TrialInputs:
 
 
 def with_pressures(rigs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Floats) -> Floats:
-    """The same rigs, rows of `TrialInputs`, at other pressures, shape (n_rigs,); the gas weighs as much more.
+    """The same trials at other pressures; the gas in them weighs as much more.
 
-    A yield pressure that is NaN leaves that of the rig.
+    Parameters
+    ----------
+    rigs
+        Rows of `TrialInputs`, shape (n_trials, n_fields), SI.
+    set_pressure_Pa, yield_pressure_Pa
+        Shape (n_trials,); a yield pressure that is NaN leaves that of the row.
+
+    Returns
+    -------
+    array, shape (n_trials, n_fields)
+        A changed copy.
     """
     place = {name: k for k, name in enumerate(TrialInputs._fields)}
     changed = rigs.copy()
@@ -70,13 +91,33 @@ def _of_trial(column: str, trial: Trial) -> object:
 
 
 def stated(column: str, trial: Trial) -> bool:
-    """Whether the sheet gives a trial a number other than zero in this column."""
+    """Whether the sheet gives a trial a number other than zero in this column.
+
+    Parameters
+    ----------
+    column
+        Name of a column of the sheet.
+    trial
+        The trial as read from it.
+
+    Returns
+    -------
+    bool
+        True also where the column holds something other than a number.
+    """
     value = _of_trial(column, trial)
     return not isinstance(value, float) or (math.isfinite(value) and value != 0)
 
 
 def check_needs(model: Model, *trials: Trial) -> None:
     """Refuse trials that lack what an effect of the model needs.
+
+    Parameters
+    ----------
+    model
+        The sum of effects.
+    *trials
+        Trials it is to be used on.
 
     Raises
     ------
