@@ -415,14 +415,14 @@ def _true_traces(
     model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], traces: Sequence[Trace | None]
 ) -> list[Trace | None]:
     """Measured pressures at the times at which they were really measured, by trial."""
-    true_traces = list(traces)
+    in_time = list(traces)
     for effect, function, place in asked(model, "trace_time"):
         for i in np.flatnonzero(on[:, effect]).tolist():
-            if (trace := true_traces[i]) is None:
+            if (trace := in_time[i]) is None:
                 continue
             state = _NOTHING._replace(time=trace[0])  # type: ignore[arg-type]
-            true_traces[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float), trace[1]
-    return true_traces
+            in_time[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float), trace[1]
+    return in_time
 
 
 def _trajectory(name: str, r: float, times_s: Floats, out: Floats, end: Sequence[float]) -> Trajectory:
