@@ -115,13 +115,11 @@ def simulate_many(
 
     Parameters
     ----------
-    model, trials, times_s, traces, relative_tolerance
-        As those of `simulate`, a list with an entry for each trial.
+    model, trials, times_s, traces, relative_tolerance : as those of `simulate`, lists with an entry for each trial
     parameters
         Shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`: values by trial in place of those
         of the model.
-    host
-        A larger model whose compiled form serves this one; its other effects do not act.
+    host : a larger model whose compiled form serves this one; its other effects do not act
 
     Returns
     -------
@@ -140,12 +138,9 @@ def trajectories(
 
     Parameters
     ----------
-    batch
-        As `prepare` or `lay_out` return it.
-    ratios, names
-        Travel ratio and name of each trial.
-    relative_tolerance
-        Local tolerance on the speed.
+    batch : as `prepare` or `lay_out` return it
+    ratios, names : travel ratio and name of each trial
+    relative_tolerance : local tolerance on the speed
 
     Returns
     -------
@@ -258,8 +253,7 @@ def prepare(
 
     Parameters
     ----------
-    model, trials, times_s, traces, parameters, host
-        As those of `simulate_many`.
+    model, trials, times_s, traces, parameters, host : as those of `simulate_many`
 
     Returns
     -------
@@ -287,8 +281,7 @@ def bends_of(trial: Trial) -> list[tuple[float, float, float]]:
 
     Parameters
     ----------
-    trial
-        The vine and its settings.
+    trial : the vine and its settings
 
     Returns
     -------
@@ -312,12 +305,9 @@ def lay_out(
 
     Parameters
     ----------
-    model, times_s, traces, parameters, host
-        As those of `simulate_many`.
-    rigs
-        Shape (n_trials, n_fields of `TrialInputs`), SI.
-    bends
-        By trial, as `bends_of` returns them.
+    model, times_s, traces, parameters, host : as those of `simulate_many`
+    rigs : shape (n_trials, n_fields of `TrialInputs`), SI
+    bends : by trial, as `bends_of` returns them
 
     Returns
     -------
