@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -137,7 +138,8 @@ def test_a_refit_brings_the_error_down_and_says_what_it_found(browser: Browser) 
     browser.until(lambda: browser.model("refit").label == "Refit")
     browser.turn()
     assert all(now < was for now, was in zip(error_of(browser), before, strict=True))
-    assert "fitted: <b>1.4" in browser.text("found_reservoir_depletion.gamma")
+    gamma, sigma = re.findall(r"[\d.]+", browser.text("found_reservoir_depletion.gamma"))[:2]
+    assert abs(float(gamma) - 1.4) < 2 * float(sigma) < 0.03  # 1.4 is what the trials were grown with
     assert "for 1 number more" in browser.text("numbers")
     assert "vinetrack add reservoir_depletion" in browser.text("commands")
     assert browser.text("status") == ""
