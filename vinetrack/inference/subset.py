@@ -58,6 +58,13 @@ def fit_subset(
     names = set(held)
     free = [not names & {number.name, number.key} for number in predictor.layout.free]
     frame = replace(frame, free=frame.free & np.array(free, dtype=bool))
+    # The numbers of a fit include what smooth errors of position moved them by; its state does not.
+    reported = {number.name: number.value for number in found.numbers}
+    stays = [
+        number.inside(reported[number.name]) if not moves and number.name in reported else theta
+        for number, moves, theta in zip(predictor.layout.free, free, state.theta, strict=True)
+    ]
+    state = replace(state, theta=np.array(stays, dtype=float))
     told = _told(found, rows)
     told = FixedTerms(
         state.spread if hold_spreads else told.spread, (state.rho, state.variance) if hold_noise else told.noise
