@@ -371,6 +371,7 @@ def depleting_track(trial: Trial, gamma: float, draw: np.random.Generator) -> Tr
 
 def test_whoever_watches_is_told_of_every_step_and_may_end_the_fit() -> None:
     pairs, _ = small_campaign(seed=31)
+    pairs = [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
     steps: list[Step] = []
     found = vt.fit(vt.base_model(), pairs, watch=steps.append)
     assert [step.iteration for step in steps][-1] == found.iterations

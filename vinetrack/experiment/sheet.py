@@ -300,7 +300,7 @@ def make_trial(row: Row, folder: Path, settings: ExperimentSettings) -> Trial:
         mass_loss=settings.mass_loss,
         tail_slack=settings.tail_slack,
         tail_store=settings.tail_store,
-        position_systematic_m=_position_systematic_m(settings, measured="track" in values or "mm_per_px" in values),
+        position_systematic_m=_position_systematic_m(settings, values),
     )
 
 
@@ -311,13 +311,17 @@ def _in_si(column: Column, value: Any, folder: Path) -> Any:
     return column.to_si(float(value)) if column.kind in ("number", "choice") else value
 
 
-def _position_systematic_m(settings: ExperimentSettings, *, measured: bool) -> float:
+def _position_systematic_m(settings: ExperimentSettings, values: dict[str, Any]) -> float:
     """Smooth error of positions, standard deviation, m: as stated, else by what is known of the lens.
 
     A target of many corners shows the distortion of the lens; two points or a scale do not, nor do positions that
-    somebody else measured say whether it was corrected (`measured`, which a scale of the trial's own counts as).
+    somebody else measured, or a scale of the trial's own, say whether it was corrected. Of a trial that nobody has
+    filmed yet nothing is known: NaN.
     """
     if settings.position_systematic_mm is not None:
         return settings.position_systematic_mm / 1e3
+    if "track" not in values and "video" not in values:
+        return math.nan
+    measured = "track" in values or "mm_per_px" in values
     knows_lens = isinstance(settings.calibration, (Charuco, Checkerboard)) and not measured
     return 0.0 if knows_lens else POSITION_SYSTEMATIC_M

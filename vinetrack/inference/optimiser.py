@@ -101,7 +101,11 @@ class Solution:
 
 @dataclass(frozen=True)
 class Step:
-    """Where the iterations are: the numbers, SI, by name, and by how much the step just found lowers −2 ln L."""
+    """Where the iterations are: the numbers, SI, by name, and by how much the step just found lowers −2 ln L.
+
+    Smooth errors of position (`vinetrack.inference.position_errors`) are fitted after the last step, and move the
+    numbers that the fit reports.
+    """
 
     iteration: int
     values: Mapping[str, float]

@@ -73,7 +73,15 @@ def simulate_campaign(
 def make(
     model: Model, trials: Sequence[Trial], camera: FilmingPlan, spreads: tuple[float, float], draw: np.random.Generator
 ) -> list[tuple[Trial, Track]]:
-    """Sheet and tracks of one campaign: what the sheet states, and what a camera would have seen."""
+    """Sheet and tracks of one campaign: what the sheet states, and what a camera would have seen.
+
+    The camera is taken for calibrated: no smooth error of position is allowed for unless the sheet states one, as in
+    `vinetrack.planning.campaign_information`, whose promise this holds to account.
+    """
+    trials = [
+        trial if math.isfinite(trial.position_systematic_m) else replace(trial, position_systematic_m=0.0)
+        for trial in trials
+    ]
     frame_s = 1 / camera.capture_fps
     count = len(trials)
     pressures = 1 + spreads[0] * draw.standard_normal(count)
