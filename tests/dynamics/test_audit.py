@@ -79,10 +79,11 @@ def test_gas_inertia_holds_the_mass_it_adds_times_the_acceleration() -> None:
 
 
 def test_tail_stretch_is_told_in_metres_at_the_edge() -> None:
-    # ½ L T₁/(EπDt), T₁ = ½ × 25000 A − ½ × 6.44 × 4^0.37
+    # ½ (L T₁ + y (PA − 2 T₁))/(EπDt) at the last point, y = 0.95 L, with T₁ = ½ × 25000 A − ½ × 6.44 × 4^0.37
     tension = 0.5 * 25e3 * A - 0.5 * 6.44 * 4.0**0.37
     stretch = row(audit(BASE, [steady(trial())]), "tail_stretch")
-    expected = 0.5 * 0.28 * tension * 4e-8 / (math.pi * 24e-3 * 200e-6)
+    strain_per_newton = 4e-8 / (math.pi * 24e-3 * 200e-6)
+    expected = 0.5 * strain_per_newton * (0.28 * tension + 0.95 * 0.28 * (28e3 * A - 2 * tension))
     assert stretch["shift_m"] == pytest.approx(expected, rel=1e-9)
     assert math.isnan(stretch["force_N"])
 
