@@ -300,11 +300,11 @@ def drag_beside_inlet(laboratory: Laboratory, draw: Draw) -> Laboratory:
 
 
 def effect(name: str) -> Fault:
-    """An effect of the catalogue, the largest of five sizes drawn."""
+    """An effect of the catalogue, the larger of two sizes drawn."""
 
     def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
         scene = Scene.of([shot.setting for shot in laboratory.shots])
-        drawn = [EFFECTS[name][0](draw, scene) for _ in range(5)]
+        drawn = [EFFECTS[name][0](draw, scene) for _ in range(2)]
         change = max(drawn, key=lambda one: abs(next(iter(one.values.values()))))
         camera = replace(laboratory.camera, scale=change.scale, clock=change.clock)
         if change.scale:
