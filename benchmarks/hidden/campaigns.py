@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hidden import kinds as catalogue
 from hidden.designs import Setting, Wants, design
-from hidden.kinds import EFFECTS, INTERRUPTED, OUTSIDERS, Scene
+from hidden.kinds import EFFECTS, INTERRUPTED, KINDS, OUTSIDERS, Scene
 from hidden.kinds import Hidden as Change
 from hidden.motion import Floats, Physics, Tube, follow
 from hidden.nuisances import Nuisances, draw_nuisances, noise, regime, scatter
@@ -71,7 +70,7 @@ def make(kind: str, seed: int, *, filmed: bool = False) -> Hidden:
     KeyError
         If there is no such kind; see `hidden.KINDS`.
     """
-    if kind not in catalogue.KINDS:
+    if kind not in KINDS:
         raise KeyError(kind)
     for attempt in range(50):
         draw = np.random.default_rng([zlib.crc32(kind.encode()), seed, attempt])
