@@ -111,12 +111,16 @@ def test_every_trial_finds_the_b_it_was_grown_with() -> None:
 
 
 def test_a_number_that_all_share_is_asked_whether_it_suits_every_vine() -> None:
-    """The sheet says 3.7 L, but the wide vine was grown on 2.8 L: alone it would have 1.32 for the true γ of 1."""
+    """The sheet says 3.7 L, but the wide vine was grown on 2.8 L: alone it would have 1.32 for the true γ of 1.
+
+    Behind a known lens: where smooth errors of position are allowed for, they hide this difference.
+    """
     isothermal = {"reservoir_depletion.gamma": 1.0}
     narrow = [trial for trial in sheet() if trial.diameter_m < 0.02]
     wide = [trial for trial in sheet(chamber_m3=2.8e-3) if trial.diameter_m > 0.02]
     virtual = [one for part in (narrow, wide) for one in grown(part, 57, ["reservoir_depletion"], isothermal)]
-    pairs = [(replace(trial, chamber_m3=3.7e-3), track) for trial, track in pairs_of(virtual)]
+    rig = {"chamber_m3": 3.7e-3, "position_systematic_m": 0.0}
+    pairs = [(replace(trial, **rig), track) for trial, track in pairs_of(virtual)]
     found = drift(fitted(pairs, vt.base_model() + vt.effects.reservoir_depletion))
     row = found.table[(found.table["parameter"] == "reservoir_depletion.gamma") & (found.table["against"] == "vine")]
     assert row["significant"].iloc[0]
