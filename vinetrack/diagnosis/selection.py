@@ -122,8 +122,12 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
     if slack is None or slack.sigma < questions.threshold:
         return None
     report("letting the tail go slack")
+    # A model far off may gain by any freedom: the rule is named only where it leaves nothing to explain.
+    after = misfit_tests(slack.fit, effects, LATER_LEVEL)
+    if after.something or after.fails or after.off:
+        return None
     first = SelectionStep(MISSING, questions, (slack,), (slack,), (), slack.names)
-    return [first, *select_effects(slack.fit, effects, report, again=MOST_AGAIN)]
+    return [first, SelectionStep(ADEQUATE, after)]
 
 
 def best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:
