@@ -338,7 +338,7 @@ def test_an_own_effect_is_loaded_and_simulated_like_any_other(tmp_path: Path) ->
 def test_an_own_effect_stands_before_one_of_the_same_name(tmp_path: Path) -> None:
     own = load_effect(written(tmp_path, GOOD, "gravity.py"))
     assert find_effect("gravity", {"gravity": own}) is own
-    assert make_model(own={"gravity": own}) != base_model()
+    assert make_model(user_effects={"gravity": own}) != base_model()
 
 
 def test_an_edited_file_is_read_anew(tmp_path: Path) -> None:

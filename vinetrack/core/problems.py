@@ -83,9 +83,9 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     ordered = sorted(problems, key=lambda problem: problem.severity != "error")
     if len(ordered) <= limit:
         return [str(problem) for problem in ordered]
-    rest = ordered[limit - 1 :]
-    errors = sum(problem.severity == "error" for problem in rest)
-    more = f"… and {len(rest)} more ({errors} errors, {len(rest) - errors} warnings)"
+    remaining = ordered[limit - 1 :]
+    errors = sum(problem.severity == "error" for problem in remaining)
+    more = f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"
     return [*(str(problem) for problem in ordered[: limit - 1]), more]
 
 

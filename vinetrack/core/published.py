@@ -15,7 +15,7 @@ DAMPING_R2 = {1: 0.964, 2: 0.981, 3: 0.896, 4: 0.971}
 """How well the power law describes the steady points of each scale."""
 
 EXPONENT = 0.37
-"""Damping exponent n, one for all scales."""
+"""Damping exponent n, one for all scales. Published: Fig. 6."""
 
 THICKNESS_UM = {1: 50.0, 2: 100.0, 3: 150.0, 4: 200.0}
 DIAMETER_MM = {1: 6.0, 2: 12.0, 3: 18.0, 4: 24.0}
@@ -26,28 +26,36 @@ LASER_POWER_PERCENT = {1: 60.0, 2: 76.0, 3: 81.0, 4: 86.0}
 """Settings by which they were made."""
 
 CONDITIONS = (8, 11)
-"""Pressures per scale in the damping fit, fewest and most."""
+"""Pressures per scale in the damping fit, fewest and most. Published: section on the test procedure."""
 
 TRIALS = (4, 5)
-"""Trials of each, fewest and most."""
+"""Trials of each, fewest and most. Published: section on the test procedure."""
 
 REPLICATES = 4
-"""N of Figs. 4, 5, 8 and 9."""
+"""N of Figs. 4, 5, 8 and 9. Published in their captions."""
 
 STEADY_FEWEST_POINTS, STEADY_CV = 3, 0.03
-"""A steady window: points in a row, and the coefficient of variation of their velocities."""
+"""A steady window: points in a row, and the coefficient of variation of their velocities. Published: section on data
+collection."""
 
 YIELD_PRESSURE_KPA, YIELD_PRESSURE_SCALE = 3.0, 4
-"""Of the 24 mm × 200 µm vine, R = 4; no other is printed."""
+"""Of the 24 mm × 200 µm vine, R = 4; no other is printed. Published: section on model validation."""
 
 CAPTURE_FPS = 1069.0
+"""Frames a second of the recordings. Published: section on the experimental setup."""
+
 CHAMBER_L = 3.7
+"""Volume of the chamber, litres. Published: Fig. 3."""
 
 LONGEST_VINE_MM = 280.0
+"""Length of the largest vine, 24 mm in diameter. Published: section on the experimental setup."""
+
 CHAMBER_CHANGE, CHAMBER_ALLOWED = 0.035, 0.05
-"""Relative change of the chamber's volume by the largest vine, and of pressure that is allowed."""
+"""Relative change of the chamber's volume by the largest vine, and of pressure that is allowed. Published: section on
+the experimental setup."""
 
 PAYLOAD_G = 35.6
+"""Payload of Figs. 4 and 9. Published in their captions."""
 
 POSITION_RMS_CM = {7: 1.90, 14: 0.29, 28: 0.31}
 """Model against measurement by pressure in kPa, of the 24 mm × 200 µm vine with the payload (Fig. 4, Table II)."""
@@ -56,16 +64,19 @@ FINAL_SPEED_RMS_M_S = {14: 0.27, 28: 0.56, 41: 1.35}
 """The same of the final speed of 24 mm × 150 µm vines with several payloads (Fig. 5, Table II)."""
 
 FINAL_SPEED_AT_MM = 120.0
+"""Travel at which the final speed of Fig. 5 is read. Published in its text."""
+
 FINAL_SPEED_THICKNESS_UM = 150.0
+"""Wall of the vines of Fig. 5. Published in its caption."""
 
 STEADY_SPEED_KPA, STEADY_SPEED_R2, STEADY_SPEED_P_VALUE = 24.0, 0.935, 0.32
-"""Steady speed against scale (Fig. 8): its pressure, and the linear fit."""
+"""Steady speed against scale (Fig. 8): its pressure, and the linear fit. Published in its caption."""
 
 THICKNESS_SERIES_DIAMETER_MM = 12.0
-"""Of the vines whose B is drawn against thickness (Fig. 7B)."""
+"""Of the vines whose B is drawn against thickness (Fig. 7B). Published in its caption."""
 
 EFFICIENCY_KPA, EFFICIENCY_AT_MM, EFFICIENCY_DIAMETERS_MM = 34.0, 150.0, (12.0, 18.0)
-"""Energy efficiency (Fig. 9), with the payload."""
+"""Energy efficiency (Fig. 9), with the payload. Published in its caption."""
 
 FAST_VINE = {"thickness_um": 100.0, "diameter_mm": 25.0, "length_mm": 400.0, "pressure_kPa": 62.0}
 """The fastest vine, at a pressure just under that at which it bursts, without payload."""
@@ -77,17 +88,18 @@ INJECTOR = {"thickness_um": 50.0, "diameter_mm": 2.5, "length_mm": 12.5, "pressu
 """One vine of the dye injector."""
 
 INJECTOR_CHAMBER_MM = (20.0, 15.0)
-"""Length and diameter of its chamber."""
+"""Length and diameter of its chamber. Published: section on the dye injector."""
 
 INJECTOR_CHANGE = 0.017
-"""Relative change of its pressure as it is printed."""
+"""Relative change of its pressure as it is printed. Published: section on the dye injector."""
 
 DRAG_EXAMPLE = {"thickness_um": 50.0, "diameter_mm": 24.0, "length_mm": 150.0, "pressure_kPa": 56.0}
 DRAG_COEFFICIENT, DRAG_SHARE = 0.82, 0.05
-"""The vine whose drag is said to stay below this share of the drive up to its pressure."""
+"""The vine whose drag is said to stay below this share of the drive up to its pressure. Published: below Eq. (2)."""
 
 PSI_KPA = 6.894757293168361
-"""Pressures look like rounded pounds per square inch: 14 kPa is 13.79."""
+"""Pressures look like rounded pounds per square inch: 14 kPa is 13.79. Derived: kPa in a psi, the unit as
+`vinetrack.core.units` defines it."""
 
 
 def scale_of(diameter_mm: float, thickness_um: float) -> int | None:

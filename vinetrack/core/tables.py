@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LARGEST_TABLE_BYTES = 200_000_000
-"""Beyond this a file is no table: probably a recording named in the wrong column."""
+"""Beyond this a file is no table: probably a recording named in the wrong column. Chosen: an hour of positions at 1000
+frames a second takes 150 MB. At half such a file is refused, at twice a recording takes memory before it is
+refused."""
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
@@ -48,8 +50,7 @@ class Table:
 
     `rows[i]` maps each column to its cell ("" where blank or where the line is short); `lines[i]` is its line in the
     file, from 1; `extra[i]` holds what stands beyond the last column; `nameless` tells that a column without a name
-    holds something. `decimal` is the decimal mark the file uses, "."
-    or ",", or "" where it uses both.
+    holds something. `decimal` is the decimal mark the file uses, "." or ",", or "" where it uses both.
     """
 
     columns: tuple[str, ...]
@@ -100,12 +101,10 @@ class Table:
 def parse_number(text: str, decimal: str = ".") -> float:
     """Read one number strictly: ASCII digits, at most one decimal mark (point or comma), an exponent, nothing else.
 
-    `decimal` ("." or ",", or "" for unknown) only settles what 1,069 and 1.069 are.
-
     Parameters
     ----------
     text : one cell.
-    decimal : the decimal mark of the file, or blank where it is unknown.
+    decimal : the decimal mark of the file, blank where unknown; it only settles what 1,069 and 1.069 are.
 
     Returns
     -------
@@ -116,8 +115,6 @@ def parse_number(text: str, decimal: str = ".") -> float:
     TableError
         Saying what is wrong with it, without repeating it.
 
-    Examples
-    --------
     >>> parse_number("0,5"), parse_number(" 2.5e3 "), parse_number("1,069", decimal=",")
     (0.5, 2500.0, 1.069)
     >>> parse_number("12 kPa")
@@ -253,9 +250,9 @@ def parse_table(text: str, skip_lines: int = 0) -> Table:
     )
     extra = tuple(tuple(filter(None, cells[width:])) for _, cells in body)
     nameless = any(cell and not name for _, cells in body for name, cell in zip(columns, cells, strict=False))
-    found = [cell for _, cells in body for cell in cells]
+    cells_in_body = [cell for _, cells in body for cell in cells]
     lines_of_rows = tuple(line + skip_lines for line, _ in body)
-    return Table(tuple(named), rows, lines_of_rows, extra, delimiter, _find_decimal(found, delimiter), nameless)
+    return Table(tuple(named), rows, lines_of_rows, extra, delimiter, _find_decimal(cells_in_body, delimiter), nameless)
 
 
 def _find_delimiter(header: str) -> str:
@@ -321,8 +318,6 @@ def safe_join(folder: Path, relative: str) -> Path:
     TableError
         If `relative` is blank, absolute, starts with a drive letter or climbs out of the folder.
 
-    Examples
-    --------
     >>> safe_join(Path("exp"), r"videos\a.mp4").as_posix()
     'exp/videos/a.mp4'
     >>> safe_join(Path("exp"), "../a.mp4")
@@ -373,7 +368,13 @@ def result_file(folder: Path, name: str, suffix: str) -> Path:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`, with its suffix; on success it takes the place of `path`, else it goes.
 
-    For writers that want a path (figures, videos); the folder is made where it is missing.
+    Parameters
+    ----------
+    path : the file to be written, by whatever wants a path; its folder is made where it is missing.
+
+    Yields
+    ------
+    temporary : path in the same folder, with the suffix of `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".tmp-{uuid.uuid4().hex}{path.suffix}")
@@ -444,6 +445,4 @@ def _plain(content: Any) -> Any:
         return [_plain(value) for value in (sorted(content) if isinstance(content, set | frozenset) else content)]
     if isinstance(content, float):
         return content if math.isfinite(content) else None
-    if isinstance(content, Path):
-        return content.as_posix()
-    return content
+    return content.as_posix() if isinstance(content, Path) else content

@@ -32,7 +32,16 @@ _NOTHING = frozenset({"", "–", "-", "—", "nan", "open"})
 
 
 def colour_wanted(stream: TextIO | None = None) -> bool:
-    """Whether a stream, by default standard output, is a terminal that wants colour."""
+    """Whether a stream is a terminal that wants colour.
+
+    Parameters
+    ----------
+    stream : standard output if None.
+
+    Returns
+    -------
+    False where NO_COLOR is set, the terminal is "dumb", or the stream is no terminal.
+    """
     stream = stream or sys.stdout
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return False
@@ -40,20 +49,50 @@ def colour_wanted(stream: TextIO | None = None) -> bool:
 
 
 def styled(text: str, *styles: str, stream: TextIO | None = None) -> str:
-    """The text in these styles (see `CODES`) where the stream wants colour, else as it is."""
+    """The text in these styles (see `CODES`) where the stream wants colour, else as it is.
+
+    Parameters
+    ----------
+    text : what is printed.
+    *styles : keys of `CODES`.
+    stream : where it is printed; standard output if None.
+
+    Returns
+    -------
+    the text between the escape codes of the styles, or unchanged.
+    """
     if not styles or not text or not colour_wanted(stream):
         return text
     return f"\x1b[{';'.join(CODES[style] for style in styles)}m{text}\x1b[0m"
 
 
 def severity_first(line: str, stream: TextIO | None = None) -> str:
-    """A line of `format_problems` with its first word in the colour of how bad it is."""
+    """Return a line of `format_problems` with its first word in the colour of its severity.
+
+    Parameters
+    ----------
+    line : "error: …" or "warning: …"; any other line stays as it is.
+    stream : where it is printed; standard output if None.
+
+    Returns
+    -------
+    the line.
+    """
     word, colon, message = line.partition(":")
     return styled(word, SEVERITIES[word], "bold", stream=stream) + colon + message if word in SEVERITIES else line
 
 
 def width(text: str) -> int:
-    """Columns that a text takes on a terminal: styles and combining marks take none, wide characters two."""
+    """Count the columns that a text takes on a terminal: styles and combining marks none, wide characters two.
+
+    Parameters
+    ----------
+    text : one line, styles included.
+
+    Returns
+    -------
+    columns.
+    """
     plain = _STYLED.sub("", text)
     return sum(
         0 if unicodedata.combining(char) else 2 if unicodedata.east_asian_width(char) in "WF" else 1 for char in plain
@@ -72,12 +111,14 @@ def table(
 
     Parameters
     ----------
-    rows
-        Cells of each row, as many in each; what is no text is written by `str`.
-    header, units
-        Names of the columns and, on a line of their own, their units.
-    align
-        A letter a column, `<` or `>`, in place of what the cells look like.
+    rows : cells of each row, as many in each; what is no text is written by `str`.
+    header, units : names of the columns and, on a line of their own, their units; no line where empty.
+    indent : text before every line.
+    align : a letter a column, `<` or `>`; by default numbers go to the right.
+
+    Returns
+    -------
+    lines, without line ends.
 
     >>> table([("a", "1.5"), ("b", "12.0")], header=("trial", "rms"), units=("", "mm"))
     ['trial   rms', '         mm', 'a       1.5', 'b      12.0']
@@ -128,15 +169,30 @@ class Progress(Generic[Item]):
         )
 
     def advance(self, count: int = 1) -> None:
-        """So many more are done."""
+        """Count steps as done.
+
+        Parameters
+        ----------
+        count : steps since the last call.
+        """
         self._bar.update(count)
 
     def reach(self, done: int) -> None:
-        """So many are done in all."""
+        """Set how many steps are done in all.
+
+        Parameters
+        ----------
+        done : steps since the beginning.
+        """
         self._bar.update(done - self._bar.n)
 
     def say(self, words: str) -> None:
-        """Show what is being done right now behind the bar."""
+        """Show what is being done right now behind the bar.
+
+        Parameters
+        ----------
+        words : a few words; the next call replaces them.
+        """
         self._bar.set_postfix_str(words, refresh=False)
 
     def __iter__(self) -> Iterator[Item]:
@@ -161,12 +217,14 @@ def progress(
 
     Parameters
     ----------
-    work
-        Things to go through, or how many steps there will be. Where nobody knows, see `waiting`.
-    description
-        What is being done, a word or two.
-    total
-        How many there will be, for an iterable that cannot tell.
+    work : what to go through, or how many steps there will be; where nobody knows, see `waiting`.
+    description : what is being done, a word or two.
+    total : how many there will be, for an iterable without a length.
+    unit : what is counted, in the singular.
+
+    Returns
+    -------
+    a bar: iterate over it, or use it as a context and call `advance` or `reach`.
 
     >>> [item for item in progress(["a", "b"], "trials")]
     ['a', 'b']

@@ -26,11 +26,29 @@ class Unit:
     metavar: str = "NUMBER"
 
     def to_si(self, value: float) -> float:
-        """The value in SI."""
+        """Return a value in SI.
+
+        Parameters
+        ----------
+        value : in this unit.
+
+        Returns
+        -------
+        the value in the unit `si`.
+        """
         return value * self.multiply / self.divide
 
     def from_si(self, value: float) -> float:
-        """A value in SI, in this unit."""
+        """Return a value in this unit.
+
+        Parameters
+        ----------
+        value : in SI.
+
+        Returns
+        -------
+        the value in this unit.
+        """
         return value * self.divide / self.multiply
 
 

@@ -23,10 +23,8 @@ from vinetrack.dynamics.simulate import Trace, simulate
 from vinetrack.dynamics.trial_inputs import trial_inputs
 from vinetrack.effects import Effect, EffectError, catalogue
 
-DRAG_SHARE = 0.05
-PRESSURE_SHARE = 0.05
-LONG_M = 0.30
 BENT_RAD = math.radians(30)
+DRAG_SHARE, PRESSURE_SHARE, LONG_M = 0.05, 0.05, 0.30
 """Published: the rules by which Alvarez et al. (2025) leave out drag, the fall of the reservoir's pressure, friction
 along the length and bends. They set which warnings are printed, and no fitted number; at half there are more, at
 twice fewer."""
@@ -154,7 +152,13 @@ def audit(model: Model, motions: Sequence[AuditedMotion], effects: Iterable[Effe
 
     Parameters
     ----------
-    effects : what might have been in the model; default the physical effects of the catalogue, at their default sizes
+    model : the model whose omissions are weighed.
+    motions : one motion a trial, from `modelled_motion` or `measured_motion`.
+    effects : what might have been in the model, at default sizes; by default the physical effects of the catalogue.
+
+    Returns
+    -------
+    a row for each trial and effect left out, one for the tension of its tail, and the warnings.
 
     Raises
     ------
@@ -167,10 +171,12 @@ def audit(model: Model, motions: Sequence[AuditedMotion], effects: Iterable[Effe
     for motion in (motion.thinned() for motion in motions):
         terms = _along(model, motion)
         neglected = [e for e in candidates if e.kind != "measurement" and not _held(e, model, motion)]
-        found = [_neglected_row(model, effect, motion, terms) for effect in neglected]
+        left_out = [_neglected_row(model, effect, motion, terms) for effect in neglected]
         tension = _tension_row(motion, terms)
-        rows += [*found, tension]
-        warnings += [f"Trial {motion.trial.name}: {words}." for words in _broken_rules(model, motion, found, tension)]
+        rows += [*left_out, tension]
+        warnings += [
+            f"Trial {motion.trial.name}: {words}." for words in _broken_rules(model, motion, left_out, tension)
+        ]
     return Audit(pd.DataFrame(rows, columns=list(COLUMNS)), tuple(warnings))
 
 

@@ -45,6 +45,10 @@ def effect_motion(effect: Effect) -> pd.DataFrame:
 
     An effect of the base model is taken out of it, another is put in.
 
+    Parameters
+    ----------
+    effect : of the catalogue, or a user's own.
+
     Returns
     -------
     table
@@ -72,7 +76,16 @@ def effect_motion(effect: Effect) -> pd.DataFrame:
 
 
 def reference_words(effect: Effect) -> str:
-    """The vine and trial of `effect_motion`, for the caption of a picture."""
+    """Describe the vine and trial of `effect_motion`, for the caption of a picture.
+
+    Parameters
+    ----------
+    effect : it decides the trial: a bend, a rising pressure, or the plain one.
+
+    Returns
+    -------
+    half a sentence.
+    """
     vine = "24 mm × 200 µm × 400 mm, P_y 3 kPa, B 6.44 N·(s/m)ⁿ, n 0.37, 35.6 g"
     if _acts_at_rest(effect):
         return f"{vine}, horizontal, pressure rising from 2 to 9 kPa, down to 1, up to 5.9 and down again"
@@ -83,7 +96,16 @@ def reference_words(effect: Effect) -> str:
 
 
 def size_words(effect: Effect) -> str:
-    """Its parameters with the values of `effect_motion`, such as `C_D = 1`; blank where it has none."""
+    """List the parameters of an effect with their values in `effect_motion`, such as `C_D = 1`.
+
+    Parameters
+    ----------
+    effect : of the catalogue, or a user's own.
+
+    Returns
+    -------
+    the list; blank where it has no parameters.
+    """
     values = [REFERENCE_VALUES.get(f"{effect.name}.{p.name}", p.default) for p in effect.parameters]
     return ", ".join(
         f"{p.symbol} = {value:g}{'' if p.unit == '1' else ' ' + p.unit}"
@@ -106,10 +128,10 @@ def _models(effect: Effect) -> tuple[Model, Model]:
     whole = make_model(catalogue()) if catalogue().get(effect.name) == effect else base_model() + effect
     nothing = {f"{e.name}.{p.name}": p.zero for e in whole for p in e.parameters if e.kind != "base"}
     none = whole.with_values({**nothing, **REFERENCE_VALUES})
-    own = {f"{effect.name}.{p.name}": p for p in effect.parameters}
+    sizes = {f"{effect.name}.{p.name}": p for p in effect.parameters}
     if effect.kind == "base":
-        return none, none.with_values({name: p.zero for name, p in own.items()})
-    return none.with_values({name: p.default for name, p in own.items()}), none
+        return none, none.with_values({name: p.zero for name, p in sizes.items()})
+    return none.with_values({name: p.default for name, p in sizes.items()}), none
 
 
 def _end_s(with_it: Model, without: Model, trial: Trial, trace: Trace | None) -> float:
@@ -117,8 +139,8 @@ def _end_s(with_it: Model, without: Model, trial: Trial, trace: Trace | None) ->
         return float(trace[0][-1])
     ends = []
     for model in (with_it, without):
-        found = simulate(model, trial, np.linspace(0.0, 2.0, 50))
-        ends.append(found.end_time_s if found.status == "ended" else math.inf)
+        motion = simulate(model, trial, np.linspace(0.0, 2.0, 50))
+        ends.append(motion.end_time_s if motion.status == "ended" else math.inf)
     end = min(ends)
     return 0.99 * end if math.isfinite(end) else 0.5
 

@@ -215,29 +215,75 @@ def no():
 
 @compiled
 def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
-    """Stands for `tip_tension` where no tail may go slack."""
+    """Stands for `tip_tension` where no tail may go slack.
+
+    Parameters
+    ----------
+    time, x, v, chamber, resting, trial : as of `tip_tension`, unused.
+
+    Returns
+    -------
+    two zeros: no tension, no force.
+    """
     return 0.0, 0.0
 
 
 @compiled
 def no_free_fall(time, y, ydot, x, v, chamber, trial):  # noqa: ARG001
-    """Stands for `free_fall` where no tail may go slack."""
+    """Stands for `free_fall` where no tail may go slack.
+
+    Parameters
+    ----------
+    time, y, ydot, x, v, chamber, trial : as of `free_fall`, unused.
+
+    Returns
+    -------
+    zero.
+    """
     return 0.0
 
 
 @compiled
 def never_slack(equations, trial, h, start, end):  # noqa: ARG001
-    """Stands for `slack_fraction` where no tail may go slack: beyond the end of every step."""
+    """Stands for `slack_fraction` where no tail may go slack: beyond the end of every step.
+
+    Parameters
+    ----------
+    equations, trial, h, start, end : as of `slack_fraction`, unused.
+
+    Returns
+    -------
+    2, in steps.
+    """
     return 2.0
 
 
 @compiled
 def not_slack_at_rest(equations, trial, time, x, chamber):  # noqa: ARG001
-    """Stands for `slack_at_rest` where no tail may go slack."""
+    """Stands for `slack_at_rest` where no tail may go slack.
+
+    Parameters
+    ----------
+    equations, trial, time, x, chamber : as of `slack_at_rest`, unused.
+
+    Returns
+    -------
+    False.
+    """
     return False
 
 
 @compiled
 def no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work):  # noqa: ARG001
-    """Stands for `follow_slack` where no tail may go slack."""
+    """Stands for `follow_slack` where no tail may go slack.
+
+    Parameters
+    ----------
+    equations, trial, times, row, start, stop, rtol, out, work : as of `follow_slack`; `row` and `start` are handed
+        back.
+
+    Returns
+    -------
+    the status TAUT, the row and the state where it began, and no time.
+    """
     return TAUT, row, start, 0.0

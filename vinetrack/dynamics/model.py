@@ -231,27 +231,24 @@ def _places(model: Model) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
 
-def make_model(names: Iterable[str] = BASE_EFFECTS, own: Mapping[str, Effect] | None = None) -> Model:
+def make_model(names: Iterable[str] = BASE_EFFECTS, user_effects: Mapping[str, Effect] | None = None) -> Model:
     """The model with these effects, at their default values.
 
     Parameters
     ----------
-    names
-        Names of effects, in the order of the sum.
-    own
-        The user's effects by name; they are looked up before the catalogue.
+    names : of effects, in the order of the sum.
+    user_effects : the user's effects by name; they are looked up before the catalogue.
 
     Returns
     -------
-    Model
-        The sum.
+    the model.
 
     Raises
     ------
     EffectError
         If a name is unknown or stands twice.
     """
-    return Model(tuple(find_effect(name, own) for name in names))
+    return Model(tuple(find_effect(name, user_effects) for name in names))
 
 
 def base_model() -> Model:

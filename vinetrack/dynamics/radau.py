@@ -12,6 +12,8 @@ from typing import NamedTuple
 from vinetrack.dynamics.equations import Point, inlined
 
 SQRT6 = 6.0**0.5
+"""Derived: √6, which the nodes are made of."""
+
 C1, C2 = (4 - SQRT6) / 10, (4 + SQRT6) / 10
 A11, A12, A13 = (88 - 7 * SQRT6) / 360, (296 - 169 * SQRT6) / 1800, (-2 + 3 * SQRT6) / 225
 A21, A22, A23 = (296 + 169 * SQRT6) / 1800, (88 + 7 * SQRT6) / 360, (-2 - 3 * SQRT6) / 225
@@ -24,7 +26,7 @@ S3 = 1 + 1 / (1 - C1) + 1 / (1 - C2)
 """Slope at the end of a step of the cubic through (0, 0), (C1, z1), (C2, z2), (1, z3): derived, the derivatives of its
 Lagrange polynomials at 1. It is free of the cancellation that f(v) suffers when stiff."""
 
-MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)
+MU = 3 + 3 ** (2 / 3) - 3 ** (1 / 3)  # source: below
 E1, E2, E3 = (-13 - 7 * SQRT6) / 3, (-13 + 7 * SQRT6) / 3, -1 / 3
 """The real eigenvalue of A⁻¹ and the weights of the estimate of the local error. Source: Hairer & Wanner, IV.8."""
 

@@ -22,6 +22,7 @@ a hopeless one costs changes."""
 FREE, RATIO = TrialInputs._fields.index("tail_free"), TrialInputs._fields.index("travel_ratio")
 """Places in the inputs of a trial: derived from the order of the fields."""
 
+# Source: Dormand & Prince, as below.
 NODES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0)
 WEIGHTS = (
     (1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -31,6 +32,7 @@ WEIGHTS = (
     (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0),
     (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
 )
+# Source: the same.
 ERROR_WEIGHTS = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 DENSE_WEIGHTS = (
     -12715105075 / 11282082432, 0.0, 87487479700 / 32700410799, -10690763975 / 1880347072,

@@ -24,7 +24,7 @@ class EffectError(UserError, ValueError):
     """A file that should be an effect is not one, or a name is not in the catalogue; the message says what to mend."""
 
 
-def load_module(path: Path) -> ModuleType:
+def _load_module(path: Path) -> ModuleType:
     """Run one effect file and return it as a module.
 
     It is entered in `sys.modules` under a name made of its path and text: the compiled form of a model looks there.
@@ -56,13 +56,21 @@ def load_module(path: Path) -> ModuleType:
 def load_effect(path: Path | str) -> Effect:
     """Read one effect from its file; its name is the file's.
 
+    Parameters
+    ----------
+    path : a Python file like those of the catalogue.
+
+    Returns
+    -------
+    the effect.
+
     Raises
     ------
     EffectError
         If the file does not follow the contract of `Effect`; the message names what is missing.
     """
     path = Path(path)
-    module = load_module(path)
+    module = _load_module(path)
     text = (module.__doc__ or "").strip()  # not `getdoc`: where only the formula follows, it would lose its indent
     functions = {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))}
     effect = Effect(
@@ -121,15 +129,24 @@ def catalogue() -> Mapping[str, Effect]:
     return MappingProxyType({name: load_effect(paths[name]) for name in names})
 
 
-def find_effect(name: str, own: Mapping[str, Effect] | None = None) -> Effect:
-    """The effect of that name, from the user's `own` first, then from the catalogue.
+def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> Effect:
+    """Return the effect of a name, from the user's own first, then from the catalogue.
+
+    Parameters
+    ----------
+    name : of an effect.
+    user_effects : effects by name, from `own_effects`.
+
+    Returns
+    -------
+    the effect.
 
     Raises
     ------
     EffectError
         If there is none; the message suggests the nearest name.
     """
-    known = {**catalogue(), **(own or {})}
+    known = {**catalogue(), **(user_effects or {})}
     if name in known:
         return known[name]
     near = difflib.get_close_matches(name, known, n=1)

@@ -73,27 +73,43 @@ UNCHANGED = {
 def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
     """A user's effects by name, each read and tried out.
 
+    Parameters
+    ----------
+    paths : files, one an effect.
+
+    Returns
+    -------
+    effects by name.
+
     Raises
     ------
     EffectError
         If a file is no effect, two have one name, or one does not do what it says; one sentence.
     """
-    found: dict[str, Effect] = {}
+    effects: dict[str, Effect] = {}
     for path in map(Path, paths):
         effect = load_effect(path)
-        if effect.name in found:
-            raise EffectError(f"{path}: there is another effect named {effect.name!r}, {found[effect.name].path}.")
+        if effect.name in effects:
+            raise EffectError(f"{path}: there is another effect named {effect.name!r}, {effects[effect.name].path}.")
         fault = next(behaviour_faults(effect), None)
         if fault is not None:
             raise EffectError(f"{path}: {fault}.")
-        found[effect.name] = effect
-    return found
+        effects[effect.name] = effect
+    return effects
 
 
 def behaviour_faults(effect: Effect) -> Iterator[str]:
     """What an effect does other than its file says: worked numbers missed, size where there should be none.
 
     Effects that change nothing at rest are asked in motion; a function that cannot be compiled is named.
+
+    Parameters
+    ----------
+    effect : read from its file.
+
+    Yields
+    ------
+    a sentence a fault, without full stop.
     """
     for hook in effect.functions:
         yield from _compile_faults(effect, hook)
@@ -107,7 +123,7 @@ def behaviour_faults(effect: Effect) -> Iterator[str]:
                 yield f"{hook} gives {value:.6g} at {zero}, where nothing should change ({UNCHANGED[hook]:g})"
 
 
-def worked_value(effect: Effect, worked: Worked) -> float:
+def _worked_value(effect: Effect, worked: Worked) -> float:
     """What the effect gives at the state, rig and parameters of a worked number; all else is NaN.
 
     Raises
@@ -123,7 +139,7 @@ def worked_value(effect: Effect, worked: Worked) -> float:
 
 def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
     try:
-        value = worked_value(effect, worked)
+        value = _worked_value(effect, worked)
     except (KeyError, ValueError) as error:
         yield f"a worked number of {worked.hook} cannot be tried ({error})"
         return

@@ -10,9 +10,19 @@ from vinetrack.effects._base import KINDS, Effect, Parameter
 _HEAD = ("name", "kind", "parameters")
 
 
-def listing(effects: Iterable[Effect], own: Mapping[str, Effect] | None = None) -> list[str]:
-    """Lines: name, kind, parameters with units, aligned, and below each its formula; base effects first."""
-    mine = set((own or {}).values())
+def listing(effects: Iterable[Effect], user_effects: Mapping[str, Effect] | None = None) -> list[str]:
+    """Lines: name, kind, parameters with units, aligned, and below each its formula; base effects first.
+
+    Parameters
+    ----------
+    effects : those to be listed.
+    user_effects : by name; those among `effects` are marked as own.
+
+    Returns
+    -------
+    lines for the terminal.
+    """
+    mine = set((user_effects or {}).values())
     effects = sorted(effects, key=lambda effect: KINDS.index(effect.kind))
     entries = []
     for effect in effects:
@@ -26,7 +36,16 @@ def listing(effects: Iterable[Effect], own: Mapping[str, Effect] | None = None) 
 
 
 def explanation(effect: Effect) -> list[str]:
-    """Lines: what one effect is, in the words of its file, then its parameters and how it stands to others."""
+    """Lines: what one effect is, in the words of its file, then its parameters and how it stands to others.
+
+    Parameters
+    ----------
+    effect : of the catalogue, or a user's own.
+
+    Returns
+    -------
+    lines for the terminal.
+    """
     lines = [f"{effect.name} ({effect.kind})", "", *effect.text.splitlines(), ""]
     if effect.parameters:
         lines += ["Parameters, in files by the name in brackets:", *_parameter_table(effect), ""]
@@ -41,12 +60,30 @@ def explanation(effect: Effect) -> list[str]:
 
 
 def remedy(effect: Effect) -> str:
-    """How to reduce an effect or to measure it, as its file says, in one line; blank where it does not."""
+    """How to reduce an effect or to measure it, as its file says, in one line; blank where it does not.
+
+    Parameters
+    ----------
+    effect : of the catalogue, or a user's own.
+
+    Returns
+    -------
+    one line, or blank.
+    """
     return _paragraph(effect, ("Reduce it", "It cannot be reduced", "Measure it"))
 
 
 def told_apart(effect: Effect) -> str:
-    """What it is easily taken for and what tells them apart, as its file says, in one line; blank where it does not."""
+    """What it is easily taken for and what tells them apart, as its file says, in one line; blank where it does not.
+
+    Parameters
+    ----------
+    effect : of the catalogue, or a user's own.
+
+    Returns
+    -------
+    one line, or blank.
+    """
     return _paragraph(effect, ("Easily taken for",))
 
 

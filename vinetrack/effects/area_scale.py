@@ -17,7 +17,7 @@ Source: the geometry of a tube; Eq. (2) of Alvarez et al. (2025).
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 2
+ORDER = 2  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("pressure_gain", "wall_stretch")
 PARAMETERS = (
     Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.05, 0.05), meaning="relative error of D"),

@@ -28,8 +28,8 @@ PARAMETERS = (
 
 
 def tail_force(s, rig, eta):  # noqa: D103
-    lost = s.linear_density * (rig.travel_ratio - 1.0) / rig.travel_ratio
-    return eta * 0.5 * lost * s.tail_velocity * s.tail_velocity
+    mass_loss = s.linear_density * (rig.travel_ratio - 1.0) / rig.travel_ratio
+    return eta * 0.5 * mass_loss * s.tail_velocity * s.tail_velocity
 
 
 _RIG = {"travel_ratio": 2.0}

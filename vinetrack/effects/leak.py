@@ -21,7 +21,7 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"
 IN_TRACE = True
-ORDER = 2
+ORDER = 2  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("reservoir_depletion",)
 PARAMETERS = (
     Parameter("rate", "1/τ", "1/s", 0.5, bounds=(0.0, 50.0), plausible=(0.0, 5.0), meaning="share of P lost a second"),

@@ -16,7 +16,7 @@ Source: the geometry of projection; Hartley & Zisserman (2004), Multiple View Ge
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 5
+ORDER = 5  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("eversion_damping", "air_drag", "time_base")
 PARAMETERS = (
     Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.1, 0.1), meaning="relative error of length"),

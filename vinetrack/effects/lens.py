@@ -19,7 +19,7 @@ Source: radial distortion to lowest order, Brown (1971), Close-range camera cali
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 4
+ORDER = 4  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("latch_release", "perspective")
 PARAMETERS = (
     Parameter("k3", "k₃", "1/m²", 0.3, bounds=(-50.0, 50.0), plausible=(-1.0, 1.0), meaning="radial distortion"),

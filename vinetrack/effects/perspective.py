@@ -18,7 +18,7 @@ Hartley & Zisserman (2004), Multiple View Geometry in Computer Vision.
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 4
+ORDER = 4  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("tail_friction", "reservoir_depletion")
 PARAMETERS = (
     Parameter("k", "k", "1/m", 0.05, bounds=(-3.0, 3.0), plausible=(-0.3, 0.3), meaning="change of scale along y"),

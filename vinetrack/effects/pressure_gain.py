@@ -15,7 +15,7 @@ Source: the linear error of a gauge; PA is all that Eq. (2) of Alvarez et al. (2
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 4
+ORDER = 4  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("area_scale", "eversion_damping", "time_base", "length_scale")
 PARAMETERS = (
     Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.05, 0.05), meaning="relative error of P"),

@@ -16,7 +16,7 @@ Source: the zero error of a gauge; Eq. (2) of Alvarez et al. (2025) knows P − 
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
-ORDER = 5
+ORDER = 5  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("yield_pressure",)
 PARAMETERS = (
     Parameter("delta", "δ", "Pa", 500.0, bounds=(-2e4, 2e4), plausible=(-2e3, 2e3), meaning="what the gauge lacks"),

@@ -23,7 +23,7 @@ from vinetrack.effects import Parameter, Worked
 KIND = "physical"
 NEEDS = ("chamber_l",)
 IN_TRACE = True
-ORDER = 1
+ORDER = 1  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("tail_friction", "leak")
 PARAMETERS = (
     Parameter("gamma", "γ", "1", 1.4, bounds=(1.0, 1.4), plausible=(1.0, 1.4), meaning="1 isothermal, 1.4 adiabatic"),

@@ -25,7 +25,7 @@ from vinetrack.effects import Parameter, Worked
 KIND = "physical"
 NEEDS = ("chamber_l",)
 IN_TRACE = True
-ORDER = 1
+ORDER = 1  # convention: see `Effect`, its place among those of one hook
 REPLACES = ("reservoir_depletion",)
 EASILY_TAKEN_FOR = ("reservoir_depletion",)
 PARAMETERS = (

@@ -21,7 +21,7 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"
 IN_TRACE = True
-ORDER = 2
+ORDER = 2  # convention: see `Effect`, its place among those of one hook
 FINITE = True
 EASILY_TAKEN_FOR = ("latch_release",)
 PARAMETERS = (

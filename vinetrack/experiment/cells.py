@@ -7,6 +7,7 @@ the column's own unit until a trial is made of them.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from vinetrack.core.records import Bend, PictureAxis
 from vinetrack.core.tables import TableError, parse_number
@@ -72,10 +73,97 @@ def read_cell(column: Column, text: str, decimal: str = ".") -> Value:
         return _read_frames(text)
     if column.kind in ("text", "path"):
         return text
-    return check_number(column, _number(text, decimal, column.allowed))
+    return _check_number(column, _number(text, decimal, column.allowed))
 
 
-def check_number(column: Column, value: float) -> float:
+def read_range(column: Column, value: Any) -> tuple[float, float]:
+    """Read lowest and highest from `low:high` or two numbers, judged as cells of the column.
+
+    Parameters
+    ----------
+    column : whose limit it is.
+    value : as the settings state it.
+
+    Returns
+    -------
+    low and high, in the unit of the column.
+
+    Raises
+    ------
+    ValueError
+        If it is no range, or the column does not allow it.
+    """
+    parts = value.split(":") if isinstance(value, str) else value
+    if not isinstance(parts, list | tuple) or len(parts) != 2:
+        raise ValueError("is not a range: write low:high, such as 7:40")
+    low, high = (read_limit(column, part) for part in parts)
+    if low > high:
+        raise ValueError("ends below where it begins: write the lower value first")
+    return low, high
+
+
+def steps_between(low: float, high: float) -> list[float]:
+    """Return three values between two others, in equal ratios where both are positive.
+
+    Parameters
+    ----------
+    low, high : in one unit.
+
+    Returns
+    -------
+    three values, in that unit.
+    """
+    parts = (0.25, 0.5, 0.75)
+    return [low ** (1 - part) * high**part if low > 0 else low + (high - low) * part for part in parts]
+
+
+def read_limit(column: Column, value: Any) -> float:
+    """Read one value, judged as a cell of the column.
+
+    Parameters
+    ----------
+    column : whose limit it is.
+    value : as the settings state it.
+
+    Returns
+    -------
+    in the unit of the column.
+
+    Raises
+    ------
+    ValueError
+        If it is no number, or the column does not allow it.
+    """
+    if isinstance(value, bool | list | tuple | dict):
+        raise ValueError("holds something that is not a number: write numbers alone")
+    return float(str(read_value(column, value)))
+
+
+def read_value(column: Column, value: Any) -> Any:
+    """Read a value of the settings as the sheet's cell would be read.
+
+    Parameters
+    ----------
+    column : of the same name.
+    value : as the settings state it.
+
+    Returns
+    -------
+    in the unit of the column.
+
+    Raises
+    ------
+    ValueError
+        If the column does not allow it, with the remedy behind a colon.
+    """
+    try:
+        return read_cell(column, str(value).strip())
+    except CellError as error:
+        remedy = error.remedy or (f"allowed is {error.allowed}" if error.allowed else "")
+        raise ValueError(f"{error.message}: {remedy}") from None
+
+
+def _check_number(column: Column, value: float) -> float:
     """The value itself, if its column allows it; see `read_cell`.
 
     Parameters
@@ -115,9 +203,9 @@ def oddity(column: Column, value: float) -> str:
 
 def _slip(column: Column, value: float) -> str:
     """The unit that was probably meant, where the value is allowed in it."""
-    own = column.unit_key or split_unit(column.name)[1]
+    unit_of_column = column.unit_key or split_unit(column.name)[1]
     for key in column.slips:
-        unit, factor = UNITS[key].text, convert(1.0, key, own)
+        unit, factor = UNITS[key].text, convert(1.0, key, unit_of_column)
         meant = value * factor
         # A slip enlarges numbers that are too small and shrinks those that are too large, never the other way round.
         if (factor > 1) == (value < column.high) and max(column.low, 1e-9) <= meant <= column.high:

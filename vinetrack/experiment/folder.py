@@ -66,7 +66,21 @@ class Experiment:
         return tuple(self.lines)
 
     def trial(self, name: str) -> Trial:
-        """The trial of that name among `trials`; KeyError where there is none."""
+        """Return the trial of a name.
+
+        Parameters
+        ----------
+        name : of a trial among `trials`.
+
+        Returns
+        -------
+        the trial.
+
+        Raises
+        ------
+        KeyError
+            If there is none.
+        """
         return {trial.name: trial for trial in self.trials}[name]
 
 
@@ -301,18 +315,18 @@ def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> l
                 Problem(message=message, file=SETTINGS, column=key, value=relative, remedy="check the path")
             )
     problems += order_problems(experiment.trials, SHEET)
-    found: list[Problem] = []
+    of_trials: list[Problem] = []
     there: list[Trial] = []
     for trial in experiment.trials:
         of_trial = _check_track(trial) if trial.track else _check_video(trial)
-        found += [replace(problem, trial=trial.name) for problem in of_trial]
+        of_trials += [replace(problem, trial=trial.name) for problem in of_trial]
         if trial.video and not of_trial:
             there.append(trial)
     if there and open_videos is not None:
-        found += open_videos(experiment, there)
+        of_trials += open_videos(experiment, there)
     lines = experiment.lines
     return problems + [
-        replace(problem, file=SHEET, line=lines[problem.trial]) if problem.trial else problem for problem in found
+        replace(problem, file=SHEET, line=lines[problem.trial]) if problem.trial else problem for problem in of_trials
     ]
 
 
@@ -323,21 +337,23 @@ def _check_track(trial: Trial) -> list[Problem]:
         track = load_track(trial)
     except TrackError as error:
         return [_from_table_error(error, SHEET, **place)]
-    found = []
+    remarks = []
     frames = float(np.median(np.diff(track.time_s))) * trial.capture_fps
     if abs(frames - 1) > 0.02:
-        found.append(f"has points {frames:.4g} frames of capture_fps apart: is capture_fps right?")
+        remarks.append(f"has points {frames:.4g} frames of capture_fps apart: is capture_fps right?")
     travel_m = float(np.ptp(track.lead_position_m[track.usable]))
     # Twice the length leaves room for an axis in the wrong unit of angle or a poor scale, not for mm taken as m.
     if travel_m > 2 * trial.length_m:
-        found.append(f"travels {travel_m:.4g} m, the vine is {trial.length_m:g} m long: are its positions in metres?")
+        remarks.append(f"travels {travel_m:.4g} m, the vine is {trial.length_m:g} m long: are its positions in metres?")
     if track.lead_position_m[track.usable][-1] < track.lead_position_m[track.usable][0]:
-        found.append("runs backwards: position should grow as the vine does")
+        remarks.append("runs backwards: position should grow as the vine does")
     if track.pressure_Pa is not None and trial.pressure_Pa > 0:
         highest_kPa = float(np.max(track.pressure_Pa)) / 1000
         if not 0.5 < highest_kPa / (trial.pressure_Pa / 1000) < 2:
-            found.append(f"has pressures up to {highest_kPa:.4g} kPa, the sheet says {trial.pressure_Pa / 1000:g} kPa")
-    return [Problem(message=message, severity="warning", **place) for message in found]
+            remarks.append(
+                f"has pressures up to {highest_kPa:.4g} kPa, the sheet says {trial.pressure_Pa / 1000:g} kPa"
+            )
+    return [Problem(message=message, severity="warning", **place) for message in remarks]
 
 
 def _check_video(trial: Trial) -> list[Problem]:

@@ -138,7 +138,7 @@ def _judge_header(table: Table, settings: ExperimentSettings, file: str) -> list
 
 def _nearest(file: Path) -> str:
     try:
-        names = [one.name for one in file.parent.iterdir()]
+        names = [entry.name for entry in file.parent.iterdir()]
     except OSError:
         return ""
     close = difflib.get_close_matches(file.name, names, 1, 0.6)

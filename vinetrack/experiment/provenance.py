@@ -38,24 +38,28 @@ def describe_run(
     inputs : every file that was read; those in the folder are listed relative to it.
     settings : those of the run.
     model : names of the effects in use.
+
+    Returns
+    -------
+    mapping of JSON types: versions, platform, SHA-256 of every input, model and settings.
     """
     return {
         "vinetrack": vinetrack.__version__,
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
-        "libraries": {name: found for name in LIBRARIES if (found := _version(name))},
+        "libraries": {name: version for name in LIBRARIES if (version := _version(name))},
         "experiment": experiment.absolute().as_posix(),
-        "inputs": {_shown(path, experiment): hash_file(path) for path in inputs},
+        "inputs": {_shown(path, experiment): _hash_file(path) for path in inputs},
         "model": list(model),
         "settings": settings,
     }
 
 
-def hash_file(path: Path) -> str:
+def _hash_file(path: Path) -> str:
     """SHA-256 of a file, or of the names and contents of a folder of frames; "missing" where there is none."""
     if path.is_dir():
         files = sorted(file for file in path.rglob("*") if file.is_file())
-        lines = [f"{file.relative_to(path).as_posix()} {hash_file(file)}\n" for file in files]
+        lines = [f"{file.relative_to(path).as_posix()} {_hash_file(file)}\n" for file in files]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
     if not path.is_file():
         return "missing"

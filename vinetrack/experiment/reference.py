@@ -59,7 +59,17 @@ def column_entries() -> list[Entry]:
 
 
 def setting_entries(model: type[BaseModel], prefix: str = "") -> Iterator[Entry]:
-    """Every key of a settings model that is no column of the sheet; those of a group as `group.key`."""
+    """Every key of a settings model that is no column of the sheet; those of a group as `group.key`.
+
+    Parameters
+    ----------
+    model : a settings model of `vinetrack.experiment.settings`.
+    prefix : of the keys of a group, such as "limits.".
+
+    Yields
+    ------
+    an entry a key.
+    """
     columns = SHARED if model is ExperimentSettings else ()
     for name, field in model.model_fields.items():
         if name in columns:

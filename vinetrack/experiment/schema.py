@@ -65,17 +65,44 @@ class Column:
         return f"{'above ' if self.above_low else ''}{self.low:g} to {self.high:g}{unit}"
 
     def in_words(self, value: float) -> str:
-        """A number of this column for a sentence: `a chamber of 3.7 litres`."""
+        """Name a number of this column in a sentence: `a chamber of 3.7 litres`.
+
+        Parameters
+        ----------
+        value : in the unit of the column.
+
+        Returns
+        -------
+        article, quantity, number and unit.
+        """
         quantity = split_unit(self.name)[0].replace("_", " ")
         article = "an" if quantity[0] in "aeiou" else "a"
         return f"{article} {quantity} of {value:.3g} {self.unit}".rstrip()
 
     def to_si(self, value: float) -> float:
-        """A number of this column in SI."""
+        """Return a number of this column in SI.
+
+        Parameters
+        ----------
+        value : in the unit of the column.
+
+        Returns
+        -------
+        the value in SI.
+        """
         return self.scale.to_si(value) if self.scale else value
 
     def of_trial(self, trial: Trial) -> float:
-        """The number that a trial has here, in the unit of the column; NaN where it has none."""
+        """Return the number that a trial has in this column.
+
+        Parameters
+        ----------
+        trial : of a sheet, in SI.
+
+        Returns
+        -------
+        in the unit of the column; NaN where it has none.
+        """
         value = float(getattr(trial, self.field))
         return self.scale.from_si(value) if self.scale else value
 

@@ -25,8 +25,8 @@ from pydantic import (
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Bend
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
-from vinetrack.experiment.cells import CellError, read_cell
-from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED, Column
+from vinetrack.experiment.cells import read_limit, read_range, read_value, steps_between
+from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
 
 BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
 """Eq. (2): the effects in use unless `model` says otherwise, whatever columns the sheet has."""
@@ -148,59 +148,20 @@ class Limits(_LimitedColumns):
     @field_validator(*LIMITED["range"], mode="before")
     @classmethod
     def _range(cls, value: Any, info: Any) -> Any:
-        return value if value is None else _read_range(COLUMNS[info.field_name], value)
+        return value if value is None else read_range(COLUMNS[info.field_name], value)
 
     @field_validator(*LIMITED["choice"], mode="before")
     @classmethod
     def _values(cls, value: Any, info: Any) -> Any:
         column = COLUMNS[info.field_name]
         if isinstance(value, str) and ":" in value:
-            low, high = _read_range(column, value)
-            return tuple(sorted({low, *(float(f"{step:.3g}") for step in _steps(low, high)), high}))
+            low, high = read_range(column, value)
+            return tuple(sorted({low, *(float(f"{step:.3g}") for step in steps_between(low, high)), high}))
         if isinstance(value, list | tuple):
             if not value:
                 raise ValueError("is empty: name at least one value, or remove the key")
-            return tuple(sorted({_read_limit(column, one) for one in value}))
-        return value if value is None else (_read_limit(column, value),)
-
-
-def _read_range(column: Column, value: Any) -> tuple[float, float]:
-    """Lowest and highest from `low:high` or two numbers, judged as cells of the column."""
-    parts = value.split(":") if isinstance(value, str) else value
-    if not isinstance(parts, list | tuple) or len(parts) != 2:
-        raise ValueError("is not a range: write low:high, such as 7:40")
-    low, high = (_read_limit(column, part) for part in parts)
-    if low > high:
-        raise ValueError("ends below where it begins: write the lower value first")
-    return low, high
-
-
-def _steps(low: float, high: float) -> list[float]:
-    """Three values between two others, in equal ratios where both are positive."""
-    parts = (0.25, 0.5, 0.75)
-    return [low ** (1 - part) * high**part if low > 0 else low + (high - low) * part for part in parts]
-
-
-def _read_limit(column: Column, value: Any) -> float:
-    """One value, judged as a cell of the column."""
-    if isinstance(value, bool | list | tuple | dict):
-        raise ValueError("holds something that is not a number: write numbers alone")
-    return float(str(_as_cell(column, value)))
-
-
-def _as_cell(column: Column, value: Any) -> Any:
-    """A value as the sheet's cell would be read.
-
-    Raises
-    ------
-    ValueError
-        If the column does not allow it, with the remedy behind a colon.
-    """
-    try:
-        return read_cell(column, str(value).strip())
-    except CellError as error:
-        remedy = error.remedy or (f"allowed is {error.allowed}" if error.allowed else "")
-        raise ValueError(f"{error.message}: {remedy}") from None
+            return tuple(sorted({read_limit(column, limit) for limit in value}))
+        return value if value is None else (read_limit(column, value),)
 
 
 _TYPES: dict[str, Any] = {
@@ -262,7 +223,7 @@ class ExperimentSettings(_SharedColumns):
             return value
         if isinstance(value, bool | list | dict):
             raise ValueError("is not a single value: write one, as in the sheet")
-        return _as_cell(column, value)
+        return read_value(column, value)
 
     @field_validator("model", "candidates", "effects")
     @classmethod
@@ -370,6 +331,14 @@ class RunSettings(_Strict):
 def read_experiment_settings(path: Path) -> ExperimentSettings:
     """Read `experiment.yaml`; all defaults where there is no such file.
 
+    Parameters
+    ----------
+    path : of `experiment.yaml`.
+
+    Returns
+    -------
+    the settings.
+
     Raises
     ------
     ExperimentError
@@ -379,12 +348,39 @@ def read_experiment_settings(path: Path) -> ExperimentSettings:
 
 
 def read_run_settings(path: Path) -> RunSettings:
-    """Read `config/config.yaml`, or a file like it; see `read_experiment_settings`."""
+    """Read `config/config.yaml`, or a file like it.
+
+    Parameters
+    ----------
+    path : the file.
+
+    Returns
+    -------
+    the settings.
+
+    Raises
+    ------
+    ExperimentError
+        With every problem of the file.
+    """
     return _validate(RunSettings, read_yaml(path), path.name)
 
 
 def run_settings(values: dict[str, Any]) -> RunSettings:
-    """Settings of a run from a mapping, such as Snakemake's `config` after `--config`; see `read_run_settings`.
+    """Check settings of a run given as a mapping, such as Snakemake's `config` after `--config`.
+
+    Parameters
+    ----------
+    values : as `config/config.yaml` would hold them.
+
+    Returns
+    -------
+    the settings.
+
+    Raises
+    ------
+    ExperimentError
+        With every problem of the mapping.
 
     >>> run_settings({"damping": {"seed": 7}}).damping.seed
     7

@@ -22,13 +22,16 @@ from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSetti
 
 SHEET = "trials.csv"
 LONGEST_NAME = 100
-"""Longer trial names leave no room for suffixes within the 255 bytes a file name may have."""
+"""Longer trial names leave no room for suffixes within the 255 bytes a file name may have. Chosen: 155 bytes remain
+for suffixes; at twice 55 remain, at half names that people write are refused."""
 
 NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa")
 """What a trial of an everting vine must have; a body that moves as a whole needs its diameter only."""
 
 PRESSURE_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2
-"""Errors where the sheet states none, part of the contract: 1 % of the pressure, and 0.2 kPa for the yield pressure."""
+"""Errors where the sheet states none, part of the contract: 1 % of the pressure, and 0.2 kPa for the yield pressure.
+Chosen: a usual gauge is of class 1, and a yield pressure is read off a slowly rising one. At half or twice the errors
+of forces near the yield pressure halve or double where the sheet states none."""
 
 RATE_REMEDY = "write the rate of capture: the file's own rate is that of playback"
 
@@ -58,7 +61,15 @@ class Row:
         return float(self.values.get("travel_ratio", 2.0))
 
     def add(self, message: str, column: str = "", severity: str = "error", **details: Any) -> None:
-        """Note a problem of this row."""
+        """Note a problem of this row.
+
+        Parameters
+        ----------
+        message : what is wrong.
+        column : where, blank for the row as a whole.
+        severity : "error" or "warning".
+        **details : further fields of `Problem`.
+        """
         place: dict[str, Any] = {"file": SHEET, "trial": self.name, "line": self.line}
         self.problems.append(Problem(message=message, column=column, severity=severity, **place, **details))
 
@@ -189,7 +200,13 @@ def _judge_name(row: Row) -> None:
 
 
 def judge_row(row: Row, folder: Path) -> None:
-    """Judge a row as a whole: paths that lead out, and values that contradict each other."""
+    """Judge a row as a whole: paths that lead out, and values that contradict each other.
+
+    Parameters
+    ----------
+    row : its problems are noted in it.
+    folder : of the experiment, which paths must not leave.
+    """
     _judge_paths(row, folder)
     judge_wall(row)
     fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
@@ -204,6 +221,17 @@ def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:
 
     Returns the required columns that neither sheet nor settings have at all: a fault of the sheet, to be reported
     once. Where the travel ratio is broken, what the row needs is not known.
+
+    Parameters
+    ----------
+    row : its problems are noted in it.
+    folder : of the experiment.
+    columns : that the sheet has.
+
+    Returns
+    -------
+    required columns that neither sheet nor settings have at all: a fault of the sheet, to be reported once. Empty where
+        the travel ratio is broken: what the row needs is then not known.
     """
     broken = {problem.column for problem in row.problems if problem.severity == "error"}
     absent: set[str] = set()
@@ -254,7 +282,12 @@ def _has_dng_frames(folder: Path, video: str) -> bool:
 
 
 def judge_wall(row: Row) -> None:
-    """Refuse a wall that no tube of this diameter can have."""
+    """Refuse a wall that no tube of this diameter can have.
+
+    Parameters
+    ----------
+    row : its problems are noted in it.
+    """
     diameter, thickness = row.values.get("diameter_mm", math.nan), row.values.get("thickness_um", math.nan)
     if thickness / 1000 > diameter / 4:
         message = f"is a wall above a quarter of the diameter of {diameter:g} mm"
@@ -263,7 +296,12 @@ def judge_wall(row: Row) -> None:
 
 
 def judge_pressures(row: Row) -> None:
-    """Warn of pressures that are legal but hardly meant."""
+    """Warn of pressures that are legal but hardly meant.
+
+    Parameters
+    ----------
+    row : its problems are noted in it.
+    """
     pressure = row.values.get("pressure_kPa", math.nan)
     onset = row.values.get("yield_pressure_kPa", math.nan)
     if row.travel_ratio == 2 and onset >= pressure:

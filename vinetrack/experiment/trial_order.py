@@ -67,7 +67,7 @@ def order_follows_pressure(trials: Sequence[Trial]) -> float:
         if len(members) > 1 and np.ptp(pressures) > 0:
             both = np.array([rankdata(ranks[members]), rankdata(pressures)])
             pairs.append((both - both.mean(axis=1, keepdims=True)) / len(members))
-    if sum(one.shape[1] for one in pairs) < FEWEST_RANKED:
+    if sum(pair.shape[1] for pair in pairs) < FEWEST_RANKED:
         return math.nan
     order, pressure = np.hstack(pairs)
     return float(order @ pressure / math.sqrt(float(order @ order) * float(pressure @ pressure)))
@@ -78,10 +78,12 @@ def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
 
     Parameters
     ----------
-    trials
-        In the order of the sheet.
-    file
-        Name of the sheet.
+    trials : in the order of the sheet.
+    file : name of the sheet.
+
+    Yields
+    ------
+    warnings.
     """
     correlation = order_follows_pressure(trials)
     _, stated = trial_order(trials)
@@ -92,13 +94,13 @@ def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
         message = f"is blank, and rows follow the pressure (rank correlation {correlation:.2f}): their order is taken"
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
     for column in ("specimen", "day"):
-        if one_a_condition(trials, column):
+        if _one_a_condition(trials, column):
             message = f"is another for each condition: what differs between {column}s looks like physics"
             remedy = f"spread every condition over two {column}s"
             yield Problem(message=message, file=file, column=column, severity="warning", remedy=remedy)
 
 
-def one_a_condition(trials: Sequence[Trial], column: str) -> bool:
+def _one_a_condition(trials: Sequence[Trial], column: str) -> bool:
     """Whether no condition has two of the column's values, though conditions of one vine have different ones.
 
     Parameters

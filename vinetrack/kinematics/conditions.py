@@ -78,11 +78,11 @@ def condition_table(
     by_condition: dict[str, list[Trial]] = {}
     for trial in known:
         by_condition.setdefault(trial.condition, []).append(trial)
-    found = {name: group.set_index("trial") for name, group in measured.groupby("condition", sort=False)}
+    tables = {name: group.set_index("trial") for name, group in measured.groupby("condition", sort=False)}
     rows = [
-        _row(members[0], found[condition], final_at_fraction, efficiency_at_mm)
+        _row(members[0], tables[condition], final_at_fraction, efficiency_at_mm)
         for condition, members in by_condition.items()
-        if condition in found
+        if condition in tables
     ]
     return pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
 
@@ -131,11 +131,17 @@ def _efficiencies(trial: Trial, values: Floats, at_mm: float) -> dict[str, objec
 
 
 def mean_with_error(values: Floats, sigmas: Floats | None = None) -> tuple[float, float, int]:
-    """Mean of the values that are known, its standard error, and their number.
+    """Return the mean of the values that are known, its standard error, and their number.
 
     Parameters
     ----------
-    values, sigmas : arrays, shape (n,); `sigmas` are the errors of single values, which stand where there is but one
+    values : shape (n,), any unit; NaN where unknown.
+    sigmas : errors of single values, shape (n,); the error of the mean where only one value is known.
+
+    Returns
+    -------
+    mean, standard error, number; NaN, NaN, 0 where nothing is known, and an error of NaN for a single value without
+        one.
     """
     known = np.isfinite(values)
     count = int(known.sum())

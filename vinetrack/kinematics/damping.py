@@ -71,10 +71,11 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
 
     Parameters
     ----------
-    points
-        A row a trial, as `vinetrack.kinematics.summary` makes them: those with `used` enter `log_log` and `both_axes`;
-        every trial that could, by its payload and travel ratio, and has a window by the published rule enters `paper`
-        with set pressure, without weight and fitted as published.
+    points : a row a trial, as `vinetrack.kinematics.summary` makes them: those with `used` enter `log_log` and
+        `both_axes`; every trial that could, by its payload and travel ratio, and has a window by the published rule
+        enters `paper` with set pressure, without weight and fitted as published.
+    resamples : resamples of whole trials.
+    seed : of the resampling.
 
     Returns
     -------
@@ -95,8 +96,11 @@ def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
 
     Parameters
     ----------
-    points
-        A row a trial, with `condition`, `eligible`, `used` and `reason`.
+    points : a row a trial, with `condition`, `eligible`, `used` and `reason`.
+
+    Returns
+    -------
+    a copy in which `used` is False and `reason` set for those conditions.
     """
     eligible = points[points["eligible"]]
     share = eligible.groupby("condition", sort=False)["used"].mean()
@@ -252,8 +256,8 @@ def _fit(
     dof = n_points - n_vines - 1
     speed_variance, force_variance = _variances(data, dof, both_axes)
     everything = np.ones((1, n_points))
-    found, log_B = slope(data.log_force[None], everything, data, speed_variance, force_variance)
-    n, log_B = float(found[0]), log_B[0]
+    exponents, log_B = slope(data.log_force[None], everything, data, speed_variance, force_variance)
+    n, log_B = float(exponents[0]), log_B[0]
     if not (math.isfinite(n) and n > 0):
         return _refusal("the speeds do not rise with the force, so there is no power law to fit", left_out)
     residual = data.log_force - log_B[data.vine] - n * data.log_speed

@@ -37,7 +37,17 @@ class DampingLaw:
 
 
 def look_at_motions(pairs: Iterable[tuple[Trial, Track]], settings: RunSettings | None = None) -> list[TrialMotion]:
-    """What the tracks say whatever the model; trials with too few points are passed over."""
+    """Find velocity, release and windows of every track; trials with too few points are passed over.
+
+    Parameters
+    ----------
+    pairs : trial and its track.
+    settings : of the run; defaults if None.
+
+    Returns
+    -------
+    motions, in the order of `pairs`.
+    """
     settings, motions = settings or RunSettings(), []
     for trial, track in pairs:
         try:
@@ -52,10 +62,18 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
 
     Parameters
     ----------
-    model
-        A fitted model (`Fit.model`): its effects on the pressure count with their fitted sizes.
-    motions
-        From `look_at_motions`.
+    model : a fitted model (`Fit.model`): its effects on the pressure count with their fitted sizes.
+    motions : from `look_at_motions`.
+    settings : of the run; defaults if None.
+
+    Returns
+    -------
+    the points of the fit, the laws by method, and the trials left out with the reason.
+
+    Raises
+    ------
+    ValueError
+        If no trial can be looked at under this model.
     """
     import pandas as pd
 
@@ -80,15 +98,18 @@ def law_table(laws: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
 
     Parameters
     ----------
-    laws
-        `DampingLaw.laws`, or `damping.json`, by name of model. A fit that was refused has no row.
+    laws : `DampingLaw.laws`, or `damping.json`, by name of model. A fit that was refused has no row.
+
+    Returns
+    -------
+    the table.
     """
     import pandas as pd
 
     rows = [
-        (name, method, vine, law["n"], *law["n_95"], own["B"], *own["B_95"], own["n_trials"])
-        for name, found in laws.items()
-        for method, law in found.items()
-        for vine, own in law["vines"].items()
+        (name, method, vine, law["n"], *law["n_95"], vine_law["B"], *vine_law["B_95"], vine_law["n_trials"])
+        for name, methods in laws.items()
+        for method, law in methods.items()
+        for vine, vine_law in law["vines"].items()
     ]
     return pd.DataFrame(rows, columns=list(LAW_COLUMNS))

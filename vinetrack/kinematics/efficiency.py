@@ -12,10 +12,20 @@ from vinetrack.core.records import Floats, Trial
 
 
 def lead_velocity_at(lead_position_m: Floats, lead_velocity_m_s: Floats, target_m: float) -> float:
-    """Velocity where the leading edge first passes `target_m`, m/s; NaN where it never gets there.
+    """Return the velocity with which the leading edge first passes a position, linear in position between points.
 
     Both arrays have shape (n,), travel counted from rest; between points the velocity is interpolated linearly in
     position.
+
+    Parameters
+    ----------
+    lead_position_m : travel from rest, shape (n,), m.
+    lead_velocity_m_s : shape (n,), m/s.
+    target_m : travel from rest, m.
+
+    Returns
+    -------
+    m/s; NaN where the edge never gets there, or is beyond at the first point.
     """
     beyond = np.flatnonzero(lead_position_m >= target_m)
     if beyond.size == 0 or beyond[0] == 0:
@@ -31,6 +41,16 @@ def energy_efficiency(trial: Trial, lead_travel_m: float, lead_velocity_m_s: flo
 
     m(x) is the moving mass, tail and payload, ẋ = r·ẏ. Source: Alvarez et al. (2025), section IV-D, with the moving
     mass of their Eq. (1).
+
+    Parameters
+    ----------
+    trial : its pressure, size and payload.
+    lead_travel_m : growth y since release, m.
+    lead_velocity_m_s : ẏ there, m/s.
+
+    Returns
+    -------
+    a fraction.
     """
     work_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m
     if not work_J > 0:
@@ -55,6 +75,15 @@ def efficiency_shares(trial: Trial, lead_travel_m: float) -> EfficiencyShares:
 
     The weight works on tail and payload along the tail's own travel x = r·y: g cosθ ∫ m dx, the third term of Eq. (2)
     of Alvarez et al. (2025). NaN where there is no mass, or no work.
+
+    Parameters
+    ----------
+    trial : its pressure, size, payload and angle.
+    lead_travel_m : growth y since release, m.
+
+    Returns
+    -------
+    two fractions.
     """
     mass_kg = float(trial.moving_mass_kg(lead_travel_m))
     gas_J = trial.pressure_Pa * trial.area_m2 * lead_travel_m

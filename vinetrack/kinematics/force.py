@@ -43,6 +43,16 @@ def steady_force(
 ) -> SteadyForce:
     """Force of a trial in one window.
 
+    Parameters
+    ----------
+    trial, track, kinematics, release : of one trial.
+    window : where it is steady or quasi-steady.
+    model : gives the pressure in the window where none was measured.
+
+    Returns
+    -------
+    force, errors, pressure and its source.
+
     Raises
     ------
     EffectError
@@ -66,7 +76,16 @@ def steady_force(
 
 
 def paper_force_N(trial: Trial) -> float:
-    """Force by the published rule, (P − P_y)A with the set pressure and without weight, N."""
+    """Return the force by the published rule, (P − P_y)A with the set pressure and without weight.
+
+    Parameters
+    ----------
+    trial : its pressures and diameter.
+
+    Returns
+    -------
+    N.
+    """
     return (trial.pressure_Pa - trial.yield_pressure_Pa) * trial.area_m2
 
 
@@ -74,6 +93,15 @@ def known_pressure(trial: Trial, track: Track, kinematics: Kinematics, release: 
     """Gauge pressure at the points of the kinematics, shape (n,), Pa; None where only the set pressure is known.
 
     Known is what was measured, or what a model with an effect on the pressure says.
+
+    Parameters
+    ----------
+    trial, track, kinematics, release : of one trial.
+    model : asked where no pressure was measured.
+
+    Returns
+    -------
+    shape (n,), Pa, or None.
     """
     if track.pressure_Pa is not None and np.isfinite(track.pressure_Pa).sum() > 1:
         measured = np.isfinite(track.pressure_Pa)
@@ -119,7 +147,16 @@ def _mean_error(measured_Pa: Floats) -> float:
 
 
 def why_not_in_fit(trial: Trial) -> str:
-    """Why a trial cannot enter the damping fit whatever its motion; blank if it can."""
+    """Why a trial cannot enter the damping fit whatever its motion; blank if it can.
+
+    Parameters
+    ----------
+    trial : as the sheet states it.
+
+    Returns
+    -------
+    half a sentence, or blank.
+    """
     if trial.travel_ratio != 2:
         return "a body that moves as a whole has no eversion damping"
     if trial.payload_kg > 0:
@@ -128,7 +165,16 @@ def why_not_in_fit(trial: Trial) -> str:
 
 
 def why_not_force(force: SteadyForce | None) -> str:
-    """Why a force cannot enter the damping fit; blank if it can."""
+    """Why a force cannot enter the damping fit; blank if it can.
+
+    Parameters
+    ----------
+    force : None where the trial has no steady window.
+
+    Returns
+    -------
+    half a sentence, or blank.
+    """
     if force is None:
         return "no steady window"
     if not force.force_N > 0:

@@ -34,7 +34,17 @@ class WindowMoments:
         self.gain = _GainTable(n, correlation)
 
     def drift(self, first: Indices, last: Indices) -> tuple[Floats, Floats, Floats]:
-        """Mean lead speed, relative change of speed across, and standard error of that, for windows [first, last]."""
+        """Fit a parabola to the positions in many windows at once: mean speed, relative change of speed, and its error.
+
+        Parameters
+        ----------
+        first, last : first and last point of each window, both included, shape (n_windows,).
+
+        Returns
+        -------
+        mean lead speed, m/s; relative change of speed from end to end; standard error of that. Each of shape
+            (n_windows,).
+        """
         s = self.sums[:, last + 1] - self.sums[:, first]
         middle = (self.u[first] + self.u[last]) / 2
         half = ((self.u[last] - self.u[first]) / 2).astype(float)
@@ -77,13 +87,13 @@ class _GainTable:
     def _one(length: int, rho: float) -> float:
         u = np.linspace(-1, 1, length)
         weights = u**2 - np.mean(u**2)
-        return ar1_sd(weights, rho) / float(np.sqrt(np.sum(weights**2)))
+        return _ar1_sd(weights, rho) / float(np.sqrt(np.sum(weights**2)))
 
     def __call__(self, length: Indices) -> Floats:
         return np.interp(np.log(length), self.log_length, self.gain)
 
 
-def ar1_sd(weights: Floats, rho: float) -> float:
+def _ar1_sd(weights: Floats, rho: float) -> float:
     """Standard deviation of Σ w_i e_i for AR(1) noise e of unit variance."""
     return math.sqrt(max(float(weights @ correlated(weights, rho)), 0.0))
 
@@ -103,7 +113,16 @@ class RangeExtremes:
         self.table = np.array(rows)
 
     def maximum(self, first: Indices, last: Indices) -> Floats:
-        """Maximum over [first, last], both included."""
+        """Return the maximum over ranges of points.
+
+        Parameters
+        ----------
+        first, last : first and last point of each range, both included, shape (n_ranges,).
+
+        Returns
+        -------
+        shape (n_ranges,), in the unit of the values.
+        """
         level = np.frexp((last - first + 1).astype(float))[1] - 1
         return np.maximum(self.table[level, first], self.table[level, last - (1 << level) + 1])
 
@@ -113,6 +132,17 @@ def chord_bounds(time_s: Floats, position_m: Floats, noise_m: float, rho: float,
 
     A chord's speed has the error σ√(2(1 − ρ^k))/Δt. Nothing is smoothed, so that a window may reach right up to the
     start-up or the end of growth without either leaking into it.
+
+    Parameters
+    ----------
+    time_s, position_m : raw positions of the leading edge, shape (n,), s and m.
+    noise_m : standard deviation σ of a position, m.
+    rho : correlation of the noise from frame to frame.
+    sigmas : half-width of a limit in standard errors.
+
+    Returns
+    -------
+    an entry a length of chord, in rising length; speeds in m/s.
     """
     bounds: list[Bounds] = []
     span = 1
@@ -164,6 +194,16 @@ def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -
     """Least squares on the raw positions of one window of at least three points, errors for AR(1) noise.
 
     Where the points scatter about their cubic clearly more than `noise_m` says, the errors are those of that scatter.
+
+    Parameters
+    ----------
+    time_s, position_m : raw positions of the leading edge in the window, shape (n,), s and m.
+    noise_m : standard deviation of a position, m.
+    rho : correlation of the noise from frame to frame.
+
+    Returns
+    -------
+    speed of the line, drift from the parabola, bend from the cubic, with standard errors.
     """
     n = time_s.size
     half = float(time_s[-1] - time_s[0]) / 2
@@ -175,7 +215,7 @@ def fit_window(time_s: Floats, position_m: Floats, noise_m: float, rho: float) -
     residual = y - np.polynomial.legendre.legval(u, np.polynomial.legendre.legfit(u, y, order))
     noise_m = _local_noise(residual, noise_m, rho, order + 1)
     slope, curve = float(rows[0] @ y), float(rows[1] @ y)
-    errors = [noise_m * ar1_sd(row, rho) for row in rows]
+    errors = [noise_m * _ar1_sd(row, rho) for row in rows]
     bend, bend_sigma = (float(rows[2] @ y), errors[2]) if order == 3 else (0.0, 0.0)
     known = slope != 0
     return LineFit(
@@ -199,10 +239,21 @@ def _local_noise(residual: Floats, noise_m: float, rho: float, terms: int) -> fl
 
 
 def judge(time_s: Floats, position_m: Floats, kinematics: Kinematics, first: int, last: int, rule: str) -> Window:
-    """Speed, error, drift and variation of the window from point `first` to `last`; not yet accepted.
+    """Measure speed, error, drift and variation in a window; whether it is accepted is left to the rule.
 
     The error of x_ss holds the noise and, where the speed bends within the window, how far the mean speed of a cubic
     lies from that of the line.
+
+    Parameters
+    ----------
+    time_s, position_m : raw positions of the leading edge, shape (n,), s and m.
+    kinematics : at the same points.
+    first, last : first and last point of the window, both included.
+    rule : its name, as `Window.rule`.
+
+    Returns
+    -------
+    the window, not accepted.
     """
     inside = slice(first, last + 1)
     t = time_s[inside]
@@ -231,6 +282,18 @@ def trim(
 
     The first and last 1, 2, 4 … frames must move within `band` (a fraction of the mean speed) and `TRIM_SIGMAS` of the
     speed that the window's parabola has there. Cutting stops where the rest would no longer be shown to be steady.
+
+    Parameters
+    ----------
+    time_s, position_m : raw positions of the leading edge, shape (n,), s and m.
+    kinematics : at the same points.
+    window : first and last point, both included.
+    band : fraction of the mean speed.
+    drift_limit : largest bound of the 95 % interval of the relative change of speed.
+
+    Returns
+    -------
+    first and last point of what is left, both included.
     """
     first, last = window
     while last - first >= 4:

@@ -71,12 +71,25 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
 
 
 def flag_rest(track: Track, release: Release) -> Track:
-    """A copy of the track with `before_release` on every row earlier than the release."""
+    """Flag every row earlier than the release `before_release`.
+
+    Parameters
+    ----------
+    track : of one trial.
+    release : of that trial.
+
+    Returns
+    -------
+    a copy; the track itself where the release is unknown or it moves from the start.
+    """
     if not math.isfinite(release.time_s) or release.moving_from_start:
         return track
     resting = track.time_s < release.time_s
     flag = np.array(
-        [join_flags(old, "before_release") if rest else old for old, rest in zip(track.flag, resting, strict=True)],
+        [
+            join_flags(old, "before_release") if at_rest else old
+            for old, at_rest in zip(track.flag, resting, strict=True)
+        ],
         dtype=track.flag.dtype if track.flag.dtype.itemsize >= 320 else "<U80",
     )
     return replace(track, flag=flag)

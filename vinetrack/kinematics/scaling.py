@@ -101,7 +101,11 @@ def regress(x: Floats, y: Floats) -> dict[str, Any]:
 
     Parameters
     ----------
-    x, y : arrays, shape (n,), n ≥ 3
+    x, y : shape (n,), n ≥ 3.
+
+    Returns
+    -------
+    `slope, slope_95, intercept, intercept_95, R2, p, n`.
     """
     from scipy.stats import linregress, t
 

@@ -75,10 +75,10 @@ def gated_window(
         return Window("gated", False, why)
     inside = slice(first, last + 1)
     search = _Search(time_s[inside], position_m[inside], kinematics, inside, drift_limit)
-    found, nearest = search.longest()
-    if found is None:
+    steady, nearest = search.longest()
+    if steady is None:
         return Window("gated", False, nearest)
-    whole = (first + found[0], first + found[1])
+    whole = (first + steady[0], first + steady[1])
     kept = trim(time_s, position_m, kinematics, whole, TRIM_BAND * drift_limit, drift_limit)
     window = judge(time_s, position_m, kinematics, *kept, "gated")
     moving = last - first + 1
@@ -91,6 +91,15 @@ def gated_window(
 
 def user_window(track: Track, kinematics: Kinematics, window_s: tuple[float, float]) -> Window:
     """The window chosen by hand, always used; `reason` warns where it is not steady.
+
+    Parameters
+    ----------
+    track, kinematics : of one trial.
+    window_s : begin and end on the clock of the track, s.
+
+    Returns
+    -------
+    the window, accepted.
 
     Raises
     ------
@@ -236,6 +245,17 @@ def paper_window(track: Track, *, travel_ratio: float, cv_limit: float = 0.03, m
     Velocities are central differences of the raw positions, as Physics Tracker computes them; the run holds at
     least `min_points` consecutive velocities with (sample standard deviation)/(mean) below `cv_limit`; x_ss is
     their mean, and its error s/√n, which is what the rule implies and not what the data allow.
+
+    Parameters
+    ----------
+    track : of one trial.
+    travel_ratio : r; speeds of the lead are multiplied by it.
+    cv_limit : largest coefficient of variation.
+    min_points : velocities in a row at least.
+
+    Returns
+    -------
+    the window; not accepted where there is no such run.
     """
     usable = track.usable
     time_s, position_m = track.time_s[usable], track.lead_position_m[usable]

@@ -71,6 +71,16 @@ class Steadiness:
 def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMotion:
     """Velocity, release and the windows that no model is asked for.
 
+    Parameters
+    ----------
+    trial : as the sheet states it.
+    track : its positions.
+    settings : of the run.
+
+    Returns
+    -------
+    track with its frames corrected and its rest flagged, kinematics, release, windows.
+
     Raises
     ------
     TrialError
@@ -90,6 +100,15 @@ def look_at_motion(trial: Trial, track: Track, settings: RunSettings) -> TrialMo
 
 def steadiness_under(motion: TrialMotion, model: Model) -> Steadiness:
     """The steady window of a trial and the force there, with the pressure along the way that a model gives.
+
+    Parameters
+    ----------
+    motion : from `look_at_motion`.
+    model : gives the pressure along the way where none was measured.
+
+    Returns
+    -------
+    all windows, the one chosen (None where no rule finds one), and the force in it.
 
     Raises
     ------
@@ -113,8 +132,14 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
 
     Parameters
     ----------
-    model
-        The model in use: it gives the pressure in the window where none was measured.
+    trial : as the sheet states it.
+    track : its positions.
+    settings : of the run.
+    model : the model in use: it gives the pressure in the window where none was measured.
+
+    Returns
+    -------
+    track, kinematics, windows, its row of results and its point of the damping fit.
 
     Raises
     ------
@@ -177,12 +202,12 @@ def _chosen(windows: Mapping[str, Window]) -> Window | None:
 
 
 def _warnings(track: Track, release: Release, windows: Mapping[str, Window]) -> list[str]:
-    found = list(track.notes)
+    warnings = list(track.notes)
     if release.moving_from_start or not math.isfinite(release.time_s):
-        found.append(release.reason)
+        warnings.append(release.reason)
     if "user" in windows and ("warning" in windows["user"].reason or not windows["user"].accepted):
-        found.append(windows["user"].reason)
-    return found
+        warnings.append(windows["user"].reason)
+    return warnings
 
 
 def _steady_columns(window: Window | None, paper: Window, force: SteadyForce | None) -> dict[str, object]:
@@ -212,7 +237,17 @@ def _end_columns(trial: Trial, kinematics: Kinematics, release: Release, setting
 
 
 def damping_point(trial: Trial, steady: Steadiness) -> dict[str, object]:
-    """The row of a trial in the damping fit, with `used` and the `reason` if not."""
+    """Return the row of a trial in the damping fit, with `used` and the `reason` if not.
+
+    Parameters
+    ----------
+    trial : as the sheet states it.
+    steady : from `steadiness_under`.
+
+    Returns
+    -------
+    a value a column; the unit stands in its name.
+    """
     window, paper, force = steady.chosen, steady.windows["paper"], steady.force
     reason = why_not_in_fit(trial) or why_not_force(force)
     nan = math.nan

@@ -46,7 +46,17 @@ def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
 
 
 def alike(table: pd.DataFrame, within: Mapping[str, float]) -> list[pd.DataFrame]:
-    """Rows in groups that agree in every column named, each within its own fraction of the group's first."""
+    """Group rows that agree in every column named, each within its own fraction of the group's first row.
+
+    Parameters
+    ----------
+    table : a row a condition.
+    within : relative difference allowed, by column.
+
+    Returns
+    -------
+    groups, each in the order of the table.
+    """
     groups: list[pd.DataFrame] = []
     left = table
     while len(left):
@@ -138,6 +148,11 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
     Sizes that do not vary are left out. Where diameter and thickness both vary each power is that of one size while
     the other stands still, which a look at one of them alone would mix up.
 
+    Parameters
+    ----------
+    sizes : by name, shape (n,), all in one unit or not: powers do not depend on it.
+    values : shape (n,); those that are not positive or unknown are left out.
+
     Returns
     -------
     dict
@@ -158,13 +173,13 @@ def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
             "R2": None,
         }
     y = np.log(values[known])
-    found = np.linalg.lstsq(matrix, y, rcond=None)[0]
-    left = y - matrix @ found
+    coefficients = np.linalg.lstsq(matrix, y, rcond=None)[0]
+    left = y - matrix @ coefficients
     errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(left @ left) / dof)
     reach = float(t.ppf(0.975, dof))
     total = float(np.sum((y - y.mean()) ** 2))
     return {
-        **{name: _power(found[i + 1], errors[i + 1], reach, dof) for i, name in enumerate(varying)},
+        **{name: _power(coefficients[i + 1], errors[i + 1], reach, dof) for i, name in enumerate(varying)},
         "R2": 1 - float(left @ left) / total if total > 0 else math.nan,
         "n": n,
         "refused": None,

@@ -88,10 +88,23 @@ def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, ka
 def smooth(
     time_s: Floats, position_m: Floats, noise_m: float, rho: float, *, order: int = 3, kappa: float = 3.0
 ) -> tuple[Floats, Floats, Indices]:
-    """Position, velocity, acceleration (3, n), error of velocity (n,) and width of window (n,), noise being known.
+    """Estimate position, velocity and acceleration at every point, the noise being known.
 
     A window is used only if the next wider one at the same side agrees too: the widest that agrees has just begun to
     disagree, and its bias may be several times its error. Each step in width changes their ratio by 1.45^5.5 = 8.
+
+    Parameters
+    ----------
+    time_s, position_m : shape (n,), s and m, finite, in order of time.
+    noise_m : standard deviation of a position, m.
+    rho : correlation of the noise from frame to frame.
+    order : of the polynomial.
+    kappa : by how many standard errors two windows may differ and still agree.
+
+    Returns
+    -------
+    position, velocity and acceleration, shape (3, n), SI; standard error of the velocity, shape (n,), m/s; points in
+        the window used, shape (n,).
     """
     n = time_s.size
     least = min(n, max(WINDOWS[0], order + 2))

@@ -46,7 +46,18 @@ class WindowFits:
     misfit_terms: int
 
     def at(self, time_s: Floats, window: Indices) -> tuple[Floats, Floats]:
-        """Position, velocity, acceleration (3, k) at times by the given windows, and velocity error of unit noise."""
+        """Evaluate the polynomials of given windows at given times.
+
+        Parameters
+        ----------
+        time_s : shape (k,), s.
+        window : number of the window for each time, shape (k,).
+
+        Returns
+        -------
+        position, velocity, acceleration, shape (3, k), SI; standard error of the velocity for noise of 1 m, shape (k,),
+            1/s.
+        """
         half = self.half_s[window]
         u = (time_s - self.middle_s[window]) / half
         value, slope, curve = _rows(u, self.coefficients.shape[0])
@@ -54,18 +65,27 @@ class WindowFits:
         values = np.array([(c * value).sum(axis=0), (c * slope).sum(axis=0) / half, (c * curve).sum(axis=0) / half**2])
         variance = np.einsum("ik,ij,jk->k", slope, self.even_covariance, slope)
         if self.odd_covariance is not None:
-            own = np.einsum("ik,ijk,jk->k", slope, self.odd_covariance[:, :, window], slope)
-            variance = np.where(self.odd[window], own, variance)
+            variance_there = np.einsum("ik,ijk,jk->k", slope, self.odd_covariance[:, :, window], slope)
+            variance = np.where(self.odd[window], variance_there, variance)
         return values, np.sqrt(np.maximum(variance, 0.0)) / half
 
     def velocities(self, time_s: Floats, side: float) -> tuple[Indices, Floats, Floats]:
-        """Window used at every point, its velocity there, and the error of that for unit noise; each (n,).
+        """Evaluate, at every point, the window in which it lies at one side.
 
         The point lies at `side` of its window (−1 beginning, 0 middle, 1 end), or as near as the ends of the track
         let it.
+
+        Parameters
+        ----------
+        time_s : of all points, shape (n,), s.
+        side : −1 beginning, 0 middle, 1 end of the window, or as near as the ends of the track allow.
+
+        Returns
+        -------
+        number of the window, velocity, m/s, and its standard error for noise of 1 m, 1/s; each of shape (n,).
         """
         n, m = time_s.size, self.coefficients.shape[1]
-        reach = window_offset(self.width, side)
+        reach = _window_offset(self.width, side)
         window = np.clip(np.arange(n) - reach, 0, m - 1)
         velocity, gain = np.empty(n), np.empty(n)
         u = 2 * reach / (self.width - 1) - 1
@@ -81,7 +101,7 @@ class WindowFits:
         return window, velocity, gain
 
 
-def window_offset(width: int, side: float) -> int:
+def _window_offset(width: int, side: float) -> int:
     """How many points of a window lie before the one at `side`."""
     return round((1 + side) / 2 * (width - 1))
 
@@ -91,12 +111,13 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
 
     Parameters
     ----------
-    time_s, position_m
-        Arrays, shape (n,), s and m, n ≥ width.
-    width, order
-        Points in a window, and the order of the polynomial, below `width`.
-    rho
-        Lag-one correlation of the noise.
+    time_s, position_m : shape (n,), s and m, n ≥ width.
+    width, order : points in a window, and the order of the polynomial, below `width`.
+    rho : lag-one correlation of the noise.
+
+    Returns
+    -------
+    the fits of n − width + 1 windows, in order.
     """
     m = time_s.size - width + 1
     last = np.arange(m) + width - 1
@@ -108,8 +129,8 @@ def fit_all_windows(time_s: Floats, position_m: Floats, width: int, order: int, 
     if odd.any():
         take = np.flatnonzero(odd)[:, None] + np.arange(width)
         u = (time_s[take] - middle[odd, None]) / half[odd, None]
-        own, own_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
-        results[:, odd] = np.einsum("mkw,mw->km", own, position_m[take])
+        uneven_weights, own_covariance, _ = _scaled(*_solve_design(u, order), order, rho)
+        results[:, odd] = np.einsum("mkw,mw->km", uneven_weights, position_m[take])
         odd_covariance = np.zeros((order + 1, order + 1, m))
         odd_covariance[:, :, odd] = own_covariance.transpose(1, 2, 0)
     misfit = np.sum(results[order + 1 :] ** 2, axis=0)
@@ -160,7 +181,19 @@ def _solve_design(u: Floats, order: int) -> tuple[Floats, int]:
 
 
 def correlated(weights: Floats, rho: float) -> Floats:
-    """R·w for AR(1) noise, R_ij = ρ^|i − j|, along the last axis: w·(R·w) is the variance of Σ w_i e_i."""
+    """Multiply weights by the correlation of AR(1) noise, R_ij = ρ^|i − j|, along the last axis.
+
+    w·(R·w) is the variance of Σ w_i e_i for noise e of variance 1.
+
+    Parameters
+    ----------
+    weights : shape (…, n).
+    rho : lag-one correlation.
+
+    Returns
+    -------
+    R·w, shape (…, n).
+    """
     from scipy.signal import lfilter
 
     if rho == 0 or weights.size == 0:

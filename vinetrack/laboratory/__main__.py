@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--processes", type=int, default=min(os.cpu_count() or 1, 4))
     given = parser.parse_args(arguments)
     experiment = read_experiment(given.experiment, strict=True)
-    path = given.nature or nature_of(experiment)
+    path = given.nature or _nature_of(experiment)
     nature, content = read_nature(path), yaml.safe_load(path.read_text(encoding="utf-8"))
     filming = make_filming(content.get("filming", {}))
     chosen = [trial for trial in experiment.trials if fnmatch.fnmatch(trial.name, given.only)]
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"Grown in the virtual laboratory: {len(grown)} trials, {n_frames} frames.", flush=True)
 
 
-def nature_of(experiment: Experiment) -> Path:
+def _nature_of(experiment: Experiment) -> Path:
     """What is true in an experiment of this name, or else in the demonstration."""
     own = Path(__file__).with_name(f"{experiment.name}.yaml")
     return own if own.exists() else DEMO

@@ -68,7 +68,7 @@ def campaign(
     ]
 
 
-def paper_B(diameter_m: float, thickness_m: float) -> float:
+def _paper_B(diameter_m: float, thickness_m: float) -> float:
     """B of a vine of the paper's campaign, N·(s/m)ⁿ: what is printed, where it is.
 
     Of a diameter of Table I with another wall it is in proportion to the wall, as Fig. 7B says ("linearly"), through
@@ -81,11 +81,11 @@ def paper_B(diameter_m: float, thickness_m: float) -> float:
 
 
 def damping_pressures_kPa(scale: int, count: int = 10) -> np.ndarray:
-    """Pressures of the damping protocol for one scale; see `steady_pressures_kPa`."""
-    return steady_pressures_kPa(isometric_vine(scale), count)
+    """Pressures of the damping protocol for one scale; see `_steady_pressures_kPa`."""
+    return _steady_pressures_kPa(isometric_vine(scale), count)
 
 
-def steady_pressures_kPa(of: Vine, count: int = 10) -> np.ndarray:
+def _steady_pressures_kPa(of: Vine, count: int = 10) -> np.ndarray:
     """Pressures at which a vine gets steady within its length, kPa, shape (count,), rounded to 0.1.
 
     The paper raises the pressure until speeds are still steady within the length of the vine. Lowest: 0.25 m/s of the
@@ -93,7 +93,7 @@ def steady_pressures_kPa(of: Vine, count: int = 10) -> np.ndarray:
     growth.
     """
     vine = of.trial("", 1.0)
-    B = paper_B(vine.diameter_m, vine.thickness_m)
+    B = _paper_B(vine.diameter_m, vine.thickness_m)
     film_kg = vine.linear_density_kg_m * vine.length_m
     slowest = 0.25
     # x/x_relax = 2L / (v τ) with τ = m / (½ n B v^(n−1)), solved for v at 3.2.
@@ -131,7 +131,7 @@ def paper_payload(replicates: int = 4) -> list[Trial]:
     return list(with_names(trials))
 
 
-def paper_walls(replicates: int = 4, count: int = 8) -> list[Trial]:
+def _paper_walls(replicates: int = 4, count: int = 8) -> list[Trial]:
     """The paper's Fig. 7B: walls of 12 mm vines other than that of R = 2, which is among the scales."""
     vines = [replace(isometric_vine(2), thickness_um=wall_um) for wall_um in WALLS_UM]
     trials = [
@@ -139,13 +139,13 @@ def paper_walls(replicates: int = 4, count: int = 8) -> list[Trial]:
         for vine in vines
         if vine != isometric_vine(2)
         for trial in campaign(
-            vine, steady_pressures_kPa(vine, count), replicates, prefix=f"fig7_{vine.thickness_um:g}um_"
+            vine, _steady_pressures_kPa(vine, count), replicates, prefix=f"fig7_{vine.thickness_um:g}um_"
         )
     ]
     return list(with_names(trials))
 
 
-def paper_speed(replicates: int = published.REPLICATES) -> list[Trial]:
+def _paper_speed(replicates: int = published.REPLICATES) -> list[Trial]:
     """The paper's Fig. 8: every scale at 24 kPa."""
     pressures_kPa = (published.STEADY_SPEED_KPA,)
     trials = [
@@ -156,7 +156,7 @@ def paper_speed(replicates: int = published.REPLICATES) -> list[Trial]:
     return list(with_names(trials))
 
 
-def paper_efficiency(replicates: int = published.REPLICATES) -> list[Trial]:
+def _paper_efficiency(replicates: int = published.REPLICATES) -> list[Trial]:
     """The paper's Fig. 9: 12 and 18 mm vines with every wall at 34 kPa, with 35.6 g."""
     pressures_kPa, payload_g = (published.EFFICIENCY_KPA,), published.PAYLOAD_G
     vines = [
@@ -180,10 +180,10 @@ def paper_campaign() -> list[Trial]:
     fastest = Vine(fast["diameter_mm"], fast["thickness_um"], fast["length_mm"])
     trials = [
         *paper_damping(),
-        *paper_walls(),
+        *_paper_walls(),
         *paper_payload(),
-        *paper_speed(),
-        *paper_efficiency(),
+        *_paper_speed(),
+        *_paper_efficiency(),
         *campaign(fastest, (fast["pressure_kPa"],), 1, prefix="fast_"),
     ]
     return list(with_names(trials))
@@ -191,7 +191,7 @@ def paper_campaign() -> list[Trial]:
 
 def paper_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
     """True parameters for the vines of the paper's campaign: B by vine, to four digits, and the printed n."""
-    by_vine = {trial.vine: float(f"{paper_B(trial.diameter_m, trial.thickness_m):.4g}") for trial in trials}
+    by_vine = {trial.vine: float(f"{_paper_B(trial.diameter_m, trial.thickness_m):.4g}") for trial in trials}
     return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}
 
 

@@ -187,7 +187,7 @@ def _fill(plane: Any, values: Frame) -> None:
     target[:, : values.shape[1]] = values
 
 
-def in_colour(levels: Frame, scene: Scene) -> Frame:
+def _in_colour(levels: Frame, scene: Scene) -> Frame:
     """BGR picture of `levels` with the scene's tint, for pictures in files; unchanged where the scene is grey."""
     import cv2
 
@@ -217,9 +217,9 @@ def _write_pictures(frames: Iterator[Frame], folder: Path, scene: Scene, rendere
     for count, levels in enumerate(frames):
         path = folder / f"frame_{count:06d}.{ending}"
         if ending == "dng":
-            write_dng(path, levels, scene.sensor.bit_depth, renderer.capture_fps, renderer.exposure_s)
+            _write_dng(path, levels, scene.sensor.bit_depth, renderer.capture_fps, renderer.exposure_s)
             continue
-        picture = in_colour(_spread(levels, scene.sensor.bit_depth), scene)
+        picture = _in_colour(_spread(levels, scene.sensor.bit_depth), scene)
         settings = [cv2.IMWRITE_PNG_COMPRESSION, 1] if ending == "png" else []
         if not cv2.imwrite(str(path), picture, settings):
             raise ValueError(f"{path}: the picture could not be written; is the disk full?")
@@ -233,7 +233,7 @@ def _write_stack(frames: Iterator[Frame], path: Path) -> None:
             stack.write(levels, photometric="minisblack", contiguous=True)
 
 
-def write_dng(path: Path, levels: Frame, bit_depth: int, capture_fps: float, exposure_s: float) -> None:
+def _write_dng(path: Path, levels: Frame, bit_depth: int, capture_fps: float, exposure_s: float) -> None:
     """Write a CinemaDNG frame as the Chronos does: FrameRate in tag 51044 (75 MHz timebase), exposure in 33434."""
     import tifffile
 

@@ -170,7 +170,7 @@ class TargetRenderer:
         return self._empty.expose(self._radiance(frame), frame, low=low, span=span)
 
 
-def target_scene(scene: Scene) -> Scene:
+def _target_scene(scene: Scene) -> Scene:
     """Return `scene` with launcher, door and ruler put away, as when the target is held up."""
     backdrop = replace(scene.backdrop, launcher=False, ruler=False, clutter=False)
     return replace(scene, backdrop=backdrop, door=None)
@@ -181,7 +181,7 @@ def render_target(target: Target, scene: Scene, *, seed: int = 0, **settings: An
 
     The truth is `scene.camera`: `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks.
     """
-    return TargetRenderer(target, target_scene(scene), seed=seed, **settings).frame(0)
+    return TargetRenderer(target, _target_scene(scene), seed=seed, **settings).frame(0)
 
 
 def render_calibration_clip(
@@ -196,5 +196,5 @@ def render_calibration_clip(
     """Write a clip (or, by the path's ending, a folder of pictures) of `target`; see `TargetRenderer` for `moves`."""
     from vinetrack.laboratory.encode import write_recording
 
-    renderer = TargetRenderer(target, target_scene(scene), seed=seed, moves=moves)
+    renderer = TargetRenderer(target, _target_scene(scene), seed=seed, moves=moves)
     write_recording(renderer, np.arange(n_frames), Path(out_path))

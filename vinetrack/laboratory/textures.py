@@ -19,7 +19,7 @@ OVERSAMPLING = 4
 """Sub-pixels per pixel when lines are drawn, so that their edges lie within 1/8 px of where they belong."""
 
 
-def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
+def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
     """Periodic Gaussian noise of mean 0 and standard deviation 1, smooth over `sigma_y`, `sigma_x` px."""
     white = np.fft.rfft2(rng.standard_normal(shape))
     fy = np.fft.fftfreq(shape[0])[:, None]
@@ -44,8 +44,8 @@ def _wall_paper(scene: Scene, rng: np.random.Generator, along: Image) -> Image:
     shape = (along.shape[0], along.shape[1])
     span = max(float(along.max()), 1.0)
     ramp = look.brightness + look.gradient * (np.clip(along / span, 0, 1) - 0.5)
-    blotches = 0.6 * smooth_noise(rng, shape, 45, 45) + 0.45 * smooth_noise(rng, shape, 9, 14)
-    grain = 0.35 * smooth_noise(rng, shape, 1.2, 1.2) + 0.25 * smooth_noise(rng, shape, 0.8, 6)
+    blotches = 0.6 * _smooth_noise(rng, shape, 45, 45) + 0.45 * _smooth_noise(rng, shape, 9, 14)
+    grain = 0.35 * _smooth_noise(rng, shape, 1.2, 1.2) + 0.25 * _smooth_noise(rng, shape, 0.8, 6)
     yy, xx = np.mgrid[: shape[0], : shape[1]]
     lit = np.exp(-(((xx / shape[1] - 0.45) / 0.65) ** 2) - ((yy / shape[0] - 0.35) / 0.9) ** 2)
     pool = 1 + 2.5 * look.texture * (lit - 0.6)
@@ -74,7 +74,7 @@ def _axis_matrix(
     return np.array([[ux, -uy, x0], [uy, ux, y0]])
 
 
-def ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.Generator) -> Image:
+def _ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.Generator) -> Image:
     """A steel ruler: tick k mm is centred k·px_per_mm from the first column; shape (width_px, length_px)."""
     import cv2
 
@@ -94,7 +94,7 @@ def ruler_patch(length_px: int, width_px: int, px_per_mm: float, rng: np.random.
             cv2.putText(ink, str(mm // 10), place, cv2.FONT_HERSHEY_SIMPLEX, 0.30 * k, 255, max(k - 2, 1))
     big[ink > 127] = 0.13
     fine = cv2.resize(big, (length_px, width_px), interpolation=cv2.INTER_AREA)
-    brushed = 1 + 0.03 * smooth_noise(rng, (width_px, length_px), 0.6, 60)
+    brushed = 1 + 0.03 * _smooth_noise(rng, (width_px, length_px), 0.6, 60)
     glare = 1 + 0.25 * np.sin(np.linspace(0, 5.0, length_px) + rng.uniform(0, 6))[None, :] ** 4
     return (fine * brushed * glare).astype(np.float32)
 
@@ -106,7 +106,7 @@ def _launcher_patch(radius_px: float, rng: np.random.Generator, reach_px: int) -
     height, width = int(2.9 * radius_px), reach_px
     across = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
     patch = 0.10 + 0.10 * np.exp(-(((across + 0.6) / 0.16) ** 2)) + np.zeros((1, width), dtype=np.float32)
-    patch *= 1 + 0.06 * smooth_noise(rng, (height, width), 0.7, 25)
+    patch *= 1 + 0.06 * _smooth_noise(rng, (height, width), 0.7, 25)
     patch[[0, 1, -2, -1], :] = 0.26
     ring = max(int(0.5 * radius_px), 5)
     round_light = 0.16 + 0.42 * np.exp(-(((across + 0.45) / 0.22) ** 2)) + 0.12 * np.exp(-(((across - 0.6) / 0.2) ** 2))
@@ -158,7 +158,7 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
     radius = scene.subject.diameter_m / scene.camera.m_per_px / 2
     if scene.backdrop.ruler:
         length, width = int(along.max()) + 40, 34
-        patch = ruler_patch(length, width, 1e-3 / scene.camera.m_per_px, rng)
+        patch = _ruler_patch(length, width, 1e-3 / scene.camera.m_per_px, rng)
         matrix = _axis_matrix(scene, corner, 0.0, round(1.9 * radius + 14))
         canvas = _paste(canvas, patch, np.ones_like(patch), matrix)
     if scene.backdrop.launcher:
@@ -168,7 +168,7 @@ def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, in
     return np.asarray(cv2.GaussianBlur(canvas, (0, 0), scene.psf_px), dtype=np.float32).clip(0, 1.5)
 
 
-def film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
+def _film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
     """Relief of crumpled film, mean 0 and standard deviation 1: soft folds along it, sharp creases at all slants.
 
     A crease is a bright flank beside a dark one; most are short and lie within 60° of the tube's axis.
@@ -186,8 +186,8 @@ def film_relief(rng: np.random.Generator, shape: tuple[int, int]) -> Image:
         cv2.polylines(lines, [curve.astype(np.int32)], isClosed=False, color=float(rng.standard_t(3)), thickness=1)
     creases = cv2.resize(cv2.GaussianBlur(lines, (0, 0), 1.9), (columns, rows), interpolation=cv2.INTER_AREA)
     flanks = creases - np.roll(creases, 2, axis=0)
-    folds = 0.8 * smooth_noise(rng, shape, 3.5, 60) + 0.5 * smooth_noise(rng, shape, 2.0, 18)
-    folds += 0.45 * smooth_noise(rng, shape, 9, 9) + 0.15 * smooth_noise(rng, shape, 0.9, 1.5)
+    folds = 0.8 * _smooth_noise(rng, shape, 3.5, 60) + 0.5 * _smooth_noise(rng, shape, 2.0, 18)
+    folds += 0.45 * _smooth_noise(rng, shape, 9, 9) + 0.15 * _smooth_noise(rng, shape, 0.9, 1.5)
     relief = folds + 0.3 * creases / max(float(creases.std()), 1e-6) + 0.45 * flanks / max(float(flanks.std()), 1e-6)
     return np.asarray((relief - relief.mean()) / relief.std(), dtype=np.float32)
 
@@ -202,21 +202,21 @@ def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px:
     shape = (2 * half + 1, length_px)
     v = (np.arange(shape[0]) - half)[:, None] / radius_px
     depth = 1 / np.sqrt(np.clip(1 - v**2, 0, 1) + 0.04)
-    wrinkles = tube.texture * film_relief(rng, shape)
+    wrinkles = tube.texture * _film_relief(rng, shape)
     clear = np.clip(1 - tube.opacity * (1 + wrinkles), 0.0, 1.0) if tube.opacity < 1 else np.zeros(shape)
     transmission = clear**depth
     light = 0.86 - 0.16 * v + 0.08 * np.cos(2.6 * v) if tube.texture else 1.0
     glow = (1 - transmission) * tube.brightness * light * (1 + 1.3 * wrinkles)
     for place, width, strength in ((-0.55, 0.075, 1.4), (0.34, 0.05, 0.6), (-0.05, 0.03, 0.3)):
-        wander = place + 0.03 * smooth_noise(rng, (4, length_px), 1, 60)[:1]
-        broken = np.clip(0.35 + 0.6 * smooth_noise(rng, (4, length_px), 1, 7)[:1], 0, 1.6)
+        wander = place + 0.03 * _smooth_noise(rng, (4, length_px), 1, 60)[:1]
+        broken = np.clip(0.35 + 0.6 * _smooth_noise(rng, (4, length_px), 1, 7)[:1], 0, 1.6)
         glow = glow + tube.specular * strength * broken * np.exp(-(((v - wander) / width) ** 2))
     return transmission.astype(np.float32), glow.astype(np.float32)
 
 
 def film_girth(tube: Tube, rng: np.random.Generator, length_px: int) -> Image:
     """Relative stretch of distances from the axis along the everted wall, shape (length_px,): its sides ripple."""
-    ripple = 0.7 * smooth_noise(rng, (4, length_px), 1, 9)[0] + 0.7 * smooth_noise(rng, (4, length_px), 1, 40)[0]
+    ripple = 0.7 * _smooth_noise(rng, (4, length_px), 1, 9)[0] + 0.7 * _smooth_noise(rng, (4, length_px), 1, 40)[0]
     return (1 + 0.08 * tube.texture * ripple).astype(np.float32)
 
 
@@ -227,7 +227,7 @@ def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px:
     """
     rows = 2 * math.ceil(radius_px * tube.tail_width) + 5
     shape = (rows, period_px)
-    texture = 0.7 * smooth_noise(rng, shape, 1.4, 9) + 0.7 * smooth_noise(rng, shape, 3.0, 2.5)
+    texture = 0.7 * _smooth_noise(rng, shape, 1.4, 9) + 0.7 * _smooth_noise(rng, shape, 3.0, 2.5)
     texture -= texture.mean(axis=1, keepdims=True)
     sums = np.zeros((rows, period_px + 1))
     np.cumsum(texture, axis=1, dtype=float, out=sums[:, 1:])
@@ -240,7 +240,7 @@ def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Imag
     grid = np.arange(-half, half + 1) / radius_px
     r2 = np.clip(grid[:, None] ** 2 + grid[None, :] ** 2, 0, 1)
     facing = np.clip(0.55 * np.sqrt(1 - r2) - 0.35 * grid[:, None] - 0.25 * grid[None, :], 0, None)
-    marks = smooth_noise(rng, r2.shape, 2.2, 2.2) + 0.5 * smooth_noise(rng, r2.shape, 6, 6)
+    marks = _smooth_noise(rng, r2.shape, 2.2, 2.2) + 0.5 * _smooth_noise(rng, r2.shape, 6, 6)
     surface = ball.brightness * (0.45 + 0.9 * facing) * (1 + ball.texture * marks)
     for gy, gx, width in ((-0.25, 0.05, 0.07), (-0.2, -0.12, 0.05)):
         surface = surface + ball.specular * np.exp(

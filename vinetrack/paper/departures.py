@@ -110,7 +110,7 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
             rows.append(("Fig. 4", trial.pressure_Pa / 1e3, departure.name, rms_m, math.nan, moved.slack_from_s))
     for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
         for departure in DEPARTURES:
-            off = [speed_change_m_s(pressure_kPa, payload_g, departure) for payload_g in payloads_g]
+            off = [_speed_change_m_s(pressure_kPa, payload_g, departure) for payload_g in payloads_g]
             rms_m_s = math.sqrt(float(np.mean(np.square(off)))) if off else math.nan
             rows.append(("Fig. 5", float(pressure_kPa), departure.name, math.nan, rms_m_s, math.nan))
     return pd.DataFrame(rows, columns=list(DEPARTURE_COLUMNS))
@@ -128,16 +128,16 @@ def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
     return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
 
 
-def speed_trial(pressure_kPa: float, payload_g: float) -> tuple[Trial, float]:
+def _speed_trial(pressure_kPa: float, payload_g: float) -> tuple[Trial, float]:
     """A trial of the paper's Fig. 5 and its B, in proportion to the wall: it is not printed."""
     wall_um = published.FINAL_SPEED_THICKNESS_UM
     B = published.DAMPING_B[4] * wall_um / published.THICKNESS_UM[4]
     return paper_trial(published.DIAMETER_MM[4], wall_um, published.LONGEST_VINE_MM, pressure_kPa, payload_g), B
 
 
-def speed_change_m_s(pressure_kPa: float, payload_g: float, departure: Departure) -> float:
+def _speed_change_m_s(pressure_kPa: float, payload_g: float, departure: Departure) -> float:
     """Change of the leading edge's speed at the paper's 12 cm against Eq. (2)."""
-    trial, B = speed_trial(pressure_kPa, payload_g)
+    trial, B = _speed_trial(pressure_kPa, payload_g)
     at_m = published.FINAL_SPEED_AT_MM / 1e3
     speeds = []
     for one in (departure, NONE):

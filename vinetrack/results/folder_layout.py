@@ -186,7 +186,16 @@ class Results:
         return self.folder / "fit.json"
 
     def trajectories(self, condition: str) -> Path:
-        """The trials of one condition and what the model says of them."""
+        """Return the file of the trials of one condition and what the model gives for them.
+
+        Parameters
+        ----------
+        condition : its name.
+
+        Returns
+        -------
+        path, CSV.
+        """
         return result_file(self.folder / "comparison", condition, ".csv")
 
     @property
@@ -200,11 +209,29 @@ class Results:
         return self.folder / "ladder.csv"
 
     def diagnosed(self, name: str) -> Path:
-        """A table that the diagnosis wrote."""
+        """Return a table that the diagnosis wrote.
+
+        Parameters
+        ----------
+        name : of the file, with suffix.
+
+        Returns
+        -------
+        path.
+        """
         return self.folder / "diagnosis" / name
 
     def predictions(self, trial: str) -> Path:
-        """One trial, and what the models before and after say of it."""
+        """Return the file of one trial and what the models before and after give for it.
+
+        Parameters
+        ----------
+        trial : its name.
+
+        Returns
+        -------
+        path, CSV.
+        """
         return result_file(self.folder / "diagnosis" / "predictions", trial, ".csv")
 
     @property
@@ -213,7 +240,16 @@ class Results:
         return self.folder / "overlays"
 
     def overlay(self, trial: str) -> Path:
-        """The recording of one trial with the edges drawn."""
+        """Return the recording of one trial with the edges drawn.
+
+        Parameters
+        ----------
+        trial : its name.
+
+        Returns
+        -------
+        path, MP4.
+        """
         return result_file(self.overlays, trial, ".mp4")
 
     @property
@@ -227,27 +263,84 @@ class Results:
         return self.folder / "report.html"
 
     def track(self, trial: str) -> Path:
-        """Where the leading edge was."""
+        """Return the file of the positions of one leading edge.
+
+        Parameters
+        ----------
+        trial : its name.
+
+        Returns
+        -------
+        path, CSV.
+        """
         return result_file(self.folder / "tracks", trial, ".csv")
 
     def kinematics(self, trial: str) -> Path:
-        """How the leading edge moved."""
+        """Return the file of the motion of one leading edge.
+
+        Parameters
+        ----------
+        trial : its name.
+
+        Returns
+        -------
+        path, CSV.
+        """
         return result_file(self.folder / "kinematics", trial, ".csv")
 
     def analysed(self, trial: str) -> Path:
-        """What one trial adds to the tables of the experiment."""
+        """Return what one trial adds to the tables of the experiment.
+
+        Parameters
+        ----------
+        trial : its name.
+
+        Returns
+        -------
+        path, JSON.
+        """
         return result_file(self.folder / "analysed", trial, ".json")
 
     def strip_figure(self, trial: str, suffix: str) -> Path:
-        """The strip of one recording with its tracked edge."""
+        """Return the strip of one recording with its tracked edge.
+
+        Parameters
+        ----------
+        trial : its name.
+        suffix : with its dot.
+
+        Returns
+        -------
+        path.
+        """
         return result_file(self.folder / "figures", f"strip_{trial}", suffix)
 
     def figure(self, name: str, suffix: str) -> Path:
-        """A figure of the whole experiment."""
+        """Return a figure of the whole experiment.
+
+        Parameters
+        ----------
+        name : of the figure.
+        suffix : with its dot.
+
+        Returns
+        -------
+        path.
+        """
         return result_file(self.folder / "figures", name, suffix)
 
     def trial_figure(self, trial: str, suffix: str) -> Path:
-        """The figure of one trial."""
+        """Return the figure of one trial.
+
+        Parameters
+        ----------
+        trial : its name.
+        suffix : with its dot.
+
+        Returns
+        -------
+        path.
+        """
         return result_file(self.folder / "figures", f"trial_{trial}", suffix)
 
 

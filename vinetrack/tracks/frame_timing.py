@@ -28,40 +28,61 @@ CLEAR_STEP_SIGMAS = 8.0
 """Motion is well above noise where one frame's step exceeds this many standard deviations of a position."""
 
 DROP_RATIO = 1.6
-"""A step above this many times its neighbours is a dropped frame."""
+"""A step above this many times its neighbours is a dropped frame. Chosen between 1, a steady step, and 2, a step over
+one dropped frame, nearer to 2 since speeds rise by up to 60 % in a frame at release. By reasoning: at half every step
+is a suspect, at twice (3.2) only two dropped frames in a row are found."""
 
 JUMP_SIGMAS = 5.5
-"""Least significance of a jump: 4e-8 by chance, 1e-4 over a long campaign's frames."""
+"""Least significance of a jump: 4e-8 by chance, 1e-4 over a long campaign's frames. Derived from the normal
+distribution, two-sided. By reasoning: at half (2.8) one step in 170 passes; at twice, steps below eleven standard
+errors of a jump are left in."""
 
 STILL, STILL_SIGMAS = 0.25, 5.0
-"""A copy stands still to within this part of a step, which must be this significant; a copy is nearly exact."""
+"""A copy stands still to within this part of a step, which must be this significant; a copy is nearly exact. Chosen.
+By reasoning: at half, positions rounded to a tenth of a step hide copies; at twice, slow frames of a motion that stops
+and goes pass for copies."""
 
 LONG_BEFORE_COPY = 1.4
-"""A step so many times those around it, just before what looks like an inserted copy, is one point seen ahead."""
+"""A step so many times those around it, just before what looks like an inserted copy, is one point seen ahead. Chosen
+between a usual step, 1, and a step ahead, 2. By reasoning: near 1 real copies in motion that speeds up are kept as
+points ahead; beyond 2 no point ahead is recognised."""
 
 COPY_SIGMAS = 3.5
-"""Least significance of the step back after an inserted copy."""
+"""Least significance of the step back after an inserted copy. Chosen: 2e-4 by chance, for steps that already stand
+still. By reasoning: at half one in 25 such steps moves the times; at twice copies in noisy tracks stay."""
 
 SIDE_POINTS = (8, 5, 3)
-"""Points taken on either side, fewer where release or the end of growth is near."""
+"""Points taken on either side, fewer where release or the end of growth is near. Chosen: a parabola with a step has
+four numbers, so that 2 × 3 points are the fewest that show scatter, and over 2 × 8 the speed changes little. By
+reasoning: half as many find fewer jumps in noise; twice as many leave no parabola near release."""
 
 SLOWEST_SIDE = 0.75
-"""Each side alone moves at least this part of a clear step."""
+"""Each side alone moves at least this part of a clear step. Chosen. By reasoning: at half, jumps are looked for where
+one step hardly stands out of the noise; at twice (1.5), only where motion is 12 standard deviations a frame."""
 
 SIMILAR_SIDES = 1.8
-"""Largest ratio of the speeds just before and just after: beyond it a long step may be the motion itself."""
+"""Largest ratio of the speeds just before and just after: beyond it a long step may be the motion itself. Chosen just
+below 2, the ratio of a double step. By reasoning: at half nothing passes; at twice a release passes for a dropped
+frame."""
 
 LARGEST_MISFIT = 0.1
-"""Scatter about the parabola, in steps, beyond which the motion is not smooth enough to show a jump."""
+"""Scatter about the parabola, in steps, beyond which the motion is not smooth enough to show a jump. Chosen: a jump of
+one step is then ten times the scatter. By reasoning: at half, tracks with noise of 5 % of a step are not corrected; at
+twice, stop-and-go motion is."""
 
 WILD_RATIO, WILD_SIGMAS = 3.0, 4.0
-"""A single wild point must leave so many times the squares of a jump, and so many squared deviations more."""
+"""A single wild point must leave so many times the squares of a jump, and so many squared deviations more. Chosen. By
+reasoning: at half, wild points move times; at twice, dropped frames in noisy tracks stay."""
 
 WIDE_SIDE_POINTS, LEAST_SHARE = 24, 0.6
-"""Points on either side that must see at least this part of the jump too, where they can tell."""
+"""Points on either side that must see at least this part of the jump too, where they can tell. Chosen: 48 points know
+a step three times better than 16, and one cubic still follows them away from release. By reasoning: at half they
+repeat the nearest points; at twice few motions follow one cubic, and the test says nothing."""
 
 UNEVEN = 0.05
-"""Spacings within this fraction of a whole number of frames count as even: printed times are rounded."""
+"""Spacings within this fraction of a whole number of frames count as even: printed times are rounded. Chosen: times
+printed to 0.1 ms at 500 frames a second err by 0.025 of a frame. By reasoning: at half such times count as uneven and
+are left alone; at twice irregular times are corrected as if even."""
 
 
 _Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]

@@ -19,11 +19,20 @@ from vinetrack.tracks.track_checks import FEWEST_POINTS, TrackError, check_press
 __all__ = ["TrackError", "attach_pressure", "load_track", "read_pressure_trace", "read_track"]
 
 HEADER_WITHIN_LINES = 20
-"""Titles and remarks above the header of a text export end well before this line."""
+"""Titles and remarks above the header of a text export end well before this line. Chosen: exports have one or two
+lines of title; twice or half changes nothing for them."""
 
 
 def load_track(trial: Trial) -> Track:
     """Track of a trial whose positions are already measured, with the pressure of its `pressure_trace` if it has one.
+
+    Parameters
+    ----------
+    trial : of the sheet, with `track` and perhaps `pressure_trace`, `point_mass` and `frames_used`.
+
+    Returns
+    -------
+    the track, positions in m.
 
     Raises
     ------
@@ -50,10 +59,13 @@ def read_track(path: Path, *, point_mass: str = "", frames_used: tuple[int, int]
 
     Parameters
     ----------
-    point_mass
-        Name of the point mass of a project; the one with the most points where blank.
-    frames_used
-        First and last frame of a project, or row of a table counted from 0, that are used.
+    path : the file.
+    point_mass : name of the point mass of a project; the one with the most points where blank.
+    frames_used : first and last frame of a project, or row of a table counted from 0, that are used.
+
+    Returns
+    -------
+    the track, s and m.
 
     Raises
     ------
@@ -125,6 +137,14 @@ def _read_positions(table: Table) -> Track:
 def read_pressure_trace(path: Path) -> tuple[Floats, Floats]:
     """Read a CSV with `time_s, pressure_kPa`: times in s and gauge pressures in Pa, both of shape (n,).
 
+    Parameters
+    ----------
+    path : the file.
+
+    Returns
+    -------
+    times in s and gauge pressures in Pa, two arrays, shape (n,).
+
     Raises
     ------
     TrackError
@@ -150,8 +170,12 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
 
     Parameters
     ----------
-    time_s, pressure_Pa
-        The trace, shape (n,), times increasing.
+    track : what the pressure belongs to.
+    time_s, pressure_Pa : the trace, shape (n,), times increasing.
+
+    Returns
+    -------
+    the track with `pressure_Pa`, shape (n_frames,).
 
     Raises
     ------
@@ -173,5 +197,7 @@ def attach_pressure(track: Track, time_s: Floats, pressure_Pa: Floats) -> Track:
 
 def _require(table: Table, *columns: str) -> None:
     if missing := [column for column in columns if column not in table.columns]:
-        found = ", ".join(table.columns[:8]) or "none"
-        raise TrackError(f"lacks the column {missing[0]} (found: {found[:120]}): name its columns {', '.join(columns)}")
+        present = ", ".join(table.columns[:8]) or "none"
+        raise TrackError(
+            f"lacks the column {missing[0]} (found: {present[:120]}): name its columns {', '.join(columns)}"
+        )

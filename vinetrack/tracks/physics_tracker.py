@@ -42,6 +42,16 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
 
     That is the one named `point_mass`, else the one with the most marks; marks outside `frames_used` are left aside.
 
+    Parameters
+    ----------
+    text : content of the file, XML.
+    point_mass : its name; the one with the most marks where blank.
+    frames_used : first and last frame; all where None.
+
+    Returns
+    -------
+    the track: s, m, and `edge_px` along the principal axis of the motion.
+
     Raises
     ------
     TrackError
@@ -65,8 +75,8 @@ def read_project(text: str, point_mass: str = "", frames_used: tuple[int, int] |
     if not unit:
         notes.append("The project names no unit of length; metres are assumed.")
     world_m = _to_world(frames, pixels, _axes(panel)) * METRES.get(unit, 1.0)
-    position_m, note = project_on_axis(world_m)
-    edge_px, _ = project_on_axis(pixels)
+    position_m, note = _project_on_axis(world_m)
+    edge_px, _ = _project_on_axis(pixels)
     missing = int(frames[-1] - frames[0]) + 1 - len(frames)
     if missing:
         notes.append(f"{missing} frames between the first and the last point have none.")
@@ -115,9 +125,9 @@ def _choose_mass(panel: Element, wanted: str) -> tuple[str, dict[int, tuple[floa
 def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
     """Numbers stored per frame under `framedata`; frames that lack one are left out."""
     values: dict[int, tuple[float, ...]] = {}
-    for item in _children(_property(node, "framedata")):
-        index = re.fullmatch(r"\[(\d{1,9})\]", item.get("name", ""), re.ASCII)
-        stored = item.find("object")
+    for entry in _children(_property(node, "framedata")):
+        index = re.fullmatch(r"\[(\d{1,9})\]", entry.get("name", ""), re.ASCII)
+        stored = entry.find("object")
         if index is None or stored is None:
             continue
         numbers = tuple(_number(stored, name) for name in names)
@@ -129,14 +139,14 @@ def _frame_values(node: Element, *names: str) -> dict[int, tuple[float, ...]]:
 def _axes(panel: Element) -> list[_Axes]:
     """The coordinate systems of the key frames, in their order."""
     coords = _object(panel, "coords")
-    found = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
-    if not found:
+    values = {} if coords is None else _frame_values(coords, "xorigin", "yorigin", "angle", "xscale", "yscale")
+    if not values:
         raise TrackError("holds no coordinate system: calibrate it in Tracker")
-    if any(xscale <= 0 or yscale <= 0 for *_, xscale, yscale in found.values()):
+    if any(xscale <= 0 or yscale <= 0 for *_, xscale, yscale in values.values()):
         raise TrackError("holds a scale that is not positive: calibrate it anew in Tracker")
-    if all(xscale == 1 and yscale == 1 for *_, xscale, yscale in found.values()):
+    if all(xscale == 1 and yscale == 1 for *_, xscale, yscale in values.values()):
         raise TrackError("was never calibrated (1 pixel is 1 m): set a calibration stick or tape in Tracker")
-    return [_Axes(n, (x, y), math.radians(angle), (sx, sy)) for n, (x, y, angle, sx, sy) in sorted(found.items())]
+    return [_Axes(n, (x, y), math.radians(angle), (sx, sy)) for n, (x, y, angle, sx, sy) in sorted(values.items())]
 
 
 def _to_world(frames: np.ndarray, pixels: Floats, axes: list[_Axes]) -> Floats:
@@ -177,13 +187,13 @@ def _property(node: Element, name: str) -> Element | None:
 
 def _object(node: Element, name: str) -> Element | None:
     """The object stored in a property."""
-    found = _property(node, name)
-    return None if found is None else found.find("object")
+    node_of_name = _property(node, name)
+    return None if node_of_name is None else node_of_name.find("object")
 
 
 def _text(node: Element, name: str) -> str | None:
-    found = _property(node, name)
-    return None if found is None else found.text
+    node_of_name = _property(node, name)
+    return None if node_of_name is None else node_of_name.text
 
 
 def _number(node: Element, name: str) -> float:
@@ -196,7 +206,16 @@ def _number(node: Element, name: str) -> float:
 
 
 def is_export_header(line: str) -> bool:
-    """Whether a line names the columns of a text export: t, and x or y."""
+    """Whether a line names the columns of a text export: t, and x or y.
+
+    Parameters
+    ----------
+    line : of a text file.
+
+    Returns
+    -------
+    bool
+    """
     names = {name for cell in re.split(r"[\t;,]", line) if (name := _column(cell)[0])}
     return "t" in names and bool(names & {"x", "y"})
 
@@ -216,6 +235,14 @@ def _column(cell: str) -> tuple[str, str]:
 def read_export(table: Table) -> Track:
     """Track of Tracker's text export; a blank coordinate is a frame without a point.
 
+    Parameters
+    ----------
+    table : its cells.
+
+    Returns
+    -------
+    the track, s and m.
+
     Raises
     ------
     TrackError
@@ -234,7 +261,7 @@ def read_export(table: Table) -> Track:
         for name in ("x", "y")
         if name in columns
     ]
-    position_m, note = project_on_axis(np.column_stack(axes))
+    position_m, note = _project_on_axis(np.column_stack(axes))
     missing = int(np.sum(~np.isfinite(position_m)))
     notes = [f"{missing} rows have no position."] if missing else []
     if not columns["t"][1] and not any(columns[name][1] for name in ("x", "y") if name in columns):
@@ -249,7 +276,7 @@ def _factor(column: tuple[str, str], units: dict[str, float]) -> float:
     return units.get(unit, 1.0)
 
 
-def project_on_axis(points: Floats) -> tuple[Floats, str]:
+def _project_on_axis(points: Floats) -> tuple[Floats, str]:
     """Positions along the principal axis of the motion, and a sentence saying so; NaN rows stay NaN.
 
     Parameters

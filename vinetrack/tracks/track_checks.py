@@ -9,11 +9,18 @@ import numpy as np
 from vinetrack.core.records import FLAGS, Floats, Track
 
 FEWEST_POINTS = 5
+"""Points of a track at least. Derived: a cubic and one to spare."""
+
 LARGEST_PRESSURE_KPA = 1000.0
+"""Largest gauge pressure taken for one in kPa. Chosen: ten times what vines bear; Pa in place of kPa are larger from 1
+kPa on. At half or twice only that message changes."""
+
 VACUUM_KPA = -101.4
-"""No gauge reads less; sensors do read a little below zero."""
+"""No gauge reads less; sensors do read a little below zero. Derived: minus the standard atmosphere, 101.325, rounded
+away from zero."""
 LARGEST_NUMBER = 1e9
-"""Seconds or metres; anything larger is no measurement and would overflow when squared and summed."""
+"""Seconds or metres; anything larger is no measurement and would overflow when squared and summed. Chosen: squares and
+their sums then stay far below 1e308."""
 
 
 class TrackError(Exception):
@@ -21,7 +28,18 @@ class TrackError(Exception):
 
 
 def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
-    """Refuse times that do not increase from row to row; `lines` gives the line of each row."""
+    """Refuse times that do not increase from row to row.
+
+    Parameters
+    ----------
+    time_s : shape (n,), s.
+    lines : line of each row in its file, for the message.
+
+    Raises
+    ------
+    TrackError
+        Naming the first row that is not later than the one before.
+    """
     wrong = np.flatnonzero(np.diff(time_s) <= 0)
     if len(wrong):
         i = int(wrong[0]) + 1
@@ -32,7 +50,18 @@ def check_times(time_s: Floats, lines: Sequence[int] | None = None) -> None:
 
 
 def check_pressure(pressure_kPa: Floats, lines: Sequence[int]) -> None:
-    """Refuse pressures beyond what the sheet allows; NaN passes."""
+    """Refuse pressures beyond what the sheet allows; NaN passes.
+
+    Parameters
+    ----------
+    pressure_kPa : shape (n,), gauge, kPa.
+    lines : line of each row in its file, for the message.
+
+    Raises
+    ------
+    TrackError
+        Naming the first reading below vacuum or above `LARGEST_PRESSURE_KPA`.
+    """
     wrong = np.flatnonzero((pressure_kPa > LARGEST_PRESSURE_KPA) | (pressure_kPa < VACUUM_KPA))
     if len(wrong):
         i = int(wrong[0])
@@ -53,7 +82,19 @@ def new_track(
     pressure_Pa: Floats | None = None,
     notes: Iterable[str] = (),
 ) -> Track:
-    """A track with blank flags, after the checks that all kinds of file share. Arrays have shape (n,).
+    """Make a track with blank flags, after the checks that all kinds of file share.
+
+    Parameters
+    ----------
+    time_s, lead_position_m : shape (n,), s and m; positions are NaN where there is none.
+    sigma_m : standard error of each position, shape (n,), m; unknown if None.
+    edge_px : position along the growth axis of the picture, shape (n,), px; unknown if None.
+    pressure_Pa : gauge pressure, shape (n,), Pa; none if None.
+    notes : sentences about the track.
+
+    Returns
+    -------
+    the track.
 
     Raises
     ------

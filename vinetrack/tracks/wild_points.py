@@ -32,7 +32,7 @@ of absolute values has 0.37 of the efficiency of the mean square), and noise tha
 them."""
 
 SCALE_FREEDOM = 15.0
-"""Degrees of freedom of that local noise: 0.37 × 41."""
+"""Degrees of freedom of that local noise: 0.37 × 41. Derived."""
 
 FALSE_ALARM = 1e-3
 """Chance that normal noise costs a track a single point. Chosen: one campaign of 24 trials in forty loses one, which
@@ -53,10 +53,14 @@ efficiency, wider since only points far off matter here."""
 
 END_POINTS, END_STEPS = 2, 1.5
 """Within so many points of an end the motion may have stopped or begun between the frames: so many frames' steps for
-each point from the end are then no sign of a wild one."""
+each point from the end are then no sign of a wild one. Chosen: growth ends or begins within a frame, which displaces
+the last points by up to a step each. By reasoning: without it the last point before a stop is rejected; at twice, wild
+points of three steps at the ends stay."""
 
 COPY_STEPS = 0.3
-"""A point this close to the one before, in steps of the motion, is a repeated frame, which `frame_timing` judges."""
+"""A point this close to the one before, in steps of the motion, is a repeated frame, which `frame_timing` judges.
+Chosen as `STILL` there, a little wider. By reasoning: at half, copies are rejected as wild before they are judged; at
+twice, wild points that happen to lie near the one before stay."""
 
 MOST_ROUNDS = 4
 """Rounds of rejection. Measured on three campaigns with 2 % of wild points: three rounds leave nothing to reject."""
@@ -65,7 +69,8 @@ FEWEST_POINTS = 2 * HALF_WIDTH + 1
 """The point and its neighbours."""
 
 MOST_NAMED = 8
-"""Points named in the sentence about a campaign; a track's notes name all of its own."""
+"""Points named in the sentence about a campaign; a track's notes name all of its own. Chosen: what fits on two
+lines."""
 
 MOST_REJECTED = 0.1
 """Where more of the points than this would be rejected the test does not describe the track, and none is. Chosen: five
@@ -94,10 +99,12 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
 
     Parameters
     ----------
-    time_s, position_m
-        Arrays, shape (n_points,), s and m, finite, in order of time; at least `FEWEST_POINTS`.
-    noise_m
-        Standard deviation of a position; neighbours are never judged more strictly than by this.
+    time_s, position_m : shape (n_points,), s and m, finite, in order of time; at least `FEWEST_POINTS`.
+    noise_m : standard deviation of a position; neighbours are never judged more strictly than by this.
+
+    Returns
+    -------
+    residuals and what they are judged by, a value a point.
     """
     n = time_s.size
     begin = np.clip(np.arange(n) - HALF_WIDTH, 0, n - FEWEST_POINTS)
@@ -135,7 +142,17 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
 
 
 def running_noise(distance_m: Floats, half_width: int = SCALE_HALF_WIDTH) -> Floats:
-    """Standard deviation around each point, m: the running median of distances ≥ 0, shape (n_points,)."""
+    """Estimate the standard deviation around each point by a running median, 0.6745 of it for normal noise.
+
+    Parameters
+    ----------
+    distance_m : absolute residuals, shape (n_points,), m.
+    half_width : points on either side.
+
+    Returns
+    -------
+    standard deviation around each point, shape (n_points,), m.
+    """
     width = min(2 * half_width + 1, distance_m.size)
     view = np.median(np.lib.stride_tricks.sliding_window_view(distance_m, width), axis=1) / 0.6745
     middle = np.clip(np.arange(distance_m.size) - width // 2, 0, view.size - 1)
@@ -174,12 +191,15 @@ def wild_points(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
 
 
 def reject_wild_points(track: Track) -> Track:
-    """A copy of the track with its wild points flagged `rejected`, and named in its notes.
+    """Flag wild points of a track `rejected`, and name them in its notes.
 
     Parameters
     ----------
-    track
-        A row for every frame; positions may be NaN.
+    track : a row for every frame; positions may be NaN.
+
+    Returns
+    -------
+    a copy, or the track itself where no point is wild.
     """
     rows = np.flatnonzero(track.usable)
     wild = rows[wild_points(track.time_s[rows], track.lead_position_m[rows])] if rows.size else rows
@@ -198,8 +218,11 @@ def listed_wild_points(tracks: Mapping[str, Track]) -> str:
 
     Parameters
     ----------
-    tracks
-        By name of trial, as `reject_wild_points` returns them.
+    tracks : by name of trial, as `reject_wild_points` returns them.
+
+    Returns
+    -------
+    the sentence, or blank.
     """
     places = [f"{name} at {place}" for name, track in tracks.items() for place in _places(track)]
     if not places:

@@ -219,7 +219,7 @@ def _line_near(
         place = np.column_stack([x, y]) - middle
         along, across = place @ unit + length / 2, (place @ side + reach) / band
         inside = (across >= 0) & (across < bins) & (along >= 0) & (along < length)
-        gathered = fan(along[inside], across[inside], time[inside], weight[inside], bins, length, n_times)
+        gathered = _fan(along[inside], across[inside], time[inside], weight[inside], bins, length, n_times)
         away = (np.arange(gathered.size) + 1) * band - reach
         worth = gathered * (1 - 0.5 * np.clip(away / reach, -1, 1) ** 2)
         i = int(np.argmax(worth))
@@ -293,7 +293,9 @@ def _best_line(
     for angle in np.radians(np.arange(0, 360, 6.0)):
         along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
         across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
-        gathered = fan(along + diagonal, (across + diagonal) / band, time, weight, bins, int(2 * diagonal) + 2, n_times)
+        gathered = _fan(
+            along + diagonal, (across + diagonal) / band, time, weight, bins, int(2 * diagonal) + 2, n_times
+        )
         i = int(np.argmax(gathered))
         if gathered[i] > best:
             offset = (i + 1) * band - diagonal
@@ -312,7 +314,7 @@ def _agreeing(
     near = np.abs(across) < band
     table = np.zeros((n_times, int(place.max()) + 1))
     np.add.at(table, (time[near].astype(int), place[near]), weight[near])
-    passed = ordered_path(table)
+    passed = _ordered_path(table)
     agree = near & (np.abs(time - passed[place]) <= max(2.0, 0.03 * n_times))
     return agree, along, across
 
@@ -360,7 +362,7 @@ def _to_picture(line: _Line, factor: float, shape: tuple[int, ...]) -> Axis:
 
 
 @njit(cache=True)
-def fan(
+def _fan(
     along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
 ) -> np.ndarray:
     """What monotone paths collect in each band of two bins across, shape (bins − 1,)."""
@@ -380,7 +382,7 @@ def fan(
 
 
 @njit(cache=True)
-def ordered_path(table: np.ndarray) -> np.ndarray:
+def _ordered_path(table: np.ndarray) -> np.ndarray:
     """Time at which a monotone path passes each place, for a table (n_times, n_places); NaN beyond its ends."""
     n, places = table.shape
     best = np.zeros((n, places + 1))

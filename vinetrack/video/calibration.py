@@ -130,7 +130,7 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
         return PlaneCalibration("mm_per_px", plane, math.nan, 0, 0, math.nan, _whole(plane), (note,))
     if isinstance(settings, TwoPoints):
         return _from_two_points(settings, width_px, height_px)
-    pictures = target_pictures(folder / settings.image, settings.image)
+    pictures = _target_pictures(folder / settings.image, settings.image)
     seen = {(picture.shape[1], picture.shape[0]) for picture in pictures}
     if seen != {(width_px, height_px)}:
         sizes = " and ".join(f"{width} × {height}" for width, height in sorted(seen))
@@ -188,7 +188,7 @@ def _whole(plane: PlaneMap) -> tuple[float, float, float, float]:
     return 0.0, 0.0, plane.width_px - 1.0, plane.height_px - 1.0
 
 
-def target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
+def _target_pictures(path: Path, name: str) -> list[NDArray[Any]]:
     """Up to MOST_PICTURES grey pictures, spread over the first SEARCHED_FRAMES frames of a picture, folder or clip.
 
     Raises

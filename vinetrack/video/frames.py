@@ -155,12 +155,12 @@ def iterate_frames(recording: Recording, region: Region | None = None) -> Iterat
     with av.open(str(recording.path)) as container:
         try:
             for frame in container.decode(video=0):
-                yield luma_plane(frame, region)
+                yield _luma_plane(frame, region)
         except av.error.FFmpegError:
             return
 
 
-def luma_plane(frame: av.VideoFrame, region: Region) -> NDArray[Any]:
+def _luma_plane(frame: av.VideoFrame, region: Region) -> NDArray[Any]:
     """Brightness of one decoded frame inside `region`: a copy, shape region.shape, uint8 or uint16."""
     name = frame.format.name
     depth = frame.format.components[0].bits
@@ -236,7 +236,7 @@ def _fill(decoded: _Decoded, recording: Recording, region: Region, threads: int)
                     if (frame.height, frame.width) != (recording.height, recording.width):
                         complaints.append("the size of the picture changes")
                         break
-                    decoded.pictures.append(luma_plane(frame, region))
+                    decoded.pictures.append(_luma_plane(frame, region))
                     decoded.pts.append(float("nan") if frame.pts is None else frame.pts * base)
                     decoded.corrupt.append(bool(frame.is_corrupt))
         except av.error.FFmpegError as error:
@@ -292,7 +292,7 @@ def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]
     return slot, f"{missing} frames are missing by the timestamps; the others keep their own time"
 
 
-def with_notes(recording: Recording, *notes: str) -> Recording:
+def _with_notes(recording: Recording, *notes: str) -> Recording:
     """The same recording with more to say."""
     return replace(recording, notes=(*recording.notes, *notes))
 

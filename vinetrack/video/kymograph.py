@@ -20,7 +20,7 @@ from vinetrack.video.strip import Strip
 
 
 @njit(cache=True)
-def change_score(
+def _change_score(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, window: int, bunch: int, noise: float
 ) -> np.ndarray:
     """How much each column changes at each frame, shape (n_frames, n_along).
@@ -56,7 +56,7 @@ def change_score(
 
 
 @njit(cache=True)
-def collect_path(score: np.ndarray) -> np.ndarray:
+def _collect_path(score: np.ndarray) -> np.ndarray:
     """Monotone path that collects most of `score` (n_frames, n_along), each column once; edge by frame, (n_frames,)."""
     n, columns = score.shape
     best = np.zeros((n, columns + 1), np.float32)
@@ -124,12 +124,12 @@ def first_path(
     logarithm counts, so that a bright glint in a few columns cannot outvote the rest.
     """
     bunch = int(np.clip(strip.shape[1] // 12, 1, 4))
-    score = change_score(strip, scale, offset, window, bunch, noise)
+    score = _change_score(strip, scale, offset, window, bunch, noise)
     peak = score.max(axis=0)
     worth = np.where(peak > 3.0, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(np.float32)
     score = score * worth[None, :]
     score = np.where(worth[None, :] > 0, score - 0.15 * score.max(axis=0, keepdims=True), -0.2).astype(np.float32)
-    return collect_path(score), score
+    return _collect_path(score), score
 
 
 Floats = NDArray[np.float64]

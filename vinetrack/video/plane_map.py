@@ -44,7 +44,7 @@ class PlaneMap:
     @classmethod
     def from_scale(cls, m_per_px: float, width_px: int, height_px: int) -> PlaneMap:
         """A plane seen square on, without distortion, known without error."""
-        step_m = m_per_px * half_diagonal_px(width_px, height_px)
+        step_m = m_per_px * _half_diagonal_px(width_px, height_px)
         parameters = np.array([step_m, 0, 0, 0, step_m, 0, 0, 0, 0, 0], dtype=float)
         return cls(width_px, height_px, parameters, np.zeros((N_PLANE + N_LENS, N_PLANE + N_LENS)))
 
@@ -100,7 +100,7 @@ class PlaneFit:
         return float(np.sqrt(np.mean(np.concatenate([(view**2).sum(axis=1) for view in self.residual_px]))))
 
 
-def half_diagonal_px(width_px: int, height_px: int) -> float:
+def _half_diagonal_px(width_px: int, height_px: int) -> float:
     """Half the picture's diagonal, px: the unit of undistorted coordinates."""
     return 0.5 * float(np.hypot(width_px, height_px))
 
@@ -128,7 +128,7 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
     reach_m = max(float(np.ptp(board, axis=0).max()) for board in boards)
     start = [_first_homography(view, board / reach_m) for view, board in zip(corners, boards, strict=True)]
     values = np.concatenate([*start, np.zeros(N_LENS)])
-    unit_px = half_diagonal_px(*size)
+    unit_px = _half_diagonal_px(*size)
     noise_px = 0.1
     for _ in range(NOISE_ROUNDS):
         arguments = (corners, [board / reach_m for board in boards], noise_px / unit_px)
@@ -150,7 +150,7 @@ def fit_planes(views: Sequence[tuple[Floats, Floats]], width_px: int, height_px:
 
 def _half_diagonals(picture_px: Floats, size: tuple[int, int]) -> Floats:
     middle = (np.array(size) - 1) / 2
-    return np.asarray((np.asarray(picture_px, dtype=float) - middle) / half_diagonal_px(*size))
+    return np.asarray((np.asarray(picture_px, dtype=float) - middle) / _half_diagonal_px(*size))
 
 
 def _undistorted(bent: Floats, lens: Floats) -> Floats:

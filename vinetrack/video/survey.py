@@ -61,7 +61,7 @@ def _judge(trial: Trial, recording: Recording) -> list[Problem]:
         Problem(message=f"is odd: {note.removeprefix(f'{recording.path.name}: ')}", severity="warning", **place)
         for note in recording.notes
     ]
-    declared, present = recording.declared_frames, frames_present(recording)
+    declared, present = recording.declared_frames, _frames_present(recording)
     count = declared if present is None else present
     if count is not None and count < FEWEST_FRAMES:
         remedy = f"at least {FEWEST_FRAMES} are needed"
@@ -73,7 +73,7 @@ def _judge(trial: Trial, recording: Recording) -> list[Problem]:
     return found
 
 
-def frames_present(recording: Recording) -> int | None:
+def _frames_present(recording: Recording) -> int | None:
     """How many frames lie in the file as far as that is known without decoding; None where it is not."""
     if recording.kind != "container":
         return recording.declared_frames

@@ -116,7 +116,7 @@ def track_frames(
     exposure_s = trial.exposure_s if np.isfinite(trial.exposure_s) else (frames.recording.exposure_s or np.nan)
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
-    rejected = odd_frames(frames.luma)
+    rejected = _odd_frames(frames.luma)
     first, last = trial.frames_used or (0, len(frames) - 1)
     number = np.arange(len(frames))
     used = (number >= first) & (number <= last)
@@ -266,7 +266,7 @@ def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
     return np.asarray(odd | (fit.sigma_px > np.maximum(1.0, 5 * np.nanmedian(fit.sigma_px))))
 
 
-def odd_frames(luma: NDArray[Any]) -> NDArray[np.bool_]:
+def _odd_frames(luma: NDArray[Any]) -> NDArray[np.bool_]:
     """Frames among the first three that resemble none after them, shape (n,): cameras are known to write such."""
     odd = np.zeros(len(luma), dtype=bool)
     if len(luma) < 8:
