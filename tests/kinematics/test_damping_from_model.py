@@ -12,8 +12,15 @@ import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.settings import RunSettings
-from vinetrack.kinematics.damping_from_model import LAW_COLUMNS, DampingLaw, law_table, look_at_motions, redo_damping
-from vinetrack.kinematics.summary import TrialMotion, summarise_trial
+from vinetrack.kinematics.summary import (
+    LAW_COLUMNS,
+    DampingLaw,
+    TrialMotion,
+    law_table,
+    look_at_motions,
+    redo_damping,
+    summarise_trial,
+)
 from vinetrack.laboratory.campaign import PAPER_B, PAPER_N, damping_pressures_kPa, damping_values, isometric_vine
 from vinetrack.laboratory.campaign import campaign as of_vine
 from vinetrack.laboratory.ground_truth import BASE, Nature

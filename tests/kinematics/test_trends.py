@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 
 from vinetrack.kinematics.conditions import CONDITION_COLUMNS
-from vinetrack.kinematics.scaling import regress
-from vinetrack.kinematics.trends import alike, fit_trends, planes
+from vinetrack.kinematics.scaling import alike, fit_trends, planes, regress
 
 PER_STEP_95 = 12.706204736  # Student's t with one degree of freedom
 PER_TWO_95 = 4.302652730  # and with two

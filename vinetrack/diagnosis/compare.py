@@ -27,7 +27,7 @@ from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.inference.fit_data import Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_trials
-from vinetrack.kinematics.efficiency import lead_velocity_at
+from vinetrack.kinematics.conditions import lead_velocity_at
 from vinetrack.kinematics.velocity import estimate_kinematics
 
 if TYPE_CHECKING:

@@ -1,19 +1,27 @@
-"""How the damping coefficient grows with the size of the vine.
+"""How the damping coefficient, steady speed and efficiency change with the size of the vine.
 
 Two descriptions of B against the diameter, both reported because neither is known to be right: a power law
 (a straight line on log axes) and a straight line. For the published vines (R = 1…4) the first has a slope of 1.80,
 the second R² = 0.983 with an intercept of −1.7 N·(s/m)ⁿ.
+
+Trends over the conditions of an experiment: steady speed against scale, efficiency against wall and diameter. A size
+counts once however often it was measured: replicates share their vine, so it is the means of vines that scatter about
+a trend, and N is their number. Slopes stand on log axes with 95 % intervals by Student's t; each p-value is the
+probability of a slope as large where there is none.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vinetrack.core.records import Floats
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ISOMETRIC_WITHIN = 0.05
 """Vines whose t/D agree within this fraction count as scaled copies of each other. Chosen: films are sold to ±5 %."""
@@ -123,3 +131,186 @@ def regress(x: Floats, y: Floats) -> dict[str, Any]:
         "p": float(line.pvalue) if math.isfinite(line.pvalue) else math.nan,
         "n": int(x.size),
     }
+
+
+SAME_SETTING_WITHIN = 0.01
+"""Pressures and payloads that agree within this fraction count as the same. Chosen: gauges are read to a per cent."""
+
+SIZES = {"thickness_um": "wall", "diameter_mm": "diameter"}
+EFFICIENCIES = ("efficiency", "efficiency_payload", "efficiency_with_weight")
+
+
+def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
+    """Families of conditions that differ in size alone, and how speed and efficiency go with it.
+
+    Parameters
+    ----------
+    conditions
+        As `vinetrack.kinematics.conditions.condition_table` returns them.
+
+    Returns
+    -------
+    dict
+        `steady_speed`: scaled copies without payload at one pressure, each family with `sizes` (mm), `x_ss_m_s`,
+        `x_ss_over_diameter_1_s`, their errors, `power` and `line` of both (see `scaling.regress`; those of the second
+        in `over_diameter`), `monotonic`, and `refused`. `efficiency`: conditions of one pressure, payload and length,
+        each family with sizes, efficiencies in three variants and, for each variant, its `trend` (see `planes`).
+    """
+    return {"steady_speed": _speed_families(conditions), "efficiency": _efficiency_families(conditions)}
+
+
+def alike(table: pd.DataFrame, within: Mapping[str, float]) -> list[pd.DataFrame]:
+    """Group rows that agree in every column named, each within its own fraction of the group's first row.
+
+    Parameters
+    ----------
+    table : a row a condition.
+    within : relative difference allowed, by column.
+
+    Returns
+    -------
+    groups, each in the order of the table.
+    """
+    groups: list[pd.DataFrame] = []
+    left = table
+    while len(left):
+        first = left.iloc[0]
+        same = np.ones(len(left), dtype=bool)
+        for column, fraction in within.items():
+            values = left[column].to_numpy(float)
+            same &= np.abs(values - first[column]) <= fraction * abs(float(first[column])) + 1e-12
+        groups.append(left[same])
+        left = left[~same]
+    return groups
+
+
+def _speed_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
+    bare = conditions[(conditions["payload_g"] == 0) & (conditions["x_ss_m_s"] > 0)]
+    bare = bare.assign(wall_over_diameter=1e-3 * bare["thickness_um"] / bare["diameter_mm"])
+    bare = bare[np.isfinite(bare["wall_over_diameter"])]
+    settings = {
+        "wall_over_diameter": ISOMETRIC_WITHIN,
+        "pressure_kPa": SAME_SETTING_WITHIN,
+        "growth_angle_deg": SAME_SETTING_WITHIN,
+    }
+    groups = [group.sort_values("diameter_mm") for group in alike(bare, settings)]
+    families = [_speed_family(group) for group in groups if np.unique(group["diameter_mm"]).size > 1]
+    return sorted(families, key=lambda family: -len(family["sizes"]))
+
+
+def _speed_family(group: pd.DataFrame) -> dict[str, Any]:
+    columns = ("x_ss_m_s", "x_ss_sigma_m_s", "x_ss_over_diameter_1_s", "x_ss_over_diameter_sigma_1_s", "n_steady")
+    sizes, speeds, relative = (
+        group[name].to_numpy(float) for name in ("diameter_mm", "x_ss_m_s", "x_ss_over_diameter_1_s")
+    )
+    return {
+        "along": "diameter_mm",
+        "pressure_kPa": float(group["pressure_kPa"].iloc[0]),
+        "wall_over_diameter": float(group["wall_over_diameter"].mean()),
+        "conditions": group["condition"].tolist(),
+        "vines": group["vine"].tolist(),
+        "sizes": sizes.tolist(),
+        **{name: group[name].tolist() for name in columns},
+        "monotonic": bool(np.all(np.diff(speeds) > 0)),
+        **_lines(sizes, speeds),
+        "over_diameter": _lines(sizes, relative),
+    }
+
+
+def _lines(sizes: Floats, values: Floats) -> dict[str, Any]:
+    """A power law and a straight line, or why neither."""
+    if np.unique(sizes).size < FEWEST_VINES:
+        return {"power": None, "line": None, "refused": f"{np.unique(sizes).size} sizes; it takes {FEWEST_VINES}"}
+    return {"power": regress(np.log(sizes), np.log(values)), "line": regress(sizes, values), "refused": None}
+
+
+def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
+    known = conditions[(conditions["efficiency"] > 0) & np.isfinite(conditions["thickness_um"])]
+    settings = {
+        "pressure_kPa": SAME_SETTING_WITHIN,
+        "payload_g": SAME_SETTING_WITHIN,
+        "length_mm": SAME_WITHIN,
+        "efficiency_at_mm": 0.0,
+        "growth_angle_deg": SAME_SETTING_WITHIN,
+    }
+    groups = [group.sort_values(["diameter_mm", "thickness_um"]) for group in alike(known, settings)]
+    families = [_efficiency_family(group) for group in groups if _sizes(group) > 1]
+    return sorted(families, key=lambda family: -len(family["conditions"]))
+
+
+def _sizes(group: pd.DataFrame) -> int:
+    return len(group[["diameter_mm", "thickness_um"]].drop_duplicates())
+
+
+def _efficiency_family(group: pd.DataFrame) -> dict[str, Any]:
+    fixed = ("pressure_kPa", "payload_g", "length_mm", "efficiency_at_mm")
+    each = ("diameter_mm", "thickness_um", "n_efficiency", "weight_share")
+    values = (name for key in EFFICIENCIES for name in (key, f"{key}_sigma"))
+    sizes = {name: group[name].to_numpy(float) for name in ("thickness_um", "diameter_mm")}
+    return {
+        **{name: float(group[name].iloc[0]) for name in fixed},
+        "conditions": group["condition"].tolist(),
+        "vines": group["vine"].tolist(),
+        **{name: group[name].tolist() for name in (*each, *values)},
+        "trend": {key: planes(sizes, group[key].to_numpy(float)) for key in EFFICIENCIES},
+    }
+
+
+def planes(sizes: Mapping[str, Floats], values: Floats) -> dict[str, Any]:
+    """Powers of all sizes at once: ln value = a + Σ pᵢ ln sizeᵢ, by least squares.
+
+    Sizes that do not vary are left out. Where diameter and thickness both vary each power is that of one size while
+    the other stands still, which a look at one of them alone would mix up.
+
+    Parameters
+    ----------
+    sizes : by name, shape (n,), all in one unit or not: powers do not depend on it.
+    values : shape (n,); those that are not positive or unknown are left out.
+
+    Returns
+    -------
+    dict
+        By size `power, power_95, p`; `R2`, `n`; and `refused`: None, or why there is no trend.
+    """
+    from scipy.stats import t
+
+    known = np.isfinite(values) & (values > 0)
+    varying = {name: np.log(size[known]) for name, size in sizes.items() if np.unique(size[known]).size > 1}
+    n, dof = int(known.sum()), int(known.sum()) - len(varying) - 1
+    if not varying or dof < 1:
+        return {"refused": _too_few(n, list(varying)), "n": n, "R2": None}
+    matrix = np.column_stack([np.ones(n), *varying.values()])
+    if np.linalg.matrix_rank(matrix) < matrix.shape[1]:
+        return {
+            "refused": f"{' and '.join(SIZES[name] for name in varying)} vary together: neither power stands alone",
+            "n": n,
+            "R2": None,
+        }
+    y = np.log(values[known])
+    coefficients = np.linalg.lstsq(matrix, y, rcond=None)[0]
+    left = y - matrix @ coefficients
+    errors = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)) * float(left @ left) / dof)
+    reach = float(t.ppf(0.975, dof))
+    total = float(np.sum((y - y.mean()) ** 2))
+    return {
+        **{name: _power(coefficients[i + 1], errors[i + 1], reach, dof) for i, name in enumerate(varying)},
+        "R2": 1 - float(left @ left) / total if total > 0 else math.nan,
+        "n": n,
+        "refused": None,
+    }
+
+
+def _too_few(n: int, varying: Sequence[str]) -> str:
+    if n == 0:
+        return "no condition has such a value above 0"
+    if not varying:
+        return "all vines are of one size"
+    powers = "a power of " + " and one of ".join(SIZES[name] for name in varying)
+    return f"{n} conditions; {powers} with an error take{'s' if len(varying) == 1 else ''} {len(varying) + 2}"
+
+
+def _power(value: float, error: float, reach: float, dof: int) -> dict[str, float | Sequence[float]]:
+    from scipy.stats import t
+
+    p = 2 * float(t.sf(abs(value) / error, dof)) if error > 0 else 0.0
+    return {"power": float(value), "power_95": [float(value - reach * error), float(value + reach * error)], "p": p}

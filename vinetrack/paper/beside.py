@@ -12,8 +12,7 @@ import pandas as pd
 
 from vinetrack.core import published
 from vinetrack.core.records import Floats, Trial
-from vinetrack.kinematics.conditions import mean_with_error
-from vinetrack.kinematics.efficiency import lead_velocity_at
+from vinetrack.kinematics.conditions import lead_velocity_at, mean_with_error
 from vinetrack.paper.departures import NONE, WITHIN, follow
 
 POSITION_COLUMNS = ("condition", "pressure_kPa", "n_trials", "rms_mean_m", "rms_single_m")

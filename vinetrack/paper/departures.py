@@ -20,7 +20,7 @@ from vinetrack.core import published
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import Model, base_model
 from vinetrack.dynamics.simulate import Trajectory, simulate
-from vinetrack.kinematics.efficiency import lead_velocity_at
+from vinetrack.kinematics.conditions import lead_velocity_at
 
 WITHIN = 0.95
 """Of the length, up to which positions are compared: a motion that stalls would else be averaged for ever."""

@@ -13,8 +13,8 @@ from vinetrack.core import published
 from vinetrack.core.constants import AIR_DENSITY_KG_M3
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
+from vinetrack.kinematics.conditions import lead_velocity_at
 from vinetrack.kinematics.damping import fit_laws
-from vinetrack.kinematics.efficiency import lead_velocity_at
 from vinetrack.kinematics.force import paper_force_N
 from vinetrack.kinematics.steady import paper_window
 from vinetrack.paper.departures import NONE, Departure, paper_trial

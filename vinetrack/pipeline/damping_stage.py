@@ -27,8 +27,7 @@ def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
     points = read_result(results.points)
 
     from vinetrack.kinematics.damping import fit_laws
-    from vinetrack.kinematics.scaling import fit_scaling
-    from vinetrack.kinematics.trends import fit_trends
+    from vinetrack.kinematics.scaling import fit_scaling, fit_trends
 
     damping = fit_laws(points, resamples=settings.resamples, seed=settings.seed)
     write_json(results.scaling, fit_scaling(damping) | fit_trends(read_result(results.conditions)))

@@ -131,7 +131,7 @@ def _write_laws(
     results: Results, found: Diagnosis, pairs: Sequence[tuple[Trial, Track]], settings: RunSettings | None
 ) -> None:
     """The damping law redone with the pressure that every model of the ladder gives: how n and B come home."""
-    from vinetrack.kinematics.damping_from_model import LAW_COLUMNS, law_table, look_at_motions, redo_damping
+    from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 
     path = results.folder / "diagnosis" / "damping_laws.csv"
     laws: dict[str, Any] = {}

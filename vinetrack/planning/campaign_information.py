@@ -31,7 +31,7 @@ from vinetrack.inference.optimiser import make_problem
 from vinetrack.inference.parameters import DAMPING, EXPONENT, FreeParameter, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import OWN, Predictor
 from vinetrack.inference.whitening import all_products
-from vinetrack.kinematics.efficiency import lead_velocity_at
+from vinetrack.kinematics.conditions import lead_velocity_at
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
 REST_FRAMES = 20
