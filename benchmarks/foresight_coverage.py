@@ -78,10 +78,10 @@ def measure(seed: int) -> list[dict[str, object]]:
     numbers = numbers_of(vt.fit(vt.base_model(), [(one.stated, one.track) for one in grown], profile=False))
     rows = []
     for k, (name, trial) in enumerate(unseen().items()):
-        belief = predictive_inputs(
+        inputs = predictive_inputs(
             replace(trial, yield_pressure_Pa=np.nan, yield_pressure_sigma_Pa=np.nan), None, numbers
         )
-        runs = run(belief, np.array([0.95 * trial.length_m]), SAMPLES, seed, with_tension=False)
+        runs = run(inputs, np.array([0.95 * trial.length_m]), SAMPLES, seed, with_tension=False)
         speeds = 2 * runs.end_lead_velocity_m_s if trial.payload_kg > 0 else runs.lead_velocity_m_s[:, 0]
         low, median, high = np.quantile(speeds, (0.05, 0.5, 0.95))
         truth = made(trial, nature, grown[0].true.yield_pressure_Pa, np.random.default_rng([seed, 5, k]))

@@ -27,7 +27,9 @@ CAMERA = FilmingPlan(1069.0, 1e-4)
 SIZES = ((24, 200, 280), (12, 100, 140))
 
 
-def beliefs(*sizes: tuple[float, float, float], spreads: tuple[float, float] = (0.01, 0.03)) -> list[PredictiveInputs]:
+def vine_inputs(
+    *sizes: tuple[float, float, float], spreads: tuple[float, float] = (0.01, 0.03)
+) -> list[PredictiveInputs]:
     found = []
     for D, t, L in sizes:
         cells = {"diameter_mm": D, "thickness_um": t, "length_mm": L, "pressure_kPa": 100, "yield_pressure_kPa": 3}
@@ -39,7 +41,7 @@ def beliefs(*sizes: tuple[float, float, float], spreads: tuple[float, float] = (
 @pytest.fixture(scope="module")
 def planned() -> tuple[Candidates, Planned, Scope]:
     scope = Scope(pressure_Pa=(14e3, 45e3), payloads_kg=(0.0, 0.0356))
-    found = candidates(beliefs(*SIZES), scope, CAMERA)
+    found = candidates(vine_inputs(*SIZES), scope, CAMERA)
     return found, plan(found, scope, 0.004, 0.02), scope
 
 
@@ -111,7 +113,7 @@ def test_what_cannot_be_had_is_said_with_what_is_nearest(planned: tuple[Candidat
 
 
 def test_noise_that_is_correlated_tells_less() -> None:
-    found = beliefs(SIZES[0])
+    found = vine_inputs(SIZES[0])
     model = joint_model(found)
     trials = [
         planned_trial(
@@ -134,17 +136,17 @@ def test_noise_that_is_correlated_tells_less() -> None:
 
 
 def test_conditions_that_take_too_long_or_too_few_frames_are_passed_over() -> None:
-    slow = candidates(beliefs(SIZES[0]), Scope(pressure_Pa=(4e3, 60e3)), FilmingPlan(1069.0, 1e-4, longest_s=1.0))
+    slow = candidates(vine_inputs(SIZES[0]), Scope(pressure_Pa=(4e3, 60e3)), FilmingPlan(1069.0, 1e-4, longest_s=1.0))
     assert slow.rejected > 0
     assert min(trial.pressure_Pa for trial in slow.trials) > 10e3
-    quick = candidates(beliefs(SIZES[0]), Scope(pressure_Pa=(9e3, 100e3)), FilmingPlan(200.0, 1e-4))
+    quick = candidates(vine_inputs(SIZES[0]), Scope(pressure_Pa=(9e3, 100e3)), FilmingPlan(200.0, 1e-4))
     assert max(trial.pressure_Pa for trial in quick.trials) < 60e3
     with pytest.raises(ValueError, match="No trial of the campaign could be filmed"):
-        candidates(beliefs(SIZES[0]), Scope(pressure_Pa=(3.1e3, 3.2e3)), CAMERA)
+        candidates(vine_inputs(SIZES[0]), Scope(pressure_Pa=(3.1e3, 3.2e3)), CAMERA)
 
 
 def test_pressures_stay_below_the_burst_pressure_that_is_dared() -> None:
-    found = candidates(beliefs(SIZES[0]), Scope(burst_share=0.5), CAMERA)
+    found = candidates(vine_inputs(SIZES[0]), Scope(burst_share=0.5), CAMERA)
     assert max(trial.pressure_Pa for trial in found.trials) <= 0.5 * 2 * 200e-6 * 7.8e6 / 24e-3 * 1.005
 
 
@@ -157,8 +159,8 @@ def test_every_trial_of_a_campaign_has_a_name_of_its_own(planned: tuple[Candidat
 
 def test_steady_speeds_alone_are_a_straight_line_in_logarithms() -> None:
     """Without doubt of P_y, σ_n is that of a slope: scatter over √Σ(ln v − mean)²."""
-    (belief,) = beliefs(SIZES[0])
-    model = joint_model([belief])
+    (inputs,) = vine_inputs(SIZES[0])
+    model = joint_model([inputs])
     trials = [
         planned_trial(
             {
@@ -179,10 +181,10 @@ def test_steady_speeds_alone_are_a_straight_line_in_logarithms() -> None:
 
 
 def test_a_fast_or_loaded_vine_never_gets_steady() -> None:
-    (belief,) = beliefs(SIZES[0])
+    (inputs,) = vine_inputs(SIZES[0])
     cells = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "yield_pressure_kPa": "3"}
     trials = [
         planned_trial({**cells, "pressure_kPa": pressure, "payload_g": payload}).trials[0]
         for pressure, payload in (("12", "0"), ("12", "35.6"), ("60", "0"))
     ]
-    assert reaches_steady(joint_model([belief]), trials, 4.0).tolist() == [True, False, False]
+    assert reaches_steady(joint_model([inputs]), trials, 4.0).tolist() == [True, False, False]

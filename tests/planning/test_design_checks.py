@@ -90,10 +90,10 @@ def test_drag_above_a_twentieth_of_the_drive() -> None:
 
 
 def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in() -> None:
-    belief = sight().belief
-    drag = next(one for one in neglected(belief, 0.95) if one.effect == "air_drag")
-    model = make_model([*belief.model.names, "air_drag"]).with_values(belief.model.values)
-    found = simulate(model, belief.trial, np.linspace(0, 2.0, 20_001))
+    inputs = sight().inputs
+    drag = next(one for one in neglected(inputs, 0.95) if one.effect == "air_drag")
+    model = make_model([*inputs.model.names, "air_drag"]).with_values(inputs.model.values)
+    found = simulate(model, inputs.trial, np.linspace(0, 2.0, 20_001))
     speed = np.interp(0.95 * 0.25, found.lead_position_m, found.lead_velocity_m_s)
     assert drag.final_m_s == pytest.approx(speed, rel=1e-3)
     assert drag.change < 0
@@ -103,7 +103,7 @@ def test_effects_in_the_model_and_those_whose_columns_are_blank_are_not_among_th
     from vinetrack.planning.predictive_inputs import read_sizes
 
     said = StatedValues(effects=("air_drag",), sizes=read_sizes("air_drag=1")[1])
-    names = {one.effect for one in neglected(sight(said).belief, 0.95)}
+    names = {one.effect for one in neglected(sight(said).inputs, 0.95)}
     assert "air_drag" not in names
     assert "inlet_loss" not in names  # no inlet in the sheet
     assert "payload_drag" not in names  # no payload
@@ -112,5 +112,5 @@ def test_effects_in_the_model_and_those_whose_columns_are_blank_are_not_among_th
 
 def test_wall_stretch_follows_from_the_wall() -> None:
     # (1 − ν/4) D/(2Et) = 0.875 × 18 mm/(2 × 25 MPa × 150 µm) = 2.1e-6 1/Pa.
-    trial = sight().belief.trial
+    trial = sight().inputs.trial
     assert typical_sizes("wall_stretch", trial)["wall_stretch.kappa"] == pytest.approx(2.1e-6)

@@ -115,9 +115,9 @@ def test_the_steady_speed_is_that_of_the_balance_of_forces() -> None:
 
 def test_bands_are_those_of_the_one_thing_that_is_uncertain() -> None:
     """Speed falls as the yield pressure rises: its quantiles are the speeds at the quantiles of that."""
-    belief = predictive_inputs(planned_trial(FAST).trials[0], StatedValues(B=3.3, n=0.37, spreads=(0.0, 0.0)))
-    sight = predict_vine(belief, samples=1500)
-    drawn = np.quantile(belief.draw(1500, 1)[YIELD], BAND, method="inverted_cdf")
+    inputs = predictive_inputs(planned_trial(FAST).trials[0], StatedValues(B=3.3, n=0.37, spreads=(0.0, 0.0)))
+    sight = predict_vine(inputs, samples=1500)
+    drawn = np.quantile(inputs.draw(1500, 1)[YIELD], BAND, method="inverted_cdf")
     speeds = [
         predict_vine(certain(trial(yield_pressure_kPa=P_y / 1e3), 3.3), samples=1).quantities[0].median for P_y in drawn
     ]
@@ -135,9 +135,9 @@ def test_draws_that_never_get_there_are_counted_as_standing_still() -> None:
 
 
 def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time() -> None:
-    belief = predictive_inputs(planned_trial(FAST).trials[0])
-    sight = predict_vine(belief, samples=300)
-    runs = run(belief, sight.curve["lead_position_m"].to_numpy(), 300, 1)
+    inputs = predictive_inputs(planned_trial(FAST).trials[0])
+    sight = predict_vine(inputs, samples=300)
+    runs = run(inputs, sight.curve["lead_position_m"].to_numpy(), 300, 1)
     when = float(sight.curve["time_high_90_s"].iloc[60])
     positions = [float(np.interp(when, times, runs.places_m)) for times in runs.time_s]
     assert np.quantile(positions, 0.05, method="inverted_cdf") == pytest.approx(
@@ -146,7 +146,7 @@ def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time() -> Non
 
 
 def test_the_same_seed_foretells_the_same() -> None:
-    belief = predictive_inputs(planned_trial(FAST).trials[0])
-    one, other = predict_vine(belief, samples=60), predict_vine(belief, samples=60)
+    inputs = predictive_inputs(planned_trial(FAST).trials[0])
+    one, other = predict_vine(inputs, samples=60), predict_vine(inputs, samples=60)
     assert one.table.equals(other.table)
-    assert not predict_vine(belief, samples=60, seed=2).table.equals(one.table)
+    assert not predict_vine(inputs, samples=60, seed=2).table.equals(one.table)

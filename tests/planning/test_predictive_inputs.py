@@ -82,9 +82,9 @@ def test_a_yield_pressure_that_nobody_gives_is_guessed_with_nine_of_ten_within_a
 
 def test_the_printed_yield_pressure_is_believed_of_the_vine_that_it_was_printed_for() -> None:
     """Printed as about 3 kPa: evenly between 2.5 and 3.5 has a standard deviation of 1/√12 kPa."""
-    belief = predictive_inputs(trial(diameter_mm=24, thickness_um=200, length_mm=280, pressure_kPa=28))
-    assert belief.origins[YIELD].startswith("printed")
-    draws = belief.draw(20_000, 1, only=["printed P_y"])[YIELD]
+    inputs = predictive_inputs(trial(diameter_mm=24, thickness_um=200, length_mm=280, pressure_kPa=28))
+    assert inputs.origins[YIELD].startswith("printed")
+    draws = inputs.draw(20_000, 1, only=["printed P_y"])[YIELD]
     assert np.mean(draws) == pytest.approx(3e3, rel=0.01)
     assert np.std(draws) == pytest.approx(1e3 / math.sqrt(12), rel=0.03)
     assert predictive_inputs(trial(diameter_mm=12, thickness_um=100)).origins[YIELD].startswith("guess")
@@ -105,8 +105,8 @@ def test_a_yield_pressure_that_is_given_has_its_stated_error() -> None:
 
 
 def test_draws_from_a_fit_have_its_covariance() -> None:
-    belief = predictive_inputs(vine_of_the_fit(), StatedValues(spreads=(0.0, 0.0)), fit_numbers(fitted(), "a"))
-    draws = belief.draw(40_000, seed=3)
+    inputs = predictive_inputs(vine_of_the_fit(), StatedValues(spreads=(0.0, 0.0)), fit_numbers(fitted(), "a"))
+    draws = inputs.draw(40_000, seed=3)
     found = np.cov([np.log(draws[B]), draws[N], draws[YIELD] / 1e5])
     # ln B has 0.06/6 = 1 %, and n the correlation −0.00048/(0.06 × 0.01) = −0.8 with it.
     expected = [[1e-4, -0.8e-4, 0.0], [-0.8e-4, 1e-4, 0.0], [0.0, 0.0, 1e-6]]
@@ -123,23 +123,23 @@ def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_
     """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
     content = fitted(trials={str(k): {} for k in range(13)})
     content["spreads"]["B"]["estimated"] = False
-    belief = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "a"))
-    draws = belief.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
+    inputs = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "a"))
+    draws = inputs.draw(100_000, 1, only=["P from trial to trial", "B from trial to trial"])
     assert np.std(draws[PRESSURE]) == pytest.approx(0.02 * 28e3 * np.sqrt(10 / 8), rel=0.02)
     assert np.std(np.log(draws[B])) == pytest.approx(0.05, rel=0.02)
 
 
 def test_a_vine_of_another_length_is_the_same_vine_for_b() -> None:
-    belief = predictive_inputs(vine_of_the_fit(length_mm=500), None, fit_numbers(fitted(), "a"))
-    assert belief.medians[B] == pytest.approx(6.0)
-    assert not belief.notes
+    inputs = predictive_inputs(vine_of_the_fit(length_mm=500), None, fit_numbers(fitted(), "a"))
+    assert inputs.medians[B] == pytest.approx(6.0)
+    assert not inputs.notes
 
 
 def test_a_vine_that_was_not_fitted_carries_b_over_with_the_error_of_the_guess() -> None:
-    belief = predictive_inputs(trial(diameter_mm=24, thickness_um=100, length_mm=280), None, fit_numbers(fitted(), "a"))
-    assert belief.medians[B] == pytest.approx(3.0)  # half the wall, half of B
-    assert any("carried over from 24mm-200um-280mm" in words for words in belief.notes)
-    assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in belief.uncertainties}
+    inputs = predictive_inputs(trial(diameter_mm=24, thickness_um=100, length_mm=280), None, fit_numbers(fitted(), "a"))
+    assert inputs.medians[B] == pytest.approx(3.0)  # half the wall, half of B
+    assert any("carried over from 24mm-200um-280mm" in words for words in inputs.notes)
+    assert {"guess of B", "t against D", "guess of P_y"} <= {one.name for one in inputs.uncertainties}
 
 
 def test_a_sheet_that_contradicts_the_fitted_yield_pressure_is_believed() -> None:
@@ -151,9 +151,9 @@ def test_a_sheet_that_contradicts_the_fitted_yield_pressure_is_believed() -> Non
 def test_numbers_that_a_fit_left_open_are_named() -> None:
     content = fitted()
     content["covariance"][1] = [*content["covariance"][1][:1], None, None]
-    belief = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "results/a"))
-    assert any("leaves n open" in words for words in belief.notes)
-    assert np.ptp(belief.draw(10, 1)[N]) == 0
+    inputs = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "results/a"))
+    assert any("leaves n open" in words for words in inputs.notes)
+    assert np.ptp(inputs.draw(10, 1)[N]) == 0
 
 
 def test_a_refused_fit_and_one_of_falling_bodies_cannot_be_believed() -> None:
@@ -181,9 +181,9 @@ def test_a_fit_from_python_is_believed_as_its_file_is() -> None:
     from lsoda_vine import small_campaign
 
     found = vt.fit(vt.base_model(), small_campaign(seed=5)[0])
-    belief = predictive_inputs(vine_of_the_fit(), None, found)
+    inputs = predictive_inputs(vine_of_the_fit(), None, found)
     n = found["n"]
-    draws = belief.draw(20_000, 1)
+    draws = inputs.draw(20_000, 1)
     assert (np.mean(draws[N]), np.std(draws[N])) == pytest.approx((n.value, (n.high - n.low) / 3.92), rel=0.05)
 
 

@@ -80,27 +80,27 @@ def test_the_gauge_rule_is_too_small_and_fast_growth_needs_most() -> None:
 
 
 def test_speeds_with_a_chamber_are_those_of_the_effect() -> None:
-    belief = predictive_inputs(trial(payload_g=35.6), StatedValues(B=6.44, n=0.37))
-    model = make_model([*belief.model.names, "reservoir_depletion"]).with_values(
-        {**belief.model.values, "reservoir_depletion.gamma": 1.0}
+    inputs = predictive_inputs(trial(payload_g=35.6), StatedValues(B=6.44, n=0.37))
+    model = make_model([*inputs.model.names, "reservoir_depletion"]).with_values(
+        {**inputs.model.values, "reservoir_depletion.gamma": 1.0}
     )
     times = np.linspace(0.0, 1.0, 20_001)
-    found = simulate(model, belief.trial, times)
-    assert final_with(belief, 3.7e-3, 1.0, 0.95) == pytest.approx(2 * found.end_lead_velocity_m_s, rel=2e-3)
+    found = simulate(model, inputs.trial, times)
+    assert final_with(inputs, 3.7e-3, 1.0, 0.95) == pytest.approx(2 * found.end_lead_velocity_m_s, rel=2e-3)
 
 
 def test_a_supply_that_is_shut_is_a_closed_chamber() -> None:
-    belief = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
-    closed = gauge_loss(28e3, swept_m3(belief.trial), 3.7e-3, 1.4, ATM)
-    assert supplied_loss(belief, 3.7e-3, 1e4, 1.4) == pytest.approx(closed, rel=0.01)
+    inputs = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
+    closed = gauge_loss(28e3, swept_m3(inputs.trial), 3.7e-3, 1.4, ATM)
+    assert supplied_loss(inputs, 3.7e-3, 1e4, 1.4) == pytest.approx(closed, rel=0.01)
 
 
 def test_a_quick_supply_saves_a_chamber() -> None:
-    belief = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
-    closed = chamber_for(28e3, swept_m3(belief.trial), 0.05, 1.4, ATM)
-    volumes = [supplied_chamber(belief, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
+    inputs = predictive_inputs(trial(), StatedValues(B=6.44, n=0.37))
+    closed = chamber_for(28e3, swept_m3(inputs.trial), 0.05, 1.4, ATM)
+    volumes = [supplied_chamber(inputs, 0.05, tau_s, 1.4) for tau_s in (0.02, 0.2)]
     assert volumes[0] < volumes[1] < closed
-    assert supplied_loss(belief, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)
+    assert supplied_loss(inputs, volumes[1], 0.2, 1.4) == pytest.approx(0.05, abs=5e-4)
 
 
 def test_a_law_of_the_chamber_in_the_model_gives_way_to_the_one_asked_about() -> None:

@@ -15,7 +15,7 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_csv
 from vinetrack.narrative.campaign_text import campaign_lines, rehearsal_lines
 from vinetrack.pipeline.design_stage import read_list, read_range
-from vinetrack.pipeline.prediction_inputs import Asked, as_option, beliefs_of, check_figure, read_ground, write_figure
+from vinetrack.pipeline.prediction_inputs import Asked, as_option, check_figure, inputs_of, read_ground, write_figure
 from vinetrack.results.folder_layout import ResultsError
 
 if TYPE_CHECKING:
@@ -91,18 +91,18 @@ def design_campaign(
     from vinetrack.planning.campaign_information import FilmingPlan
 
     check_figure(figure)
-    beliefs = _beliefs(asked, wanted)
+    vine_inputs = _beliefs(asked, wanted)
     scope = _scope(wanted)
     camera = FilmingPlan(wanted.capture_fps, wanted.noise_mm / 1e3, wanted.correlation, wanted.longest_s)
     try:
         with waiting("weighing conditions"):
-            found = plan(candidates(beliefs, scope, camera), scope, wanted.n_error, wanted.B_error)
-        rehearsal = _rehearsed(found, beliefs, camera, wanted)
+            found = plan(candidates(vine_inputs, scope, camera), scope, wanted.n_error, wanted.B_error)
+        rehearsal = _rehearsed(found, vine_inputs, camera, wanted)
     except EffectError as error:
         raise as_option(error) from None
     except (SimulationError, FitError, CampaignError) as error:
         raise ResultsError(str(error)) from None
-    lines = list(campaign_lines(found, beliefs, camera, wanted.n_error, wanted.B_error, wanted.most_trials))
+    lines = list(campaign_lines(found, vine_inputs, camera, wanted.n_error, wanted.B_error, wanted.most_trials))
     if rehearsal is not None:
         lines += rehearsal_lines(found, rehearsal)
     shown = found.best or found.nearest
@@ -121,11 +121,11 @@ def _beliefs(asked: Asked, wanted: Wanted) -> list[PredictiveInputs]:
         raise ExperimentError(
             [Problem(message="is missing", column="--vine", remedy="name one or more, as 24x200x280")]
         )
-    beliefs = []
+    vine_inputs = []
     for text in dict.fromkeys(wanted.vines):
         cells = {**asked.cells, **read_vine(text), "pressure_kPa": STAND_IN_KPA}
-        beliefs += beliefs_of(read_ground(replace(asked, cells=cells)))
-    return beliefs
+        vine_inputs += inputs_of(read_ground(replace(asked, cells=cells)))
+    return vine_inputs
 
 
 def _scope(wanted: Wanted) -> Scope:
@@ -143,7 +143,7 @@ def _scope(wanted: Wanted) -> Scope:
 
 
 def _rehearsed(
-    found: Planned, beliefs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: Wanted
+    found: Planned, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: Wanted
 ) -> SimulatedCampaigns | None:
     """The campaign made so many times and fitted; None where there is none to make."""
     from vinetrack.core.terminal import Progress, progress
@@ -159,7 +159,7 @@ def _rehearsed(
             found.candidates.model,
             trials,
             camera,
-            beliefs[0].spreads,
+            vine_inputs[0].spreads,
             campaigns=wanted.check,
             seed=wanted.seed,
             watch=bar.advance,

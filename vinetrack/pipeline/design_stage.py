@@ -12,8 +12,8 @@ from vinetrack.experiment.schema import option
 from vinetrack.pipeline.prediction_inputs import (
     Asked,
     as_option,
-    beliefs_of,
     check_figure,
+    inputs_of,
     litres,
     read_ground,
     shown,
@@ -143,8 +143,8 @@ def _refuse_standstill(room: Room, found: Sequence[Choice]) -> None:
     """There is no fastest of vines that do not move, at the medians of what is believed."""
     if found[0].sight.final.median > 0:
         return
-    highest_Pa = max(choice.sight.belief.trial.pressure_Pa for choice in found)
-    yield_kPa = found[0].sight.belief.trial.yield_pressure_Pa / 1e3
+    highest_Pa = max(choice.sight.inputs.trial.pressure_Pa for choice in found)
+    yield_kPa = found[0].sight.inputs.trial.yield_pressure_Pa / 1e3
     message = f"moves none of these vines to its end, against a yield pressure of {yield_kPa:.3g} kPa"
     remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
     if highest_Pa < 0.995 * room.pressure_Pa:
@@ -168,7 +168,7 @@ def _vine_lines(room: Room, found: Sequence[Choice]) -> Iterator[str]:
     yield ""
     rows = []
     for choice in found:
-        trial, final = choice.sight.belief.trial, choice.sight.final
+        trial, final = choice.sight.inputs.trial, choice.sight.final
         rows.append(
             (
                 f"{1e6 * trial.thickness_m:g}",
@@ -190,7 +190,7 @@ def _vine_lines(room: Room, found: Sequence[Choice]) -> Iterator[str]:
             f"the choice of film is open: {1e6 * found[0].thickness_m:g} µm is the fastest in {found[0].odds:.0%} of "
             "the draws only; measuring B and P_y of the first two would decide it"
         )
-    yield f"uncertainties of the fastest, {trial_words(best.belief.trial)}: final speed by each alone"
+    yield f"uncertainties of the fastest, {trial_words(best.inputs.trial)}: final speed by each alone"
     rows_of = [
         (f"  {one.name}", f"{shown(one.low, 'm/s')} to {shown(one.high, 'm/s')} m/s", one.words) for one in best.shares
     ]
@@ -207,7 +207,7 @@ def _vine_picture(found: Sequence[Choice]) -> Figure:
             thickness_um=1e6 * choice.thickness_m,
             diameters_mm=1e3 * choice.others[:, 0],
             speeds_m_s=choice.others[:, 1],
-            best=(1e3 * choice.sight.belief.trial.diameter_m, choice.sight.final.median),
+            best=(1e3 * choice.sight.inputs.trial.diameter_m, choice.sight.final.median),
             band=(choice.sight.final.low, choice.sight.final.high),
             odds=choice.odds,
         )
@@ -237,16 +237,16 @@ def design_reservoir(
     check_figure(figure)
     ground = read_ground(asked, needed=SIZED)
     trial = ground.planned.trials[0]
-    belief = beliefs_of(ground)[0] if math.isfinite(trial.thickness_m) else None
+    inputs = inputs_of(ground)[0] if math.isfinite(trial.thickness_m) else None
     loss = within_percent / 100
     try:
         with waiting("simulating"):
-            lines = [*_reservoir_lines(trial, belief, loss, at_fraction)]
-            if supply_s is not None and belief is not None:
-                lines += _supplied(belief, loss, supply_s)
+            lines = [*_reservoir_lines(trial, inputs, loss, at_fraction)]
+            if supply_s is not None and inputs is not None:
+                lines += _supplied(inputs, loss, supply_s)
     except EffectError as error:
         raise as_option(error) from None
-    if supply_s is not None and belief is None:
+    if supply_s is not None and inputs is None:
         lines.append("! how fast the vine draws gas depends on its wall: give --thickness-um to use --supply-s")
     if figure is not None:
         write_figure(_reservoir_picture(trial, loss), figure)
@@ -254,56 +254,56 @@ def design_reservoir(
     return lines
 
 
-def _reservoir_lines(trial: Trial, belief: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
+def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float, at_fraction: float) -> Iterator[str]:
     from vinetrack.core.terminal import table
     from vinetrack.planning.reservoir_design import GAMMAS, chambers, swept_m3
 
     words = (
         trial_words(trial)
-        if belief is not None
+        if inputs is not None
         else (f"{1e3 * trial.diameter_m:.4g} mm × {1e3 * trial.length_m:.4g} mm at {trial.pressure_Pa / 1e3:.4g} kPa")
     )
     yield f"{words}: it sweeps {litres(swept_m3(trial))}"
     yield f"closed chamber that keeps the gauge pressure within {100 * loss:g} %, by the gas law in absolute pressure"
     yield ""
     found = chambers(trial, loss)
-    rows = [_row(one, belief, at_fraction) for one in found]
+    rows = [_row(one, inputs, at_fraction) for one in found]
     laws = [law.split(",")[0] for law in GAMMAS]
-    speeds = [f"speed, {law}" for law in laws] if belief is not None else []
+    speeds = [f"speed, {law}" for law in laws] if inputs is not None else []
     head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
     yield from table(rows, head, ("", "", "% of gauge", "% of gauge", *["m/s"] * len(speeds)), align="<>" + ">" * 4)
-    if belief is not None:
-        steady = _final(belief, math.inf, 1.0, at_fraction)
+    if inputs is not None:
+        steady = _final(inputs, math.inf, 1.0, at_fraction)
         place = "" if trial.payload_kg > 0 else f" at y/L = {at_fraction:g}"
         yield f"speed: final speed at the medians{place}; {shown(steady, 'm/s')} m/s at constant pressure"
     yield ("slow: γ = 1, the gas stays at room temperature; fast: γ = 1.4, it takes up no heat, as within milliseconds")
 
 
-def _row(one: Chamber, belief: PredictiveInputs | None, at_fraction: float) -> tuple[str, ...]:
+def _row(one: Chamber, inputs: PredictiveInputs | None, at_fraction: float) -> tuple[str, ...]:
     from vinetrack.planning.reservoir_design import GAMMAS
 
     losses = [f"{100 * share:.1f}" for share in one.losses.values()]
     speeds = (
         []
-        if belief is None
-        else [shown(_final(belief, one.volume_m3, gamma, at_fraction), "m/s") for gamma in GAMMAS.values()]
+        if inputs is None
+        else [shown(_final(inputs, one.volume_m3, gamma, at_fraction), "m/s") for gamma in GAMMAS.values()]
     )
     return one.name, litres(one.volume_m3), *losses, *speeds
 
 
-def _final(belief: PredictiveInputs, volume_m3: float, gamma: float, at_fraction: float) -> float:
+def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction: float) -> float:
     from vinetrack.planning.design_checks import final_m_s, whole_model
     from vinetrack.planning.reservoir_design import final_with
 
     if math.isinf(volume_m3):
-        return final_m_s(belief, belief.model, whole_model(belief.model), at_fraction)
-    return final_with(belief, volume_m3, gamma, at_fraction)
+        return final_m_s(inputs, inputs.model, whole_model(inputs.model), at_fraction)
+    return final_with(inputs, volume_m3, gamma, at_fraction)
 
 
-def _supplied(belief: PredictiveInputs, loss: float, supply_s: float) -> list[str]:
+def _supplied(inputs: PredictiveInputs, loss: float, supply_s: float) -> list[str]:
     from vinetrack.planning.reservoir_design import GAMMAS, supplied_chamber
 
-    volumes = {law.split(",")[0]: supplied_chamber(belief, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
+    volumes = {law.split(",")[0]: supplied_chamber(inputs, loss, supply_s, gamma) for law, gamma in GAMMAS.items()}
     words = ", ".join(f"{litres(volume) if volume > 0 else 'none'} ({law})" for law, volume in volumes.items())
     return [f"with a supply that closes the gap in {1e3 * supply_s:g} ms, at the medians: {words}"]
 

@@ -14,9 +14,9 @@ from vinetrack.pipeline.prediction_inputs import (
     Asked,
     Ground,
     as_option,
-    beliefs_of,
     check_figure,
     input_rows,
+    inputs_of,
     read_ground,
     shown,
     trial_words,
@@ -99,9 +99,9 @@ def foresee_all(ground: Ground, samples: int, seed: int, at_fraction: float) -> 
 
     found = []
     try:
-        for belief in progress(beliefs_of(ground), "predicting", unit="condition"):
-            sight = predict_vine(belief, samples=samples, seed=seed, at_fraction=at_fraction)
-            found.append(Foretold(sight, design_checks(sight), neglected(belief, at_fraction)))
+        for inputs in progress(inputs_of(ground), "predicting", unit="condition"):
+            sight = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
+            found.append(Foretold(sight, design_checks(sight), neglected(inputs, at_fraction)))
     except SimulationError as error:
         raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
     except EffectError as error:
@@ -114,12 +114,10 @@ def _one(found: Foretold) -> Iterator[str]:
     from vinetrack.core.terminal import table
 
     sight = found.sight
-    belief = sight.belief
-    yield f"{trial_words(belief.trial)}; {' + '.join(belief.model.names)}"
+    inputs = sight.inputs
+    yield f"{trial_words(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
-    yield from table(
-        input_rows(belief.inputs()), ("what goes in", "median", "90 % band", "unit", "from"), align="<><<<"
-    )
+    yield from table(input_rows(inputs.bands()), ("what goes in", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
     rows = [_quantity_row(one) for one in sight.quantities]
     yield from table(rows, ("what comes out", "at y/L", "median", "90 % band", "unit"), align="<<><<")
@@ -173,10 +171,10 @@ def _several(found: Sequence[Foretold]) -> Iterator[str]:
     from vinetrack.core.terminal import table
     from vinetrack.planning.prediction import TIME
 
-    yield f"{' + '.join(found[0].sight.belief.model.names)}; medians and 90 % bands of {found[0].sight.samples} draws"
+    yield f"{' + '.join(found[0].sight.inputs.model.names)}; medians and 90 % bands of {found[0].sight.samples} draws"
     rows = [
         (
-            one.sight.belief.trial.condition,
+            one.sight.inputs.trial.condition,
             *_quantity_row(one.sight.final)[1:4],
             *_quantity_row(one.sight[TIME])[2:4],
             f"{one.sight.slack:.0%}",
@@ -185,7 +183,7 @@ def _several(found: Sequence[Foretold]) -> Iterator[str]:
     ]
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
-    if any(one.sight.belief.trial.payload_kg > 0 for one in found):
+    if any(one.sight.inputs.trial.payload_kg > 0 for one in found):
         yield "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine"
     yield ""
     yield "uncertainties included:"
@@ -194,7 +192,7 @@ def _several(found: Sequence[Foretold]) -> Iterator[str]:
     yield ""
     said = dict.fromkeys(text for one in found for text in one.hazards)
     for text in said:
-        conditions = [one.sight.belief.trial.condition for one in found if text in one.hazards]
+        conditions = [one.sight.inputs.trial.condition for one in found if text in one.hazards]
         yield f"! {'all conditions' if len(conditions) == len(found) else ', '.join(conditions)}: {text}"
 
 
@@ -202,7 +200,7 @@ def _picture(sight: VinePrediction) -> PredictionPicture:
     from vinetrack.figures.prediction_figures import PredictionPicture
 
     return PredictionPicture(
-        title=trial_words(sight.belief.trial),
+        title=trial_words(sight.inputs.trial),
         curve=sight.curve,
         final_name=sight.final.name,
         shares=[(share.name, share.low, share.high) for share in sight.shares],
@@ -214,12 +212,12 @@ def _entry(found: Foretold) -> dict[str, Any]:
     """One condition as JSON holds it, SI."""
     sight = found.sight
     return {
-        "condition": sight.belief.trial.condition,
-        "model": list(sight.belief.model.names),
+        "condition": sight.inputs.trial.condition,
+        "model": list(sight.inputs.model.names),
         "samples": sight.samples,
         "inputs": [
             {"name": i.name, "unit": i.unit, "median": i.median, "low_90": i.low, "high_90": i.high, "from": i.origin}
-            for i in sight.belief.inputs()
+            for i in sight.inputs.bands()
         ],
         "quantities": [
             {

@@ -93,7 +93,7 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
         model=planned.settings.model,
         effects=tuple(name for name, _ in sizes),
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
-        own=own,
+        experiment_effects=own,
         spreads=asked.spreads,
     )
     return Ground(planned, said, fit)
@@ -146,7 +146,7 @@ def read_fit(results: Path) -> tuple[FitNumbers, Mapping[str, Effect]]:
     return fit, own
 
 
-def beliefs_of(ground: Ground) -> list[PredictiveInputs]:
+def inputs_of(ground: Ground) -> list[PredictiveInputs]:
     """A belief for every trial.
 
     Raises

@@ -1,9 +1,9 @@
 """How well trials that are not yet made would pin n and B: the information of the linear mixed model about them.
 
-Each condition is simulated once at what is believed, with a camera's frames and noise; what it would say of n, B and
-the yield pressure follows from the sensitivities of its positions, with release, origin and the deviations of pressure
-and B that every trial has of its own integrated out. Information adds up over trials, so any campaign is judged without
-simulating it again.
+Each condition is simulated once at the medians of the predictive inputs, with a camera's frames and noise; what it
+would say of n, B and the yield pressure follows from the sensitivities of its positions, with release, origin and the
+deviations of pressure and B that every trial has of its own integrated out. Information adds up over trials, so any
+campaign is judged without simulating it again.
 
 Beside it, what steady speeds alone would say of n, by the damping law
 
@@ -35,11 +35,17 @@ from vinetrack.kinematics.conditions import lead_velocity_at
 from vinetrack.planning.predictive_inputs import PredictiveInputs
 
 REST_FRAMES = 20
+"""Frames at rest before release. Chosen: their mean fixes the origin to 0.22 of one frame's noise; at half 0.32, at
+twice 0.16, small beside what growth says."""
+
 RELEASE_PART = 0.4
-"""Where between two frames the release falls, in frames: nowhere special."""
+"""Where between two frames the release falls, in frames: nowhere special. Chosen: n and B answer alike wherever it
+falls, only the first frames differ."""
 
 FEWEST_MOVING = 12
-"""Frames of growth below which a trial is not worth filming."""
+"""Frames of growth below which a trial is not worth filming. Chosen: release, origin, the deviations of pressure and B,
+and a curve take six numbers, here with as many frames to spare. At half trials are planned that a fit can barely use;
+at twice fast vines drop out."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,16 @@ class Information:
         """Covariance of the free numbers after so many trials of every condition, shape (n_free, n_free).
 
         Infinite on the diagonal where they say nothing of a number.
+
+        Parameters
+        ----------
+        counts : array, shape (n_conditions,)
+            Trials of each condition.
+
+        Returns
+        -------
+        array, shape (n_free, n_free)
+            Scaled as the fit holds the numbers.
         """
         total = np.tensordot(counts, self.each, axes=1) + np.diag(self.prior)
         scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-300))
@@ -78,22 +94,62 @@ class Information:
         return np.asarray((vectors / values) @ vectors.T * scale[:, None] * scale)
 
     def errors(self, counts: Floats) -> tuple[float, dict[str, float]]:
-        """Standard errors of n (absolute) and of B by vine (relative)."""
+        """Standard errors of n (absolute) and of B by vine (relative).
+
+        Parameters
+        ----------
+        counts : array, shape (n_conditions,)
+            Trials of each condition.
+
+        Returns
+        -------
+        n : float
+            Absolute standard error of n; 0 where n is not free.
+        B : dict
+            Relative standard error of B by vine.
+        """
         diagonal = np.sqrt(np.diag(self.covariance(counts)))
-        n = next((one.scale * float(diagonal[k]) for k, one in enumerate(self.free) if one.key == EXPONENT), 0.0)
-        B = {one.vine: float(diagonal[k]) for k, one in enumerate(self.free) if one.key == DAMPING}
+        n = next(
+            (number.scale * float(diagonal[k]) for k, number in enumerate(self.free) if number.key == EXPONENT), 0.0
+        )
+        B = {number.vine: float(diagonal[k]) for k, number in enumerate(self.free) if number.key == DAMPING}
         return n, B
 
 
-def joint_model(beliefs: Sequence[PredictiveInputs]) -> Model:
-    """One model with the medians of all vines: B of each, the rest shared."""
-    first = beliefs[0].model
-    B: Value = {belief.trial.vine: belief.medians[DAMPING] for belief in beliefs}
+def joint_model(vine_inputs: Sequence[PredictiveInputs]) -> Model:
+    """One model with the medians of all vines: B of each, the rest shared.
+
+    Parameters
+    ----------
+    vine_inputs
+        Predictive inputs of each vine; the model of the first is taken.
+
+    Returns
+    -------
+    Model
+    """
+    first = vine_inputs[0].model
+    B: Value = {inputs.trial.vine: inputs.medians[DAMPING] for inputs in vine_inputs}
     return first.with_values({DAMPING: B})
 
 
 def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[FitTrial | None]:
-    """Each trial as a fit would see it, without noise; None for those too slow or too quick to be filmed."""
+    """Each trial as a fit would see it, without noise; None for those too slow or too quick to be filmed.
+
+    Parameters
+    ----------
+    model
+        At its assumed values.
+    trials
+        Conditions, one trial each.
+    camera
+        Frame rate, noise, longest recording.
+
+    Returns
+    -------
+    list of FitTrial or None
+        One a trial, in order.
+    """
     frame_s = float(1 / camera.capture_fps)
     ends = simulate_many(model, trials, [np.array([0.0, camera.longest_s])] * len(trials))
     data: list[FitTrial | None] = []
@@ -103,17 +159,17 @@ def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[F
         frames = np.arange(-REST_FRAMES, max(int(end * camera.capture_fps), 1), dtype=float)
         times.append((frames + 1 - RELEASE_PART) * frame_s)
     moved = simulate_many(model, trials, times)
-    for trial, one, end in zip(trials, moved, until, strict=True):
-        keep = one.lead_position_m < END_FRACTION * trial.length_m
-        if end == 0.0 or np.count_nonzero(keep & (one.lead_position_m > 0)) < FEWEST_MOVING:
+    for trial, trajectory, end in zip(trials, moved, until, strict=True):
+        keep = trajectory.lead_position_m < END_FRACTION * trial.length_m
+        if end == 0.0 or np.count_nonzero(keep & (trajectory.lead_position_m > 0)) < FEWEST_MOVING:
             data.append(None)
             continue
         count = int(np.count_nonzero(keep))
         data.append(
             FitTrial(
                 trial=trial,
-                time_s=one.time_s[keep],
-                lead_position_m=one.observed_position_m[keep],
+                time_s=trajectory.time_s[keep],
+                lead_position_m=trajectory.observed_position_m[keep],
                 first=np.arange(count) == 0,
                 n_rest=REST_FRAMES,
                 noise_m=camera.noise_m,
@@ -124,13 +180,31 @@ def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[F
 
 
 def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -> Floats:
-    """Speed of the leading edge at 0.95 of the length, m/s, shape (n_trials,); 0 where it does not get there."""
+    """Speed of the leading edge at 0.95 of the length, m/s, shape (n_trials,); 0 where it does not get there.
+
+    Parameters
+    ----------
+    model
+        With B by vine.
+    trials
+        Conditions.
+    longest_s : float
+        Growth is followed for so long, s.
+
+    Returns
+    -------
+    array, shape (n_trials,)
+    """
     times = [np.linspace(0.0, 1.0, 4000) ** 2 * longest_s] * len(trials)
     moved = simulate_many(model, trials, times)
     return np.array(
         [
-            np.nan_to_num(lead_velocity_at(one.lead_position_m, one.lead_velocity_m_s, END_FRACTION * trial.length_m))
-            for trial, one in zip(trials, moved, strict=True)
+            np.nan_to_num(
+                lead_velocity_at(
+                    trajectory.lead_position_m, trajectory.lead_velocity_m_s, END_FRACTION * trial.length_m
+                )
+            )
+            for trial, trajectory in zip(trials, moved, strict=True)
         ]
     )
 
@@ -138,42 +212,67 @@ def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -
 def information(
     model: Model, data: Sequence[FitTrial], camera: FilmingPlan, spreads: tuple[float, float]
 ) -> Information:
-    """What one trial of each condition would say.
+    """What one trial of each condition would say: the information of the linear mixed model, trial effects eliminated.
 
     Parameters
     ----------
-    model : at the values believed, B by vine
-    data : see `filmed`
-    spreads : relative, of pressure and B from trial to trial
+    model
+        At its assumed values, with B by vine.
+    data
+        See `filmed`; None left out.
+    camera
+        Noise of a position and its correlation.
+    spreads : (float, float)
+        Relative between-trial standard deviations of pressure and B.
+
+    Returns
+    -------
+    Information
     """
     layout = make_layout(model, data)
     predictor = Predictor(layout, data)
-    own = np.zeros((len(data), OWN))
+    trial_effects = np.zeros((len(data), OWN))
     theta = layout.start
-    predictor.linearise(theta, own)  # its steps are right the second time
-    columns = predictor.linearise(theta, own)
-    grams = all_products(columns, [item.first for item in data])
-    frame = make_problem(predictor, own)
+    predictor.linearise(theta, trial_effects)  # its steps are right the second time
+    columns = predictor.linearise(theta, trial_effects)
+    grams = all_products(columns, [trial_data.first for trial_data in data])
+    problem = make_problem(predictor, trial_effects)
     variance = np.full(len(data), camera.noise_m**2 * (1 - camera.noise_correlation**2))
-    state = FitState(theta, own, spreads, camera.noise_correlation, variance)
-    return _information(layout, frame, state, grams)
+    state = FitState(theta, trial_effects, spreads, camera.noise_correlation, variance)
+    return _information(layout, problem, state, grams)
 
 
-def _information(layout: ParameterMap, frame: MixedProblem, state: FitState, grams: Floats) -> Information:
-    left, _ = left_to_keys(marginal(grams, frame, state), frame, state.spread)
+def _information(layout: ParameterMap, problem: MixedProblem, state: FitState, grams: Floats) -> Information:
+    left, _ = left_to_keys(marginal(grams, problem, state), problem, state.spread)
     count = len(layout.free)
     each = np.zeros((len(left), count + 1, count + 1))
     for k, block in enumerate(left):
-        each[np.ix_([k], frame.index[k], frame.index[k])] += block[None, :-1, :-1]
+        each[np.ix_([k], problem.index[k], problem.index[k])] += block[None, :-1, :-1]
     return Information(layout.free, each[:, :count, :count], layout.prior_precision)
 
 
 STEADY = 0.97
-"""Of the speed of Eq. (3), that a vine must have come to at 0.95 of its length to count as steady."""
+"""Of the speed of Eq. (3), that a vine must have come to at 0.95 of its length to count as steady. Chosen: as in a
+steady window, 3 % of speed are 1 % of force at n = 0.37. At half (1.5 %) fewer vines count as steady, at twice more do,
+with a bias of 2 %."""
 
 
 def reaches_steady(model: Model, trials: Sequence[Trial], longest_s: float) -> np.ndarray:
-    """Which bare vines come to within 3 % of their steady speed before the end, shape (n_trials,)."""
+    """Which bare vines come to within 3 % of their steady speed before the end, shape (n_trials,).
+
+    Parameters
+    ----------
+    model
+        With B by vine.
+    trials
+        Conditions.
+    longest_s : float
+        Growth is followed for so long, s.
+
+    Returns
+    -------
+    array of bool, shape (n_trials,)
+    """
     times = [np.linspace(0.0, longest_s, 2000)] * len(trials)
     reached = []
     for trial, moved in zip(trials, simulate_many(model, trials, times), strict=True):
@@ -184,7 +283,19 @@ def reaches_steady(model: Model, trials: Sequence[Trial], longest_s: float) -> n
 
 
 def steady_speed(model: Model, trial: Trial) -> float:
-    """Tail speed of Eq. (3), m/s."""
+    """Tail speed of Eq. (3) of Alvarez et al. (2025), ((P − P_y)A/B)^(1/n), m/s.
+
+    Parameters
+    ----------
+    model
+        With damping; B by vine.
+    trial
+        Pressure, yield pressure, diameter and vine.
+
+    Returns
+    -------
+    float
+    """
     values = dict(zip(model.parameter_names, model.parameters_for(trial.vine).tolist(), strict=True))
     force_N = max(trial.pressure_Pa - trial.yield_pressure_Pa, 0.0) * trial.area_m2
     return float((force_N / values[DAMPING]) ** (1 / values[EXPONENT]))
@@ -193,7 +304,27 @@ def steady_speed(model: Model, trial: Trial) -> float:
 def steady_error(
     model: Model, trials: Sequence[Trial], counts: Floats, spreads: tuple[float, float], steady: np.ndarray
 ) -> float:
-    """Standard error of n from the steady trials among so many of each condition; infinite where they cannot tell."""
+    """Standard error of n from the steady trials among so many of each condition; infinite where they cannot tell.
+
+    Weighted least squares of ln F = ln B_v + n ln ẋ_ss with a shared shift of the yield pressure for each vine.
+
+    Parameters
+    ----------
+    model
+        With damping; B by vine.
+    trials
+        Conditions.
+    counts : array, shape (n_trials,)
+        Trials of each condition.
+    spreads : (float, float)
+        Relative between-trial standard deviations of pressure and B.
+    steady : array of bool, shape (n_trials,)
+        See `reaches_steady`.
+
+    Returns
+    -------
+    float
+    """
     vines = list(dict.fromkeys(trial.vine for trial in trials))
     size = 1 + 2 * len(vines)
     total = np.zeros((size, size))

@@ -26,11 +26,16 @@ from vinetrack.planning.predictive_inputs import BAND, YIELD, PredictiveInputs
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, burst_pressure_Pa, hoop_stress_Pa
 
 CERTAIN = 0.95
+"""Chosen: the usual level. At 0.9 vines that fail one time in ten pass without a word, at 0.975 a doubtful yield
+pressure alone is named."""
+
 WORTH_A_WORD = 0.05
-"""Share of the draws above which a hazard is named."""
+"""Share of the draws above which a hazard is named. Chosen: one draw in twenty, as the ends of the band that is stated.
+At half rarer hazards are named, at twice those of one draw in ten."""
 
 FILM_MODULUS_PA = 25e6
-"""Young's modulus of the film, 10 to 50 MPa."""
+"""Young's modulus of the film, 10 to 50 MPa. Chosen: near the geometric middle of that range, 22 MPa. At half the
+stretch that is named doubles, at twice it halves."""
 
 INEVITABLE = (
     "air_drag",
@@ -61,13 +66,24 @@ class Neglected:
 
 
 def design_checks(sight: VinePrediction) -> tuple[str, ...]:
-    """Sentences about what a person should know before building this, most serious first."""
+    """Sentences about what a person should know before building this, most serious first.
+
+    Parameters
+    ----------
+    sight
+        Prediction of the vine.
+
+    Returns
+    -------
+    tuple of str
+        Blank where nothing speaks against it.
+    """
     return (
-        *_burst(sight.belief.trial),
+        *_burst(sight.inputs.trial),
         *_no_growth(sight),
         *_slack(sight),
         *_rules(sight),
-        *sight.belief.notes,
+        *sight.inputs.notes,
     )
 
 
@@ -82,8 +98,8 @@ def _burst(trial: Trial) -> Iterator[str]:
 
 
 def _no_growth(sight: VinePrediction) -> Iterator[str]:
-    trial = sight.belief.trial
-    low, median, high = np.quantile(sight.belief.draw(2000, 1)[YIELD], BAND) / 1e3
+    trial = sight.inputs.trial
+    low, median, high = np.quantile(sight.inputs.draw(2000, 1)[YIELD], BAND) / 1e3
     if median >= trial.pressure_Pa / 1e3:
         yield (
             f"{trial.pressure_Pa / 1e3:g} kPa lies below the yield pressure, {median:.3g} kPa ({low:.2g} to "
@@ -97,7 +113,7 @@ def _no_growth(sight: VinePrediction) -> Iterator[str]:
 
 
 def _slack(sight: VinePrediction) -> Iterator[str]:
-    trial = sight.belief.trial
+    trial = sight.inputs.trial
     if sight.slack < WORTH_A_WORD:
         return
     often = "in every draw" if sight.slack > 0.995 else f"in {sight.slack:.0%} of the draws"
@@ -116,59 +132,97 @@ def _slack(sight: VinePrediction) -> Iterator[str]:
 
 def _least_tension(sight: VinePrediction) -> str:
     """The median where that is below 0 itself, else how low it comes in one draw of twenty."""
-    one = sight[LEAST_TENSION]
+    tension = sight[LEAST_TENSION]
     return (
-        f"{one.median:.2g} N" if one.median < 0 else f"{one.median:.2g} N, in one draw of twenty below {one.low:.2g} N"
+        f"{tension.median:.2g} N"
+        if tension.median < 0
+        else f"{tension.median:.2g} N, in one draw of twenty below {tension.low:.2g} N"
     )
 
 
 def _rules(sight: VinePrediction) -> Iterator[str]:
     """Broken rules of the audit along the median motion, without what has been said of the tail."""
-    belief = sight.belief
-    (moved,), _ = follow(belief, *_medians(belief))
-    keep = moved.lead_position_m <= sight.at_fraction * belief.trial.length_m
-    motion = AuditedMotion(belief.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
-    for sentence in audit(belief.model, [motion]).warnings:
+    inputs = sight.inputs
+    (moved,), _ = follow(inputs, *_medians(inputs))
+    keep = moved.lead_position_m <= sight.at_fraction * inputs.trial.length_m
+    motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
+    for sentence in audit(inputs.model, [motion]).warnings:
         words = sentence.partition(": ")[2].rstrip(".")
         if not words.startswith("the tail would have to push"):
             yield words
 
 
-def _medians(belief: PredictiveInputs) -> tuple[list[Trial], Floats]:
-    return belief.laid_out(belief.draw(1, 0, only=()))
+def _medians(inputs: PredictiveInputs) -> tuple[list[Trial], Floats]:
+    return inputs.laid_out(inputs.draw(1, 0, only=()))
 
 
-def neglected(belief: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
+def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, ...]:
     """What each effect that no vine is free of would make of the final speed at the medians, largest change first.
 
     Each is put in by itself, at its typical size; those whose columns are blank are passed over.
+
+    Parameters
+    ----------
+    inputs
+        Predictive inputs of the vine.
+    at_fraction : float
+        y/L at which the final speed is taken.
+
+    Returns
+    -------
+    tuple of Neglected
     """
-    host = whole_model(belief.model)
-    without = final_m_s(belief, belief.model, host, at_fraction)
-    found = []
+    host = whole_model(inputs.model)
+    without = final_m_s(inputs, inputs.model, host, at_fraction)
+    neglected_effects = []
     for name in INEVITABLE:
         effect = catalogue()[name]
-        held = name in belief.model or any(name in other.replaces for other in belief.model)
-        if held or (name == "payload_drag" and belief.trial.payload_kg == 0):
+        held = name in inputs.model or any(name in other.replaces for other in inputs.model)
+        if held or (name == "payload_drag" and inputs.trial.payload_kg == 0):
             continue
-        sizes = typical_sizes(name, belief.trial)
-        model = (belief.model + effect).with_values(sizes)
+        sizes = typical_sizes(name, inputs.trial)
+        model = (inputs.model + effect).with_values(sizes)
         try:
-            final = final_m_s(belief, model, host, at_fraction)
+            final = final_m_s(inputs, model, host, at_fraction)
         except EffectError:
             continue
-        found.append(Neglected(name, _words(effect, sizes), final, without))
-    return tuple(sorted(found, key=lambda one: -abs(np.nan_to_num(one.change))))
+        neglected_effects.append(Neglected(name, _words(effect, sizes), final, without))
+    return tuple(sorted(neglected_effects, key=lambda effect: -abs(np.nan_to_num(effect.change))))
 
 
 def whole_model(model: Model) -> Model:
-    """The catalogue and the model's own effects: its compiled form serves every model that is looked at here."""
-    own = {effect.name: effect for effect in model if effect.name not in catalogue()}
-    return make_model([*catalogue(), *own], own)
+    """The catalogue and the model's own effects: its compiled form serves every model that is looked at here.
+
+    Parameters
+    ----------
+    model
+        Its effects beside the catalogue are kept.
+
+    Returns
+    -------
+    Model
+    """
+    further = {effect.name: effect for effect in model if effect.name not in catalogue()}
+    return make_model([*catalogue(), *further], further)
 
 
 def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
-    """Parameters of an effect where they follow from the vine: wall stretch, (1 − ν/4) D/(2Et) of soft film, ν = ½."""
+    """Parameters of an effect where they follow from the vine: wall stretch, (1 − ν/4) D/(2Et) of soft film, ν = ½.
+
+    Source: thin-walled closed tube, radial strain under hoop stress PD/2t and half of it along the tube.
+
+    Parameters
+    ----------
+    name : str
+        Name of an effect.
+    trial
+        Diameter and thickness of the vine.
+
+    Returns
+    -------
+    dict
+        By `effect.parameter`, SI; blank where the effect's defaults serve.
+    """
     if name != "wall_stretch":
         return {}
     return {"wall_stretch.kappa": (1 - 0.5 / 4) * trial.diameter_m / (2 * FILM_MODULUS_PA * trial.thickness_m)}
@@ -180,9 +234,26 @@ def _words(effect: Effect, sizes: Mapping[str, float]) -> str:
     return ", ".join(f"{p.symbol} = {value:.3g}{'' if p.unit == '1' else ' ' + p.unit}" for p, value in values)
 
 
-def final_m_s(belief: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
-    """The final speed at the medians under this model: a payload's at the end, else the leading edge's."""
-    (trial,), _ = _medians(belief)
+def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: float) -> float:
+    """The final speed at the medians under this model: a payload's at the end, else the leading edge's.
+
+    Parameters
+    ----------
+    inputs
+        Predictive inputs; their trial at the medians is simulated.
+    model
+        What is simulated.
+    host
+        A model that holds all effects of `model`, compiled once for many.
+    at_fraction : float
+        y/L at which the speed of the leading edge is taken.
+
+    Returns
+    -------
+    float
+        0 where the vine does not grow to its end.
+    """
+    (trial,), _ = _medians(inputs)
     (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=host)
     if end.status != "ended":
         return 0.0

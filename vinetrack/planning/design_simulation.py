@@ -32,9 +32,13 @@ from vinetrack.planning.hypothesis_predictions import Hypothesis
 from vinetrack.planning.simulated_tracks import TrackSampling, film
 
 MOST_ITERATIONS = 20
+"""Chosen for time: refits start from a fit and end within ten. At half some are cut short, at twice only time is
+spent."""
+
 FURTHEST_DRAW = 2.0
 """Standard deviations by which a number that is taken for true may lie from its best value: beyond, what is linear
-about a fit is not to be trusted."""
+about a fit is not to be trusted. Chosen: 5 % of draws are cut. At half the scatter of the truth is too small, at twice
+one draw in thousands leaves the range where a linear answer holds."""
 
 
 class PartlyLinear(Predictor):
@@ -43,24 +47,64 @@ class PartlyLinear(Predictor):
     def __init__(self, layout: ParameterMap, old: Predictor, solution: Solution, new: Sequence[FitTrial]) -> None:
         super().__init__(layout, [*old.data, *new], old.host)
         self.old, self.at, self.known = len(old.data), solution.state, solution.columns
-        rest = replace(layout, index=layout.index[self.old :], base=layout.base[self.old :])
-        self.new = Predictor(rest, new, old.host)
+        new_layout = replace(layout, index=layout.index[self.old :], base=layout.base[self.old :])
+        self.new = Predictor(new_layout, new, old.host)
         self.new.steps = old.steps.copy()
 
-    def linearise(self, theta: Floats, own: Floats, *, own_only: bool = False) -> list[Floats]:
-        """As that of `Predictor`."""
-        moved = self.residuals_of_old(theta, own)
+    def linearise(self, theta: Floats, trial_effects: Floats, *, own_only: bool = False) -> list[Floats]:
+        """Residuals and sensitivities, as `Predictor.linearise`; those of the old trials with constant sensitivities.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        trial_effects : array, shape (n_trials, OWN)
+            Release, origin and deviations of each trial.
+        own_only : bool
+            Sensitivities of the new trials to trial effects alone.
+
+        Returns
+        -------
+        list of arrays, shape (n_points, n_columns + 1)
+            One a trial; the last column is the residual, m.
+        """
+        moved = self.residuals_of_old(theta, trial_effects)
         columns = [np.column_stack([known[:, :-1], r]) for known, r in zip(self.known, moved, strict=True)]
-        return columns + self.new.linearise(theta, own[self.old :], own_only=own_only)
+        return columns + self.new.linearise(theta, trial_effects[self.old :], own_only=own_only)
 
-    def residuals(self, theta: Floats, own: Floats) -> list[Floats]:
-        """As those of `Predictor`."""
-        return self.residuals_of_old(theta, own) + self.new.residuals(theta, own[self.old :])
+    def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
+        """Measured minus predicted positions of all trials, m.
 
-    def residuals_of_old(self, theta: Floats, own: Floats) -> list[Floats]:
-        """Measured minus predicted position of the old trials, m, as far as they answer linearly."""
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        trial_effects : array, shape (n_trials, OWN)
+            Release, origin and deviations of each trial.
+
+        Returns
+        -------
+        list of arrays, shape (n_points,)
+        """
+        return self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.old :])
+
+    def residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
+        """Measured minus predicted position of the old trials, m, as far as they answer linearly.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        trial_effects : array, shape (n_trials, OWN)
+            Release, origin and deviations of each trial.
+
+        Returns
+        -------
+        list of arrays, shape (n_points,)
+            One for each old trial.
+        """
         change = np.append(theta[: self.at.theta.size] - self.at.theta, np.zeros(theta.size - self.at.theta.size + 1))
-        steps = np.hstack([own[: self.old] - self.at.own, change[self.layout.index[: self.old]]])
+        steps = np.hstack([trial_effects[: self.old] - self.at.own, change[self.layout.index[: self.old]]])
         return [known[:, -1] - known[:, :-1] @ step for known, step in zip(self.known, steps, strict=True)]
 
 
@@ -77,6 +121,20 @@ def expected(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: in
     """Rise of −2 ln L, shape (n_draws, n, n): (true, refitted); NaN where a refit is lost.
 
     Deviations of the trials are one standard deviation either way, in turns, so that few draws show the average.
+
+    Parameters
+    ----------
+    bench
+        Hypotheses, conditions, cameras.
+    design : sequence of int
+        Places among the conditions, one a trial.
+    draws : sequence of int
+        Numbers of the draws; with `seed` they make the random numbers.
+    seed : int
+
+    Returns
+    -------
+    array, shape (n_draws, n, n)
     """
     return _rises(bench, design, draws, seed, thorough=False)
 
@@ -86,6 +144,20 @@ def observed(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: in
 
     Only where the pressure was measured do the old trials still answer linearly: to follow every wiggle of a trace
     takes a hundred times as long.
+
+    Parameters
+    ----------
+    bench
+        Hypotheses, conditions, cameras.
+    design : sequence of int
+        Places among the conditions, one a trial.
+    draws : sequence of int
+        Numbers of the draws; with `seed` they make the random numbers.
+    seed : int
+
+    Returns
+    -------
+    array, shape (n_draws, n, n)
     """
     return _rises(bench, design, draws, seed, thorough=True)
 
@@ -93,7 +165,7 @@ def observed(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: in
 def _rises(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: int, *, thorough: bool) -> Floats:
     n = len(bench.hypotheses)
     rises = np.full((len(draws), n, n), math.nan)
-    now = np.array([-2 * one.fit.log_likelihood for one in bench.hypotheses])
+    now = np.array([-2 * hypothesis.fit.log_likelihood for hypothesis in bench.hypotheses])
     for k, a in np.ndindex(len(draws), n):
         rng = np.random.default_rng([seed, int(thorough), draws[k], a])
         truth = bench.hypotheses[a]
@@ -103,9 +175,9 @@ def _rises(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: int,
             filmed = film(truth, design, bench.conditions, bench.cameras, theta, signs * truth.spread, rng)
         except SimulationError:
             continue
-        seen = [(place, item) for place, item in zip(design, filmed, strict=True) if item is not None]
+        seen = [(place, trial_data) for place, trial_data in zip(design, filmed, strict=True) if trial_data is not None]
         if seen:
-            then = np.array([_refitted(one, seen, thorough=thorough) for one in bench.hypotheses])
+            then = np.array([_refitted(hypothesis, seen, thorough=thorough) for hypothesis in bench.hypotheses])
             rises[k, a] = then - now - (then[a] - now[a])
     return rises
 
@@ -117,14 +189,37 @@ def _in_turns(design: Sequence[int], draw: int) -> Floats:
 
 
 def separation(rises: Floats) -> Floats:
-    """σ from rises of −2 ln L, their mean over the draws, shape (n, n): 0 where a wrong hypothesis gains."""
+    """σ from rises of −2 ln L, their mean over the draws, shape (n, n): 0 where a wrong hypothesis gains.
+
+    Parameters
+    ----------
+    rises : array, shape (n_draws, n, n)
+        From `expected` or `observed`; NaN is left out.
+
+    Returns
+    -------
+    array, shape (n, n)
+        In standard deviations.
+    """
     known = np.isfinite(rises)
     mean = np.where(known, rises, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
     return np.asarray(np.sqrt(np.maximum(mean, 0.0)))
 
 
 def drawn(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
-    """True numbers as the trials so far leave them open, those of new vines as far as guesses err."""
+    """True numbers as the trials so far leave them open, those of new vines as far as guesses err.
+
+    Parameters
+    ----------
+    hypothesis
+        Taken for true.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    array, shape (n_free,)
+        Free numbers, scaled, within their bounds.
+    """
     old = hypothesis.fit.predictor.layout.start.size
     values, vectors = np.linalg.eigh(hypothesis.views[0].information[:old, :old])
     known = values > 1e-9 * values[-1]
@@ -137,26 +232,26 @@ def drawn(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
 
 def _refitted(hypothesis: Hypothesis, seen: Sequence[tuple[int, FitTrial]], *, thorough: bool) -> float:
     """−2 ln L of a hypothesis fitted to the trials so far and those seen; NaN where the fit is lost."""
-    items = [item for _, item in seen]
+    items = [trial_data for _, trial_data in seen]
     layout, old = _wider_layout(hypothesis, [place for place, _ in seen]), hypothesis.fit.solution
     quick = PartlyLinear(layout, hypothesis.fit.predictor, old, items)
     try:
         state = _wider_state(hypothesis, quick, items)
-        frame = make_problem(quick, state.own)
-        frame = replace(
-            frame, own_centre=np.concatenate([old.frame.own_centre, frame.own_centre[len(old.frame.own_centre) :]])
+        problem = make_problem(quick, state.own)
+        problem = replace(
+            problem, own_centre=np.concatenate([old.frame.own_centre, problem.own_centre[len(old.frame.own_centre) :]])
         )
         # Spreads and noise stay until the numbers have moved: what is only not yet fitted must not pass for scatter.
         told = FixedTerms(state.spread, (state.rho, state.variance))
-        found = solve(quick, frame, state, told, warm=True, most_iterations=MOST_ITERATIONS)
+        solution = solve(quick, problem, state, told, warm=True, most_iterations=MOST_ITERATIONS)
         whole: Predictor = quick
-        if thorough and all(item.trace is None for item in quick.data[: quick.old]):
+        if thorough and all(trial_data.trace is None for trial_data in quick.data[: quick.old]):
             whole = Predictor(layout, quick.data, quick.host)
             whole.steps = quick.new.steps.copy()
-        found = solve(whole, frame, found.state, warm=True, most_iterations=MOST_ITERATIONS)
+        solution = solve(whole, problem, solution.state, warm=True, most_iterations=MOST_ITERATIONS)
     except SimulationError:
         return math.nan
-    return -2 * log_likelihood(found)
+    return -2 * log_likelihood(solution)
 
 
 def _wider_layout(hypothesis: Hypothesis, places: Sequence[int]) -> ParameterMap:
@@ -181,9 +276,9 @@ def _wider_state(hypothesis: Hypothesis, predictor: PartlyLinear, items: Sequenc
     before = hypothesis.fit.solution.state
     theta = predictor.layout.start
     theta[: before.theta.size] = before.theta
-    own, _ = align(predictor.new.data, predictor.new, theta, initial_trial_effects(items))
+    trial_effects, _ = align(predictor.new.data, predictor.new, theta, initial_trial_effects(items))
     variance = np.concatenate([before.variance, np.full(len(items), hypothesis.variance)])
-    return replace(before, theta=theta, own=np.concatenate([before.own, own]), variance=variance)
+    return replace(before, theta=theta, own=np.concatenate([before.own, trial_effects]), variance=variance)
 
 
 __all__ = ["Bench", "PartlyLinear", "drawn", "expected", "observed", "separation"]

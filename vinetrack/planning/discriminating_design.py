@@ -29,15 +29,28 @@ from vinetrack.planning.hypothesis_predictions import Hypothesis, View
 from vinetrack.planning.simulated_tracks import Course, TrackSampling, blank
 
 POINTS = 100
-"""Times at which a condition is looked at; each stands for the frames about it."""
+"""Times at which a condition is looked at; each stands for the frames about it. Chosen: smooth curves are summed to a
+thousandth. At half designs are rated to a few thousandths, at twice the search takes twice as long."""
 
 PAST_THE_END = 1.05
+"""In end times. Chosen: behind the end the position is constant, so that any instant there says the same."""
+
 WELL_SEPARATED = 5.0
-"""Standard deviations beyond which more of one pair is worth less than some of another."""
+"""Standard deviations beyond which more of one pair is worth less than some of another. Chosen: five sigma leave no
+doubt. At half a design is content with pairs at 2.5 σ; at twice it spends trials on pairs that are told apart
+already."""
 
 MOST_PASSES = 4
+"""Chosen for time: exchange usually ends after two passes; at half it may stop short of the best, at twice nothing
+changes."""
+
 GAIN = 1.005
+"""Chosen: an exchange must gain half a per cent, so that ties do not cycle; a design is left at most that much worse.
+At half and twice the loss halves and doubles."""
+
 BOUND_PASSES = 4
+"""Chosen: each pass fixes all numbers that left their room; few ever leave it. At half some designs are rated a little
+too good, at twice nothing changes."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +75,17 @@ class Side:
     up: Floats
 
     def narrowed(self, allowed: NDArray[np.int_]) -> Side:
-        """With some of the conditions only, and the numbers that they or the trials so far say something of."""
+        """With some of the conditions only, and the numbers that they or the trials so far say something of.
+
+        Parameters
+        ----------
+        allowed : array of int, shape (n_allowed,)
+            Places of the conditions kept.
+
+        Returns
+        -------
+        Side
+        """
         felt = np.any(self.information[0][allowed].diagonal(axis1=1, axis2=2) > 0, axis=0)
         use = np.flatnonzero(felt | (np.abs(self.leans[0]) > 0) | (np.count_nonzero(self.known[0], axis=0) > 1))
         return Side(
@@ -84,20 +107,40 @@ def all_sides(
     cameras: Sequence[TrackSampling],
     runs: Sequence[Course],
 ) -> list[Side]:
-    """Every hypothesis with what one trial of each condition would answer at its best values so far."""
+    """Every hypothesis with what one trial of each condition would answer at its best values so far.
+
+    Parameters
+    ----------
+    hypotheses
+        Carried to the conditions, see `hypothesis_predictions.carry`.
+    conditions
+        Trials that could be made.
+    cameras
+        Of each condition.
+    runs
+        How each condition runs, see `simulated_tracks.courses`.
+
+    Returns
+    -------
+    list of Side
+        One a hypothesis.
+    """
     data = hypotheses[0].fit.predictor.data
     times, weights = zip(*(_times(lens, run) for lens, run in zip(cameras, runs, strict=True)), strict=True)
-    items = [blank(one, t, data, 1e-3 * t) for one, t in zip(conditions, times, strict=True)]
-    own = np.zeros((len(conditions), OWN))
-    predictors = [one.predictor(range(len(conditions)), items) for one in hypotheses]
-    columns = [np.stack(p.linearise(one.theta, own)) for p, one in zip(predictors, hypotheses, strict=True)]
+    items = [blank(condition, t, data, 1e-3 * t) for condition, t in zip(conditions, times, strict=True)]
+    trial_effects = np.zeros((len(conditions), OWN))
+    predictors = [hypothesis.predictor(range(len(conditions)), items) for hypothesis in hypotheses]
+    columns = [
+        np.stack(p.linearise(hypothesis.theta, trial_effects))
+        for p, hypothesis in zip(predictors, hypotheses, strict=True)
+    ]
     heavy = np.sqrt(np.stack(weights))[:, :, None]
     # The last column is placeholder − motion; differences of two hypotheses are free of the placeholder.
-    motions = np.stack([-one[:, :, -1] for one in columns], axis=2)
+    motions = np.stack([-block[:, :, -1] for block in columns], axis=2)
     sides = []
-    for k, (one, mine, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
+    for k, (hypothesis, mine, predictor) in enumerate(zip(hypotheses, columns, predictors, strict=True)):
         feels = np.column_stack([predictor.feels_pressure, predictor.feels_damping])
-        sides.append(_side(one, mine * heavy, (motions - motions[:, :, [k]]) * heavy, feels))
+        sides.append(_side(hypothesis, mine * heavy, (motions - motions[:, :, [k]]) * heavy, feels))
     return sides
 
 
@@ -141,16 +184,16 @@ def _left(hypothesis: Hypothesis, view: View, products: Floats) -> tuple[Floats,
     """Information, pull and gap with the own numbers of a trial eliminated, placed among all free numbers."""
     precision = np.full(OWN, 1e-9)
     precision[list(SPREAD_COLUMNS)] = 1 / np.array(view.spread) ** 2
-    own = products[:, :OWN, :OWN] + np.diag(precision)
-    rest = products[:, OWN:, OWN:] - products[:, OWN:, :OWN] @ solve_each(own, products[:, :OWN, OWN:])
+    within_trial = products[:, :OWN, :OWN] + np.diag(precision)
+    reduced = products[:, OWN:, OWN:] - products[:, OWN:, :OWN] @ solve_each(within_trial, products[:, :OWN, OWN:])
     index = hypothesis.layout.index
     n, keys, size = len(products), index.shape[1], hypothesis.theta.size
     every = np.arange(n)
     wide = np.zeros((n, size + 1, size + 1))
-    np.add.at(wide, (every[:, None, None], index[:, :, None], index[:, None, :]), rest[:, :keys, :keys])
-    pull = np.zeros((n, size + 1, rest.shape[2] - keys))
-    np.add.at(pull, (every[:, None], index), rest[:, :keys, keys:])
-    return wide[:, :size, :size], pull[:, :size], np.einsum("nkk->nk", rest[:, keys:, keys:])
+    np.add.at(wide, (every[:, None, None], index[:, :, None], index[:, None, :]), reduced[:, :keys, :keys])
+    pull = np.zeros((n, size + 1, reduced.shape[2] - keys))
+    np.add.at(pull, (every[:, None], index), reduced[:, :keys, keys:])
+    return wide[:, :size, :size], pull[:, :size], np.einsum("nkk->nk", reduced[:, keys:, keys:])
 
 
 def separations(sides: Sequence[Side], designs: NDArray[np.int_]) -> Floats:
@@ -158,10 +201,17 @@ def separations(sides: Sequence[Side], designs: NDArray[np.int_]) -> Floats:
 
     Parameters
     ----------
-    designs : array, shape (n_designs, n_trials): places among the conditions, one a trial
+    sides
+        From `all_sides`.
+    designs : array of int, shape (n_designs, n_trials)
+        Places among the conditions, one a trial.
+
+    Returns
+    -------
+    array, shape (n_designs, n, n)
     """
     n = len(sides)
-    found = np.zeros((len(designs), n, n))
+    squares = np.zeros((len(designs), n, n))
     for b, side in enumerate(sides):
         for view in range(len(side.rise)):
             information = side.known[view] + _over_trials(side.information[view], designs)
@@ -171,12 +221,12 @@ def separations(sides: Sequence[Side], designs: NDArray[np.int_]) -> Floats:
             for a in range(n):
                 if a != b:
                     square = left[:, a] - _best_refit(information, pull[:, :, a], side.down, side.up)
-                    found[:, a, b] = square if view == 0 else np.minimum(found[:, a, b], square)
-    return np.sqrt(np.maximum(found, 0.0))
+                    squares[:, a, b] = square if view == 0 else np.minimum(squares[:, a, b], square)
+    return np.sqrt(np.maximum(squares, 0.0))
 
 
-def _over_trials(one: Floats, designs: NDArray[np.int_]) -> Floats:
-    return np.asarray(sum(one[designs[:, k]] for k in range(designs.shape[1])))
+def _over_trials(by_condition: Floats, designs: NDArray[np.int_]) -> Floats:
+    return np.asarray(sum(by_condition[designs[:, k]] for k in range(designs.shape[1])))
 
 
 def _best_refit(square: Floats, slope: Floats, down: Floats, up: Floats) -> Floats:
@@ -206,15 +256,41 @@ def worth(between: Floats) -> Floats:
     """How good designs are, shape (n_designs,), from their separations, shape (n_designs, n, n).
 
     Every pair counts by the smaller of its two directions, the first few σ of it most.
+
+    Parameters
+    ----------
+    between : array, shape (n_designs, n, n)
+        Separations, σ, of ordered pairs.
+
+    Returns
+    -------
+    array, shape (n_designs,)
     """
     n = between.shape[1]
-    one, other = np.triu_indices(n, 1)
-    square = np.minimum(between[:, one, other], between[:, other, one]) ** 2
+    first, second = np.triu_indices(n, 1)
+    square = np.minimum(between[:, first, second], between[:, second, first]) ** 2
     return np.asarray(np.sum(square / (square + WELL_SEPARATED**2), axis=1))
 
 
 def best_design(sides: Sequence[Side], allowed: NDArray[np.int_], trials: int) -> tuple[NDArray[np.int_], float]:
-    """The trials (places among the conditions, rising) that separate best, among those `allowed`, and their worth."""
+    """The trials that separate best, by exchange of one trial at a time (Fedorov 1972).
+
+    Parameters
+    ----------
+    sides
+        From `all_sides`.
+    allowed : array of int
+        Places of the conditions to choose from.
+    trials : int
+        How many trials, replicates counted.
+
+    Returns
+    -------
+    design : array of int, shape (trials,)
+        Places among all conditions, rising.
+    worth : float
+        See `worth`.
+    """
     narrow = [side.narrowed(allowed) for side in sides]
     alone = np.repeat(np.arange(allowed.size)[:, None], trials, axis=1)
     good = worth(separations(narrow, alone))
@@ -235,7 +311,26 @@ def best_design(sides: Sequence[Side], allowed: NDArray[np.int_], trials: int) -
 def likeliest_vines(
     sides: Sequence[Side], conditions: Sequence[Condition], places: NDArray[np.int_], trials: int, most: int
 ) -> list[str]:
-    """New vines, best first, by what the best of their conditions alone would separate."""
+    """New vines, best first, by what the best of their conditions alone would separate.
+
+    Parameters
+    ----------
+    sides
+        From `all_sides`.
+    conditions
+        Trials that could be made.
+    places : array of int
+        Places of those with new vines.
+    trials : int
+        Replicates that each condition is rated with.
+    most : int
+        At most so many vines.
+
+    Returns
+    -------
+    list of str
+        Names of vines.
+    """
     narrow = [side.narrowed(places) for side in sides]
     alone = np.repeat(np.arange(places.size)[:, None], trials, axis=1)
     order = np.argsort(-worth(separations(narrow, alone)))

@@ -23,21 +23,36 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
 SAME_RIG, OTHER_RIG, NEW_VINE = EFFORTS = (0, 1, 2)
-"""What a trial asks for: nothing new; another chamber, connector or angle; a vine that has to be made."""
+"""What a trial asks for: nothing new; another chamber, connector or angle; a vine that has to be made. Defined in order
+of effort; nothing but their order counts."""
 
 HEADROOM = 1.25
-"""Pressures are looked at up to this many times the highest that was used."""
+"""Pressures are looked at up to this many times the highest that was used. Chosen: a modest step beyond experience. At
+1.12 less of the model is tested, at 1.5 pressures may exceed what a rig can hold."""
 
 ABOVE_YIELD = 1.15
-"""Nearer to the yield pressure its own error decides how a vine moves."""
+"""Nearer to the yield pressure its own error decides how a vine moves. Chosen: an error of 3 % of P_y is then 20 % of
+the drive P − P_y. At 1.07 it is 40 %, at 1.3 slow trials are not offered."""
 
 PRESSURE_STEP_PA = 100.0
-"""As finely as pressures are set."""
+"""As finely as pressures are set. Chosen: regulators are read to about 0.1 kPa; at half or twice a plan's pressures
+differ by less than their errors."""
 
 PAYLOAD_KG = 0.05
+"""Payload offered where none was used yet, kg. Chosen: several times the mass of a usual tail; the user's limits
+replace it."""
+
 PRESSURES_LOOKED_AT = 6
+"""Chosen: over a range of ten, steps of 1.6. At half an optimum between pressures is missed by little (designs are flat
+there), at twice the search takes longer."""
+
 MOST_NEW_VINES = 10
+"""Chosen for time; the most different sizes are kept. At half a useful size may be missed, at twice the search takes
+twice as long."""
+
 SAME = 1e-4
+"""Relative difference below which two values are the same. Chosen: below any tolerance of a workshop, above
+rounding."""
 
 
 @dataclass(frozen=True)
@@ -59,28 +74,40 @@ def conditions(data: Sequence[FitTrial], limits: Limits) -> list[Condition]:
 
     Parameters
     ----------
-    data : the trials of the experiment, at least one
+    data
+        Trials of the experiment, at least one.
+    limits
+        What the user allows.
+
+    Returns
+    -------
+    list of Condition
+        Named `next_1`, `next_2`, …
     """
     models = _models(data)
     if not models:
         return []
-    used = [item.trial for item in data if item.trial.travel_ratio != 1]
+    used = [trial_data.trial for trial_data in data if trial_data.trial.travel_ratio != 1]
     vines = [(data[k].trial, k) for k in models]
-    found = []
+    feasible = []
     for vine, k in vines:
         if _allowed(vine, limits):
             for effort, rig in _rigs(vine, used, limits):
-                found += _loads(rig, k, effort, used, limits)
+                feasible += _loads(rig, k, effort, used, limits)
     for vine, k in _new_vines(vines, limits) if limits.new_vines else []:
         rigs = _rigs(vine, used, limits)
         least = min((effort for effort, _ in rigs), default=SAME_RIG)
         for effort, rig in rigs:
             if effort == least:
-                found += _loads(rig, k, NEW_VINE, used, limits)
-    named = [f"next_{i + 1}" for i in range(len(found))]
+                feasible += _loads(rig, k, NEW_VINE, used, limits)
+    named = [f"next_{i + 1}" for i in range(len(feasible))]
     return [
-        replace(one, trial=replace(one.trial, name=name), changed=_changed(one.trial, data[one.like].trial))
-        for one, name in zip(found, named, strict=True)
+        replace(
+            condition,
+            trial=replace(condition.trial, name=name),
+            changed=_changed(condition.trial, data[condition.like].trial),
+        )
+        for condition, name in zip(feasible, named, strict=True)
     ]
 
 
@@ -94,15 +121,21 @@ def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
 def _models(data: Sequence[FitTrial]) -> list[int]:
     """The trial of each everting vine that stands for it: the first of its commonest rig and yield pressure."""
     rigs = [
-        (item.trial.vine, item.trial.yield_pressure_Pa, item.trial.chamber_m3, item.trial.inlet_m, item.trial.bends)
-        for item in data
+        (
+            trial_data.trial.vine,
+            trial_data.trial.yield_pressure_Pa,
+            trial_data.trial.chamber_m3,
+            trial_data.trial.inlet_m,
+            trial_data.trial.bends,
+        )
+        for trial_data in data
     ]
     texts = [repr(rig) for rig in rigs]
-    found = []
-    for vine in dict.fromkeys(item.trial.vine for item in data if item.trial.travel_ratio != 1):
+    places = []
+    for vine in dict.fromkeys(trial_data.trial.vine for trial_data in data if trial_data.trial.travel_ratio != 1):
         mine = [texts[i] for i, rig in enumerate(rigs) if rig[0] == vine]
-        found.append(texts.index(Counter(mine).most_common(1)[0][0]))
-    return found
+        places.append(texts.index(Counter(mine).most_common(1)[0][0]))
+    return places
 
 
 def _allowed(vine: Trial, limits: Limits) -> bool:
@@ -116,7 +149,7 @@ def _allowed(vine: Trial, limits: Limits) -> bool:
 
 
 def _among(value: float, values: Iterable[float]) -> bool:
-    return any(math.isclose(value, one, rel_tol=SAME, abs_tol=1e-12) for one in values)
+    return any(math.isclose(value, listed, rel_tol=SAME, abs_tol=1e-12) for listed in values)
 
 
 def _rigs(vine: Trial, used: Sequence[Trial], limits: Limits) -> list[tuple[int, Trial]]:
@@ -143,10 +176,10 @@ def _choices(
     if not math.isfinite(now):
         return [now]
     if given is not None:
-        return [one * unit for one in given]
-    known = [now, *(one for one in dict.fromkeys(used) if math.isfinite(one))]
+        return [value * unit for value in given]
+    known = [now, *(value for value in dict.fromkeys(used) if math.isfinite(value))]
     known += [_rounded(now * factor) for factor in factors]
-    return [one for i, one in enumerate(known) if not _among(one, known[:i])]
+    return [value for i, value in enumerate(known) if not _among(value, known[:i])]
 
 
 def _loads(rig: Trial, like: int, effort: int, used: Sequence[Trial], limits: Limits) -> list[Condition]:
@@ -163,7 +196,7 @@ def _payloads(used: Sequence[Trial], limits: Limits) -> list[float]:
     before = {trial.payload_kg for trial in used}
     heaviest = max(before) if max(before) > 0 else PAYLOAD_KG
     low, high = (0.0, heaviest) if limits.payload_g is None else (1e-3 * g for g in limits.payload_g)
-    return sorted({low, high, *(one for one in before if low <= one <= high)})
+    return sorted({low, high, *(payload for payload in before if low <= payload <= high)})
 
 
 def _pressures(rig: Trial, payload_kg: float, used: Sequence[Trial], limits: Limits) -> list[tuple[float, float]]:
@@ -197,14 +230,14 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
     vines = [trial for trial, _ in models]
     diameters = _sizes([v.diameter_m for v in vines], limits.diameter_mm, 1e-3, (0.5, 0.75, 1.5))
     walls = _sizes([v.thickness_m for v in vines], limits.thickness_um, 1e-6, (0.5, 2.0))
-    found: list[tuple[Trial, int]] = []
+    vines_found: list[tuple[Trial, int]] = []
     for diameter, wall in itertools.product(diameters, walls):
         if wall > diameter / 4 or not COLUMNS["diameter_mm"].low <= 1e3 * diameter <= COLUMNS["diameter_mm"].high:
             continue
         near, like = min(models, key=lambda m: _distance(m[0], diameter, wall))
         lengths = [near.length_m] if limits.length_mm is None else [1e-3 * mm for mm in limits.length_mm]
         for length in lengths:
-            one = replace(
+            sized = replace(
                 near,
                 diameter_m=diameter,
                 thickness_m=wall,
@@ -213,9 +246,9 @@ def _new_vines(models: Sequence[tuple[Trial, int]], limits: Limits) -> list[tupl
                 track=None,
                 pressure_trace=None,
             )
-            if not any(_alike(one, vine) for vine in vines):
-                found.append((with_names([one])[0], like))
-    return _spread_out(found, MOST_NEW_VINES)
+            if not any(_alike(sized, vine) for vine in vines):
+                vines_found.append((with_names([sized])[0], like))
+    return _spread_out(vines_found, MOST_NEW_VINES)
 
 
 def _sizes(
@@ -223,8 +256,8 @@ def _sizes(
 ) -> list[float]:
     """Sizes to look at: those the user lists, else those used and some beyond."""
     if given is not None:
-        return [one * unit for one in given]
-    known = {one for one in before if math.isfinite(one)}
+        return [size * unit for size in given]
+    known = {size for size in before if math.isfinite(size)}
     if not known:
         return []
     return sorted(known | {_rounded(f * (min(known) if f < 1 else max(known))) for f in factors})
@@ -239,18 +272,18 @@ def _distance(vine: Trial, diameter_m: float, thickness_m: float) -> float:
     return math.hypot(math.log(vine.diameter_m / diameter_m), math.log(vine.thickness_m / thickness_m))
 
 
-def _alike(one: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "thickness_m", "length_m")) -> bool:
-    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
+def _alike(trial: Trial, other: Trial, names: Sequence[str] = ("diameter_m", "thickness_m", "length_m")) -> bool:
+    pairs = [(getattr(trial, name), getattr(other, name)) for name in names]
     return all(_among(a, [b]) or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
 
 
-def _spread_out(found: list[tuple[Trial, int]], most: int) -> list[tuple[Trial, int]]:
+def _spread_out(vines: list[tuple[Trial, int]], most: int) -> list[tuple[Trial, int]]:
     """At most so many vines, those furthest from one another in diameter, thickness and length."""
-    if len(found) <= most:
-        return found
-    places = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in found])
+    if len(vines) <= most:
+        return vines
+    places = np.log([[v.diameter_m, v.thickness_m, v.length_m] for v, _ in vines])
     chosen = [int(np.argmax(np.linalg.norm(places - places.mean(axis=0), axis=1)))]
     while len(chosen) < most:
         away = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
         chosen.append(int(np.argmax(away)))
-    return [found[k] for k in sorted(chosen)]
+    return [vines[k] for k in sorted(chosen)]

@@ -21,9 +21,12 @@ if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit
 
 FEWEST_TO_SPARE = 3
-"""Degrees of freedom that a spread has at least: a fit does not estimate it with fewer trials to spare."""
+"""Degrees of freedom that a spread has at least: a fit does not estimate it with fewer trials to spare. Derived: below
+three the t distribution has no variance."""
 
 NORMAL_95 = 1.959963984540054
+"""Standard normal quantile of 0.975."""
+
 _VINE = re.compile(r"([\d.]+)mm-([\d.]+)um(?:-([\d.]+)mm)?")
 
 
@@ -50,7 +53,19 @@ class FitNumbers:
     n_trials: int
 
     def place(self, key: str, vine: str = "") -> int | None:
-        """Where a number stands, for all vines or for this one; None where it does not."""
+        """Where a number stands, for all vines or for this one; None where it does not.
+
+        Parameters
+        ----------
+        key : str
+            Name of a parameter, `effect.parameter`.
+        vine : str
+            Name of a vine.
+
+        Returns
+        -------
+        int or None
+        """
         for k, (own_key, own_vine) in enumerate(zip(self.keys, self.vines, strict=True)):
             if own_key == key and own_vine in ("", vine):
                 return k
@@ -58,16 +73,27 @@ class FitNumbers:
 
     def sizes(self) -> dict[str, tuple[float, float]]:
         """Diameter and thickness, m, of every vine that has a B of its own."""
-        found = {}
+        sizes = {}
         for key, vine in zip(self.keys, self.vines, strict=True):
             if key == DAMPING and (size := size_of(vine)):
-                found[vine] = size
-        return found
+                sizes[vine] = size
+        return sizes
 
 
 def size_of(vine: str) -> tuple[float, float] | None:
     """Diameter and thickness in metres out of the name of a vine; None where it does not say.
 
+    Parameters
+    ----------
+    vine : str
+        Name as `vinetrack.experiment.naming` gives it.
+
+    Returns
+    -------
+    (float, float) or None
+
+    Examples
+    --------
     >>> size_of("24mm-200um-280mm")
     (0.024, 0.0002)
     """
@@ -77,6 +103,17 @@ def size_of(vine: str) -> tuple[float, float] | None:
 
 def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
     """Numbers of a fit from what `fit.json` holds.
+
+    Parameters
+    ----------
+    content : mapping
+        What `fit.json` holds.
+    source : str
+        Named in messages and origins.
+
+    Returns
+    -------
+    FitNumbers
 
     Raises
     ------
@@ -126,22 +163,45 @@ def _stretch(number: Mapping[str, Any], log: bool) -> float:
     return max(half / (NORMAL_95 * (sigma / number["value"] if log else sigma)), 1.0)
 
 
-def numbers_of(found: Fit) -> FitNumbers:
-    """Numbers of a fit as `vinetrack.fit` returns it."""
+def numbers_of(fit: Fit) -> FitNumbers:
+    """Numbers of a fit as `vinetrack.fit` returns it.
+
+    Parameters
+    ----------
+    fit
+        A fit.
+
+    Returns
+    -------
+    FitNumbers
+    """
     content = {
-        "model": found.model.names,
-        "numbers": [number.to_json() for number in found.numbers],
-        "covariance": found.covariance,
+        "model": fit.model.names,
+        "numbers": [number.to_json() for number in fit.numbers],
+        "covariance": fit.covariance,
         "spreads": {
-            name: {"value": spread.value, "estimated": spread.estimated} for name, spread in found.spreads.items()
+            name: {"value": spread.value, "estimated": spread.estimated} for name, spread in fit.spreads.items()
         },
-        "trials": {trial.name: None for trial in found.trials},
+        "trials": {trial.name: None for trial in fit.trials},
     }
     return fit_numbers(content, "the fit")
 
 
 def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
-    """The fitted vine of this diameter and wall, of any length, for B is a matter of the tip; None if there is none."""
+    """The fitted vine of this diameter and wall, of any length, for B is a matter of the tip; None if there is none.
+
+    Parameters
+    ----------
+    numbers
+        Of a fit.
+    trial
+        Diameter, thickness and vine.
+
+    Returns
+    -------
+    str or None
+        Name of the vine; that of the same length before others.
+    """
     sizes = [
         (vine, size) for vine, size in numbers.sizes().items() if alike(size, (trial.diameter_m, trial.thickness_m))
     ]
@@ -149,20 +209,57 @@ def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
     return exact[0] if exact else sizes[0][0] if sizes else None
 
 
-def alike(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether two sizes are the same to five digits."""
-    return all(abs(a / b - 1) < 1e-5 for a, b in zip(one, other, strict=True))
+def alike(first: tuple[float, float], second: tuple[float, float]) -> bool:
+    """Whether two sizes are the same to five digits.
+
+    Parameters
+    ----------
+    first, second : (float, float)
+        Diameter and thickness, m.
+
+    Returns
+    -------
+    bool
+    """
+    return all(abs(a / b - 1) < 1e-5 for a, b in zip(first, second, strict=True))
 
 
 def nearest_vine(numbers: FitNumbers, trial: Trial) -> str | None:
-    """The fitted vine whose size is nearest, in logarithms; None where no vine says its size."""
+    """The fitted vine whose size is nearest, in logarithms; None where no vine says its size.
+
+    Parameters
+    ----------
+    numbers
+        Of a fit.
+    trial
+        Diameter and thickness.
+
+    Returns
+    -------
+    str or None
+        Name of the vine.
+    """
     target = np.log([trial.diameter_m, trial.thickness_m])
     sizes = numbers.sizes()
     return min(sizes, key=lambda vine: float(np.sum((np.log(sizes[vine]) - target) ** 2)), default=None)
 
 
 def yield_place(numbers: FitNumbers, vine: str, stated_Pa: float) -> int | None:
-    """Where the yield pressure of a fitted vine stands; of several the one nearest to what the sheet says."""
+    """Where the yield pressure of a fitted vine stands; of several the one nearest to what the sheet says.
+
+    Parameters
+    ----------
+    numbers
+        Of a fit.
+    vine : str
+        Name of a vine.
+    stated_Pa : float
+        Yield pressure of the sheet, NaN where it has none.
+
+    Returns
+    -------
+    int or None
+    """
     places = [
         k
         for k, (key, name) in enumerate(zip(numbers.keys, numbers.vines, strict=True))

@@ -28,7 +28,9 @@ wide that any trial with the vine says more."""
 
 WIDER = ((1.0, 1.0), (2.0, 1.0), (1.0, 2.0), (2.0, 2.0), (4.0, 2.0), (2.0, 5.0), (4.0, 5.0))
 """Factors on the spreads of pressure and B that a refit may come to: a wrong hypothesis explains by scatter what it
-can."""
+can. Chosen: up to what scatter real batches show. Reasoned: without the last a wrong hypothesis is rated as separated
+where five times the scatter of B would hide it; with twice as wide ones the rating hardly changes, since scatter costs
+ln L."""
 
 
 @dataclass(frozen=True)
@@ -75,18 +77,55 @@ class Hypothesis:
         return np.minimum(lower - self.theta, 0.0), np.maximum(upper - self.theta, 0.0)
 
     def layout_of(self, places: Sequence[int]) -> ParameterMap:
-        """The layout of some conditions."""
+        """The layout of some conditions.
+
+        Parameters
+        ----------
+        places : sequence of int
+            Places among the conditions.
+
+        Returns
+        -------
+        ParameterMap
+        """
         return replace(self.layout, index=self.layout.index[list(places)], base=self.layout.base[list(places)])
 
     def predictor(self, places: Sequence[int], items: Sequence[FitTrial]) -> Predictor:
-        """Simulates these trials, one for each of the conditions at `places`."""
+        """Simulates these trials, one for each of the conditions at `places`.
+
+        Parameters
+        ----------
+        places : sequence of int
+            Places among the conditions.
+        items : sequence of FitTrial
+            The trial to simulate at each place.
+
+        Returns
+        -------
+        Predictor
+            With the step sizes of the fit.
+        """
         made = Predictor(self.layout_of(places), items, self.fit.predictor.host)
         made.steps = self.fit.predictor.steps.copy()
         return made
 
 
 def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
-    """A fit carried to these conditions."""
+    """A fit carried to further conditions: new vines add their numbers, with priors.
+
+    Parameters
+    ----------
+    fit
+        One of the fits that the data cannot tell apart.
+    name : str
+        Name of the hypothesis.
+    conditions
+        Trials that could be made.
+
+    Returns
+    -------
+    Hypothesis
+    """
     old = fit.predictor.layout
     state = fit.solution.state
     numbers, index = list(old.free), []
@@ -102,14 +141,14 @@ def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
                 row[column] = places[spot]
         index.append(row)
     added = numbers[len(old.free) :]
-    moved = [damping_scatter() if one.key == DAMPING else _stated_sd(one) for one in added]
+    moved = [damping_scatter() if number.key == DAMPING else _stated_sd(number) for number in added]
     base = np.array([_base_row(fit, condition) for condition in conditions])
     return Hypothesis(
         name=name,
         fit=fit,
         layout=ParameterMap(old.model, tuple(numbers), old.keys, np.array(index).reshape(len(conditions), -1), base),
-        theta=np.concatenate([state.theta, [one.inside(one.start) for one in added]]),
-        views=_views(fit, np.array([1 / OPEN**2 + (one.scale / one.prior_sd) ** 2 for one in added])),
+        theta=np.concatenate([state.theta, [number.inside(number.start) for number in added]]),
+        views=_views(fit, np.array([1 / OPEN**2 + (number.scale / number.prior_sd) ** 2 for number in added])),
         spread_of_new=np.array(moved),
         rho=state.rho,
         variance=float(np.exp(np.mean(np.log(state.variance)))),
@@ -119,9 +158,9 @@ def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
 
 def _views(fit: Fit, precision_of_new: Floats) -> tuple[View, ...]:
     """What the trials so far say, with all the scatter that a refit may come to; new numbers by their priors alone."""
-    state, frame = fit.solution.state, fit.solution.frame
-    part = marginal(fit.solution.grams, frame, state)
-    found: dict[tuple[float, float], View] = {}
+    state, problem = fit.solution.state, fit.solution.frame
+    part = marginal(fit.solution.grams, problem, state)
+    views: dict[tuple[float, float], View] = {}
     plain = 0.0
     for factors in WIDER:
         spread = tuple(
@@ -129,18 +168,18 @@ def _views(fit: Fit, precision_of_new: Floats) -> tuple[View, ...]:
             for s, factor, most, can in zip(state.spread, factors, LARGEST_SPREAD, fit.solution.estimable, strict=True)
         )
         pair = (max(spread[0], LEAST_SPREAD), max(spread[1], LEAST_SPREAD))
-        if pair in found:
+        if pair in views:
             continue
-        information, slope, square, log_det = normal_equations(part, frame, state, pair)
+        information, slope, square, log_det = normal_equations(part, problem, state, pair)
         old, size = slope.size, slope.size + precision_of_new.size
         wide = np.zeros((size, size))
         wide[:old, :old] = information
         wide[range(old, size), range(old, size)] = precision_of_new
-        plain = plain if found else square + log_det
+        plain = plain if views else square + log_det
         wider = (pair[0] / max(state.spread[0], LEAST_SPREAD), pair[1] / max(state.spread[1], LEAST_SPREAD))
         leans = np.concatenate([slope, np.zeros(size - old)])
-        found[pair] = View(pair, wider, wide, leans, square + log_det - plain)
-    return tuple(found.values())
+        views[pair] = View(pair, wider, wide, leans, square + log_det - plain)
+    return tuple(views.values())
 
 
 def _stated_sd(number: FreeParameter) -> float:
@@ -155,7 +194,7 @@ def _of_new_vine(fit: Fit, like: FreeParameter, trial: Trial) -> FreeParameter:
     """The number of a new vine in place of that of the vine it is modelled on."""
     if like.key == YIELD_PRESSURE:
         return replace(like, vine=trial.vine, start=trial.yield_pressure_Pa)
-    start = new_damping(fit, trial) if like.key == DAMPING else _mean_of_vines(fit, like.key)
+    start = _new_damping(fit, trial) if like.key == DAMPING else _mean_of_vines(fit, like.key)
     return replace(like, vine=trial.vine, start=float(np.clip(start, like.lower, like.upper)))
 
 
@@ -163,14 +202,19 @@ def _mean_of_vines(fit: Fit, key: str) -> float:
     return float(np.mean([number.value for number in fit.numbers if number.key == key]))
 
 
-def new_damping(fit: Fit, trial: Trial) -> float:
+def _new_damping(fit: Fit, trial: Trial) -> float:
     """B of a vine that has not been grown, N·(s/m)ⁿ: the guess by size, times what the grown vines differ from it."""
-    sizes = {item.trial.vine: item.trial for item in fit.predictor.data if item.trial.travel_ratio != 1}
+    sizes = {
+        trial_data.trial.vine: trial_data.trial
+        for trial_data in fit.predictor.data
+        if trial_data.trial.travel_ratio != 1
+    }
     column = fit.predictor.damping_column
     rows, _ = fit.predictor.layout.rows(fit.solution.state.theta)
-    grown = {item.trial.vine: float(rows[i, column]) for i, item in enumerate(fit.predictor.data)}
+    grown = {trial_data.trial.vine: float(rows[i, column]) for i, trial_data in enumerate(fit.predictor.data)}
     off = [
-        math.log(max(grown[vine], 1e-9) / damping_prior(one.diameter_m, one.thickness_m)) for vine, one in sizes.items()
+        math.log(max(grown[vine], 1e-9) / damping_prior(trial_of_vine.diameter_m, trial_of_vine.thickness_m))
+        for vine, trial_of_vine in sizes.items()
     ]
     return damping_prior(trial.diameter_m, trial.thickness_m) * math.exp(float(np.mean(off)))
 
@@ -180,5 +224,5 @@ def _base_row(fit: Fit, condition: Condition) -> Floats:
     rows, _ = fit.predictor.layout.rows(fit.solution.state.theta)
     row = np.array(rows[condition.like])
     if fit.predictor.damping_column >= 0 and condition.trial.vine != _vine_of(fit, condition):
-        row[fit.predictor.damping_column] = new_damping(fit, condition.trial)
+        row[fit.predictor.damping_column] = _new_damping(fit, condition.trial)
     return row

@@ -1,4 +1,4 @@
-"""Beliefs made: from a fit, from what a person says, from guesses."""
+"""Predictive inputs assembled from stated values, a fit, and printed values or scaling laws."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ class StatedValues:
     model: tuple[str, ...] = BASE_EFFECTS
     effects: tuple[str, ...] = ()
     sizes: Mapping[str, Size] = field(default_factory=dict)
-    own: Mapping[str, Effect] = field(default_factory=dict)
+    experiment_effects: Mapping[str, Effect] = field(default_factory=dict)
     spreads: tuple[float, float] | None = None
 
 
 class _Making:
-    """A belief while it is put together."""
+    """Predictive inputs while they are put together."""
 
     def __init__(self, trial: Trial, fit: FitNumbers | None) -> None:
         self.trial = trial if trial.vine else with_names([trial])[0]
@@ -78,18 +78,22 @@ class _Making:
 
 
 def predictive_inputs(
-    trial: Trial, said: StatedValues | None = None, fit: FitNumbers | Fit | None = None
+    trial: Trial, stated: StatedValues | None = None, fit: FitNumbers | Fit | None = None
 ) -> PredictiveInputs:
-    """Put together what is believed of a trial.
+    """Assemble the predictive inputs of a trial, each from its first source: stated values, a fit, printed values.
 
     Parameters
     ----------
     trial
-        The vine and its rig; a yield pressure of NaN is guessed, or taken from the fit.
-    said
+        The vine and its rig; a yield pressure of NaN is taken from the fit or the printed values.
+    stated
         Numbers that a person gives.
     fit
         A fit, or the numbers of one; its model is then the model.
+
+    Returns
+    -------
+    PredictiveInputs
 
     Raises
     ------
@@ -98,21 +102,23 @@ def predictive_inputs(
     FitError
         If the fit is not one of everting vines.
     """
-    said = said or StatedValues()
+    stated = stated or StatedValues()
     if fit is not None and not isinstance(fit, FitNumbers):
-        said = replace(said, own={**{effect.name: effect for effect in fit.model}, **said.own})
+        stated = replace(
+            stated, experiment_effects={**{effect.name: effect for effect in fit.model}, **stated.experiment_effects}
+        )
         fit = numbers_of(fit)
     making = _Making(trial, fit)
-    model = wanted_model(fit.model if fit else said.model, said.effects, said.own)
+    model = wanted_model(fit.model if fit else stated.model, stated.effects, stated.experiment_effects)
     if fit is not None and DAMPING not in fit.keys:
         raise FitError(f"{fit.source} is not a fit of everting vines: it has no B to predict with.")
     anchor = _anchor(making)
-    _damping(making, said, anchor)
-    _exponent(making, said)
+    _damping(making, stated, anchor)
+    _exponent(making, stated)
     _yield_pressure(making, anchor)
-    _further(making, said, model, anchor)
+    _further(making, stated, model, anchor)
     _from_fit(making)
-    spreads = _spreads(making, said)
+    spreads = _spreads(making, stated)
     values = {name: value for name, value in making.values.items() if name in model.parameter_names}
     return PredictiveInputs(
         trial=replace(making.trial, yield_pressure_Pa=making.values[YIELD]),
@@ -134,25 +140,25 @@ def _anchor(making: _Making) -> tuple[str, bool]:
     return nearest_vine(making.fit, making.trial) or "", False
 
 
-def _damping(making: _Making, said: StatedValues, anchor: tuple[str, bool]) -> None:
+def _damping(making: _Making, stated: StatedValues, anchor: tuple[str, bool]) -> None:
     vine, is_same = anchor
     trial, fit = making.trial, making.fit
-    if math.isfinite(said.B):
-        making.know(DAMPING, said.B, "given")
-        if said.B_error > 0:
-            words = f"B is given to {100 * said.B_error:.2g} % (one standard deviation)"
-            making.doubt("error of B", words, f"B given|{trial.vine}", scaled(DAMPING, said.B_error))
+    if math.isfinite(stated.B):
+        making.know(DAMPING, stated.B, "given")
+        if stated.B_error > 0:
+            words = f"B is given to {100 * stated.B_error:.2g} % (one standard deviation)"
+            making.doubt("error of B", words, f"B given|{trial.vine}", scaled(DAMPING, stated.B_error))
         return
     place = fit.place(DAMPING, vine) if fit else None
     if fit is not None and place is not None:
         making.drawn[DAMPING] = place
-        own = math.exp(float(fit.mean[place])) if fit.log[place] else float(fit.mean[place])
+        fitted_B = math.exp(float(fit.mean[place])) if fit.log[place] else float(fit.mean[place])
         if is_same or fit.vines[place] == "":
-            making.know(DAMPING, own, f"fitted, {fit.source}")
+            making.know(DAMPING, fitted_B, f"fitted, {fit.source}")
             return
         size = fit.sizes()[vine]
         factor = guess.damping_prior(trial.diameter_m, trial.thickness_m) / guess.damping_prior(*size)
-        making.know(DAMPING, own * factor, f"scaled from {vine} of {fit.source} as t·D^0.75: a guess")
+        making.know(DAMPING, fitted_B * factor, f"scaled from {vine} of {fit.source} as t·D^0.75: a guess")
         making.notes.append(
             f"no vine of {fit.source} has this diameter and wall: B is carried over from {vine} by a guess"
         )
@@ -197,12 +203,12 @@ def _doubt_guess(making: _Making, split: float) -> None:
         making.doubt("t against D", words, "B split", scaled(DAMPING, split * guess.SPLIT_SIGMA))
 
 
-def _exponent(making: _Making, said: StatedValues) -> None:
-    if math.isfinite(said.n):
-        making.know(EXPONENT, said.n, "given")
-        if said.n_error > 0:
-            words = f"n is given to {said.n_error:.2g} (one standard deviation)"
-            making.doubt("error of n", words, "n given", shifted(EXPONENT, said.n_error))
+def _exponent(making: _Making, stated: StatedValues) -> None:
+    if math.isfinite(stated.n):
+        making.know(EXPONENT, stated.n, "given")
+        if stated.n_error > 0:
+            words = f"n is given to {stated.n_error:.2g} (one standard deviation)"
+            making.doubt("error of n", words, "n given", shifted(EXPONENT, stated.n_error))
         return
     place = making.fit.place(EXPONENT) if making.fit else None
     if making.fit is not None and place is not None:
@@ -248,14 +254,14 @@ def _agrees(fit: FitNumbers, place: int, trial: Trial) -> bool:
     return not math.isfinite(stated) or abs(stated - float(fit.mean[place])) <= max(room, 1.0)
 
 
-def _further(making: _Making, said: StatedValues, model: Model, anchor: tuple[str, bool]) -> None:
+def _further(making: _Making, stated: StatedValues, model: Model, anchor: tuple[str, bool]) -> None:
     """Parameters of all other effects: as said, as fitted, or at their typical size."""
     for effect in model:
         for parameter in effect.parameters:
             name = f"{effect.name}.{parameter.name}"
             if name in making.values:
                 continue
-            size = said.sizes.get(name)
+            size = stated.sizes.get(name)
             place = making.fit.place(name, anchor[0]) if making.fit else None
             if size is not None:
                 making.know(name, size.middle, "given")
@@ -303,7 +309,7 @@ def _from_fit(making: _Making) -> None:
         )
 
 
-def _spreads(making: _Making, said: StatedValues) -> tuple[float, float]:
+def _spreads(making: _Making, stated_values: StatedValues) -> tuple[float, float]:
     """What differs from one trial to the next: relative spreads of pressure and B."""
     fit, trial = making.fit, making.trial
     stated = trial.pressure_sigma_Pa / trial.pressure_Pa if trial.pressure_Pa > 0 else guess.PRESSURE_SPREAD
@@ -312,8 +318,8 @@ def _spreads(making: _Making, said: StatedValues) -> tuple[float, float]:
     if fit is not None and fit.spreads:
         pressure, damping = fit.spreads.get("pressure", pressure), fit.spreads.get("B", damping)
         origin, dof = f"found in {fit.source}:", {**dof, **fit.spread_dof}
-    if said.spreads is not None:
-        (pressure, damping), origin, dof = said.spreads, "given:", {"pressure": math.inf, "B": math.inf}
+    if stated_values.spreads is not None:
+        (pressure, damping), origin, dof = stated_values.spreads, "given:", {"pressure": math.inf, "B": math.inf}
     making.know(PRESSURE, trial.pressure_Pa, "set")
     if pressure > 0:
         move = relative(PRESSURE, pressure, dof["pressure"])

@@ -29,13 +29,42 @@ GAMMAS = {"slow, isothermal (γ = 1)": 1.0, "fast, adiabatic (γ = 1.4)": 1.4}
 
 
 def swept_m3(trial: Trial) -> float:
-    """Volume of the grown vine, m³."""
+    """Volume of the grown vine, m³.
+
+    Parameters
+    ----------
+    trial
+        Diameter and length.
+
+    Returns
+    -------
+    float
+    """
     return trial.area_m2 * trial.length_m
 
 
 def gauge_loss(pressure_Pa: float, swept: float, chamber_m3: float, gamma: float, ambient_Pa: float) -> float:
     """Share of the gauge pressure lost when the volume `swept`, m³, has been filled from a closed chamber.
 
+    Parameters
+    ----------
+    pressure_Pa : float
+        Gauge pressure at the start, Pa.
+    swept : float
+        Volume filled, m³.
+    chamber_m3 : float
+        Volume of the closed chamber, m³.
+    gamma : float
+        Exponent of the gas law, 1 to 1.4.
+    ambient_Pa : float
+        Ambient pressure, absolute, Pa.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
     >>> round(gauge_loss(48e3, 61.36e-9, 3534.3e-9, 1.0, 101_325.0), 3)  # the dye injector: 5.3 %, not 1.7
     0.053
     """
@@ -44,13 +73,43 @@ def gauge_loss(pressure_Pa: float, swept: float, chamber_m3: float, gamma: float
 
 
 def chamber_for(pressure_Pa: float, swept: float, loss: float, gamma: float, ambient_Pa: float) -> float:
-    """Volume of the closed chamber, m³, that loses just this share of its gauge pressure."""
+    """Volume of the closed chamber, m³, that loses just this share of its gauge pressure.
+
+    Parameters
+    ----------
+    pressure_Pa : float
+        Gauge pressure at the start, Pa.
+    swept : float
+        Volume filled, m³.
+    loss : float
+        Share of the gauge pressure that may be lost.
+    gamma : float
+        Exponent of the gas law, 1 to 1.4.
+    ambient_Pa : float
+        Ambient pressure, absolute, Pa.
+
+    Returns
+    -------
+    float
+    """
     q = (((1 - loss) * pressure_Pa + ambient_Pa) / (pressure_Pa + ambient_Pa)) ** (1 / gamma)
     return swept * q / (1 - q)
 
 
 def chamber_by_gauge(swept: float, loss: float) -> float:
-    """What Boyle's law gives where gauge pressure is put into it, m³: V₁/V₂ = 1 − ε. It is too small."""
+    """What Boyle's law gives where gauge pressure is put into it, m³: V₁/V₂ = 1 − ε. It is too small.
+
+    Parameters
+    ----------
+    swept : float
+        Volume filled, m³.
+    loss : float
+        Share of the gauge pressure that may be lost.
+
+    Returns
+    -------
+    float
+    """
     return swept * (1 - loss) / loss
 
 
@@ -64,7 +123,19 @@ class Chamber:
 
 
 def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
-    """The chambers worth looking at: that asked about, those that keep the pressure, and what the gauge rule says."""
+    """The chambers worth looking at: that asked about, those that keep the pressure, and what the gauge rule says.
+
+    Parameters
+    ----------
+    trial
+        Pressure, size, ambient pressure and, where it has one, chamber.
+    loss : float
+        Share of the gauge pressure that may be lost.
+
+    Returns
+    -------
+    tuple of Chamber
+    """
     volume = swept_m3(trial)
 
     def chamber(name: str, volume_m3: float) -> Chamber:
@@ -85,26 +156,59 @@ def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
     return (*asked, *needed, chamber("by gauge pressure (wrong)", chamber_by_gauge(volume, loss)))
 
 
-def supplied_loss(belief: PredictiveInputs, chamber_m3: float, tau_s: float, gamma: float) -> float:
-    """Largest share of the gauge pressure lost at the medians with a supply that closes the gap in `tau_s`."""
-    trial = replace(belief.trial, chamber_m3=chamber_m3)
-    model = _with(belief.model, "supply_refill", tau=tau_s, gamma=gamma)
-    (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=whole_model(belief.model))
+def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gamma: float) -> float:
+    """Largest share of the gauge pressure lost at the medians with a supply that closes the gap in `tau_s`.
+
+    Parameters
+    ----------
+    inputs
+        Predictive inputs; the medians are simulated.
+    chamber_m3 : float
+        Volume of the chamber, m³.
+    tau_s : float
+        Time constant of the supply, s.
+    gamma : float
+        Exponent of the gas law.
+
+    Returns
+    -------
+    float
+    """
+    trial = replace(inputs.trial, chamber_m3=chamber_m3)
+    model = _with(inputs.model, "supply_refill", tau=tau_s, gamma=gamma)
+    (end,) = simulate_many(model, [trial], [np.array([0.0, LONGEST_S])], host=whole_model(inputs.model))
     until = end.end_time_s if end.status in ("ended", "stalled") else LONGEST_S
     times = until * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS)
-    (moved,) = simulate_many(model, [trial], [times], host=whole_model(belief.model))
+    (moved,) = simulate_many(model, [trial], [times], host=whole_model(inputs.model))
     pressure = pressure_along(model, trial, times, moved.lead_position_m, moved.lead_velocity_m_s)
     return 1 - float(np.min(pressure)) / trial.pressure_Pa
 
 
-def supplied_chamber(belief: PredictiveInputs, loss: float, tau_s: float, gamma: float) -> float:
-    """Volume of the chamber, m³, that with such a supply loses just this share; 0 where the supply alone will do."""
+def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma: float) -> float:
+    """Volume of the chamber, m³, that with such a supply loses just this share; 0 where the supply alone will do.
+
+    Parameters
+    ----------
+    inputs
+        Predictive inputs; the medians are simulated.
+    loss : float
+        Share of the gauge pressure that may be lost.
+    tau_s : float
+        Time constant of the supply, s.
+    gamma : float
+        Exponent of the gas law.
+
+    Returns
+    -------
+    float
+        m³
+    """
 
     def beyond(log_volume: float) -> float:
-        return supplied_loss(belief, math.exp(log_volume), tau_s, gamma) - loss
+        return supplied_loss(inputs, math.exp(log_volume), tau_s, gamma) - loss
 
     closed = chamber_for(
-        belief.trial.pressure_Pa, swept_m3(belief.trial), loss, gamma, belief.trial.ambient_pressure_Pa
+        inputs.trial.pressure_Pa, swept_m3(inputs.trial), loss, gamma, inputs.trial.ambient_pressure_Pa
     )
     low, high = math.log(closed / 1e4), math.log(closed * 1.01)
     if beyond(low) <= 0:
@@ -112,11 +216,27 @@ def supplied_chamber(belief: PredictiveInputs, loss: float, tau_s: float, gamma:
     return math.exp(brentq(beyond, low, high, xtol=1e-3))
 
 
-def final_with(belief: PredictiveInputs, chamber_m3: float, gamma: float, at_fraction: float) -> float:
-    """The final speed at the medians with a closed chamber of this volume, m/s; see `Foresight.final`."""
-    model = _with(belief.model, "reservoir_depletion", gamma=gamma)
-    trial = replace(belief.trial, chamber_m3=chamber_m3)
-    return final_m_s(replace(belief, trial=trial, model=model), model, whole_model(belief.model), at_fraction)
+def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fraction: float) -> float:
+    """The final speed at the medians with a closed chamber of this volume, m/s; see `VinePrediction.final`.
+
+    Parameters
+    ----------
+    inputs
+        Predictive inputs; the medians are simulated.
+    chamber_m3 : float
+        Volume of the chamber, m³.
+    gamma : float
+        Exponent of the gas law.
+    at_fraction : float
+        y/L at which a bare vine's speed is taken.
+
+    Returns
+    -------
+    float
+    """
+    model = _with(inputs.model, "reservoir_depletion", gamma=gamma)
+    trial = replace(inputs.trial, chamber_m3=chamber_m3)
+    return final_m_s(replace(inputs, trial=trial, model=model), model, whole_model(inputs.model), at_fraction)
 
 
 def _with(model: Model, name: str, **values: float) -> Model:

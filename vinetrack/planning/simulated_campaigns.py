@@ -55,7 +55,29 @@ def simulate_campaign(
     seed: int = 1,
     watch: Callable[[], None] | None = None,
 ) -> SimulatedCampaigns:
-    """Make a campaign so many times, fit each, and compare with the truth; `watch` is called after each."""
+    """Simulate a campaign several times, fit each, and compare with the truth.
+
+    Parameters
+    ----------
+    model
+        The truth, with B by vine.
+    trials
+        Trials of the campaign, replicates one by one.
+    camera
+        Frame rate, noise and longest recording.
+    spreads : (float, float)
+        Relative between-trial standard deviations of pressure and B.
+    campaigns : int
+        How many are simulated.
+    seed : int
+        Of the random numbers.
+    watch : callable, optional
+        Called after each campaign.
+
+    Returns
+    -------
+    SimulatedCampaigns
+    """
     fitted_model = replace(model, values={k: v for k, v in model.values.items() if k not in (DAMPING, EXPONENT)})
     rows: list[dict[str, tuple[float, float, bool]]] = []
     failed = 0
@@ -77,6 +99,23 @@ def make(
 
     The camera is taken for calibrated: no smooth error of position is allowed for unless the sheet states one, as in
     `vinetrack.planning.campaign_information`, whose promise this holds to account.
+
+    Parameters
+    ----------
+    model
+        The truth, with B by vine.
+    trials
+        Trials of the campaign.
+    camera
+        Frame rate, noise and longest recording.
+    spreads : (float, float)
+        Relative between-trial standard deviations of pressure and B.
+    draw : numpy.random.Generator
+
+    Returns
+    -------
+    list of (Trial, Track)
+        Trials as the sheet states them.
     """
     trials = [
         trial if math.isfinite(trial.position_systematic_m) else replace(trial, position_systematic_m=0.0)
@@ -104,8 +143,8 @@ def make(
     since = [time_s - begin for time_s, begin in zip(times, release.tolist(), strict=True)]
     moved = simulate_many(model, true, since, parameters=theta)
     return [
-        (trial, _track(time_s, one.observed_position_m, camera, draw))
-        for trial, time_s, one in zip(trials, times, moved, strict=True)
+        (trial, _track(time_s, trajectory.observed_position_m, camera, draw))
+        for trial, time_s, trajectory in zip(trials, times, moved, strict=True)
     ]
 
 
@@ -119,10 +158,10 @@ def _track(time_s: Floats, position_m: Floats, camera: FilmingPlan, draw: np.ran
 
 def _errors(truth: Model, fitted: Model, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, tuple[float, float, bool]]:
     """Error, stated error and whether the interval held, of n and of ln B by vine (name `B vine`)."""
-    found = fit(fitted, pairs, profile=False)
+    fit_result = fit(fitted, pairs, profile=False)
     names = truth.parameter_names
     rows = {}
-    for number in found.numbers:
+    for number in fit_result.numbers:
         if number.key not in (DAMPING, EXPONENT):
             continue
         vine = number.vine or pairs[0][0].vine

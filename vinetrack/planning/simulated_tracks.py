@@ -19,17 +19,23 @@ from vinetrack.planning.hypothesis_predictions import Hypothesis
 from vinetrack.tracks.position_noise import ar1_noise
 
 LONGEST = 1.5
-"""A recording lasts no longer than this many times the longest that was used."""
+"""A recording lasts no longer than this many times the longest that was used. Chosen: storage and light of a camera
+allow a little more than was used. At half slow trials are not offered, at twice some that the camera may not hold."""
 
 LEAST_TRAVEL = 0.3
-"""Part of its length that a vine must grow while filmed for a trial to be worth making."""
+"""Part of its length that a vine must grow while filmed for a trial to be worth making. Chosen: less hardly leaves the
+start behind. At half trials that show only the start are offered, at twice only those that nearly finish."""
 
 TIMES_LOOKED_AT = 400
+"""Instants at which a condition is followed. Derived: the end is interpolated to (1/400)²/8 of the curvature."""
+
 LEAST_SLACK = 1.05
 """Tail speed, in steady speeds at the same pressure, beyond which a tail would have to push: there the model is in
-doubt unless it was made for that, or the trials so far were of that kind."""
+doubt unless it was made for that, or the trials so far were of that kind. Chosen: 5 % over the steady speed is the
+model's rounding of the start; at half ordinary trials are refused, at twice trials with a pushing tail pass."""
 
 LINGER_FRAMES = 3
+"""Least frames at rest that are planned. Chosen: they fix the origin to 0.6 of one frame's noise."""
 
 
 @dataclass(frozen=True)
@@ -43,25 +49,37 @@ class TrackSampling:
 
 
 def camera_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
-    """The experiment's camera, at the frame rate of the trial at `like`."""
-    seen = [item for item in data if item.trial.travel_ratio != 1]
-    moving_s = [item.time_s[-1] - item.time_s[max(item.n_rest - 1, 0)] for item in seen]
+    """The experiment's camera, at the frame rate of the trial at `like`.
+
+    Parameters
+    ----------
+    data
+        Trials of the experiment, with everting ones among them.
+    like : int
+        Place of the trial whose frame rate is taken.
+
+    Returns
+    -------
+    TrackSampling
+    """
+    seen = [trial_data for trial_data in data if trial_data.trial.travel_ratio != 1]
+    moving_s = [trial_data.time_s[-1] - trial_data.time_s[max(trial_data.n_rest - 1, 0)] for trial_data in seen]
     return TrackSampling(
         frame_s=data[like].frame_s,
-        rest_frames=max(int(np.median([item.n_rest for item in seen])), LINGER_FRAMES),
-        frames_behind_end=int(np.median([_behind_end(item) for item in seen])),
+        rest_frames=max(int(np.median([trial_data.n_rest for trial_data in seen])), LINGER_FRAMES),
+        frames_behind_end=int(np.median([_behind_end(trial_data) for trial_data in seen])),
         longest_s=LONGEST * float(max(moving_s)),
     )
 
 
-def _behind_end(item: FitTrial) -> int:
+def _behind_end(trial_data: FitTrial) -> int:
     """Points of a track that show the vine at the end of its growth."""
-    last = int(np.flatnonzero(item.first)[-1])
-    y = item.lead_position_m
-    if last == 0 or not math.isfinite(item.trial.length_m):
+    last = int(np.flatnonzero(trial_data.first)[-1])
+    y = trial_data.lead_position_m
+    if last == 0 or not math.isfinite(trial_data.trial.length_m):
         return 0
-    left_out = y[last] - y[last - 1] > 0.25 * (1 - END_FRACTION) * item.trial.length_m
-    still = float(np.ptp(y[last:])) < 10 * max(item.noise_m, 1e-6)
+    left_out = y[last] - y[last - 1] > 0.25 * (1 - END_FRACTION) * trial_data.trial.length_m
+    still = float(np.ptp(y[last:])) < 10 * max(trial_data.noise_m, 1e-6)
     return y.size - last if left_out and still else 0
 
 
@@ -77,7 +95,23 @@ class Course:
 
 
 def blank(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_position_m: Floats) -> FitTrial:
-    """A trial as a fit sees it, at these times since release; where the experiment measures pressure it is constant."""
+    """A trial as a fit sees it, at these times since release; where the experiment measures pressure it is constant.
+
+    Parameters
+    ----------
+    condition
+        The trial that could be made.
+    time_s : array, shape (n_points,), s
+        Times since release; those up to 0 are at rest.
+    data
+        Trials of the experiment; noise and pressure trace are those of the one the condition is like.
+    lead_position_m : array, shape (n_points,), m
+        Positions to fill in.
+
+    Returns
+    -------
+    FitTrial
+    """
     like = data[condition.like]
     trace = None
     if like.trace is not None:
@@ -98,34 +132,50 @@ def blank(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_p
 def courses(
     hypotheses: Sequence[Hypothesis], conditions: Sequence[Condition], cameras: Sequence[TrackSampling]
 ) -> list[Course | None]:
-    """How every condition would run; None where it is not worth filming, or where the model is in doubt."""
+    """How every condition would run; None where it is not worth filming, or where the model is in doubt.
+
+    Parameters
+    ----------
+    hypotheses
+        Carried to the conditions; that last is the one whose slack decides.
+    conditions
+        Trials that could be made.
+    cameras
+        Of each condition.
+
+    Returns
+    -------
+    list of Course or None
+    """
     data = hypotheses[0].fit.predictor.data
     times = [np.linspace(0.0, camera.longest_s, TIMES_LOOKED_AT) for camera in cameras]
-    items = [blank(one, t, data, t) for one, t in zip(conditions, times, strict=True)]
+    items = [blank(condition, t, data, t) for condition, t in zip(conditions, times, strict=True)]
     every = range(len(conditions))
-    own = np.zeros((len(conditions), OWN))
+    trial_effects = np.zeros((len(conditions), OWN))
     runs: list[list[Trajectory | None]] = []
     jobs: list[Job] = []
     for hypothesis in hypotheses:
         predictor = hypothesis.predictor(every, items)
-        jobs = predictor.jobs(hypothesis.theta, own)
+        jobs = predictor.jobs(hypothesis.theta, trial_effects)
         runs.append(_followed(predictor, jobs))
     allowed = max(LEAST_SLACK, _slackest_so_far(hypotheses[-1].fit))
-    found: list[Course | None] = []
+    runs_or_none: list[Course | None] = []
     for i, condition in enumerate(conditions):
-        mine = [one for one in (run[i] for run in runs) if one is not None]
+        mine = [trajectory for trajectory in (run[i] for run in runs) if trajectory is not None]
         if len(mine) < len(runs):
-            found.append(None)
+            runs_or_none.append(None)
             continue
         length_m = condition.trial.length_m
-        near_s = min(_reaches(one, END_FRACTION * length_m, cameras[i].longest_s) for one in mine)
-        grown_m = min(float(np.interp(near_s, one.time_s, one.lead_position_m)) for one in mine)
-        slack = slackness(hypotheses[-1].fit, condition.trial, jobs[i], mine[-1].tail_velocity_m_s)
+        near_s = min(_reaches(trajectory, END_FRACTION * length_m, cameras[i].longest_s) for trajectory in mine)
+        grown_m = min(float(np.interp(near_s, trajectory.time_s, trajectory.lead_position_m)) for trajectory in mine)
+        slack = _slackness(hypotheses[-1].fit, condition.trial, jobs[i], mine[-1].tail_velocity_m_s)
         worth = grown_m > LEAST_TRAVEL * (length_m if math.isfinite(length_m) else 0.0)
         doubtful = condition.trial.tail_slack != "free" and slack > allowed
-        ends = max(one.end_time_s if one.status == "ended" else math.inf for one in mine)
-        found.append(Course(near_s, ends) if worth and not doubtful and near_s > 8 * cameras[i].frame_s else None)
-    return found
+        ends = max(trajectory.end_time_s if trajectory.status == "ended" else math.inf for trajectory in mine)
+        runs_or_none.append(
+            Course(near_s, ends) if worth and not doubtful and near_s > 8 * cameras[i].frame_s else None
+        )
+    return runs_or_none
 
 
 def _followed(predictor: Predictor, jobs: Sequence[Job]) -> list[Trajectory | None]:
@@ -148,7 +198,7 @@ def _reaches(moved: Trajectory, position_m: float, otherwise_s: float) -> float:
     return float(np.interp(position_m, moved.lead_position_m[k - 1 : k + 1], moved.time_s[k - 1 : k + 1]))
 
 
-def slackness(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) -> float:
+def _slackness(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) -> float:
     """Largest tail speed, in the steady speed of a bare vine there; 0 where the model has no damping."""
     names = fit.model.parameter_names
     if DAMPING not in names or EXPONENT not in names:
@@ -164,12 +214,12 @@ def slackness(fit: Fit, trial: Trial, job: Job, tail_velocity_m_s: Floats) -> fl
 def _slackest_so_far(fit: Fit) -> float:
     """Largest slackness among the trials of the experiment."""
     jobs = fit.predictor.jobs(fit.solution.state.theta, np.zeros((len(fit.trials), OWN)))
-    found = [
-        slackness(fit, one.trial, job, one.trial.travel_ratio * one.predicted_velocity_m_s)
-        for one, job in zip(fit.trials, jobs, strict=True)
-        if one.trial.travel_ratio != 1
+    slack = [
+        _slackness(fit, trial_fit.trial, job, trial_fit.trial.travel_ratio * trial_fit.predicted_velocity_m_s)
+        for trial_fit, job in zip(fit.trials, jobs, strict=True)
+        if trial_fit.trial.travel_ratio != 1
     ]
-    return max((one for one in found if math.isfinite(one)), default=0.0)
+    return max((value for value in slack if math.isfinite(value)), default=0.0)
 
 
 def film(
@@ -187,8 +237,24 @@ def film(
 
     Parameters
     ----------
-    theta : array, shape (n_free,): the true numbers, scaled
-    deviations : array, shape (n_places, 2): of pressure, relative, and of ln B
+    truth
+        The hypothesis taken for true.
+    places : sequence of int
+        Places among the conditions, one a trial.
+    conditions
+        All conditions.
+    cameras
+        Of all conditions.
+    theta : array, shape (n_free,)
+        The true numbers, scaled.
+    deviations : array, shape (n_places, 2)
+        Of pressure, relative, and of ln B.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    list of FitTrial or None
+        One a place.
     """
     chosen, lenses = [conditions[k] for k in places], [cameras[k] for k in places]
     data = truth.fit.predictor.data
@@ -196,21 +262,21 @@ def film(
         lens.frame_s * np.arange(lens.rest_frames + math.ceil(lens.longest_s / lens.frame_s), dtype=float)
         for lens in lenses
     ]
-    items = [blank(one, t, data, t) for one, t in zip(chosen, times, strict=True)]
+    items = [blank(condition, t, data, t) for condition, t in zip(chosen, times, strict=True)]
     predictor = truth.predictor(places, items)
-    own = np.zeros((len(chosen), OWN))
-    own[:, RELEASE] = [(lens.rest_frames - 1 + rng.uniform()) * lens.frame_s for lens in lenses]
-    own[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
-    own[:, PRESSURE] = np.where(predictor.feels_pressure, deviations[:, 0], 0.0)
-    own[:, DAMPING_DEVIATION] = np.where(predictor.feels_damping, deviations[:, 1], 0.0)
+    trial_effects = np.zeros((len(chosen), OWN))
+    trial_effects[:, RELEASE] = [(lens.rest_frames - 1 + rng.uniform()) * lens.frame_s for lens in lenses]
+    trial_effects[:, ORIGIN] = rng.uniform(-0.02, 0.02, len(chosen))
+    trial_effects[:, PRESSURE] = np.where(predictor.feels_pressure, deviations[:, 0], 0.0)
+    trial_effects[:, DAMPING_DEVIATION] = np.where(predictor.feels_damping, deviations[:, 1], 0.0)
     seen = []
-    for i, moved in enumerate(predictor.run(predictor.jobs(theta, own))):
+    for i, moved in enumerate(predictor.run(predictor.jobs(theta, trial_effects))):
         stop = times[i].size
         if moved.status == "ended":
-            last_s = own[i, RELEASE] + moved.end_time_s
+            last_s = trial_effects[i, RELEASE] + moved.end_time_s
             stop = min(stop, int(np.searchsorted(times[i], last_s)) + lenses[i].frames_behind_end)
         noise = ar1_noise(stop, math.sqrt(truth.variance / (1 - truth.rho**2)), truth.rho, rng)
-        position_m = own[i, ORIGIN] + moved.observed_position_m[:stop] + noise
+        position_m = trial_effects[i, ORIGIN] + moved.observed_position_m[:stop] + noise
         seen.append(_as_seen(chosen[i], times[i][:stop], position_m, items[i].trace))
     return seen
 
