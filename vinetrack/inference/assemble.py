@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.records import Floats
+from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, TrialFit
@@ -18,8 +19,9 @@ from vinetrack.inference.intervals import Precision, among_first, near_bound, pr
 from vinetrack.inference.mixed_effects import deviance, estimate_spreads, marginal, trial_effect_prior
 from vinetrack.inference.optimiser import Solution, chi2_per_dof
 from vinetrack.inference.parameters import YIELD_PRESSURE, FreeParameter, ParameterMap
+from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import smooth_errors
-from vinetrack.inference.robust_covariance import widened_covariance
+from vinetrack.inference.robust_covariance import few_trials, widened_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.whitening import at_correlation, whiten
 
@@ -35,6 +37,10 @@ MISSES = 2.0
 """χ² per degree of freedom from which the fit warns that it misses the data. Chosen: half of it would warn of every
 sound fit (χ² per degree of freedom is 1 there), twice would keep silent about visible misfit; it decides a warning
 alone."""
+
+DISAGREE = 1.0
+"""Standard deviation between trials, in errors of the number shared, from which the fit says that trials disagree.
+Derived: of two trials that scatter by more than their noise it is √2, of trials that agree mostly 0; wording alone."""
 
 SPREAD_NAMES = ("pressure", "B")
 
@@ -54,11 +60,15 @@ def assemble(
     wide = smooth.solution if smooth else solution
     by_noise = precision(wide)
     trials = _trial_fits(predictor, solution, among_first(by_noise, len(layout.free)))
+    pooled = _pooled(predictor, solution, options)
+    if pooled is not None:
+        wide, by_noise = pooled.solution, replace(by_noise, covariance=_with_unknown(pooled.covariance, by_noise))
     if smooth is not None:
         trials = tuple(replace(one, whitened=white) for one, white in zip(trials, smooth.whitened, strict=True))
-    known = widened_covariance(predictor, solution, trials, by_noise, wide if smooth else None)
+    known = widened_covariance(predictor, solution, trials, by_noise, wide if smooth else None, pooled)
     by_noise, known = (among_first(one, len(layout.free)) for one in (by_noise, known))
     numbers = _numbers(predictor, solution, wide.state.theta, by_noise, known, profile=profile)
+    between = _outside(layout, numbers, _between(pooled, len(numbers)))
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([item.time_s.size for item in predictor.data], dtype=float)
     variance = float(np.average(state.variance, weights=weights)) / (1 - state.rho**2)
@@ -77,14 +87,54 @@ def assemble(
         chi2_per_dof=chi2,
         log_likelihood=plain + smooth.gain if smooth else plain,
         trials=trials,
-        messages=(*_messages(layout, solution, numbers, known, chi2), *_weighted(predictor.data)),
+        messages=(
+            *_messages(layout, solution, numbers, known, chi2),
+            *_disagreements(numbers, between),
+            *_weighted(predictor.data),
+        ),
         left_out=dict(left_out),
         converged=solution.converged,
         iterations=solution.iterations,
         predictor=predictor,
         solution=solution,
         options=options,
+        between=between,
     )
+
+
+def _pooled(predictor: Predictor, solution: Solution, options: Mapping[str, Any]) -> Pooled | None:
+    """The trials weighed by how much they disagree, where the fit itself knows of no disagreement.
+
+    That is where trials are few, or have nothing of their own: B and pressure are what a vine's trials may differ by.
+    """
+    held = options.get("held")
+    if held is not None and held.noise is not None:
+        return None
+    if few_trials(predictor, solution) or not solution.frame.feels.any():
+        return pool(predictor, solution, len(predictor.layout.free))
+    return None
+
+
+def _between(pooled: Pooled | None, count: int) -> Floats:
+    return np.zeros((count, count)) if pooled is None else pooled.between[:count, :count]
+
+
+def _disagreements(numbers: Sequence[Number], between: Floats) -> list[str]:
+    """Numbers that trials disagree about by more than the error of their mean, in words."""
+    sd = np.sqrt(np.diag(between))
+    found = [
+        f"{n.title} by ± {sd[k] * display_unit(n.unit)[1]:.2g} {display_unit(n.unit)[0]}".rstrip()
+        for k, n in enumerate(numbers)
+        if sd[k] > DISAGREE * n.sigma and math.isfinite(n.sigma)
+    ]
+    if not found:
+        return []
+    return [f"trials disagree by more than their noise, in {', '.join(found)}: they count nearly alike"]
+
+
+def _with_unknown(covariance: Floats, known: Precision) -> Floats:
+    unknown = ~np.isfinite(np.diag(known.covariance))
+    return np.where(np.diag(unknown), math.inf, covariance)
 
 
 def log_likelihood(solution: Solution) -> float:

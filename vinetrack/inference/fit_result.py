@@ -120,7 +120,9 @@ class Fit:
     deviation of a position and `noise_correlation` its lag-one correlation, found with the model;
     `chi2_per_dof` holds what the model leaves against the noise of the tracks alone: 1 where nothing is missed.
     `log_likelihood` is the marginal one, every trial's own numbers integrated out, spreads and noise at their best:
-    what hypotheses are compared by. `left_out` gives trials that could not be used, and why.
+    what hypotheses are compared by. `left_out` gives trials that could not be used, and why. `between`, of the shape
+    of `covariance`, is by how much the numbers of a trial differ from the shared ones, beyond its deviations of
+    pressure and B (`vinetrack.inference.pooling`): all zeros where the trials agree, or are many.
     """
 
     model: Model
@@ -139,6 +141,7 @@ class Fit:
     predictor: Predictor
     solution: Solution
     options: Mapping[str, Any]
+    between: Floats | None = None
 
     def __getitem__(self, name: str) -> Number:
         """The number of that name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique.

@@ -40,6 +40,11 @@ CORRELATIONS = np.concatenate(
 )
 SPREAD_COLUMNS = (PRESSURE, DAMPING_DEVIATION)
 
+LOOSE, WITHIN_LEAST = 1e-9, 1e-6
+"""Precision of a shared number freed in one trial, in units of what that trial tells of it at white noise; least part
+of the residual that stays. Derived: 1e-9 is far below any information at the correlations of the grid, far above
+rounding; a residual of which a millionth stays is a thousand times its noise, all of it disagreement."""
+
 
 @dataclass(frozen=True)
 class FitState:
@@ -342,33 +347,46 @@ def estimate_spreads(
 
 
 def estimate_noise(
-    grams: Floats, frame: MixedProblem, state: FitState, rho: float | None = None
+    grams: Floats, frame: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
 ) -> tuple[float, Floats]:
     """Correlation of the noise, the same for all trials, and the variance of its innovations in each, m².
 
     Restricted likelihood of what is left once each trial's own numbers have been fitted. A trial's variance is drawn to
-    that of all as far as trials do not differ by more than chance. The correlation is `rho` where given.
+    that of all as far as trials do not differ by more than chance. The correlation is `rho` where given. `within` frees
+    the shared numbers in every trial too, so that what trials disagree by does not pass for noise.
     """
     grid = CORRELATIONS if rho is None else np.array([rho])
     centre, precision = trial_effect_prior(frame, state)
     stiff = precision * state.variance[:, None]
-    shared = np.count_nonzero(frame.free) / frame.index.shape[0]
+    pull_back = stiff * (state.own - centre)
+    freed = OWN + frame.index.shape[1] if within else OWN
+    shared = 0.0 if within else np.count_nonzero(frame.free) / frame.index.shape[0]
+    if within:
+        stiff = np.concatenate([stiff, _loose(grams, freed)], axis=1)
+        pull_back = np.pad(pull_back, ((0, 0), (0, freed - OWN)))
     scores, squares = [], []
     for value in grid:
         white = at_correlation(grams, float(value))
-        inner = white[:, :OWN, :OWN] + stiff[:, :, None] * np.eye(OWN)
-        taken = np.einsum("nkk->n", solve_each(inner, white[:, :OWN, :OWN])) + shared
+        inner = white[:, :freed, :freed] + stiff[:, :, None] * np.eye(freed)
+        taken = np.einsum("nkk->n", solve_each(inner, white[:, :freed, :freed])) + shared
         dof = np.maximum(frame.points - taken, 1.0)
-        pull = white[:, :OWN, -1] - stiff * (state.own - centre)
+        pull = white[:, :freed, -1] - pull_back
         gain = np.sum(pull * solve_each(inner, pull[:, :, None])[:, :, 0], axis=1)
-        square = np.maximum(white[:, -1, -1] - gain, 0.2 * white[:, -1, -1])
+        least = WITHIN_LEAST if within else 0.2
+        square = np.maximum(white[:, -1, -1] - gain, least * white[:, -1, -1])
         score = np.sum(dof * np.log(square / dof)) - np.sum(frame.stretches) * math.log(1 - value**2)
         scores.append(score + np.sum(np.linalg.slogdet(inner)[1]))
         squares.append((square, dof))
     best = int(np.argmin(scores))
     if rho is None:
-        return estimate_noise(grams, frame, state, _lowest(grid, np.array(scores), best))
+        return estimate_noise(grams, frame, state, _lowest(grid, np.array(scores), best), within=within)
     return rho, _draw_together(*squares[0])
+
+
+def _loose(grams: Floats, freed: int) -> Floats:
+    """Precision that leaves the shared numbers free in every trial, shape (n_trials, n_keys): tiny beside its own."""
+    told = np.einsum("nkk->nk", grams[:, 0])[:, OWN:freed]
+    return np.asarray(np.where(told > 0, LOOSE * told, 1.0))
 
 
 def _lowest(grid: Floats, scores: Floats, best: int) -> float:

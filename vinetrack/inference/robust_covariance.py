@@ -17,6 +17,7 @@ from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.intervals import Precision
 from vinetrack.inference.mixed_effects import cross_products, inverse_among, trial_effects_eliminated
 from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.pooling import Pooled, trial_information
 from vinetrack.inference.sensitivity import OWN, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.inference.whitening import products
@@ -44,16 +45,42 @@ def scatter_of(single: Floats, degrees: float) -> Floats:
     return np.asarray(np.sum((single - single.mean(axis=0)) ** 2, axis=0) * trials / degrees)
 
 
+def few_trials(predictor: Predictor, solution: Solution) -> bool:
+    """Whether trials are too few for a sandwich over them.
+
+    Parameters
+    ----------
+    solution : at the end of the fit
+
+    Returns
+    -------
+    bool
+    """
+    spare = len(predictor.data) - np.count_nonzero(solution.frame.free)
+    return len(predictor.data) < FEWEST_CLUSTERS or bool(spare < FEWEST_DEGREES)
+
+
 def widened_covariance(
     predictor: Predictor,
     solution: Solution,
     trials: Sequence[TrialFit],
     known: Precision,
     wide: Solution | None = None,
+    pooled: Pooled | None = None,
 ) -> Precision:
     """Covariance and degrees of freedom at the end of a fit, widened where trials say that they should be.
 
-    `wide` is the fit with smooth errors of position among its numbers, to which `known` then belongs.
+    Parameters
+    ----------
+    solution : at the end of the fit
+    trials : its trials
+    known : covariance and degrees of freedom by the noise model
+    wide : the fit with smooth errors of position among its numbers, to which `known` then belongs
+    pooled : its trials weighed by how much they disagree, to which `known` then belongs; `wide` is its solution
+
+    Returns
+    -------
+    Precision
     """
     doubts = systematics_of(predictor, solution, trials, positions=wide is None)
     plain, robust, shared = _sandwich(predictor, wide or solution, doubts)
@@ -61,14 +88,21 @@ def widened_covariance(
     live = diagonal > 0
     ratio = np.ones(diagonal.size)
     spare = len(trials) - np.count_nonzero(live)
-    if len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
+    at_most = known.degrees
+    if pooled is not None:
+        diagonal = np.diag(pooled.covariance)
+        live = diagonal > 0
+        variance, few = _few_trials(pooled.information, pooled.scores, wide or solution, pooled.covariance)
+        ratio[live] = np.sqrt(np.maximum(variance[live] / diagonal[live], 1.0))
+        at_most = np.where(np.diag(pooled.between) > 0, np.minimum(at_most, few), at_most)
+    elif len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
         ratio[live] = np.sqrt(np.maximum(np.diag(robust)[live] / diagonal[live], 1.0))
         clusters = len(set(coarsest_groups([item.trial for item in predictor.data])))
         few = np.full(diagonal.size, float(min(int(spare), clusters - 1)))
     else:
-        variance, few = _few_trials(wide or solution, plain)
+        variance, few = _few_trials(*trial_information(wide or solution), wide or solution, plain)
         ratio[live] = np.sqrt(np.maximum(variance[live] / diagonal[live], 1.0))
-    degrees = np.where(ratio > 1, np.minimum(known.degrees, few), known.degrees)
+    degrees = np.where(ratio > 1, np.minimum(at_most, few), at_most)
     covariance = np.where(np.isfinite(known.covariance), known.covariance, 0.0) * ratio[:, None] * ratio + shared
     unknown = np.flatnonzero(~np.isfinite(np.diag(known.covariance)))
     covariance[unknown, unknown] = np.inf
@@ -82,7 +116,7 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     return plain, robust
 
 
-def _few_trials(solution: Solution, plain: Floats) -> tuple[Floats, Floats]:
+def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: Floats) -> tuple[Floats, Floats]:
     """Variances of the free numbers from how trials disagree, unbiased for few of them; and their degrees of freedom.
 
     Each trial pulls the fit towards itself, by its share K_i of the information, and so shows less than it errs by: in
@@ -90,25 +124,25 @@ def _few_trials(solution: Solution, plain: Floats) -> tuple[Floats, Floats]:
     McCaffrey, Survey Methodology 28, 169, 2002). What one trial alone tells of has no scatter: there the model's
     stands. Degrees of freedom are Satterthwaite's; two trials have one.
 
+    Parameters
+    ----------
+    information, scores : of the trials, see `trial_information`
+    plain : array, shape (n_free, n_free), covariance by the model
+
     Returns
     -------
     variance, degrees : arrays, shape (n_free,), numbers as the fit holds them
     """
-    frame, state = solution.frame, solution.state
-    p, size = solution.columns[0].shape[1] - OWN - 1, frame.prior_mean.size
-    blocks = trial_effects_eliminated(solution.grams, p, frame, state)
-    variance, degrees = np.diag(plain).copy(), np.full(size, np.inf)
+    variance, degrees = np.diag(plain).copy(), np.full(len(plain), np.inf)
     live = np.flatnonzero(np.diag(plain) > 0)
-    if not live.size or len(blocks) < 2:
+    if not live.size or len(scores) < 2:
         return variance, degrees
     root = _root(plain[np.ix_(live, live)])
-    score = _scores(blocks[:, :p, p], frame.index, size)[:, live] @ root
+    score = (scores - scores.mean(axis=0))[:, live] @ root
     shares, mended = [], []
-    constant = root.T @ np.diag(frame.prior_precision[live]) @ root
-    for block, places in zip(blocks[:, :p, :p], frame.index, strict=True):
-        full = np.zeros((size + 1, size + 1))
-        np.add.at(full, (places[:, None], places[None, :]), block)
-        share = root.T @ full[np.ix_(live, live)] @ root
+    constant = root.T @ np.diag(solution.frame.prior_precision[live]) @ root
+    for single in information:
+        share = root.T @ single[np.ix_(live, live)] @ root
         values, vectors = np.linalg.eigh(share)
         seen = values < LARGEST_SHARE
         mended.append((vectors[:, seen] / np.sqrt(1 - np.maximum(values[seen], 0.0))) @ vectors[:, seen].T)

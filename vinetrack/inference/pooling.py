@@ -1,0 +1,212 @@
+"""Few trials that disagree: a between-trial variance of the shared numbers, which decides how much each trial weighs.
+
+A fit gives every trial a noise of its own, and some a deviation of B and pressure. Where trials differ in a number that
+they share (the drag of two bodies, the yield pressure of a tube from day to day), the trial with the smaller noise
+decides the number, and what it misses in the others passes for their noise, which makes them weigh still less. So:
+
+1. The noise of a trial is what is left once its own B, n, C_D ... have been fitted too.
+2. The numbers θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M), M being the covariance that one typical
+   trial leaves. With A_i the information and g_i the score of a trial at the current numbers, its estimate has the
+   covariance A_i⁻¹ + τ² M. τ² maximises the restricted likelihood (random-effects meta-analysis: DerSimonian & Laird,
+   Controlled Clinical Trials 7, 177, 1986; REML as in Viechtbauer, J. Educ. Behav. Stat. 30, 261, 2005).
+3. A step in θ with these weights, trajectories anew, until nothing moves.
+
+With τ² = 0 the weights are those of the noise; with a large τ² all trials count alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.mixed_effects import (
+    FitState,
+    MixedProblem,
+    estimate_noise,
+    inverse_among,
+    trial_effect_step,
+    trial_effects_eliminated,
+)
+from vinetrack.inference.optimiser import Solution, floor
+from vinetrack.inference.position_errors import position_shapes, with_shapes
+from vinetrack.inference.sensitivity import ORIGIN, OWN, Predictor
+
+MOST_STEPS, SETTLED = 12, 0.05
+"""Steps at most, and the length of a step in standard errors at which they end. Chosen: a twentieth of an error; the
+two drops of the tests take four steps."""
+
+LARGEST_TAU2 = 1e6
+"""Largest τ², in variances of one trial by its noise. Chosen: trials a thousand of their errors apart weigh alike."""
+
+LONGEST_STEP = 3.0
+"""Longest step of a number in standard deviations of what trials scatter by. Chosen: beyond it a straight line says
+little; half takes a few more steps."""
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Shared numbers with trials weighed by noise and by how much they disagree, as the fit holds them.
+
+    `solution` stands at these numbers, smooth errors of position behind them. `information`, shape (n_trials, n_free,
+    n_free), and `scores`, shape (n_trials, n_free), are those of the trials with τ² in them; `between`, shape (n_free,
+    n_free), is τ² M, the covariance of a trial's numbers about the shared ones.
+    """
+
+    solution: Solution
+    information: Floats
+    scores: Floats
+    covariance: Floats
+    between: Floats
+
+
+def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None:
+    """Weigh the trials of a fit by noise and disagreement.
+
+    Parameters
+    ----------
+    solution : where the fit ended
+    shared : how many of its free numbers may scatter between trials: the first ones
+
+    Returns
+    -------
+    Pooled or None
+        None for a single trial, or where the trajectories cannot be followed.
+    """
+    if len(predictor.data) < 2:
+        return None
+    shapes = _shapes(predictor, solution)
+    count = shapes[0].shape[1]
+    problem = with_shapes(solution.frame, count) if count else solution.frame
+    state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(count)))
+    columns: Sequence[Floats] = solution.columns
+    for _ in range(MOST_STEPS):
+        wide = _with_shapes(columns, shapes, state.theta[shared:])
+        grams = predictor.products(wide)
+        rho, variance = estimate_noise(grams, problem, state, within=True)
+        state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
+        found = _weighed(replace(solution, state=state, frame=problem, grams=grams, columns=tuple(wide)), shared)
+        step = found.covariance @ _slope(found, problem, state)
+        scatter = np.sqrt(np.diag(found.covariance) + np.diag(found.between))
+        longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
+        errors = np.sqrt(np.maximum(np.diag(found.covariance), 1e-300))
+        if float(np.max(np.abs(step) / errors, initial=0.0)) < SETTLED:
+            return found
+        step = step * min(1.0, LONGEST_STEP / longest)
+        state = _moved(found.solution, state, step)
+        try:
+            columns = predictor.linearise(state.theta[:shared], state.own)
+        except SimulationError:
+            return None
+    return None
+
+
+def _shapes(predictor: Predictor, solution: Solution) -> list[Floats]:
+    grown = [
+        item.lead_position_m - own[ORIGIN] - columns[:, -1]
+        for item, own, columns in zip(predictor.data, solution.state.own, solution.columns, strict=True)
+    ]
+    return position_shapes(predictor, grown)
+
+
+def _with_shapes(columns: Sequence[Floats], shapes: Sequence[Floats], sizes: Floats) -> list[Floats]:
+    return [
+        np.column_stack([one[:, :-1], shape, one[:, -1] - shape @ sizes])
+        for one, shape in zip(columns, shapes, strict=True)
+    ]
+
+
+def _slope(found: Pooled, problem: MixedProblem, state: FitState) -> Floats:
+    return np.asarray(found.scores.sum(axis=0) - problem.prior_precision * (state.theta - problem.prior_mean))
+
+
+def _moved(solution: Solution, state: FitState, step: Floats) -> FitState:
+    """The state a step further, releases, origins and deviations of the trials following to first order."""
+    frame = solution.frame
+    theta = np.clip(state.theta + step, frame.lower, frame.upper)
+    change = np.append(theta - state.theta, 0.0)[frame.index]
+    turned = solution.grams.copy()
+    # The residual once the numbers have moved: r − X δ.
+    turned[..., -1] -= np.einsum("nsik,nk->nsi", solution.grams[..., OWN:-1], change)
+    own = state.own + trial_effect_step(turned, frame, state)
+    return replace(state, theta=theta, own=own)
+
+
+def _weighed(solution: Solution, shared: int) -> Pooled:
+    """Weights of the trials at a state, τ² at its most likely value."""
+    frame, state = solution.frame, solution.state
+    size = frame.prior_mean.size
+    information, scores = trial_information(solution)
+    total = information.sum(axis=0) + np.diag(frame.prior_precision)
+    inside = (state.theta > frame.lower) & (state.theta < frame.upper)
+    live = np.flatnonzero(frame.free & inside & (np.diag(total) > 0))
+    root = _typical_root(inverse_among(total, live), information, shared)
+    prior = np.diag(frame.prior_precision)
+    own = state.theta - frame.prior_mean
+
+    def weighed(tau2: float) -> tuple[Floats, Floats, float]:
+        inner = np.eye(size) + tau2 * root.T @ information @ root
+        less = tau2 * root @ np.linalg.solve(inner, np.broadcast_to(root.T, inner.shape))
+        weight = information - information @ less @ information
+        score = scores - np.einsum("nij,nj->ni", information @ less, scores)
+        inside_all = (weight.sum(axis=0) + prior)[np.ix_(live, live)]
+        slope = (score.sum(axis=0) - frame.prior_precision * own)[live]
+        scale = 1 / np.sqrt(np.diag(inside_all))
+        even = inside_all * scale[:, None] * scale
+        gained = float((scale * slope) @ np.linalg.lstsq(even, scale * slope, rcond=1e-11)[0])
+        log_det = float(np.sum(np.linalg.slogdet(inner)[1])) + float(np.linalg.slogdet(inside_all)[1])
+        explained = float(np.einsum("ni,nij,nj->", scores, less, scores))
+        return weight, score, log_det - explained - gained
+
+    tau2 = _most_likely(lambda value: weighed(value)[2]) if live.size else 0.0
+    weight, score, _ = weighed(tau2)
+    covariance = inverse_among(weight.sum(axis=0) + prior, live)
+    return Pooled(solution, weight, score, covariance, tau2 * root @ root.T)
+
+
+def trial_information(solution: Solution) -> tuple[Floats, Floats]:
+    """What each trial tells of the free numbers, as the fit holds them, all it has of its own integrated out.
+
+    Parameters
+    ----------
+    solution : where they stand
+
+    Returns
+    -------
+    information : array, shape (n_trials, n_free, n_free)
+    scores : array, shape (n_trials, n_free), the slopes of ln L
+    """
+    frame = solution.frame
+    size, p = frame.prior_mean.size, frame.index.shape[1]
+    blocks = trial_effects_eliminated(solution.grams, p, frame, solution.state)
+    information = np.zeros((len(blocks), size + 1, size + 1))
+    scores = np.zeros((len(blocks), size + 1))
+    for i, (block, places) in enumerate(zip(blocks, frame.index, strict=True)):
+        np.add.at(information[i], (places[:, None], places[None, :]), block[:p, :p])
+        np.add.at(scores[i], places, block[:p, p])
+    return information[:, :size, :size], scores[:, :size]
+
+
+def _typical_root(covariance: Floats, information: Floats, shared: int) -> Floats:
+    """A root of M: the covariance of all trials times the number of trials that tell of a number."""
+    telling = np.count_nonzero(np.einsum("nkk->nk", information) > 0, axis=0).astype(float)
+    telling[shared:] = 0.0
+    factor = np.sqrt(telling)
+    values, vectors = np.linalg.eigh(covariance * factor[:, None] * factor)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _most_likely(deviance: Callable[[float], float]) -> float:
+    """The τ² of lowest deviance: 0, or the lowest of a grid, refined."""
+    from scipy.optimize import minimize_scalar
+
+    logs = np.linspace(math.log(1e-2), math.log(LARGEST_TAU2), 24)
+    levels = [deviance(math.exp(one)) for one in logs]
+    best = int(np.argmin(levels))
+    low, high = logs[max(best - 1, 0)], logs[min(best + 1, logs.size - 1)]
+    found = minimize_scalar(lambda one: deviance(math.exp(one)), bounds=(low, high), method="bounded")
+    return float(math.exp(found.x)) if found.fun < deviance(0.0) else 0.0
