@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import vinetrack as vt
 from vinetrack.cli.main import app
 from vinetrack.core.tables import write_json
-from vinetrack.pipeline.model_stage import fit_entry
+from vinetrack.inference.fit_summary import summary_of
 from vinetrack.pipeline.prediction_inputs import Asked, inputs_of, read_ground
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
@@ -39,7 +39,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A results folder with the fit of two vines grown by scipy, seed 31."""
     folder = tmp_path_factory.mktemp("results") / "vines"
     found = vt.fit(vt.base_model(), small_campaign(seed=31)[0])
-    write_json(folder / "fit.json", {"refused": None, **fit_entry(found, ())})
+    write_json(folder / "fit.json", summary_of(found).to_json())
     return folder
 
 

@@ -93,6 +93,8 @@ def diagnosis(verdict: str = "missing", **changes: Any) -> dict[str, Any]:
         "notes": [],
         "refused": None,
     }
+    if "final_verdict" in changes:
+        rounds[-1]["verdict"] = changes["final_verdict"]
     return content | changes
 
 

@@ -8,6 +8,8 @@ import pandas as pd
 import pytest
 
 from vinetrack.core.records import Trial
+from vinetrack.inference.fit_result import Number
+from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.conditions import CONDITION_COLUMNS
 from vinetrack.paper.arithmetic import computed_rows
 from vinetrack.paper.beside import POSITION_COLUMNS, SPEED_COLUMNS
@@ -77,17 +79,14 @@ SCALING = {
         }
     ],
 }
-FIT = {
-    "numbers": [
-        {
-            "parameter": "yield_pressure.P_y",
-            "vine": "24mm-200um-280mm",
-            "value": 2950.0,
-            "low_95": 2900.0,
-            "high_95": None,
-        }
-    ]
-}
+FIT = FitSummary(
+    names=("yield_pressure",),
+    numbers=(
+        Number(
+            "yield_pressure.P_y", "24mm-200um-280mm", "P_y", "Pa", 2950.0, nan, 2900.0, nan, dof=nan, method="linear"
+        ),
+    ),
+)
 
 
 def found(mark: str = SIMULATED, **changes: object) -> Found:
@@ -111,7 +110,7 @@ def found(mark: str = SIMULATED, **changes: object) -> Found:
 
 def nothing() -> Found:
     empty = {name: pd.DataFrame(columns=list(columns), dtype=float) for name, columns in EMPTY.items()}
-    return found(damping={}, scaling={}, fit={}, **empty)
+    return found(damping={}, scaling={}, fit=FitSummary(()), **empty)
 
 
 EMPTY = {

@@ -11,6 +11,7 @@ import pandas as pd
 import pytest
 from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, moved, one_round, refused
 
+from vinetrack.diagnosis.result import Round
 from vinetrack.figures.style import render
 from vinetrack.pipeline.diagnosis_tables import (
     draw_diagnosed,
@@ -151,7 +152,8 @@ def test_what_the_last_model_says_joins_the_comparison_where_something_was_added
 
 
 def test_rankings_keep_what_could_not_be_tested_and_round_two_says_what_was_added() -> None:
-    rounds = [one_round("missing", "air_drag"), one_round("adequate", model=[*BASE, "air_drag"])]
+    told = [one_round("missing", "air_drag"), one_round("adequate", model=[*BASE, "air_drag"])]
+    rounds = [Round.from_json(one) for one in told]
     table = ranking_table(rounds[0])
     assert table["effect"].tolist() == ["air_drag", "leak", "time_base", "payload_drag"]
     assert math.isnan(table["delta_chi2"].iloc[-1])
@@ -161,9 +163,7 @@ def test_rankings_keep_what_could_not_be_tested_and_round_two_says_what_was_adde
 
 def test_ties_stand_in_the_order_of_the_ranking() -> None:
     cosines = {"effects": ["time_base", "leak", "air_drag"], "matrix": [[1, 0.1, 0.2], [0.1, 1, 0.3], [0.2, 0.3, 1]]}
-    ordered = in_order_of_rank(cosines, [one_round("missing", "air_drag")])
-    assert ordered == {
-        "effects": ["air_drag", "leak", "time_base"],
-        "matrix": [[1, 0.3, 0.2], [0.3, 1, 0.1], [0.2, 0.1, 1]],
-    }
-    assert in_order_of_rank({}, []) == {"effects": [], "matrix": []}
+    names, matrix = in_order_of_rank(Round.from_json(one_round("missing", "air_drag") | {"cosines": cosines}))
+    assert names == ["air_drag", "leak", "time_base"]
+    assert matrix == [[1, 0.3, 0.2], [0.3, 1, 0.1], [0.2, 0.1, 1]]
+    assert in_order_of_rank(Round.from_json({"verdict": ""})) == ([], [])

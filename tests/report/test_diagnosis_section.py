@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 
+import pandas as pd
 import pytest
 from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, laws, moved, next_experiment, number, refused
 from test_report import EVIL, SVG, Tags, page
 
+from vinetrack.diagnosis.result import Candidate, Diagnosis, Round
 from vinetrack.figures.registry import DIAGNOSIS_FIGURES
-from vinetrack.narrative.verdict_summary import facts, listed, meaning, sentence, size
+from vinetrack.inference.fit_result import Number
+from vinetrack.narrative import verdict_summary
+from vinetrack.narrative.verdict_summary import Fact, listed
 from vinetrack.report.build import ReportFigure
 from vinetrack.report.diagnosis_section import (
     DiagnosisResult,
@@ -22,6 +26,22 @@ from vinetrack.report.diagnosis_section import (
 from vinetrack.report.diagnosis_section import next_experiment as next_entry
 
 
+def read(content: dict) -> Diagnosis:
+    return Diagnosis.from_json(content)
+
+
+def facts(content: dict, table: pd.DataFrame | None) -> list[Fact]:
+    return verdict_summary.facts(read(content), table)
+
+
+def sentence(content: dict) -> str:
+    return verdict_summary.sentence(read(content))
+
+
+def meaning(content: dict) -> str:
+    return verdict_summary.meaning(read(content))
+
+
 def heading(html: str) -> str:
     found = re.search(r"<h1>(.*?)</h1>", html, re.DOTALL)
     assert found is not None
@@ -30,7 +50,7 @@ def heading(html: str) -> str:
 
 def shown(content: dict, **changes: object) -> str:
     added = ["", *content.get("effects", [])]
-    return page(diagnosis=DiagnosisResult(content, ladder(*added), **changes))  # type: ignore[arg-type]
+    return page(diagnosis=DiagnosisResult(read(content), ladder(*added), **changes))  # type: ignore[arg-type]
 
 
 SENTENCES = {
@@ -141,14 +161,14 @@ def test_unexplained_names_the_nearest_candidate_and_why_it_is_not_the_answer() 
 
 def test_what_could_still_hide_is_in_the_unit_of_its_number() -> None:
     row = candidate("leak", 1.0, largest={"k": 2500.0, "tau": float("nan")})
-    table = hidden_table([row])
+    table = hidden_table([Candidate.from_json(row)])
     assert table is not None
     assert table.rows == [("leak", "k", "2.50 kPa")]
     unfitted = candidate("leak", 1.0, numbers=[], largest={"leak.k": 2500.0, "leak.j": 1.0})
-    table = hidden_table([unfitted], {"leak.k": ("κ", "Pa")})
+    table = hidden_table([Candidate.from_json(unfitted)], {"leak.k": ("κ", "Pa")})
     assert table is not None
     assert table.rows == [("leak", "κ", "2.50 kPa"), ("leak", "j", "1.00 SI")]
-    assert hidden_table([candidate("leak", 1.0)]) is None
+    assert hidden_table([Candidate.from_json(candidate("leak", 1.0))]) is None
 
 
 def test_candidates_that_cannot_be_tested_here_are_listed_with_the_reason() -> None:
@@ -158,7 +178,7 @@ def test_candidates_that_cannot_be_tested_here_are_listed_with_the_reason() -> N
 
 
 def test_the_ranking_has_every_candidate_with_its_numbers() -> None:
-    section = diagnosis_section(DiagnosisResult(diagnosis()))
+    section = diagnosis_section(DiagnosisResult(read(diagnosis())))
     assert section is not None
     first = section["rounds"][0]["table"].rows
     assert [row[0] for row in first] == ["● reservoir depletion", "leak", "time base"]
@@ -169,8 +189,12 @@ def test_the_ranking_has_every_candidate_with_its_numbers() -> None:
 
 def test_ties_are_named_most_alike_first() -> None:
     cosines = {"effects": ["a", "b_c", "d"], "matrix": [[1, 0.96, None], [0.96, 1, -0.99], [None, -0.99, 1]]}
-    assert tied_pairs(cosines) == ["b c and d (cosine -0.990)", "a and b c (cosine 0.960)"]
-    assert tied_pairs({}) == []
+    entry = Round.from_json({"verdict": "missing", "cosines": cosines})
+    assert tied_pairs(entry) == [
+        "b c and d (cosine -0.990)",
+        "a and b c (cosine 0.960)",
+    ]
+    assert tied_pairs(Round.from_json({"verdict": ""})) == []
 
 
 def test_how_the_numbers_moved_stands_side_by_side() -> None:
@@ -220,7 +244,7 @@ def test_what_drifts_is_said_once_and_what_does_not_is_not() -> None:
 
 def test_a_missing_force_is_drawn_with_what_it_looks_like() -> None:
     figures = [ReportFigure("missing_force", "The missing force", "c", SVG)]
-    html = page(diagnosis=DiagnosisResult(diagnosis("unexplained")), figures=figures)
+    html = page(diagnosis=DiagnosisResult(read(diagnosis("unexplained"))), figures=figures)
     assert html.index("It looks like a constant.") < html.index('id="figure-missing_force"')
     for words in ("the same everywhere", "93 %", "0.400 ± 0.020"):
         assert words in html
@@ -241,12 +265,12 @@ def test_without_a_diagnosis_the_law_is_the_headline() -> None:
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_a_diagnosis_with_nothing_but_a_verdict_makes_a_page(verdict: str) -> None:
     bare = {"verdict": verdict, "effects": [], "answer_set": [], "rounds": []}
-    assert heading(page(diagnosis=DiagnosisResult(bare))).startswith(verdict)
+    assert heading(page(diagnosis=DiagnosisResult(read(bare)))).startswith(verdict)
 
 
 def test_pictures_stand_in_the_parts_they_belong_to() -> None:
     figures = [ReportFigure(key, key, "c", SVG, f"{key}.csv", "a\n1\n") for key in DIAGNOSIS_FIGURES]
-    html = page(diagnosis=DiagnosisResult(diagnosis(), ladder("", "a")), figures=figures)
+    html = page(diagnosis=DiagnosisResult(read(diagnosis()), ladder("", "a")), figures=figures)
     order = ["figure-ladder", "figure-before_after", 'id="law"', 'id="where"', "figure-where", "figure-missing_force"]
     order += ['id="candidates"', "figure-candidates", 'id="tied"', "figure-cosines", 'id="drift"', "figure-drift"]
     places = [html.index(f'id="{one}"' if one.startswith("figure") else f"<h2 {one}") for one in order]
@@ -274,8 +298,8 @@ def test_whatever_stands_in_the_file_is_escaped(place: str) -> None:
 
 
 def test_numbers_are_said_in_units_that_read_well() -> None:
-    assert size(number("a.k", "k", 2500.0, 100.0, "Pa", "v")) == "k (v) = 2.50 ± 0.10 kPa"
-    assert size(number("a.k", "k", 2500.0, None, "Pa")) == "k = 2.50 kPa"
+    shown = [Number.from_json(number("a.k", "k", 2500.0, sigma, "Pa", "v")) for sigma in (100.0, None)]
+    assert [verdict_summary.size(one) for one in shown] == ["k (v) = 2.50 ± 0.10 kPa", "k (v) = 2.50 kPa"]
 
 
 def test_names_are_listed_as_a_person_says_them() -> None:

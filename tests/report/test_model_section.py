@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 from test_report import EVIL, SVG, Tags, page
 
+from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.report.build import ReportFigure
 from vinetrack.report.model_section import ModelResult, model_section, verdict
 
@@ -65,7 +66,7 @@ CHECK = pd.DataFrame(
 
 
 def result(**changes: object) -> ModelResult:
-    return ModelResult({**FIT, **changes}, comparison(3.0, 4.0), CHECK)
+    return ModelResult(FitSummary.from_json({**FIT, **changes}), comparison(3.0, 4.0), CHECK)
 
 
 def words(html: str) -> str:
@@ -102,7 +103,7 @@ def test_figures_of_the_model_stand_in_its_section() -> None:
 
 
 def test_a_refused_fit_says_why_and_shows_no_table() -> None:
-    refused = ModelResult({"model": ["gravity"], "refused": "No trial can be fitted."}, comparison(), CHECK.iloc[:0])
+    refused = ModelResult(FitSummary(("gravity",), refused="No trial can be fitted."), comparison(), CHECK.iloc[:0])
     text = words(page(model=refused))
     assert "The model in use, gravity, was not fitted: No trial can be fitted." in text
     assert "What the fit found" not in text

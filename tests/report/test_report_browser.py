@@ -11,6 +11,7 @@ import pytest
 from hand_diagnosis import diagnosis, ladder, moved
 from test_report import curves, page, trials, windows
 
+from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures.ladder_figures import draw_before_after, draw_ladder
 from vinetrack.figures.style import render
 from vinetrack.report.build import Clip, ReportFigure
@@ -53,7 +54,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
         trial_figures=dict.fromkeys(names, pictures["before_after"]),
         recordings={name: Recording(pictures["ladder"], ["", "doubtful"]) for name in names},
         clip=Clip(names[0], (folder / "a.mp4").read_bytes(), "caption"),
-        diagnosis=DiagnosisResult(diagnosis("ambiguous"), steps, moved()),
+        diagnosis=DiagnosisResult(Diagnosis.from_json(diagnosis("ambiguous")), steps, moved()),
     )
     path = folder / "report.html"
     path.write_text(html, encoding="utf-8")

@@ -58,7 +58,7 @@ def diagnose(
         if json_file is not None:
             from vinetrack.core.tables import write_json
 
-            write_json(json_file, {**found.to_json(), "refused": None})
+            write_json(json_file, found.to_json())
         typer.echo(str(found))
 
 

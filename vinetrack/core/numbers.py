@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 _FIXED_EXPONENTS = (-4, 6)
 """Decimal exponents written without "e": the range of Python's own `g` format, 0.0001 to 999999."""
@@ -27,6 +28,23 @@ def decimals(sigma: float) -> int:
     decimals : int, 0 to 12.
     """
     return min(max(1 - math.floor(math.log10(sigma)), 0), _MOST_DECIMALS) if 0 < sigma < math.inf else 0
+
+
+def or_nan(value: Any) -> float:
+    """Return a number of a JSON file as a float; NaN for None, which stands there for an unknown number.
+
+    Parameters
+    ----------
+    value : a number, or None.
+
+    Returns
+    -------
+    float
+
+    >>> or_nan(None), or_nan(2)
+    (nan, 2.0)
+    """
+    return math.nan if value is None else float(value)
 
 
 def number(value: float | None, digits: int = 3) -> str:

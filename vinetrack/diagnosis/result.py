@@ -11,10 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.core.notebook import html_table, plot
+from vinetrack.core.numbers import or_nan
 from vinetrack.inference.fit_result import Fit, Number
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
     from vinetrack.diagnosis.locate import Failure
 
@@ -88,6 +91,33 @@ class Candidate:
             "along": [number.to_json() for number in self.along],
         }
 
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> Candidate:
+        """Read an entry of `ranking`; what is absent stands at its default.
+
+        Parameters
+        ----------
+        entry : `effect` at least.
+
+        Returns
+        -------
+        Candidate
+        """
+        return cls(
+            effect=str(entry["effect"]),
+            kind=str(entry.get("kind") or ""),
+            status=str(entry.get("status") or ""),
+            delta_chi2=or_nan(entry.get("delta_chi2")),
+            sigma=or_nan(entry.get("sigma")),
+            numbers=tuple(Number.from_json(one) for one in entry.get("numbers") or ()),
+            plausible=bool(entry.get("plausible", True)),
+            in_answer_set=bool(entry.get("in_answer_set")),
+            reason=str(entry.get("reason") or ""),
+            largest={str(name): or_nan(value) for name, value in (entry.get("largest") or {}).items()},
+            along=tuple(Number.from_json(one) for one in entry.get("along") or ()),
+            posterior_weight=or_nan(entry.get("posterior_weight")),
+        )
+
 
 @dataclass(frozen=True)
 class Round:
@@ -119,14 +149,39 @@ class Round:
             "cosines": {"effects": list(self.cosine_names), "matrix": [list(row) for row in self.cosines]},
         }
 
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> Round:
+        """Read an entry of `rounds`; the fits are not in it.
 
-@dataclass(frozen=True)
+        Parameters
+        ----------
+        entry : `verdict` at least.
+
+        Returns
+        -------
+        Round
+        """
+        cosines = entry.get("cosines") or {}
+        return cls(
+            model=tuple(entry.get("model") or ()),
+            verdict=str(entry["verdict"]),
+            answer_set=tuple(entry.get("answer_set") or ()),
+            ranking=tuple(Candidate.from_json(one) for one in entry.get("ranking") or ()),
+            explanation=str(entry.get("explanation") or ""),
+            cosine_names=tuple(cosines.get("effects") or ()),
+            cosines=tuple(tuple(or_nan(value) for value in row) for row in cosines.get("matrix") or ()),
+        )
+
+
+@dataclass(frozen=True, repr=False)
 class Diagnosis:
     """The whole answer. Printed, it is what a person reads on the terminal.
 
     `effects` are those added, in order; `fits` the model the user came with and every one after it. `drift` holds a row
     a drifting parameter, `ladder` the errors before and after (None where not computed), `next_experiment` what
     to do now where something is tied; `failure` tells where the first model fails, `force_table` what force it lacks.
+    One that was read back has no `fits` but the numbers of the last model in `stored_parameters`; `refused` is the
+    reason why no diagnosis could be made, blank where one was: there are no rounds then.
     """
 
     rounds: tuple[Round, ...]
@@ -141,44 +196,132 @@ class Diagnosis:
     notes: Sequence[str] = ()
     failure: Failure | None = None
     force_table: pd.DataFrame | None = None
+    stored_parameters: tuple[Number, ...] = ()
+    refused: str = ""
 
     @property
     def verdict(self) -> str:
-        """About the model the user came with."""
-        return self.rounds[0].verdict
+        """About the model the user came with; blank where no diagnosis could be made."""
+        return self.rounds[0].verdict if self.rounds else ""
 
     @property
     def final_verdict(self) -> str:
-        """About the model with everything added."""
-        return self.rounds[-1].verdict
+        """About the model with everything added; blank where no diagnosis could be made."""
+        return self.rounds[-1].verdict if self.rounds else ""
 
     @property
     def answer_set(self) -> tuple[str, ...]:
         """Every hypothesis that the data cannot exclude for the first effect that is missing."""
-        return self.rounds[0].answer_set
+        return self.rounds[0].answer_set if self.rounds else ()
+
+    @property
+    def ranking(self) -> tuple[Candidate, ...]:
+        """The candidates of the first round, best first."""
+        return self.rounds[0].ranking if self.rounds else ()
+
+    @property
+    def initial_model(self) -> tuple[str, ...]:
+        """Names of the effects of the model the user came with."""
+        return self.rounds[0].model if self.rounds else ()
+
+    @property
+    def final_model(self) -> tuple[str, ...]:
+        """Names of the effects of the model with everything added."""
+        return (*self.initial_model, *(name for name in self.effects if name not in self.initial_model))
+
+    @property
+    def parameters(self) -> tuple[Number, ...]:
+        """The numbers of the model with everything added, SI."""
+        return self.fits[-1].numbers if self.fits else self.stored_parameters
 
     @property
     def fit(self) -> Fit:
         """The last model fitted."""
         return self.fits[-1]
 
+    def candidates(self) -> pd.DataFrame:
+        """The candidates of all rounds, one row each.
+
+        Returns
+        -------
+        DataFrame
+            Columns `round, effect, kind, status, delta_chi2, sigma, size, in_answer_set, plausible, reason`; the size
+            is text with its standard error and unit, for the units differ from effect to effect.
+        """
+        import pandas as pd
+
+        from vinetrack.narrative.verdict_summary import sizes
+
+        columns = ["round", "effect", "kind", "status", "delta_chi2", "sigma", "size", "in_answer_set", "plausible"]
+        rows = [
+            (i, c.effect, c.kind, c.status, c.delta_chi2, c.sigma, sizes(c), c.in_answer_set, c.plausible, c.reason)
+            for i, step in enumerate(self.rounds, 1)
+            for c in step.ranking
+        ]
+        return pd.DataFrame(rows, columns=[*columns, "reason"])
+
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it; numbers in SI units."""
+        first = self.rounds[0].to_json() if self.rounds else {}
         return {
-            "verdict": self.verdict,
+            "verdict": self.verdict or None,
             "effects": list(self.effects),
             "answer_set": list(self.answer_set),
             "explanation": self.explanation,
-            "final_verdict": self.final_verdict,
+            "final_verdict": self.final_verdict or None,
             "rounds": [one.to_json() for one in self.rounds],
-            "parameters": [number.to_json() for number in self.fit.numbers] if self.fits else [],
-            "cosines": self.rounds[0].to_json()["cosines"],
+            "parameters": [number.to_json() for number in self.parameters],
+            "cosines": first.get("cosines", {}),
             "where": list(self.where),
             "drift": [dict(row) for row in self.drift],
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
             "missing_force": None if self.missing_force is None else dict(self.missing_force),
             "notes": list(self.notes),
+            "refused": self.refused or None,
         }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any], ladder: pd.DataFrame | None = None) -> Diagnosis:
+        """Read what `to_json` wrote.
+
+        Parameters
+        ----------
+        content : of `diagnosis.json`.
+        ladder : of `ladder.csv`; None where there is none.
+
+        Returns
+        -------
+        Diagnosis
+            Without fits, `failure` and `force_table`, which the file does not hold.
+        """
+        rounds = content.get("rounds") or ([{"verdict": content["verdict"]}] if content.get("verdict") else [])
+        return cls(
+            rounds=tuple(Round.from_json(one) for one in rounds),
+            effects=tuple(content.get("effects") or ()),
+            explanation=str(content.get("explanation") or ""),
+            ladder=ladder,
+            drift=tuple(content.get("drift") or ()),
+            where=tuple(str(line) for line in content.get("where") or ()),
+            next_experiment=content.get("next_experiment"),
+            missing_force=content.get("missing_force"),
+            notes=tuple(str(note) for note in content.get("notes") or ()),
+            stored_parameters=tuple(Number.from_json(one) for one in content.get("parameters") or ()),
+            refused=str(content.get("refused") or ""),
+        )
+
+    def plot(self, name: str = "", **options: Any) -> Figure:
+        """Return a figure of the report: `ladder` (the default), `before_after`, `where`, `candidates`, …, by name."""
+        return plot(self, name, **options)
+
+    def __repr__(self) -> str:
+        named = ", ".join(self.effects or self.answer_set)
+        return f"Diagnosis({self.verdict or 'refused'}{f': {named}' if named else ''})"
+
+    def _repr_html_(self) -> str:
+        from vinetrack.narrative.verdict_summary import facts, sentence
+
+        rows = [(fact.question, fact.answer, fact.note) for fact in facts(self, self.ladder)]
+        return html_table(("", "", ""), rows, f"{self.verdict or 'refused'}: {sentence(self)}", [self.explanation])
 
     def __str__(self) -> str:
         from vinetrack.narrative.verdict_text import diagnosis_text

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.notebook import html_table
 from vinetrack.core.records import Floats
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
 
@@ -18,17 +19,19 @@ Value = float | Mapping[str, float]
 """A parameter's value: one number, or one for each vine by name."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Model:
     """A sum of effects; `model + effect` and `model - effect` (or its name) give new models.
 
     `values` holds parameters by `effect.parameter` (B of `eversion_damping` is `"eversion_damping.B"`), SI; what is not
-    given stands at its default. A value shared per vine may be a mapping from the vine's name.
+    given stands at its default. A value shared per vine may be a mapping from the vine's name. `user_effects`
+    holds the user's effects by name, which `model + name` looks up before the catalogue.
 
     Examples
     --------
-    >>> import vinetrack.effects as effects
-    >>> model = base_model() + effects.reservoir_depletion
+    >>> model = base_model() + "reservoir_depletion"
+    >>> model
+    Model(pressure_drive + gravity + eversion_damping + yield_pressure + reservoir_depletion)
     >>> print(model)
     m(x) ẍ = tip force +PA, on the tail +½PA, by ½ = 1/r
              tail force +m(x) g cosθ
@@ -43,6 +46,7 @@ class Model:
 
     effects: tuple[Effect, ...]
     values: Mapping[str, Value] = field(default_factory=dict)
+    user_effects: Mapping[str, Effect] = field(default_factory=dict, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         names = [effect.name for effect in self.effects]
@@ -65,15 +69,16 @@ class Model:
         """Every parameter as `effect.parameter`, in the order of `parameters_for`."""
         return tuple(f"{effect.name}.{parameter.name}" for effect in self.effects for parameter in effect.parameters)
 
-    def __add__(self, other: Effect) -> Model:
-        return replace(self, effects=(*self.effects, other))
+    def __add__(self, other: Effect | str) -> Model:
+        effect = find_effect(other, self.user_effects) if isinstance(other, str) else other
+        return replace(self, effects=(*self.effects, effect))
 
     def __sub__(self, other: Effect | str) -> Model:
         name = other if isinstance(other, str) else other.name
         if name not in self.names:
             raise EffectError(f"The model has no effect {name!r}; it has {', '.join(self.names)}.")
         values = {key: value for key, value in self.values.items() if key.split(".")[0] != name}
-        return Model(tuple(effect for effect in self.effects if effect.name != name), values)
+        return replace(self, effects=tuple(one for one in self.effects if one.name != name), values=values)
 
     def __contains__(self, name: object) -> bool:
         return name in self.names
@@ -124,6 +129,13 @@ class Model:
                     value = value[vine]
                 numbers.append(float(value))
         return np.array(numbers)
+
+    def __repr__(self) -> str:
+        return f"Model({' + '.join(self.names)})"
+
+    def _repr_html_(self) -> str:
+        rows = [(effect.name, effect.formula, effect.summary) for effect in self.effects]
+        return html_table(("effect", "in the equation of motion", ""), rows)
 
     def __str__(self) -> str:
         terms = "\n         ".join(effect.formula for effect in self.effects)
@@ -248,7 +260,8 @@ def make_model(names: Iterable[str] = BASE_EFFECTS, user_effects: Mapping[str, E
     EffectError
         If a name is unknown or stands twice.
     """
-    return Model(tuple(find_effect(name, user_effects) for name in names))
+    found = tuple(find_effect(name, user_effects) for name in names)
+    return Model(found, user_effects=dict(user_effects or {}))
 
 
 def base_model() -> Model:

@@ -23,7 +23,8 @@ from vinetrack.inference.fit_data import FitTrial, prepare
 from vinetrack.inference.left_out import rest_is_seen
 from vinetrack.inference.starts import initial_trial_effects
 from vinetrack.pipeline.model_stage import measured
-from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+from vinetrack.results.folder_layout import Results, ResultsError, read_result
+from vinetrack.results.stored import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -190,8 +191,8 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     if not data:
         why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items()) or "every trial failed"
         raise ResultsError(f"{folder} has no trial to explore: {why}")
-    fitted = read_json(results.fit)
-    refused = str(fitted.get("refused") or "")
+    fitted = read_fit(results)
+    refused = fitted.refused
     compared = {} if refused else _compared(results)
     seen = _on_one_clock(data, compared)
     effects = {**catalogue(), **user_effects}
@@ -206,16 +207,12 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
         left_out={**experiment.failed, **experiment.left_out, **left_out},
         bands=_bands(compared),
         floors_m=floors,
-        numbers={_full_name(entry): float(entry["value"]) for entry in fitted.get("numbers", [])},
-        log_likelihood=float(math.nan if fitted.get("log_likelihood") is None else fitted["log_likelihood"]),
+        numbers={entry.name: entry.value for entry in fitted.numbers},
+        log_likelihood=fitted.log_likelihood,
         refused=refused,
         effects=effects,
         unusable=_unusable(effects.values(), [trial_data.trial for trial_data in data]),
     )
-
-
-def _full_name(entry: Mapping[str, Any]) -> str:
-    return f"{entry['parameter']}[{entry['vine']}]" if entry["vine"] else str(entry["parameter"])
 
 
 def _compared(results: Results) -> dict[str, pd.DataFrame]:

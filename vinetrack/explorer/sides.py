@@ -20,7 +20,8 @@ from vinetrack.explorer.look import command_block, escaped, table
 from vinetrack.explorer.series import vine_colours
 from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
-from vinetrack.results.folder_layout import ResultsError, read_json
+from vinetrack.results.folder_layout import Results, ResultsError
+from vinetrack.results.stored import read_diagnosis
 
 AT_THE_FLOOR = 1.15
 """Chosen: an error within 15 % of the replicate scatter counts as equal to it; with six replicates that scatter is
@@ -339,34 +340,19 @@ def read_summary(folder: Path) -> DiagnosisSummary | None:
     -------
     DiagnosisSummary or None
     """
-    path = folder / DIAGNOSIS
-    if not path.exists():
-        return None
     try:
-        content = read_json(path)
-        rounds: Sequence[Mapping[str, Any]] = content.get("rounds") or [{}]
-        cosines = content.get("cosines") or rounds[0].get("cosines") or {}
-        return DiagnosisSummary(
-            verdict=str(content["verdict"]),
-            explanation=str(content.get("explanation", "")),
-            answer_set=tuple(content.get("answer_set", ())),
-            suspects=tuple(_suspect(entry) for entry in rounds[0].get("ranking", ())),
-            cosine_names=tuple(cosines.get("effects", ())),
-            cosines=tuple(tuple(_float_or_nan(value) for value in row) for row in cosines.get("matrix", ())),
-            next_experiment=content.get("next_experiment"),
-        )
-    except (ResultsError, KeyError, TypeError, AttributeError, ValueError):
+        found = read_diagnosis(Results(folder))
+    except ResultsError:
         return None
-
-
-def _suspect(entry: Mapping[str, Any]) -> RankedCandidate:
-    return RankedCandidate(
-        effect=str(entry["effect"]),
-        delta_chi2=_float_or_nan(entry.get("delta_chi2")),
-        in_answer_set=bool(entry.get("in_answer_set")),
-        reason=str(entry.get("reason", "")),
+    if found is None:
+        return None
+    first = found.rounds[0] if found.rounds else None
+    return DiagnosisSummary(
+        verdict=found.verdict or "not diagnosed",
+        explanation=found.explanation,
+        answer_set=found.answer_set,
+        suspects=tuple(RankedCandidate(c.effect, c.delta_chi2, c.in_answer_set, c.reason) for c in found.ranking),
+        cosine_names=first.cosine_names if first else (),
+        cosines=tuple(tuple(row) for row in first.cosines) if first else (),
+        next_experiment=found.next_experiment,
     )
-
-
-def _float_or_nan(value: Any) -> float:
-    return math.nan if value is None else float(value)

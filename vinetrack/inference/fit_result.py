@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.numbers import decimals
+from vinetrack.core.notebook import html_table, plot
+from vinetrack.core.numbers import decimals, or_nan
 from vinetrack.core.records import Floats, Trial
 from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import Model
@@ -17,6 +18,7 @@ from vinetrack.inference.fit_data import FitError
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
     from vinetrack.inference.optimiser import Solution
     from vinetrack.inference.sensitivity import Predictor
@@ -67,6 +69,35 @@ class Number:
             "bound": self.bound,
         }
 
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> Number:
+        """Read what `to_json` wrote; unknown numbers are NaN, degrees of freedom too.
+
+        Parameters
+        ----------
+        entry : `parameter, symbol, unit, value` at least, SI.
+
+        Returns
+        -------
+        Number
+        """
+        value, sigma, low, high, bound = (
+            or_nan(entry.get(key)) for key in ("value", "sigma", "low_95", "high_95", "bound")
+        )
+        return cls(
+            key=str(entry["parameter"]),
+            vine=str(entry.get("vine") or ""),
+            symbol=str(entry["symbol"]),
+            unit=str(entry["unit"]),
+            value=value,
+            sigma=sigma,
+            low=low,
+            high=high,
+            dof=math.nan,
+            method=str(entry.get("interval") or ("linear" if math.isfinite(low) else "none")),
+            bound=bound,
+        )
+
 
 @dataclass(frozen=True)
 class BetweenTrialSpread:
@@ -112,8 +143,43 @@ class TrialFit:
         return float(np.sqrt(np.mean(self.residual_m**2)))
 
 
-@dataclass(frozen=True)
-class Fit:
+class NumberTable:
+    """What a fit in memory and one that was read back have in common: the numbers with their covariance."""
+
+    numbers: tuple[Number, ...]
+    covariance: Floats
+
+    def __getitem__(self, name: str) -> Number:
+        """The number of that name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique.
+
+        Raises
+        ------
+        FitError
+            If there is none or several.
+        """
+        fits = [n for n in self.numbers if name in (n.name, n.key, n.key.split(".")[1], n.title)]
+        if len(fits) != 1:
+            known = ", ".join(number.name for number in (fits or self.numbers)) or "none"
+            raise FitError(f"{name!r} is {'no number' if not fits else 'more than one number'} of the fit: {known}.")
+        return fits[0]
+
+    def correlation(self, one: str, other: str) -> float:
+        """Correlation of the errors of two numbers."""
+        i, j = self.numbers.index(self[one]), self.numbers.index(self[other])
+        return float(self.covariance[i, j] / math.sqrt(self.covariance[i, i] * self.covariance[j, j]))
+
+    def table(self) -> pd.DataFrame:
+        """A row a number: `parameter, vine, value, sigma, low_95, high_95, unit, interval`; SI."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            [(n.key, n.vine, n.value, n.sigma, n.low, n.high, n.unit, n.method) for n in self.numbers],
+            columns=["parameter", "vine", "value", "sigma", "low_95", "high_95", "unit", "interval"],
+        )
+
+
+@dataclass(frozen=True, repr=False)
+class Fit(NumberTable):
     """A model fitted to trajectories. Printed, it is a table.
 
     `model` carries the fitted values. `covariance` is that of `numbers`, SI, in their order. `noise_m` is the standard
@@ -143,54 +209,91 @@ class Fit:
     options: Mapping[str, Any]
     between: Floats | None = None
 
-    def __getitem__(self, name: str) -> Number:
-        """The number of that name: `effect.parameter`, `effect.parameter[vine]`, or the parameter's name if unique.
-
-        Raises
-        ------
-        FitError
-            If there is none or several.
-        """
-        fits = [n for n in self.numbers if name in (n.name, n.key, n.key.split(".")[1], n.title)]
-        if len(fits) != 1:
-            known = ", ".join(number.name for number in (fits or self.numbers)) or "none"
-            raise FitError(f"{name!r} is {'no number' if not fits else 'more than one number'} of the fit: {known}.")
-        return fits[0]
-
-    def correlation(self, one: str, other: str) -> float:
-        """Correlation of the errors of two numbers."""
-        i, j = self.numbers.index(self[one]), self.numbers.index(self[other])
-        return float(self.covariance[i, j] / math.sqrt(self.covariance[i, i] * self.covariance[j, j]))
-
     def trial(self, name: str) -> TrialFit:
         """The trial of that name; KeyError where there is none."""
         return {trial.name: trial for trial in self.trials}[name]
 
-    def table(self) -> pd.DataFrame:
-        """A row a number: `parameter, vine, value, sigma, low_95, high_95, unit, interval`."""
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects of the model, in order."""
+        return self.model.names
+
+    def positions(self) -> pd.DataFrame:
+        """Measured and predicted positions of all trials, one row a point.
+
+        Returns
+        -------
+        DataFrame
+            Columns `trial, time_s, lead_position_m, predicted_position_m, residual_m`, on the clock of each track.
+        """
         import pandas as pd
 
-        return pd.DataFrame(
-            [(n.key, n.vine, n.value, n.sigma, n.low, n.high, n.unit, n.method) for n in self.numbers],
-            columns=["parameter", "vine", "value", "sigma", "low_95", "high_95", "unit", "interval"],
-        )
+        parts = [
+            pd.DataFrame(
+                {
+                    "trial": trial.name,
+                    "time_s": trial.time_s,
+                    "lead_position_m": trial.lead_position_m,
+                    "predicted_position_m": trial.predicted_position_m,
+                    "residual_m": trial.residual_m,
+                }
+            )
+            for trial in self.trials
+        ]
+        return pd.concat(parts, ignore_index=True)
+
+    def plot(self, name: str = "model_comparison", **options: Any) -> Figure:
+        """Return a figure of the report for this model: `model_comparison` or `model_residuals`."""
+        return plot(self, name, **options)
+
+    def __repr__(self) -> str:
+        return f"Fit({' + '.join(self.model.names)}; {len(self.trials)} trials)"
+
+    def _repr_html_(self) -> str:
+        title = f"{' + '.join(self.model.names)}, fitted to {len(self.trials)} trials"
+        head = ("", "value", "standard error", "95 % interval", "unit")
+        return html_table(head, [number_row(number) for number in self.numbers], title, self.messages)
 
     def __str__(self) -> str:
         points = sum(trial.time_s.size for trial in self.trials)
-        lines = [f"{' + '.join(self.model.names)}, fitted to {len(self.trials)} trials ({points} positions)"]
-        lines += aligned([("", "value", "error", "95 % interval", "unit"), *map(_row, self.numbers)])
-        lines += [_spread_line(name, spread) for name, spread in self.spreads.items()]
-        lines.append(
-            f"noise {self.noise_m * 1e3:.3g} mm, correlation {self.noise_correlation:.2f};"
-            f" χ² per degree of freedom {self.chi2_per_dof:.3g}; ln L {self.log_likelihood:.1f}"
-        )
-        lines += [f"! {message}" for message in self.messages]
-        if self.left_out:
-            lines.append(f"left out: {'; '.join(f'{name} ({why})' for name, why in self.left_out.items())}")
-        return "\n".join(lines)
+        head = f"{' + '.join(self.model.names)}, fitted to {len(self.trials)} trials ({points} positions)"
+        return "\n".join([head, *numbers_text(self)])
 
 
-def _row(number: Number) -> tuple[str, ...]:
+def numbers_text(found: Any) -> list[str]:
+    """Return the numbers of a fit and of its noise as lines of text, and what to beware of.
+
+    Parameters
+    ----------
+    found : a `Fit`, or a `FitSummary`.
+
+    Returns
+    -------
+    list of str
+    """
+    lines = aligned([("", "value", "error", "95 % interval", "unit"), *map(number_row, found.numbers)])
+    lines += [_spread_line(name, spread) for name, spread in found.spreads.items()]
+    lines.append(
+        f"noise {found.noise_m * 1e3:.3g} mm, correlation {found.noise_correlation:.2f};"
+        f" χ² per degree of freedom {found.chi2_per_dof:.3g}; ln L {found.log_likelihood:.1f}"
+    )
+    lines += [f"! {message}" for message in found.messages]
+    if found.left_out:
+        lines.append(f"left out: {'; '.join(f'{name} ({why})' for name, why in found.left_out.items())}")
+    return lines
+
+
+def number_row(number: Number) -> tuple[str, ...]:
+    """Return a number as texts in its display unit: name, value, `± standard error`, 95 % interval, unit.
+
+    Parameters
+    ----------
+    number : SI.
+
+    Returns
+    -------
+    tuple of str
+    """
     unit, factor = display_unit(number.unit)
     if not math.isfinite(number.sigma):
         return number.title, f"{number.value * factor:.4g}", "open", "", unit

@@ -1,12 +1,12 @@
-"""The diagnosis of `diagnosis.json` in sentences: what is missing, how sure that is, and what adding it changed.
+"""A diagnosis in sentences: what is missing, how sure that is, and what adding it changed.
 
-The page, the figures and the explorer take these sentences; `verdict_text` prints a diagnosis that is still in memory.
+The page, the figures, notebooks and the explorer take these sentences; `verdict_text` prints a whole diagnosis.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,9 @@ from vinetrack.narrative.between_text import difference_headline, trials_differ
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from vinetrack.diagnosis.result import Candidate, Diagnosis
+    from vinetrack.inference.fit_result import Number
 
 BADGES = {
     "missing": "missing",
@@ -109,19 +112,19 @@ def joined(names: Sequence[str], last: str = "and") -> str:
     return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
 
 
-def sentence(diagnosis: Mapping[str, Any]) -> str:
+def sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict in one sentence.
 
     Parameters
     ----------
-    diagnosis : content of `diagnosis.json`.
+    diagnosis : in memory, or read back.
 
     Returns
     -------
     str
     """
-    verdict, answers = diagnosis.get("verdict"), list(diagnosis.get("answer_set") or [])
-    added = list(diagnosis.get("effects") or [])
+    verdict, answers = diagnosis.verdict, list(diagnosis.answer_set)
+    added = list(diagnosis.effects)
     if verdict == "missing":
         return f"Missing from the model: {listed(added or answers, 'and')}."
     if verdict == "ambiguous":
@@ -137,41 +140,39 @@ def sentence(diagnosis: Mapping[str, Any]) -> str:
     return "No diagnosis could be made."
 
 
-def meaning(diagnosis: Mapping[str, Any]) -> str:
+def meaning(diagnosis: Diagnosis) -> str:
     """Return what the verdict means, and the verdict on the model with all added effects.
 
     Parameters
     ----------
-    diagnosis : content of `diagnosis.json`.
+    diagnosis : in memory, or read back.
 
     Returns
     -------
     str
     """
-    text = MEANINGS.get(str(diagnosis.get("verdict")), str(diagnosis.get("refused") or ""))
-    if diagnosis.get("verdict") == "artefact" and trials_differ(list(diagnosis.get("answer_set") or [])):
+    text = MEANINGS.get(diagnosis.verdict, diagnosis.refused)
+    if diagnosis.verdict == "artefact" and trials_differ(list(diagnosis.answer_set)):
         text = TRIALS_DIFFER
-    added = list(diagnosis.get("effects") or [])
-    then = THEREAFTER.get(str(diagnosis.get("final_verdict")), "") if added else ""
+    added = diagnosis.effects
+    then = THEREAFTER.get(diagnosis.final_verdict, "") if added else ""
     return f"{text} {then.replace('With it,', 'With them,') if len(added) > 1 else then}".strip()
 
 
-def facts(diagnosis: Mapping[str, Any], ladder: pd.DataFrame | None) -> list[Fact]:
+def facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
     """Return significance, size and change of the error: as many numbers as the verdict has.
 
     Parameters
     ----------
-    diagnosis : content of `diagnosis.json`.
+    diagnosis : in memory, or read back.
     ladder : `ladder.csv`; None where there is none.
 
     Returns
     -------
     list of Fact
     """
-    first = (diagnosis.get("rounds") or [{}])[0]
-    ranking = list(first.get("ranking") or [])
     entries = [
-        _significance(diagnosis, ranking),
+        _significance(diagnosis),
         *_sizes(diagnosis),
         _upper_limits(diagnosis),
         *_errors(ladder),
@@ -194,99 +195,104 @@ def known(value: Any) -> bool:
     return isinstance(value, int | float) and math.isfinite(value)
 
 
-def _significance(diagnosis: Mapping[str, Any], ranking: Sequence[Mapping[str, Any]]) -> Fact | None:
-    verdict = diagnosis.get("verdict")
-    tested = [row for row in ranking if known(row.get("delta_chi2"))]
-    others = [row for row in tested if not row.get("in_answer_set")]
-    best = max(tested, key=lambda row: float(row["delta_chi2"]), default=None)
+def _significance(diagnosis: Diagnosis) -> Fact | None:
+    ranking, verdict = diagnosis.ranking, diagnosis.verdict
+    tested = [row for row in ranking if known(row.delta_chi2)]
+    others = [row for row in tested if not row.in_answer_set]
+    best = max(tested, key=_gain, default=None)
     if verdict == "adequate":
         # By the score: a predicted gain may belong to a size of the wrong sign.
-        scored = [row for row in ranking if known(row.get("sigma"))]
-        best = max(scored, key=lambda row: abs(float(row["sigma"])), default=None)
-        note = f"the best of {len(scored)} candidates: {plain(best['effect'])}" if best else ""
+        scored = [row for row in ranking if known(row.sigma)]
+        best = max(scored, key=lambda row: abs(row.sigma), default=None)
+        note = f"the best of {len(scored)} candidates: {plain(best.effect)}" if best else ""
         return Fact("Most significant candidate", f"{_sigmas(best)} σ", note) if best else None
     if verdict == "unexplained" and best is not None:
-        note = f"{_sigmas(best)} σ better" + (f", but {best['reason']}" if best.get("reason") else "")
-        return Fact("Nearest candidate", plain(best["effect"]), note)
-    inside = [row for row in tested if row.get("in_answer_set")]
-    best = max(inside, key=lambda row: float(row["delta_chi2"]), default=None)
+        note = f"{_sigmas(best)} σ better" + (f", but {best.reason}" if best.reason else "")
+        return Fact("Nearest candidate", plain(best.effect), note)
+    inside = [row for row in tested if row.in_answer_set]
+    best = max(inside, key=_gain, default=None)
     if best is None:
         return None
-    tried = sum(row.get("status") != "not testable here" for row in ranking)
+    tried = sum(row.status != "not testable here" for row in ranking)
     note = f"of {tried} candidates tested" if tried > 1 else "the only candidate"
     note = f"{len(inside)} of {tried} candidates fit equally well" if len(inside) > 1 else note
-    rival = max(others, key=lambda row: float(row["delta_chi2"]), default=None)
+    rival = max(others, key=_gain, default=None)
     if rival is not None:
-        behind = float(best["delta_chi2"]) - float(rival["delta_chi2"])
+        behind = best.delta_chi2 - rival.delta_chi2
         # An implausible candidate, or one predicted and not fitted, may have the larger Δχ².
-        note = f"next best: {plain(rival['effect'])}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
-        note += "" if rival.get("plausible", True) else ", not plausible"
+        note = f"next best: {plain(rival.effect)}" + (f", worse by Δχ² = {number(behind)}" if behind > 0 else "")
+        note += "" if rival.plausible else ", not plausible"
     return Fact("Significance", f"{_sigmas(best)} σ", note)
 
 
-def _sigmas(row: Mapping[str, Any]) -> str:
-    sigma = row.get("sigma")
-    sigma = abs(float(sigma)) if known(sigma) and sigma is not None else math.sqrt(max(float(row["delta_chi2"]), 0.0))
+def _gain(row: Candidate) -> float:
+    return row.delta_chi2
+
+
+def _sigmas(row: Candidate) -> str:
+    sigma = abs(row.sigma) if known(row.sigma) else math.sqrt(max(row.delta_chi2, 0.0))
     return f"{sigma:.0f}" if sigma >= 9.5 else f"{sigma:.1f}"
 
 
-def size(entry: Mapping[str, Any]) -> str:
-    """Return a fitted number with its error in its display unit: `γ = 1.170 ± 0.004`.
+def size(entry: Number) -> str:
+    """Return a fitted number with its standard error in its display unit: `γ = 1.170 ± 0.004`.
 
     Parameters
     ----------
-    entry : a number of `diagnosis.json` or `fit.json`: `symbol, value, sigma, unit` (SI) and `vine` where it has one.
+    entry : SI.
 
     Returns
     -------
     str
     """
-    unit, factor = display_unit(entry["unit"])
-    sigma = factor * float(entry["sigma"]) if known(entry.get("sigma")) else None
-    vine = f" ({entry['vine']})" if entry.get("vine") else ""
-    return f"{entry['symbol']}{vine} = {with_error(factor * float(entry['value']), sigma)} {unit}".strip()
+    unit, factor = display_unit(entry.unit)
+    sigma = factor * entry.sigma if known(entry.sigma) else None
+    return f"{entry.title} = {with_error(factor * entry.value, sigma)} {unit}".strip()
 
 
-def sizes(row: Mapping[str, Any]) -> str:
-    """Return all fitted numbers of an entry of a ranking.
+def sizes(row: Candidate) -> str:
+    """Return all fitted numbers of a candidate.
 
     Parameters
     ----------
-    row : an entry of `ranking` in `diagnosis.json`.
+    row : an entry of a ranking.
 
     Returns
     -------
     str, blank where it has no fitted number
     """
-    return ", ".join(size(entry) for entry in row.get("numbers") or [] if known(entry.get("value")))
+    return ", ".join(size(entry) for entry in row.numbers if known(entry.value))
 
 
-def _sizes(diagnosis: Mapping[str, Any]) -> list[Fact]:
+def _sizes(diagnosis: Diagnosis) -> list[Fact]:
     """The size of every effect that was added, at the end; of those in the answer set where none was."""
-    added = list(diagnosis.get("effects") or [])
-    if added:
-        numbers = list(diagnosis.get("parameters") or [])
-        of = {name: [n for n in numbers if str(n["parameter"]).split(".")[0] == name] for name in added}
-        return [Fact(f"Size of {plain(name)}", size(of[name][0]), _interval(of[name][0])) for name in added if of[name]]
-    first = (diagnosis.get("rounds") or [{}])[0]
-    members = [row for row in first.get("ranking") or [] if row.get("in_answer_set") and row.get("numbers")]
-    return [Fact(f"If {plain(row['effect'])}", sizes(row)) for row in members[:3]]
+    if diagnosis.effects:
+        of = {name: [n for n in diagnosis.parameters if n.key.split(".")[0] == name] for name in diagnosis.effects}
+        return [Fact(f"Size of {plain(name)}", size(n[0]), size_interval(n[0])) for name, n in of.items() if n]
+    members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
+    return [Fact(f"If {plain(row.effect)}", sizes(row)) for row in members[:3]]
 
 
-def _interval(entry: Mapping[str, Any]) -> str:
-    unit, factor = display_unit(entry["unit"])
-    if not (known(entry.get("low_95")) and known(entry.get("high_95"))):
+def size_interval(entry: Number) -> str:
+    """Return the 95 % interval of a fitted number in its display unit: `95 %: 1.162 to 1.178`; "open" where unknown.
+
+    Parameters
+    ----------
+    entry : SI.
+
+    Returns
+    -------
+    str
+    """
+    unit, factor = display_unit(entry.unit)
+    if not (known(entry.low) and known(entry.high)):
         return "95 %: open"
-    low, high = (factor * float(entry[key]) for key in ("low_95", "high_95"))
-    return f"95 %: {number(low, 4)} to {number(high, 4)} {unit}".strip()
+    return f"95 %: {number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
 
 
-def _upper_limits(diagnosis: Mapping[str, Any]) -> Fact | None:
-    if diagnosis.get("verdict") != "adequate":
-        return None
-    first = (diagnosis.get("rounds") or [{}])[0]
-    bounded = [row for row in first.get("ranking") or [] if row.get("largest")]
-    if not bounded:
+def _upper_limits(diagnosis: Diagnosis) -> Fact | None:
+    bounded = [row for row in diagnosis.ranking if row.largest]
+    if diagnosis.verdict != "adequate" or not bounded:
         return None
     return Fact("Upper limits", f"{len(bounded)} candidates", "the largest undetected size of each is listed below")
 
@@ -305,9 +311,9 @@ def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
     return [Fact(what, answer, f"replicate scatter {number(floor)} mm" if math.isfinite(floor) else "")]
 
 
-def _exponent(diagnosis: Mapping[str, Any]) -> list[Fact]:
+def _exponent(diagnosis: Diagnosis) -> list[Fact]:
     """The damping exponent of the final model."""
-    for entry in diagnosis.get("parameters") or []:
-        if entry["parameter"] == "eversion_damping.n" and known(entry.get("value")):
-            return [Fact("Damping exponent", size(entry), _interval(entry))]
+    for entry in diagnosis.parameters:
+        if entry.key == "eversion_damping.n" and known(entry.value):
+            return [Fact("Damping exponent", size(entry), size_interval(entry))]
     return []

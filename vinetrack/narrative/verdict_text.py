@@ -23,7 +23,7 @@ from vinetrack.diagnosis.result import (
 from vinetrack.dynamics.model import base_model
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.between_text import difference_headline, difference_in_words, remedies_in_words, trials_differ
-from vinetrack.narrative.verdict_summary import joined
+from vinetrack.narrative.verdict_summary import joined, size
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,26 +43,6 @@ _SHOWN_CANDIDATES = 8
 """Of a round on the terminal; chosen: two rounds fit a screen of 24 lines, and `diagnosis.json` has all."""
 
 
-def size_in_words(number: Number) -> str:
-    """Return `γ = 1.170 ± 0.004` in its display unit; without error where the fit could not state one.
-
-    Parameters
-    ----------
-    number : SI.
-
-    Returns
-    -------
-    str
-    """
-    unit, factor = display_unit(number.unit)
-    tail = f" {unit}" if unit else ""
-    if not (math.isfinite(number.sigma) and number.sigma > 0):
-        return f"{number.symbol} = {number.value * factor:.4g}{tail}"
-    digits = decimals(number.sigma * factor)
-    vine = f" ({number.vine})" if number.vine else ""
-    return f"{number.symbol}{vine} = {number.value * factor:.{digits}f} ± {number.sigma * factor:.{digits}f}{tail}"
-
-
 def sizes_in_words(numbers: Sequence[Number]) -> str:
     """Return all sizes of a hypothesis; blank where it has none.
 
@@ -74,7 +54,7 @@ def sizes_in_words(numbers: Sequence[Number]) -> str:
     -------
     str
     """
-    return ", ".join(map(size_in_words, numbers))
+    return ", ".join(map(size, numbers))
 
 
 def explain(finding: SelectionStep) -> str:
@@ -227,6 +207,8 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     -------
     str, lines separated by line feeds
     """
+    if not diagnosis.rounds:
+        return diagnosis.explanation
     lines = [f"{diagnosis.verdict}: {_headline(diagnosis)}", "", diagnosis.explanation]
     for step in diagnosis.rounds:
         if step.ranking:

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core import published
+from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.paper.foretold import departures_in_words
 from vinetrack.paper.found_sizes import size_rows
 from vinetrack.paper.rows import NOT_CHECKABLE, PREFERRED, SIMULATED, PaperRow, bounds, number
@@ -31,7 +32,7 @@ class Found:
     damping: Mapping[str, Any]
     scaling: Mapping[str, Any]
     conditions: pd.DataFrame
-    fit: Mapping[str, Any]
+    fit: FitSummary
     positions: pd.DataFrame
     speeds: pd.DataFrame
     departures: pd.DataFrame
@@ -130,9 +131,9 @@ def _position_rows(found: Found) -> Iterator[PaperRow]:
 
 def _yield_row(found: Found) -> PaperRow:
     ours, low, high = nan, nan, nan
-    for one in found.fit.get("numbers") or ():
-        if one["parameter"] == "yield_pressure.P_y" and one["vine"].startswith("24mm-200um"):
-            ours, low, high = (number(one[key]) / 1e3 for key in ("value", "low_95", "high_95"))
+    for one in found.fit.numbers:
+        if one.key == "yield_pressure.P_y" and one.vine.startswith("24mm-200um"):
+            ours, low, high = (value / 1e3 for value in (one.value, one.low, one.high))
     return PaperRow(
         row="yield_pressure",
         where="Section IV-A",

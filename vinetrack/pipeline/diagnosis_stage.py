@@ -15,7 +15,8 @@ import numpy as np
 
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
-from vinetrack.results.folder_layout import Results, empty_table, read_json, read_result
+from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_result
+from vinetrack.results.stored import read_diagnosis
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,18 +83,11 @@ def _reason(error: Exception) -> str:
 
 def _write_refusal(results: Results, experiment: Experiment, reason: str) -> dict[str, Any]:
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS
+    from vinetrack.diagnosis.result import Diagnosis
 
-    content: dict[str, Any] = {
-        "verdict": None,
-        "refused": reason,
-        "effects": [],
-        "answer_set": [],
-        "explanation": f"No diagnosis could be made: {reason}",
-        "final_verdict": None,
-        "rounds": [],
-        "parameters": [],
-        "model": list(experiment.settings.model),
-    }
+    words = f"No diagnosis could be made: {reason}"
+    found = Diagnosis(rounds=(), effects=(), explanation=words, refused=reason)
+    content = {**found.to_json(), "model": list(experiment.settings.model)}
     _emptied(results)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS))
     write_json(results.diagnosis, content)
@@ -122,7 +116,7 @@ def write_diagnosis(results: Results, found: Diagnosis) -> dict[str, Any]:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_csv(path, table)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS) if found.ladder is None else found.ladder)
-    content = {**found.to_json(), "refused": None}
+    content = found.to_json()
     write_json(results.diagnosis, content)
     return content
 
@@ -235,7 +229,9 @@ def diagnosis_lines(folder: Path) -> list[str]:
     ResultsError
         If it has not been diagnosed.
     """
-    content = read_json(Results(folder).diagnosis)
-    if content["verdict"] is None:
-        return [content["explanation"]]
-    return [f"{content['verdict']}: {content['explanation']}", *(f"! {note}" for note in content.get("notes", ()))]
+    found = read_diagnosis(Results(folder))
+    if found is None:
+        raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
+    if not found.verdict:
+        return [found.explanation]
+    return [f"{found.verdict}: {found.explanation}", *(f"! {note}" for note in found.notes)]

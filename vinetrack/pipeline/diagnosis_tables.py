@@ -15,13 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.figures.style import rows as iter_rows
-from vinetrack.narrative.verdict_summary import known, listed, sizes
-from vinetrack.results.folder_layout import Results, read_json, read_result
+from vinetrack.narrative.verdict_summary import listed, sizes
+from vinetrack.results import stored
+from vinetrack.results.folder_layout import Results, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from vinetrack.diagnosis.result import Round
     from vinetrack.effects import Effect
     from vinetrack.experiment.folder import Experiment
     from vinetrack.report.diagnosis_section import DiagnosisResult
@@ -61,28 +63,25 @@ def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTable
     ----------
     conditions : `trial, vine, condition, condition_label` of every trial, vines and pressures in their order.
     """
-    if not results.diagnosis.exists():
-        return None
-    content = read_json(results.diagnosis)
-    if not content.get("verdict"):
+    found = stored.read_diagnosis(results)
+    if found is None or not found.verdict:
         return None
     labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
     trials = predicted_trials(results, conditions)
     worst = worst_condition(trials)
-    rounds = list(content.get("rounds") or [])
-    cosines = in_order_of_rank(content.get("cosines") or {}, rounds)
+    names, matrix = in_order_of_rank(found.rounds[0])
     return DiagnosisTables(
         ladder=_table(results.ladder),
         trials=trials,
         before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
         where=where_table(trials, labels, _table(results.diagnosed("along_position.csv"))),
-        cells=cosine_cells(cosines),
+        cells=cosine_cells(names, matrix),
         drift=_table(results.diagnosed("drift_groups.csv")),
         force=_table(results.diagnosed("missing_force.csv")),
-        rounds=[(question(i, rounds), ranking_table(one)) for i, one in enumerate(rounds)],
-        cosines=(list(cosines["effects"]), list(cosines["matrix"])),
+        rounds=[(question(i, found.rounds), ranking_table(one)) for i, one in enumerate(found.rounds)],
+        cosines=(names, matrix),
         worst=worst,
-        added=listed(list(content.get("effects") or [])),
+        added=listed(found.effects),
         labels=labels,
     )
 
@@ -91,17 +90,16 @@ def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult 
     """What the page says of the diagnosis; None where there is none."""
     from vinetrack.report.diagnosis_section import DiagnosisResult
 
-    if not results.diagnosis.exists():
+    found = stored.read_diagnosis(results)
+    if found is None:
         return None
-    content = read_json(results.diagnosis)
-    paths = (results.ladder, results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
-    ladder, moved, laws = (table if len(table := _table(path)) else None for path in paths)
-    ranked = [str(row["effect"]) for one in content.get("rounds") or [] for row in one.get("ranking") or []]
-    named = [*(content.get("effects") or []), *(content.get("answer_set") or [])]
-    effects = _effects([*named, *ranked], experiment)
+    paths = (results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
+    moved, laws = (table if len(table := _table(path)) else None for path in paths)
+    named = [*found.effects, *found.answer_set]
+    effects = _effects([*named, *(row.effect for one in found.rounds for row in one.ranking)], experiment)
     return DiagnosisResult(
-        content,
-        ladder,
+        found,
+        found.ladder,
         moved,
         laws,
         {name: effects[name].summary for name in named if name in effects},
@@ -306,50 +304,37 @@ def _means(members: pd.DataFrame, along: str, low: float, high: float) -> dict[s
     return {model: np.array(values) for model, values in found.items()}
 
 
-def question(index: int, rounds: Sequence[Mapping[str, Any]]) -> str:
+def question(index: int, rounds: Sequence[Round]) -> str:
     """What a round asks, in words."""
     if index == 0:
         return "Which effect is missing from the initial model?"
-    first = set(rounds[0].get("model") or [])
-    added = [name for name in rounds[index].get("model") or [] if name not in first]
+    added = [name for name in rounds[index].model if name not in rounds[0].model]
     return f"Which is missing with {listed(added)} added?"
 
 
-def ranking_table(one: Mapping[str, Any]) -> pd.DataFrame:
+def ranking_table(one: Round) -> pd.DataFrame:
     """The ranking of a round as a table; Δχ² of those not testable is NaN."""
     import pandas as pd
 
-    rows = [
-        {
-            "effect": str(row["effect"]),
-            "kind": str(row.get("kind", "")),
-            "status": str(row.get("status", "")),
-            "delta_chi2": float(row["delta_chi2"]) if known(row.get("delta_chi2")) else math.nan,
-            "sigma": float(row["sigma"]) if known(row.get("sigma")) else math.nan,
-            "in_answer_set": bool(row.get("in_answer_set")),
-            "plausible": bool(row.get("plausible", True)),
-            "size": sizes(row),
-            "reason": str(row.get("reason") or ""),
-        }
-        for row in one.get("ranking") or []
-    ]
     columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
+    rows = [
+        (c.effect, c.kind, c.status, c.delta_chi2, c.sigma, c.in_answer_set, c.plausible, sizes(c), c.reason)
+        for c in one.ranking
+    ]
     return pd.DataFrame(rows, columns=columns)
 
 
-def in_order_of_rank(cosines: Mapping[str, Any], rounds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The matrix of cosines with the answer first, then as the first round ranks its candidates."""
-    names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
-    ranking = list(rounds[0].get("ranking") or []) if rounds else []
-    places = {row["effect"]: (not row.get("in_answer_set"), i) for i, row in enumerate(ranking)}
-    order = sorted(range(len(matrix)), key=lambda i: places.get(names[i], (True, len(ranking))))
-    return {"effects": [names[i] for i in order], "matrix": [[matrix[i][j] for j in order] for i in order]}
+def in_order_of_rank(one: Round) -> tuple[list[str], list[list[float]]]:
+    """Names and matrix of the cosines of a round with the answer first, then as it ranks its candidates."""
+    names, matrix = one.cosine_names, one.cosines
+    places = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(one.ranking)}
+    order = sorted(range(len(matrix)), key=lambda i: places.get(names[i], (True, len(one.ranking))))
+    return [names[i] for i in order], [[matrix[i][j] for j in order] for i in order]
 
 
-def cosine_cells(cosines: Mapping[str, Any]) -> pd.DataFrame:
+def cosine_cells(names: Sequence[str], matrix: Sequence[Sequence[float]]) -> pd.DataFrame:
     """The matrix of cosines as rows of pairs, each once."""
     import pandas as pd
 
-    names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
     rows = [(names[i], names[j], matrix[i][j]) for i in range(len(matrix)) for j in range(i)]
     return pd.DataFrame(rows, columns=["effect", "other", "cosine"])

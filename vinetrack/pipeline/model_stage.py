@@ -17,6 +17,7 @@ import numpy as np
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+from vinetrack.results.stored import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,6 +51,7 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     from vinetrack.diagnosis.compare import COMPARISON_COLUMNS
     from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, payload_curves
     from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
+    from vinetrack.inference.fit_summary import FitSummary, summary_of
     from vinetrack.inference.model_check import CHECK_COLUMNS
     from vinetrack.results.folder_layout import empty_table
 
@@ -59,7 +61,7 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     tables = {results.comparison: COMPARISON_COLUMNS, results.model_check: CHECK_COLUMNS, results.audit: AUDIT_COLUMNS}
     tables[results.payload_model] = CURVE_COLUMNS
     found: dict[Path, pd.DataFrame] = {}
-    content: dict[str, Any] = {"model": list(experiment.settings.model), "refused": None}
+    content: dict[str, Any] = {}
     trajectories: dict[str, pd.DataFrame] = {}
     try:
         fit, comparison = _fitted(experiment, pairs, kinematics, settings)
@@ -67,9 +69,9 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
         weighed = _audited(fit, comparison, pairs, kinematics)
         curves = payload_curves(fit, settings.final_at_fraction)
     except Exception as error:
-        content["refused"] = _reason(error)
+        content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
     else:
-        content |= fit_entry(fit, weighed.warnings, check_message)
+        content = summary_of(fit, weighed.warnings, (check_message,) if check_message else ()).to_json()
         found = {results.comparison: comparison.table, results.model_check: checked, results.audit: weighed.table}
         found[results.payload_model] = curves
         trajectories = dict(comparison.trajectories)
@@ -196,39 +198,6 @@ def _reason(error: Exception) -> str:
     return INTERNAL_FAULT
 
 
-def fit_entry(found: Fit, warnings: tuple[str, ...], check_message: str = "") -> dict[str, Any]:
-    """A fit as `fit.json` holds it: SI units, numbers in the order of `covariance`; deviations are relative."""
-    return {
-        "model": list(found.model.names),
-        "numbers": [number.to_json() for number in found.numbers],
-        "covariance": found.covariance,
-        "spreads": {
-            name: {"value": spread.value, "estimated": spread.estimated} for name, spread in found.spreads.items()
-        },
-        "noise_m": found.noise_m,
-        "noise_correlation": found.noise_correlation,
-        "chi2_per_dof": found.chi2_per_dof,
-        "log_likelihood": found.log_likelihood,
-        "converged": found.converged,
-        "messages": [*found.messages, *([check_message] if check_message else [])],
-        "warnings": list(warnings),
-        "left_out": dict(found.left_out),
-        "trials": {
-            trial.name: {
-                "release_s": trial.release_s,
-                "release_sigma_s": trial.release_sigma_s,
-                "origin_m": trial.origin_m,
-                "origin_sigma_m": trial.origin_sigma_m,
-                "pressure_deviation": trial.pressure_deviation,
-                "pressure_deviation_sigma": trial.pressure_deviation_sigma,
-                "damping_deviation": trial.damping_deviation,
-                "damping_deviation_sigma": trial.damping_deviation_sigma,
-            }
-            for trial in found.trials
-        },
-    }
-
-
 def _write_trajectories(results: Results, trajectories: dict[str, pd.DataFrame]) -> None:
     """A file a condition; those of an earlier run go, or a condition that is no more would still be drawn."""
     folder = results.folder / "comparison"
@@ -250,9 +219,9 @@ def comparison_lines(folder: Path) -> list[str]:
     from vinetrack.figures.style import rows
 
     results = Results(folder)
-    content, table = read_json(results.fit), read_result(results.comparison)
-    if content["refused"]:
-        return [f"{' + '.join(content['model'])} was not fitted: {content['refused']}"]
+    fit, table = read_fit(results), read_result(results.comparison)
+    if fit.refused:
+        return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"]
     body = [
         (
             str(row.condition),
@@ -267,7 +236,7 @@ def comparison_lines(folder: Path) -> list[str]:
     ]
     head = ("condition", "rms position", "replicates", "ratio", "rms final speed", "worst at", "")
     lines = aligned(body, head, ("", "mm", "mm", "", "m/s", "ms", "mm"), align="<>>>>>>")
-    return [" + ".join(content["model"]), *lines, *(f"! {message}" for message in content["messages"])]
+    return [" + ".join(fit.names), *lines, *(f"! {message}" for message in fit.messages)]
 
 
 def _shown(value: float, decimals: int) -> str:

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.narrative.verdict_summary import plain
 from vinetrack.pipeline.pool import map_trials
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+from vinetrack.results.stored import read_diagnosis, read_fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -261,14 +263,13 @@ def metres_to_px(track: pd.DataFrame) -> Any:
 
 def added_effects(results: Results) -> str:
     """The effects that the diagnosis added, in words; blank where there is none."""
-    if not results.diagnosis.exists():
-        return ""
-    return " and ".join(str(name).replace("_", " ") for name in read_json(results.diagnosis).get("effects") or [])
+    found = read_diagnosis(results)
+    return " and ".join(map(plain, found.effects)) if found is not None else ""
 
 
 def _release_s(trial: str, results: Results, track: pd.DataFrame) -> float:
-    fitted = read_json(results.fit).get("trials") or {} if results.fit.exists() else {}
-    return float(fitted[trial]["release_s"]) if trial in fitted else _first_moving_s(track)
+    fitted = read_fit(results).trials if results.fit.exists() else {}
+    return fitted[trial].release_s if trial in fitted else _first_moving_s(track)
 
 
 def _first_moving_s(track: pd.DataFrame) -> float:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
+from vinetrack.results.stored import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,12 +76,10 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
     """Every table behind a figure, by the name of its file."""
     from vinetrack.paper import beside
     from vinetrack.paper.departures import departure_table, motion_table, pressure_table
-    from vinetrack.paper.rows import number
 
     trials = experiment.trials
     positions, speeds = beside.position_conditions(trials), beside.speed_conditions(trials)
-    fitted = read_json(results.fit).get("trials") or {}
-    found = {name: beside.Rest(number(one["release_s"]), number(one["origin_m"])) for name, one in fitted.items()}
+    found = {name: beside.Rest(one.release_s, one.origin_m) for name, one in read_fit(results).trials.items()}
     rests = {name: rest for name, rest in found.items() if math.isfinite(rest.release_s + rest.origin_m)}
     kinematics = {
         trial.name: read_result(results.kinematics(trial.name))
@@ -165,7 +164,7 @@ def _found(mark: str, results: Results, tables: Mapping[str, pd.DataFrame]) -> A
         damping=read_json(results.damping),
         scaling=read_json(results.scaling),
         conditions=read_result(results.conditions),
-        fit=read_json(results.fit),
+        fit=read_fit(results),
         positions=tables["paper_positions"],
         speeds=tables["paper_speeds"],
         departures=tables["paper_departures"],

@@ -13,6 +13,7 @@ from vinetrack.narrative.law_text import METHOD_NAMES
 from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
 from vinetrack.pipeline.figures_stage import describe_conditions
 from vinetrack.results.folder_layout import Results, read_json, read_result
+from vinetrack.results.stored import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -74,7 +75,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         recordings={name: _recording(results, name) for name in filmed},
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
         clip=_clip(results, diagnosed, trials),
-        model=ModelResult(read_json(results.fit), read_result(results.comparison), read_result(results.model_check)),
+        model=ModelResult(read_fit(results), read_result(results.comparison), read_result(results.model_check)),
         diagnosis=read_diagnosis(results, experiment),
         sections=[_paper_section(results)] if experiment.settings.published else [],
     )
@@ -104,7 +105,7 @@ def _drawn(results: Results, own_data: Mapping[str, str]) -> list[RegisteredFigu
     empty |= set() if scaling["isometric"] or scaling["thickness"] else {"scaling"}
     empty |= {key for key, of in (("speed_scaling", "steady_speed"), ("efficiency", "efficiency")) if not scaling[of]}
     empty |= set() if len(read_result(results.payload_model)) else {"payload_speed"}
-    empty |= {"model_comparison", "model_residuals"} if read_json(results.fit)["refused"] else set()
+    empty |= {"model_comparison", "model_residuals"} if read_fit(results).refused else set()
     empty |= {name for name, figure in CAMPAIGN_FIGURES.items() if not figure.data and name not in own_data}
     return [figure for name, figure in CAMPAIGN_FIGURES.items() if name not in empty and _svg(results, figure).exists()]
 

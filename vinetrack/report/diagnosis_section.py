@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.numbers import interval, number, with_error
 from vinetrack.core.units import display_unit
+from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, Candidate, Diagnosis, Round
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.candidate_figures import TIED_COSINE
+from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.law_text import PREFERRED
 from vinetrack.narrative.verdict_summary import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
 from vinetrack.report.section import ReportTable
@@ -17,19 +19,17 @@ from vinetrack.report.section import ReportTable
 if TYPE_CHECKING:
     import pandas as pd
 
-NOT_TESTABLE = "not testable here"
-
 
 @dataclass(frozen=True)
 class DiagnosisResult:
-    """`diagnosis.json`, `ladder.csv`, the values of every number along it, and the damping law under every model.
+    """The diagnosis, the errors of its models, the values of every number along it, and the damping law under each.
 
     None where a part does not exist.
     `summaries` says of effects by name what each is, in a sentence; `units` of parameters (`effect.parameter`) their
     symbol and unit.
     """
 
-    content: Mapping[str, Any]
+    diagnosis: Diagnosis
     ladder: pd.DataFrame | None = None
     moved: pd.DataFrame | None = None
     laws: pd.DataFrame | None = None
@@ -50,37 +50,28 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
     """
     if result is None:
         return None
-    content = result.content
-    rounds = list(content.get("rounds") or [])
-    drifting = [
-        str(row["sentence"])
-        for row in content.get("drift") or []
-        if row.get("sentence") and row.get("significant", True)
-    ]
+    found = result.diagnosis
+    drifting = [str(row["sentence"]) for row in found.drift if row.get("sentence") and row.get("significant", True)]
     return {
-        "badge": BADGES.get(str(content.get("verdict")), BADGES["none"]),
-        "kind": str(content.get("verdict")) if content.get("verdict") in BADGES else "none",
-        "sentence": sentence(content),
-        "meaning": meaning(content),
-        "summaries": [
-            result.summaries[name]
-            for name in content.get("effects") or content.get("answer_set") or []
-            if name in result.summaries
-        ],
-        "facts": facts(content, result.ladder),
-        "explanation": str(content.get("explanation") or ""),
+        "badge": BADGES.get(found.verdict, BADGES["none"]),
+        "kind": found.verdict if found.verdict in BADGES else "none",
+        "sentence": sentence(found),
+        "meaning": meaning(found),
+        "summaries": [result.summaries[name] for name in found.effects or found.answer_set if name in result.summaries],
+        "facts": facts(found, result.ladder),
+        "explanation": found.explanation,
         "ladder": ladder_table(result.ladder),
-        "where": [str(line) for line in content.get("where") or [] if str(line) not in drifting],
-        "force": missing_force(content.get("missing_force")),
-        "rounds": [_round(i, entry) for i, entry in enumerate(rounds)],
-        "hidden": _hidden(content, result.units),
-        "blind": _blind(rounds[0].get("ranking") or []) if rounds else [],
-        "tied": tied_pairs(content.get("cosines") or {}),
-        "next": next_experiment(content.get("next_experiment")),
+        "where": [line for line in found.where if line not in drifting],
+        "force": missing_force(found.missing_force),
+        "rounds": [_round(i, entry) for i, entry in enumerate(found.rounds)],
+        "hidden": _hidden(found, result.units),
+        "blind": _blind(found.ranking),
+        "tied": tied_pairs(found.rounds[0]) if found.rounds else [],
+        "next": next_experiment(found.next_experiment),
         "drift": drifting,
         "moved": moved_table(result.moved),
         "laws": law_table(result.laws),
-        "notes": [str(note) for note in content.get("notes") or []],
+        "notes": list(found.notes),
     }
 
 
@@ -121,53 +112,50 @@ def _step(added: str) -> str:
     return f"+ {listed(added.split('+'))}" if added else "initial model"
 
 
-def _round(index: int, entry: Mapping[str, Any]) -> dict[str, Any]:
-    ranking = [row for row in entry.get("ranking") or [] if row.get("status") != NOT_TESTABLE]
+def _round(index: int, entry: Round) -> dict[str, Any]:
     head = ("Candidate", "kind", "Δχ²", "σ", "size", "status", "")
     rows = [
         (
-            ("● " if row.get("in_answer_set") else "") + plain(row["effect"]),
-            str(row.get("kind", "")),
-            number(row.get("delta_chi2")),
-            number(row.get("sigma"), 2),
+            ("● " if row.in_answer_set else "") + plain(row.effect),
+            row.kind,
+            number(row.delta_chi2),
+            number(row.sigma, 2),
             sizes(row) or "–",
-            "fitted" if row.get("status") == "refitted" else "predicted",
-            "; ".join(
-                part for part in ("" if row.get("plausible", True) else "not plausible", row.get("reason", "")) if part
-            ),
+            "fitted" if row.status == REFITTED else "predicted",
+            "; ".join(part for part in ("" if row.plausible else "not plausible", row.reason) if part),
         )
-        for row in ranking
+        for row in entry.ranking
+        if row.status != NOT_TESTABLE
     ]
     return {
         "title": f"Round {index + 1}: {round_question(entry)}",
-        "verdict": str(entry.get("verdict", "")),
-        "explanation": str(entry.get("explanation") or ""),
+        "verdict": entry.verdict,
+        "explanation": entry.explanation,
         "table": ReportTable("", head, rows, frozenset({2, 3}), "● in the answer set") if rows else None,
     }
 
 
-def round_question(entry: Mapping[str, Any]) -> str:
+def round_question(entry: Round) -> str:
     """Return the question of a round.
 
     Parameters
     ----------
-    entry : an entry of `rounds` in `diagnosis.json`.
+    entry : of a diagnosis.
 
     Returns
     -------
     str
     """
-    return f"which effect is missing from {listed(list(entry.get('model') or []))}?"
+    return f"which effect is missing from {listed(entry.model)}?"
 
 
-def _hidden(content: Mapping[str, Any], units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
+def _hidden(found: Diagnosis, units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
     """Upper limits on undetected effects, where no effect is missing: only then they hold."""
-    rounds = list(content.get("rounds") or [])
-    return hidden_table(rounds[-1].get("ranking") or [], units) if content.get("final_verdict") == "adequate" else None
+    return hidden_table(found.rounds[-1].ranking, units) if found.final_verdict == ADEQUATE else None
 
 
 def hidden_table(
-    ranking: Sequence[Mapping[str, Any]], units: Mapping[str, tuple[str, str]] | None = None
+    ranking: Sequence[Candidate], units: Mapping[str, tuple[str, str]] | None = None
 ) -> ReportTable | None:
     """Return one-sided 95 % upper limits on the size of every candidate of a ranking; None where there are none.
 
@@ -182,14 +170,14 @@ def hidden_table(
     """
     rows = []
     for row in ranking:
-        of = {str(n["parameter"]).split(".")[-1]: (str(n["symbol"]), str(n["unit"])) for n in row.get("numbers") or []}
-        for name, largest in (row.get("largest") or {}).items():
+        of = {entry.key.split(".")[-1]: (entry.symbol, entry.unit) for entry in row.numbers}
+        for name, largest in row.largest.items():
             if not known(largest):
                 continue
-            short = str(name).split(".")[-1]
-            symbol, unit = of.get(short) or (units or {}).get(f"{row['effect']}.{short}") or (short, "SI")
+            short = name.split(".")[-1]
+            symbol, unit = of.get(short) or (units or {}).get(f"{row.effect}.{short}") or (short, "SI")
             shown, factor = display_unit(unit)
-            rows.append((plain(row["effect"]), symbol, f"{number(factor * float(largest))} {shown}".strip()))
+            rows.append((plain(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
     if not rows:
         return None
     note = "A larger effect would have been detected (one-sided 95 %)."
@@ -198,32 +186,30 @@ def hidden_table(
     )
 
 
-def _blind(ranking: Sequence[Mapping[str, Any]]) -> list[str]:
+def _blind(ranking: Sequence[Candidate]) -> list[str]:
     """Candidates without an observable effect under these conditions, each with the reason."""
     return [
-        f"{plain(row['effect'])}: {row.get('reason') or 'no reason is given'}"
-        for row in ranking
-        if row.get("status") == NOT_TESTABLE
+        f"{plain(row.effect)}: {row.reason or 'no reason is given'}" for row in ranking if row.status == NOT_TESTABLE
     ]
 
 
-def tied_pairs(cosines: Mapping[str, Any]) -> list[str]:
+def tied_pairs(entry: Round) -> list[str]:
     """Return the pairs of candidates with nearly proportional effects on the trajectories, largest cosine first.
 
     Parameters
     ----------
-    cosines : `cosines` of `diagnosis.json`: names and matrix.
+    entry : a round, with its cosines.
 
     Returns
     -------
     list of str
     """
-    names, matrix = list(cosines.get("effects") or []), list(cosines.get("matrix") or [])
+    names, matrix = entry.cosine_names, entry.cosines
     pairs = [
-        (abs(float(matrix[i][j])), names[i], names[j], float(matrix[i][j]))
+        (abs(matrix[i][j]), names[i], names[j], matrix[i][j])
         for i in range(len(matrix))
         for j in range(i)
-        if known(matrix[i][j]) and abs(float(matrix[i][j])) >= TIED_COSINE
+        if known(matrix[i][j]) and abs(matrix[i][j]) >= TIED_COSINE
     ]
     return [f"{plain(b)} and {plain(a)} (cosine {number(value)})" for _, a, b, value in sorted(pairs, reverse=True)]
 
@@ -317,7 +303,7 @@ def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:
     titles: dict[tuple[str, str], str] = {}
     for entry in moved.fillna({"vine": "", "added": ""}).to_dict("records"):
         key = (str(entry["parameter"]), str(entry["vine"]))
-        left, _, right = size({str(k): v for k, v in entry.items()}).partition(" = ")
+        left, _, right = size(Number.from_json({str(k): v for k, v in entry.items()})).partition(" = ")
         titles[key] = left
         cells.setdefault(key, {})[str(entry["added"])] = right
     rows = [[titles[key], *(cells[key].get(step, "–") for step in steps)] for key in cells]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,9 @@ from vinetrack.figures.style import rows
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from vinetrack.inference.fit_result import BetweenTrialSpread, Number
+    from vinetrack.inference.fit_summary import FitSummary
 
 _EXPLAINED = (
     "The model in use is fitted to the positions of all trials at once. Each trial is then predicted with its own "
@@ -24,9 +26,9 @@ _EXPLAINED = (
 
 @dataclass(frozen=True)
 class ModelResult:
-    """`fit.json`, `comparison.csv` and `model_check.csv` of a results folder."""
+    """The fit, the comparison and the check of the damping law of a results folder."""
 
-    fit: Mapping[str, Any]
+    fit: FitSummary
     comparison: pd.DataFrame
     check: pd.DataFrame
 
@@ -46,15 +48,15 @@ def model_section(result: ModelResult | None) -> dict[str, Any] | None:
         return None
     fit = result.fit
     return {
-        "names": " + ".join(fit["model"]),
-        "refused": fit.get("refused") or "",
+        "names": " + ".join(fit.names),
+        "refused": fit.refused,
         "explained": _EXPLAINED,
         "verdict": verdict(result.comparison),
-        "numbers": [_number(entry) for entry in fit.get("numbers", [])],
-        "spreads": [_spread(name, spread) for name, spread in (fit.get("spreads") or {}).items()],
-        "messages": list(fit.get("messages", [])),
-        "left_out": [f"{name}: {reason}" for name, reason in (fit.get("left_out") or {}).items()],
-        "warnings": list(fit.get("warnings", [])),
+        "numbers": [_number(entry) for entry in fit.numbers],
+        "spreads": [_spread(name, spread) for name, spread in fit.spreads.items()],
+        "messages": list(fit.messages),
+        "left_out": [f"{name}: {reason}" for name, reason in fit.left_out.items()],
+        "warnings": list(fit.warnings),
         "conditions": [_condition(row) for row in rows(result.comparison)],
         "check": [_check(row) for row in rows(result.check)],
     }
@@ -94,23 +96,22 @@ def _rms(values: pd.Series) -> float:
     return math.sqrt(float((values**2).mean()))
 
 
-def _number(entry: Mapping[str, Any]) -> dict[str, str]:
-    unit, factor = display_unit(entry["unit"])
-    low, high = (None if entry[key] is None else factor * entry[key] for key in ("low_95", "high_95"))
-    known = low is not None and high is not None
+def _number(entry: Number) -> dict[str, str]:
+    unit, factor = display_unit(entry.unit)
+    known = math.isfinite(entry.low) and math.isfinite(entry.high)
     return {
-        "symbol": entry["symbol"],
-        "vine": entry["vine"],
-        "parameter": entry["parameter"],
-        "value": with_error(factor * entry["value"], None if entry["sigma"] is None else factor * entry["sigma"]),
-        "interval": f"{number(low)} to {number(high)}" if known else "open",
+        "symbol": entry.symbol,
+        "vine": entry.vine,
+        "parameter": entry.key,
+        "value": with_error(factor * entry.value, factor * entry.sigma),
+        "interval": f"{number(factor * entry.low)} to {number(factor * entry.high)}" if known else "open",
         "unit": unit,
     }
 
 
-def _spread(name: str, spread: Mapping[str, Any]) -> str:
-    how = "" if spread["estimated"] else ", held"
-    return f"{name} {number(100 * spread['value'], 2)} %{how}"
+def _spread(name: str, spread: BetweenTrialSpread) -> str:
+    how = "" if spread.estimated else ", held"
+    return f"{name} {number(100 * spread.value, 2)} %{how}"
 
 
 def _condition(row: Any) -> dict[str, str]:

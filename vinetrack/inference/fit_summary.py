@@ -1,0 +1,184 @@
+"""A fit as `fit.json` holds it: everything that is quoted from a fit, without what it was computed with.
+
+`summary_of` takes it from a fit in memory and `FitSummary.from_json` from a file, so the keys of the file stand here
+alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.notebook import html_table
+from vinetrack.core.numbers import or_nan
+from vinetrack.core.records import Floats
+from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, number_row, numbers_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class TrialEstimates:
+    """What a fit estimated for one trial; deviations are relative, of the set pressure and of the vine's B."""
+
+    release_s: float
+    release_sigma_s: float
+    origin_m: float
+    origin_sigma_m: float
+    pressure_deviation: float
+    pressure_deviation_sigma: float
+    damping_deviation: float
+    damping_deviation_sigma: float
+
+
+@dataclass(frozen=True, repr=False)
+class FitSummary(NumberTable):
+    """The quoted part of a fit: see `vinetrack.inference.fit_result.Fit` for what each field means.
+
+    `names` are those of the effects; `covariance` is that of `numbers`, SI, in their order; `warnings` are those of the
+    audit. `refused` is the reason why the model was not fitted, blank where it was: all else is empty then.
+    """
+
+    names: tuple[str, ...]
+    numbers: tuple[Number, ...] = ()
+    covariance: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    spreads: Mapping[str, BetweenTrialSpread] = field(default_factory=dict)
+    noise_m: float = math.nan
+    noise_correlation: float = math.nan
+    chi2_per_dof: float = math.nan
+    log_likelihood: float = math.nan
+    converged: bool = False
+    messages: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    trials: Mapping[str, TrialEstimates] = field(default_factory=dict)
+    refused: str = ""
+
+    @property
+    def values(self) -> dict[str, float | dict[str, float]]:
+        """Fitted values by `effect.parameter`, SI, as `Model.with_values` takes them."""
+        found: dict[str, Any] = {}
+        for number in self.numbers:
+            if number.vine:
+                found.setdefault(number.key, {})[number.vine] = number.value
+            else:
+                found[number.key] = number.value
+        return found
+
+    def trial_table(self) -> pd.DataFrame:
+        """A row a trial: `trial, release_s, release_sigma_s, origin_m, …`; deviations are relative."""
+        import pandas as pd
+
+        columns = ["trial", *(one.name for one in fields(TrialEstimates))]
+        return pd.DataFrame([{"trial": name, **asdict(one)} for name, one in self.trials.items()], columns=columns)
+
+    def to_json(self) -> dict[str, Any]:
+        """As `fit.json` holds it, SI; a refused fit has its model and the reason alone."""
+        content: dict[str, Any] = {"model": list(self.names), "refused": self.refused or None}
+        if self.refused:
+            return content
+        return content | {
+            "numbers": [number.to_json() for number in self.numbers],
+            "covariance": self.covariance,
+            "spreads": {name: asdict(spread) for name, spread in self.spreads.items()},
+            "noise_m": self.noise_m,
+            "noise_correlation": self.noise_correlation,
+            "chi2_per_dof": self.chi2_per_dof,
+            "log_likelihood": self.log_likelihood,
+            "converged": self.converged,
+            "messages": list(self.messages),
+            "warnings": list(self.warnings),
+            "left_out": dict(self.left_out),
+            "trials": {name: asdict(one) for name, one in self.trials.items()},
+        }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> FitSummary:
+        """Read what `to_json` wrote; unknown numbers are NaN.
+
+        Parameters
+        ----------
+        content : of `fit.json`; keys other than `model` may be absent.
+
+        Returns
+        -------
+        FitSummary
+        """
+        numbers = tuple(Number.from_json(entry) for entry in content.get("numbers") or ())
+        matrix = [[or_nan(cell) for cell in row] for row in content.get("covariance") or ()]
+        keys = [one.name for one in fields(TrialEstimates)]
+        return cls(
+            names=tuple(content["model"]),
+            numbers=numbers,
+            covariance=np.array(matrix, dtype=float) if matrix else np.full((len(numbers), len(numbers)), math.nan),
+            spreads={
+                str(name): BetweenTrialSpread(or_nan(spread["value"]), bool(spread["estimated"]))
+                for name, spread in (content.get("spreads") or {}).items()
+            },
+            noise_m=or_nan(content.get("noise_m")),
+            noise_correlation=or_nan(content.get("noise_correlation")),
+            chi2_per_dof=or_nan(content.get("chi2_per_dof")),
+            log_likelihood=or_nan(content.get("log_likelihood")),
+            converged=bool(content.get("converged")),
+            messages=tuple(content.get("messages") or ()),
+            warnings=tuple(content.get("warnings") or ()),
+            left_out=dict(content.get("left_out") or {}),
+            trials={
+                str(name): TrialEstimates(*(or_nan(one.get(key)) for key in keys))
+                for name, one in (content.get("trials") or {}).items()
+            },
+            refused=str(content.get("refused") or ""),
+        )
+
+    def __repr__(self) -> str:
+        state = "refused" if self.refused else f"{len(self.trials)} trials"
+        return f"FitSummary({' + '.join(self.names)}; {state})"
+
+    def _repr_html_(self) -> str:
+        if self.refused:
+            return html_table((), (), f"{' + '.join(self.names)} was not fitted: {self.refused}")
+        head = ("", "value", "standard error", "95 % interval", "unit")
+        title = f"{' + '.join(self.names)}, fitted to {len(self.trials)} trials"
+        return html_table(head, [number_row(number) for number in self.numbers], title, self.messages)
+
+    def __str__(self) -> str:
+        if self.refused:
+            return f"{' + '.join(self.names)} was not fitted: {self.refused}"
+        head = f"{' + '.join(self.names)}, fitted to {len(self.trials)} trials"
+        return "\n".join([head, *numbers_text(self)])
+
+
+def summary_of(found: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
+    """Return what is quoted from a fit.
+
+    Parameters
+    ----------
+    found : the fit.
+    warnings : of the audit.
+    further_messages : beside those of the fit.
+
+    Returns
+    -------
+    FitSummary
+    """
+    keys = [one.name for one in fields(TrialEstimates)]
+    return FitSummary(
+        names=tuple(found.model.names),
+        numbers=found.numbers,
+        covariance=found.covariance,
+        spreads=found.spreads,
+        noise_m=found.noise_m,
+        noise_correlation=found.noise_correlation,
+        chi2_per_dof=found.chi2_per_dof,
+        log_likelihood=found.log_likelihood,
+        converged=found.converged,
+        messages=(*found.messages, *further_messages),
+        warnings=tuple(warnings),
+        left_out=found.left_out,
+        trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in found.trials},
+    )
