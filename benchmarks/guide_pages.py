@@ -69,7 +69,7 @@ def stage_demonstration(results: Path, scratch: Path) -> None:
     (slips / "trials.csv").write_text("\n".join(sheet_lines) + "\n", encoding="utf-8")
     (slips / "videos").symlink_to(experiment / "videos")
     settings = (experiment / "experiment.yaml").read_text(encoding="utf-8")
-    (slips / "experiment.yaml").write_text(settings.replace("exposure_us", "exposure_ms"), encoding="utf-8")
+    (slips / "experiment.yaml").write_text(settings.replace("exposure_us", "exposre_us"), encoding="utf-8")
 
 
 def stage_own_effect(folder: Path) -> None:

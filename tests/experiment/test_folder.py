@@ -178,7 +178,7 @@ def test_a_broken_cell_is_named_with_file_line_trial_and_column(
         ("payload_g", "0.0356", "looks like kilograms"),
         ("thickness_um", "0.2", "looks like millimetres"),
         ("length_mm", "0.28", "looks like metres"),
-        ("exposure_us,capture_fps", "2000,1000", "longer than a frame"),
+        ("exposure_us,capture_fps", "1200,1000", "longer than a frame"),
         ("payload_gg", "3", "did you mean payload_g?"),
         ("remarks", "nice", "is no column of a trial sheet and is ignored"),
     ],

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from vinetrack.experiment.folder import read_experiment
+from vinetrack.experiment.folder import ExperimentError, read_experiment
 
 REST = "trial,track,thickness_um,length_mm,"
 TRACK = "time_s,position_m\n" + "".join(f"{i / 1000},{i / 1000}\n" for i in range(8))
@@ -61,3 +61,22 @@ def test_a_unit_of_another_quantity_is_no_column(tmp_path: Path) -> None:
     read = read_experiment(write(tmp_path / "v", header, "a,a.csv,100,300,24,28,3,4"))
     assert math.isnan(read.trials[0].chamber_m3)
     assert any(problem.column == "chamber_in" and "no column" in problem.message for problem in read.problems)
+
+
+def test_a_key_of_the_settings_in_another_unit_is_converted_and_said(tmp_path: Path) -> None:
+    header = "trial,track,thickness_um,length_mm,diameter_mm,pressure_kPa"
+    folder = write(tmp_path / "v", header, "a,a.csv,100,300,24,28")
+    (folder / "experiment.yaml").write_text("yield_pressure_psi: 0.435\n")
+    read = read_experiment(folder)
+    assert read.trials[0].yield_pressure_Pa == pytest.approx(435 * 6.894757293168361, rel=1e-12)
+    (problem,) = [problem for problem in read.problems if problem.file == "experiment.yaml"]
+    assert (problem.column, problem.line, problem.severity) == ("yield_pressure_psi", 1, "warning")
+    assert problem.message == "is read as yield_pressure_kPa: 1 psi is 6.89476 kPa"
+
+
+def test_a_key_in_two_units_is_refused(tmp_path: Path) -> None:
+    header = "trial,track,thickness_um,length_mm,diameter_mm,pressure_kPa"
+    folder = write(tmp_path / "v", header, "a,a.csv,100,300,24,28")
+    (folder / "experiment.yaml").write_text("yield_pressure_psi: 0.435\nyield_pressure_kPa: 3\n")
+    with pytest.raises(ExperimentError, match="yield_pressure_psi is no setting"):
+        read_experiment(folder)

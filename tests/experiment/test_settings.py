@@ -60,7 +60,7 @@ def test_every_column_may_be_shared(tmp_path: Path) -> None:
         "pressure_sigma_kPa: 0.3\nyield_pressure_kPa: 3\nyield_pressure_sigma_kPa: 0.1\npressure_trace: p.csv\n"
         "payload_g: 35.6\ngrowth_angle_deg: 90\nchamber_l: 3.7\ninlet_mm: 6\nbends: 100:30:20;150:30:20\n"
         "film_density_kg_m3: 1180\nmm_per_px: 0.37\ntravel_ratio: 1\nsteady: 0.05:0.2\nuse: no\n"
-        "specimen: a\nday: 1\n",
+        "specimen: a\nday: 1\ncapture_fps_is_playback: yes\ncompare_sizes: no\n",
     )
     assert {name for name in SHARED if getattr(settings, name) is None} == set()
     assert settings.bends == (Bend(0.1, 0.03, 0.02), Bend(0.15, 0.03, 0.02))

@@ -11,7 +11,8 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from vinetrack.experiment.schema import COLUMNS, Column, option
+from vinetrack.experiment.column import Column
+from vinetrack.experiment.schema import COLUMNS, option
 
 VINE, RIG, BELIEF, OUT = "The vine", "The rig", "Inputs of the model", "Output files"
 

@@ -64,22 +64,19 @@ def _options(
 
 @app.command()
 def check(experiment: ExperimentPath) -> None:
-    """Check the sheet, settings, effects, tracks and videos, in seconds, before any work."""
+    """Check sheet, settings, effects, tracks and recordings, in seconds; say what was understood of each recording."""
     with _sentences(None):
         from vinetrack.core.terminal import severity_first
-        from vinetrack.experiment.folder import check_experiment, format_problems
-        from vinetrack.pipeline.effects_stage import model_problems
+        from vinetrack.pipeline.check_stage import check_folder
         from vinetrack.pipeline.workflow import find_experiment
-        from vinetrack.video.survey import survey
 
-        folder = find_experiment(experiment)
-        problems = [*check_experiment(folder, survey), *model_problems(folder)]
-        for line in format_problems(problems):
+        checked = check_folder(find_experiment(experiment))
+        for line in checked.lines():
             typer.echo(severity_first(line))
-        if any(problem.severity == "error" for problem in problems):
+        if checked.failed:
             raise typer.Exit(1)
-        if not problems:
-            typer.echo(f"{experiment}: nothing to mend.")
+        if not checked.problems:
+            typer.echo(f"{experiment}: no problems found.")
 
 
 @app.command()

@@ -65,6 +65,8 @@ class Trial:
     track: Path | None = None
     pressure_trace: Path | None = None
     capture_fps: float = math.nan
+    capture_fps_is_playback: bool = False
+    compare_sizes: bool = True
     exposure_s: float = math.nan
     diameter_m: float = math.nan
     thickness_m: float = math.nan

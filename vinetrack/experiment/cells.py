@@ -12,7 +12,7 @@ from typing import Any
 from vinetrack.core.records import Bend, PictureAxis
 from vinetrack.core.tables import TableError, parse_number
 from vinetrack.core.units import UNITS, convert, split_unit
-from vinetrack.experiment.schema import Column
+from vinetrack.experiment.column import Column
 
 Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxis
 

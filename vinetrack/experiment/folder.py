@@ -20,13 +20,13 @@ from vinetrack.core.records import Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
 from vinetrack.experiment.cells import oddity
 from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.other_units import in_sheet_units, keys_in_other_units
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import (
     SHEET,
     Row,
     find_missing,
-    in_sheet_units,
     judge_pressures,
     judge_row,
     make_trial,
@@ -49,6 +49,7 @@ class Experiment:
     `trials` are those to analyse, in the order of the sheet; `failed` maps the name of every trial with a fault to
     the reason, `left_out` those that the sheet puts aside (`use: no`) likewise; `names` lists all three in the order
     of the sheet and `lines` gives their lines in it. `problems` holds everything that was found, warnings too.
+    `angle_blank` names the vines whose direction of growth nobody stated: it counts as straight down.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Experiment:
     left_out: dict[str, str] = field(default_factory=dict)
     problems: tuple[Problem, ...] = ()
     lines: dict[str, int] = field(default_factory=dict)
+    angle_blank: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -143,6 +145,7 @@ def _assemble(folder: Path, settings: ExperimentSettings, rows: list[Row], probl
         left_out={row.name: "left out by the sheet (use: no)" for row in rows if not row.in_use},
         problems=tuple(problems),
         lines={row.name: row.line for row in rows},
+        angle_blank=tuple(row.name for row in rows if "growth_angle_deg" not in row.values and row.travel_ratio == 2),
     )
 
 
@@ -153,6 +156,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
     except ExperimentError as error:
         problems += error.problems
         return None
+    problems += keys_in_other_units(folder / SETTINGS)
     for key, relative in _settings_paths(settings):
         try:
             safe_join(folder, relative)

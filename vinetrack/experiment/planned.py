@@ -15,12 +15,12 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Trial
 from vinetrack.core.tables import Table, TableError, read_table
 from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.other_units import in_sheet_units
 from vinetrack.experiment.schema import COLUMNS, SHARED, option
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import (
     SHEET,
     Row,
-    in_sheet_units,
     judge_pressures,
     judge_wall,
     make_trial,

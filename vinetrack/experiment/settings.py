@@ -26,6 +26,7 @@ from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Bend
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
 from vinetrack.experiment.cells import read_limit, read_range, read_value, steps_between
+from vinetrack.experiment.other_units import in_key_units
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
 
 BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
@@ -344,7 +345,9 @@ def read_experiment_settings(path: Path) -> ExperimentSettings:
     ExperimentError
         With every problem of the file.
     """
-    return _validate(ExperimentSettings, read_yaml(path), path.name) if path.exists() else ExperimentSettings()
+    if not path.exists():
+        return ExperimentSettings()
+    return _validate(ExperimentSettings, in_key_units(read_yaml(path), path.name)[0], path.name)
 
 
 def read_run_settings(path: Path) -> RunSettings:

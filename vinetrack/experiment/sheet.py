@@ -14,10 +14,10 @@ from typing import Any
 
 from vinetrack.core.problems import Problem
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
-from vinetrack.core.tables import Table, TableError, parse_number, safe_join
-from vinetrack.core.units import UNITS, convert, split_unit
+from vinetrack.core.tables import Table, TableError, safe_join
 from vinetrack.experiment.cells import CellError, oddity, read_cell
-from vinetrack.experiment.schema import COLUMNS, SHARED, Column, column_in_other_unit
+from vinetrack.experiment.column import Column
+from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import Charuco, Checkerboard, ExperimentSettings
 
 SHEET = "trials.csv"
@@ -111,59 +111,6 @@ def read_row(table: Table, index: int, settings: ExperimentSettings) -> Row:
     return row
 
 
-def in_sheet_units(table: Table, file: str) -> tuple[Table, list[Problem]]:
-    """Columns in other units, such as `pressure_psi` or `diameter_in`, as the columns that they stand for.
-
-    Parameters
-    ----------
-    table : the sheet as it is written.
-    file : its name, for messages.
-
-    Returns
-    -------
-    table, problems
-        The table with those columns renamed and their numbers converted, and a warning for each that says so. Cells
-        that are no numbers stay as they are: they are refused where cells are read. A column whose quantity stands in
-        the sheet in two units is left alone, and so ignored.
-    """
-    problems: list[Problem] = []
-    renamed: dict[str, tuple[Column, str]] = {}
-    for name in table.columns:
-        if name in COLUMNS or (other := column_in_other_unit(name)) is None:
-            continue
-        column, unit = other
-        place: dict[str, Any] = {"file": file, "line": 1, "column": name, "severity": "warning"}
-        if column.name in table.columns or column.name in [target.name for target, _ in renamed.values()]:
-            problems.append(Problem(message=f"is ignored: {column.name} stands in the sheet as well", **place))
-            continue
-        renamed[name] = other
-        size = convert(1.0, unit, split_unit(column.name)[1])
-        message = f"is read as {column.name}: 1 {UNITS[unit].text} is {size:.6g} {column.unit}"
-        problems.append(Problem(message=message, **place))
-    if not renamed:
-        return table, problems
-    rows = tuple(
-        {
-            (renamed[name][0].name if name in renamed else name): (
-                _converted(cell, renamed[name][1], renamed[name][0], table.decimal) if name in renamed else cell
-            )
-            for name, cell in row.items()
-        }
-        for row in table.rows
-    )
-    columns = tuple(renamed[name][0].name if name in renamed else name for name in table.columns)
-    return replace(table, columns=columns, rows=rows), problems
-
-
-def _converted(cell: str, unit: str, column: Column, decimal: str) -> str:
-    """A cell in the unit of its column, to 15 digits, as the sheet writes numbers."""
-    try:
-        value = convert(parse_number(cell, decimal), unit, split_unit(column.name)[1])
-    except TableError:
-        return cell
-    return f"{value:.15g}".replace(".", decimal or ".")
-
-
 def unknown_columns(table: Table, file: str) -> list[Problem]:
     """A warning for every column that no trial sheet has, with the nearest that it may have meant.
 
@@ -210,10 +157,14 @@ def judge_row(row: Row, folder: Path) -> None:
     _judge_paths(row, folder)
     judge_wall(row)
     fps, exposure = row.values.get("capture_fps", math.nan), row.values.get("exposure_us", math.nan)
-    # 2 % allows for rounding of both; a shutter that stays open longer than its frame does not exist.
+    # 2 % allows for rounding of both; a shutter that stays open longer than its frame does not exist, and a frame and
+    # a half is no rounding.
     if exposure > 1.02e6 / fps:
-        message = f"is longer than a frame at {fps:g} frames a second ({1e6 / fps:.4g} µs)"
-        row.add(message, "exposure_us", "warning", value=f"{exposure:g}")
+        longer = exposure * fps / 1e6
+        message = f"is longer than a frame at {fps:g} frames a second ({1e6 / fps:.4g} µs), a factor {longer:.3g}"
+        severity = "error" if longer > 1.5 else "warning"
+        remedy = "check its unit and capture_fps" if longer > 1.5 else ""
+        row.add(message, "exposure_us", severity, value=f"{exposure:g}", remedy=remedy)
 
 
 def find_missing(row: Row, folder: Path, columns: tuple[str, ...]) -> set[str]:

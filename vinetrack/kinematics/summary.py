@@ -173,11 +173,19 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         "n_frames": track.time_s.size,
         "mm_per_px": trial.m_per_px * 1e3,
         "scale_rel_sigma": math.nan,
+        "tube_width_mm": math.nan,
+        "growth_mm": 1e3 * _growth_m(motion),
         "noise_m": kinematics.noise_m,
         **_steady_columns(steady.chosen, windows["paper"], steady.force),
         **_end_columns(trial, kinematics, motion.release, settings),
     }
     return TrialResult(track, kinematics, motion.release, windows, row, damping_point(trial, steady))
+
+
+def _growth_m(motion: TrialMotion) -> float:
+    """From release to the furthest usable position, m."""
+    position_m = motion.track.lead_position_m[motion.track.usable]
+    return float(position_m.max() - motion.release.lead_position_m) if position_m.size else math.nan
 
 
 def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSettings) -> dict[str, Window]:

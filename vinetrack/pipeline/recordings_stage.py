@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import logging
 import traceback
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.numbers import number
 from vinetrack.core.tables import write_bytes, write_json
 from vinetrack.pipeline.tracks_stage import INTERNAL_FAULT, analyse, failed_row, write_empty
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
 if TYPE_CHECKING:
-    from vinetrack.core.records import Trial
+    from vinetrack.core.records import Track, Trial
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
     from vinetrack.video.measure import Measurement
@@ -37,13 +39,20 @@ def analyse_recording(experiment: Experiment, name: str, folder: Path, settings:
     if fault:
         log.error("trial %s:\n%s", name, fault)
     log.info("%s: %s", name, reason or "analysed")
-    return f"{name}: failed: {reason}" if reason else f"{name}: {_counted(results, name)}."
+    return f"{name}: failed: {reason}" if reason else f"{name}: {_understood(results, trial)}."
 
 
-def _counted(results: Results, name: str) -> str:
-    """How many frames of a trial show where the edge was, in words."""
-    track = read_result(results.track(name))
-    return f"edge known in {int(track['lead_position_m'].notna().sum())} of {len(track)} frames"
+def _understood(results: Results, trial: Trial) -> str:
+    """How many frames of a trial show where the edge was, and its sizes beside those of the sheet, in words."""
+    track = read_result(results.track(trial.name))
+    row = read_json(results.analysed(trial.name))["row"]
+    words = f"edge known in {int(track['lead_position_m'].notna().sum())} of {len(track)} frames"
+    sizes = (
+        ("tube", row["tube_width_mm"], "mm wide", trial.diameter_m),
+        ("growth", row["growth_mm"], "mm", trial.length_m),
+    )
+    said = [f"{what} {number(seen)} {unit} (sheet {1e3 * stated:g})" for what, seen, unit, stated in sizes if seen]
+    return "; ".join([words, f"{number(row['mm_per_px'], 4)} mm/px", *said])
 
 
 def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: RunSettings) -> tuple[str, str]:
@@ -54,7 +63,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     measurement = None
     try:
         measurement = measure_recording(trial, experiment.settings, experiment.folder)
-        track = measurement.tracking.track
+        track = _with_size_notes(trial, measurement)
         if trial.pressure_trace is not None:
             track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
         reason, fault = analyse(
@@ -65,6 +74,7 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
             experiment,
             mm_per_px=1e3 * measurement.m_per_px,
             scale_rel_sigma=measurement.scale_rel_sigma,
+            tube_width_mm=1e3 * measurement.m_per_px * measurement.tracking.tube_width_px,
         )
         _add_view(results, trial.name, measurement, getattr(experiment.settings.calibration, "image", None))
     except (RecordingError, TrackError) as error:
@@ -75,6 +85,26 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
         write_empty(results, trial.name, failed_row(trial, reason))
     _draw(trial, results, measurement, reason, settings)
     return reason, fault
+
+
+def _with_size_notes(trial: Trial, measurement: Measurement) -> Track:
+    """The track with a note for every size or exposure in the picture that differs from the sheet.
+
+    Raises
+    ------
+    RecordingError
+        Where one differs beyond what lens and ruler can make.
+    """
+    from vinetrack.video.frames import RecordingError
+    from vinetrack.video.recording_facts import exposure_problems, size_problems, tracked_facts
+
+    problems = size_problems(trial, tracked_facts(trial, measurement))
+    problems += exposure_problems(trial, measurement.tracking)
+    errors = [problem.reason for problem in problems if problem.severity == "error"]
+    if errors:
+        raise RecordingError("; ".join(errors))
+    track = measurement.tracking.track
+    return replace(track, notes=(*track.notes, *(problem.reason for problem in problems)))
 
 
 def _add_view(results: Results, name: str, measurement: Measurement, image: str | None) -> None:

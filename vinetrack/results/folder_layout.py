@@ -34,6 +34,8 @@ TRIALS_COLUMNS = (
     "n_frames",
     "mm_per_px",
     "scale_rel_sigma",
+    "tube_width_mm",
+    "growth_mm",
     "noise_m",
     "steady_from_s",
     "steady_to_s",

@@ -29,6 +29,7 @@ from vinetrack.video.edge_state import (
     moving_frames,
     repicture,
     residuals,
+    seen_exposure,
 )
 from vinetrack.video.growth_end import growth_end
 from vinetrack.video.strip import Strip
@@ -47,6 +48,11 @@ UNFIT = 3.0
 """Factor of the bands' disagreement where no blur within reason fits: all rows err together then."""
 HIDDEN = 3.2
 """Misfit, in units of the noise and in usual ones, above which something else stands there and the edge is a guess."""
+SIDES_PX = 1.0
+"""Error of a width between two sides that are each known to a blur of about 0.7 px."""
+FAINT, FAINT_PART = 25.0, 0.15
+"""Grey levels of contrast below which the sides of a tube fade away, and the error of its width then, a part of it.
+Measured (benchmarks/seen_sizes.py, seeds 20900 and up): 0.76 of the width is seen at 16 levels, 0.96 and more at 70."""
 EVIDENCE_CLIP = 2.5
 """Widths beyond which a pixel is as unlike film (or background) as can be."""
 
@@ -60,6 +66,8 @@ class EdgeFit:
     residual in units of the noise (1 is perfect), `amplitude` the contrast relative to that of the pixels it passes;
     `contrast` is their mean signed contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far
     each row of the tip lags behind its foremost point; `passed` the first and last column passed.
+    `seen_exposure_frames` is what the blur shows where it contradicts a stated exposure, else NaN, and
+    `fast_px_per_frame` the speed at which it does.
     """
 
     edge_px: Floats
@@ -72,6 +80,8 @@ class EdgeFit:
     exposure_frames: float
     tip_lag_px: Floats
     passed: tuple[int, int]
+    seen_exposure_frames: float = np.nan
+    fast_px_per_frame: float = np.nan
 
 
 def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -> EdgeFit:
@@ -108,11 +118,30 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
         fit = mend_jumps(strip, state, fit_edges(strip, state))
         if turn >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < SETTLED_PX:
             break
-    return _finish(strip, state, fit, exposure, passed)
+    finished = _finish(strip, state, fit, exposure, passed)
+    if not np.isfinite(exposure_frames):
+        return finished
+    seen, speed = seen_exposure(strip, state, fit, exposure)
+    return replace(finished, seen_exposure_frames=seen, fast_px_per_frame=speed)
 
 
-def outline(strip: Strip, parts: int = 12) -> tuple[float, float, float]:
-    """Centreline of what the front leaves behind: shift of its begin and slope (px a px) across, and half width, px.
+@dataclass(frozen=True)
+class Outline:
+    """What the front leaves behind: a centreline and a width, px.
+
+    `shift_px` and `slope` (px a px) are of the centreline across the strip; `half_px` is half of what holds all of the
+    width, with room for its blur; `width_px` the width between the sides and `width_sigma_px` its standard error.
+    """
+
+    shift_px: float
+    slope: float
+    half_px: float
+    width_px: float
+    width_sigma_px: float
+
+
+def outline(strip: Strip, parts: int = 12) -> Outline:
+    """Centreline and width of what the front leaves behind.
 
     From the contrast by row in `parts` stretches along the way: a given axis two degrees off would otherwise cut the
     tube obliquely.
@@ -127,17 +156,36 @@ def outline(strip: Strip, parts: int = 12) -> tuple[float, float, float]:
     pictures = _first_state(strip, np.minimum(path, passed[1]), ASSUMED_EXPOSURE).pictures
     power = (pictures[0] - pictures[1]).astype(float)[:, passed[0] : passed[1]] ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
-    sides, places = [], []
+    sides, places, contrasts = [], [], []
     for piece in np.array_split(np.arange(power.shape[1]), min(parts, max(1, power.shape[1] // 12))):
         profile = np.sqrt(np.minimum(power[:, piece], 9 * np.median(power[:, piece]) + 1e3).mean(axis=1))
         low, high = _bright_run(profile - max(0.4 * float(np.quantile(profile, 0.75)), 0.25 * float(profile.max())))
         sides.append((rows[0] + low, rows[0] + high))
+        contrasts.append(float(np.quantile(profile, 0.75)))
         places.append(passed[0] + float(piece.mean()))
     side, place = np.array(sides), np.array(places)
     width = side[:, 1] - side[:, 0]
     alike = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
     slope, begin = _robust_line(place[alike], side[alike].mean(axis=1))
-    return begin, slope, float(np.median(width)) / 2 + 1.5
+    middle = float(np.median(width))
+    scatter = 1.4826 * float(np.median(np.abs(width - middle))) / np.sqrt(len(width))
+    faint = FAINT_PART * middle if float(np.median(contrasts)) < FAINT else 0.0
+    return Outline(begin, slope, middle / 2 + 1.5, middle, float(np.linalg.norm([scatter, SIDES_PX, faint])))
+
+
+def rough_growth(strip: Strip) -> tuple[float, float]:
+    """Columns that the front passes, px, and its mean speed over the middle of them, px a frame, without a fit.
+
+    Raises
+    ------
+    ValueError
+        Where nothing in the strip changes as a passing front does.
+    """
+    path, passed = _first_path(strip)
+    end = growth_end(strip, path, passed)
+    growth = float(end - passed[0])
+    early, late = (int(np.searchsorted(path, passed[0] + part * growth)) for part in (0.2, 0.9))
+    return growth, 0.7 * growth / max(late - early, 1)
 
 
 def _bright_run(excess: Floats) -> tuple[float, float]:

@@ -52,7 +52,8 @@ class Recording:
     """What a recording says about itself, before its frames are decoded.
 
     `declared_frames` is the file's own count (None where it gives none); `capture_fps` and `exposure_s` are those of
-    DNG frames, None elsewhere; `notes` are sentences for a person.
+    DNG frames, None elsewhere; `playback_fps` is the rate at which a film plays, None for pictures; `notes` are
+    sentences for a person.
     """
 
     path: Path
@@ -66,6 +67,7 @@ class Recording:
     files: tuple[Path, ...] = ()
     numbers: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
+    playback_fps: float | None = None
 
     @property
     def whole(self) -> Region:
@@ -189,7 +191,8 @@ def _inspect_container(path: Path) -> Recording:
                 raise RecordingError(f"{path.name}: not one frame can be decoded; the file is damaged or empty")
             depth = first.format.components[0].bits
             declared = _declared_frames(stream, container)
-            return Recording(path, "container", first.width, first.height, depth, declared)
+            playback = float(stream.average_rate) if stream.average_rate else None
+            return Recording(path, "container", first.width, first.height, depth, declared, playback_fps=playback)
     except av.error.FFmpegError as error:
         raise RecordingError(_why_unreadable(path, complaints, str(error))) from error
 

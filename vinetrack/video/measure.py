@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
-from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
+from vinetrack.video.frames import Recording, RecordingError, inspect_recording, read_frames
 from vinetrack.video.track import Tracking, capture_rate, track_frames
 
 if TYPE_CHECKING:
@@ -25,13 +26,21 @@ class Measurement:
 
     `m_per_px` is the mean along the growth axis and `scale_rel_sigma` its relative standard error, NaN where unknown:
     an error that all points share, kept apart from the random error of each. `calibration` is None where the scale is
-    the trial's own `mm_per_px`.
+    the trial's own `mm_per_px`. `capture_fps` and the `recording` are what the track was made from.
     """
 
     tracking: Tracking
     m_per_px: float
     scale_rel_sigma: float
     calibration: PlaneCalibration | None
+    capture_fps: float
+    recording: Recording
+
+    @property
+    def growth_m(self) -> float:
+        """From the first usable position to the furthest, m."""
+        position_m = self.tracking.track.lead_position_m[self.tracking.track.usable]
+        return float(np.max(position_m) - position_m[0]) if position_m.size else math.nan
 
 
 def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) -> Measurement:
@@ -54,15 +63,15 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     if trial.video is None:
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
-    capture_fps = capture_rate(trial, recording.capture_fps)
-    calibration = _calibration(trial, settings, folder, recording.width, recording.height)
+    capture_fps = capture_rate(trial, recording)
+    calibration = calibration_of(trial, settings, folder, recording)
     if calibration is None and not math.isfinite(trial.m_per_px):
         raise RecordingError(
             f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
         )
     frames = read_frames(recording)
     m_per_px, rel_sigma, position_m = trial.m_per_px, math.nan, None
-    axis = _given_axis(trial, settings, m_per_px if calibration is None else calibration.m_per_px)
+    axis = given_axis(trial, settings, m_per_px if calibration is None else calibration.m_per_px)
     if calibration is not None:
         axis = axis or _found_axis(frames.luma, trial)
         along = calibration.along(axis.from_px, axis.to_px)
@@ -71,22 +80,34 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     # What is to be said of a scale that was merely given belongs to the experiment, not to each of its trials.
     notes = calibration.notes if calibration is not None and math.isfinite(calibration.reprojection_px) else ()
     tracking = replace(tracking, track=replace(tracking.track, notes=(*tracking.track.notes, *notes)))
-    return Measurement(tracking, m_per_px, rel_sigma, calibration)
+    return Measurement(tracking, m_per_px, rel_sigma, calibration, capture_fps, recording)
 
 
-def _calibration(
-    trial: Trial, settings: ExperimentSettings, folder: Path, width_px: int, height_px: int
+def calibration_of(
+    trial: Trial, settings: ExperimentSettings, folder: Path, recording: Recording
 ) -> PlaneCalibration | None:
-    """The calibration of the experiment; None where the trial brings a scale of its own or there is none."""
+    """The calibration of the experiment; None where the trial brings a scale of its own or there is none.
+
+    Parameters
+    ----------
+    trial, settings, folder : see `measure_recording`.
+    recording : opened, for the size of its picture.
+
+    Raises
+    ------
+    RecordingError
+        Where the calibration cannot be used.
+    """
     if math.isfinite(trial.m_per_px) or settings.calibration is None:
         return None
     try:
-        return calibrate(settings.calibration, folder, width_px, height_px)
+        return calibrate(settings.calibration, folder, recording.width, recording.height)
     except CalibrationError as error:
         raise RecordingError(f"calibration: {error}") from error
 
 
-def _given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
+def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
+    """The growth axis of the sheet or the settings, None where neither has one; `m_per_px` is for its width."""
     if trial.axis is not None:
         return Axis(trial.axis.from_px, trial.axis.to_px, trial.axis.width_m / m_per_px)
     if settings.axis is None:

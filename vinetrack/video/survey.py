@@ -1,7 +1,8 @@
-"""Recordings and calibration looked at before any work: what can be known in seconds, without decoding.
+"""Recordings and calibration looked at before any work: what can be known in seconds.
 
 Every recording is opened and its header read; its frames are counted where the file's own index, or a walk through
-its packets, tells without decoding. The calibration is read once for each size of picture.
+its packets, tells without decoding. The calibration is read once for each size of picture. Into one recording of each
+condition a look is taken, and what it shows is compared with the sheet.
 """
 
 from __future__ import annotations
@@ -17,43 +18,135 @@ from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.terminal import progress
 from vinetrack.experiment.settings import Axis, ExperimentSettings
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
+from vinetrack.video.measure import given_axis
+from vinetrack.video.quick_look import look_at
+from vinetrack.video.recording_facts import RecordingFacts, size_problems
 from vinetrack.video.track import FEWEST_FRAMES, capture_rate
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
+    from vinetrack.video.calibration import PlaneCalibration
 
 SETTINGS = "experiment.yaml"
 LARGEST_WALKED_BYTES = 64_000_000
 """A file without an index is read to its end to count its frames; of larger ones a hundred would take minutes."""
 
 
+MOST_LOOKS = 12
+"""Chosen: recordings that are looked into, about a second each; at half of them a sheet of eight conditions is not
+covered, at twice as many `check` takes half a minute."""
+
+
+class Surveyor:
+    """Opens the recordings of an experiment; keeps what was understood of each in `facts`, by trial.
+
+    `looked_into` are those in which frames were looked at.
+    """
+
+    def __init__(self) -> None:
+        self.facts: dict[Trial, RecordingFacts] = {}
+        self.looked_into: list[Trial] = []
+
+    def __call__(self, experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
+        """Say what is wrong with the recordings of these trials, each with the trial's name, and with the calibration.
+
+        Parameters
+        ----------
+        experiment
+            Its settings (`calibration`, `axis`) and folder.
+        trials
+            Those whose recording is there to be opened.
+
+        Returns
+        -------
+        problems : of the recordings first.
+        """
+        problems: list[Problem] = []
+        opened: dict[Trial, Recording] = {}
+        sound: list[Trial] = []
+        for trial in progress(list(trials), "recordings", unit="recording"):
+            try:
+                opened[trial] = recording = inspect_recording(trial.video or Path())
+                found = _judge(trial, recording)
+            except (RecordingError, OSError) as error:
+                found = [_unusable(error, trial.video.name if trial.video else "")]
+            if all(problem.severity != "error" for problem in found):
+                sound.append(trial)
+            problems += [replace(problem, trial=trial.name) for problem in found]
+        of_scale, calibrations = _judge_scale(experiment.settings, experiment.folder, opened)
+        self.looked_into = _one_a_condition(sound)
+        for trial in progress(sound, "looking into recordings", unit="recording"):
+            scale = calibrations.get((opened[trial].width, opened[trial].height))
+            facts = _understood(trial, experiment.settings, opened[trial], scale, trial in self.looked_into)
+            problems += [replace(problem, trial=trial.name) for problem in size_problems(trial, facts)]
+            self.facts[trial] = facts
+        return problems + of_scale
+
+
 def survey(experiment: Experiment, trials: Iterable[Trial]) -> list[Problem]:
-    """Say what is wrong with the recordings of these trials, each with the trial's name, and with the calibration.
+    """Say what is wrong with the recordings of these trials; see `Surveyor`.
 
     Parameters
     ----------
-    experiment
-        Its settings (`calibration`, `axis`) and folder.
-    trials
-        Those whose recording is there to be opened.
+    experiment, trials : see `Surveyor`.
     """
-    problems: list[Problem] = []
-    opened: dict[Trial, Recording] = {}
-    for trial in progress(list(trials), "recordings", unit="recording"):
-        try:
-            opened[trial] = recording = inspect_recording(trial.video or Path())
-            found = _judge(trial, recording)
-        except (RecordingError, OSError) as error:
-            found = [_unusable(error, trial.video.name if trial.video else "")]
-        problems += [replace(problem, trial=trial.name) for problem in found]
-    return problems + _judge_scale(experiment.settings, experiment.folder, opened)
+    return Surveyor()(experiment, trials)
+
+
+def _one_a_condition(trials: list[Trial]) -> list[Trial]:
+    """The recordings to look into: all of a few, else the first of each condition, of each vine where many."""
+    if len(trials) <= MOST_LOOKS:
+        return trials
+    conditions = list({(trial.condition, trial.m_per_px): trial for trial in reversed(trials)}.values())[::-1]
+    if len(conditions) <= MOST_LOOKS:
+        return conditions
+    vines = list({(trial.vine, trial.m_per_px): trial for trial in reversed(trials)}.values())[::-1]
+    others = [trial for trial in conditions if trial not in vines]
+    return [*vines, *others][:MOST_LOOKS]
+
+
+def _understood(
+    trial: Trial, settings: ExperimentSettings, recording: Recording, scale: PlaneCalibration | None, look: bool
+) -> RecordingFacts:
+    """The facts of one recording, with those that a look into it shows where it is wanted."""
+    m_per_px, rel_sigma = trial.m_per_px, math.nan
+    if not math.isfinite(m_per_px) and scale is not None:
+        m_per_px, rel_sigma = scale.m_per_px, scale.scale_rel_sigma
+    axis = given_axis(trial, settings, m_per_px)
+    count = _frames_present(recording)
+    count = recording.declared_frames if count is None else count
+    seen = look_at(recording, trial, axis, count) if look else None
+    if scale is not None and seen is not None and seen.axis is not None and not math.isfinite(trial.m_per_px):
+        along = scale.along(seen.axis.from_px, seen.axis.to_px)
+        m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
+    capture_fps = capture_rate(trial, recording)
+    facts = RecordingFacts(
+        trial=trial.name,
+        n_frames=count,
+        capture_fps=capture_fps,
+        playback_fps=recording.playback_fps,
+        mm_per_px=1e3 * m_per_px,
+        scale_rel_sigma=rel_sigma,
+        picture_mm=1e3 * m_per_px * recording.width,
+        axis=axis,
+    )
+    if seen is None:
+        return facts
+    return replace(
+        facts,
+        axis=seen.axis or axis,
+        tube_width_mm=1e3 * m_per_px * seen.tube_width_px,
+        tube_width_sigma_mm=1e3 * m_per_px * seen.tube_width_sigma_px,
+        growth_mm=1e3 * m_per_px * seen.growth_px,
+        mean_speed_m_s=m_per_px * seen.px_per_frame * capture_fps,
+    )
 
 
 def _judge(trial: Trial, recording: Recording) -> list[Problem]:
     """A recording that opens, against what the sheet says of it and what the file declares."""
     place: dict[str, Any] = {"column": "video", "value": recording.path.name}
     try:
-        capture_rate(trial, recording.capture_fps)
+        capture_rate(trial, recording)
     except RecordingError as error:
         message, _, remedy = str(error).removeprefix(f"{trial.name}: capture_fps ").rpartition("; ")
         return [Problem(message=message or remedy, column="capture_fps", remedy=remedy if message else "")]
@@ -94,9 +187,15 @@ def _frames_present(recording: Recording) -> int | None:
         return None
 
 
-def _judge_scale(settings: ExperimentSettings, folder: Path, opened: dict[Trial, Recording]) -> list[Problem]:
-    """What is wrong with calibration and axis, for the recordings that open."""
+Calibrations = dict[tuple[int, int], "PlaneCalibration"]
+
+
+def _judge_scale(
+    settings: ExperimentSettings, folder: Path, opened: dict[Trial, Recording]
+) -> tuple[list[Problem], Calibrations]:
+    """What is wrong with calibration and axis, for the recordings that open; and the calibration by size of picture."""
     problems: list[Problem] = []
+    calibrations: Calibrations = {}
     unscaled = [trial for trial in opened if not math.isfinite(trial.m_per_px)]
     sizes = sorted({(opened[trial].width, opened[trial].height) for trial in unscaled})
     if unscaled and settings.calibration is None:
@@ -105,7 +204,7 @@ def _judge_scale(settings: ExperimentSettings, folder: Path, opened: dict[Trial,
         message = f"is missing: {some} a scale" if some.startswith("no ") else f"is missing: {some} scale"
         problems.append(Problem(message=message, file=SETTINGS, column="calibration", remedy=remedy))
     elif unscaled:
-        problems += _judge_calibration(settings, folder, sizes)
+        problems += _judge_calibration(settings, folder, sizes, calibrations)
     for trial, recording in opened.items():
         if trial.axis is not None and not _inside(trial.axis, recording):
             message = f"leaves the picture of {recording.path.name}, {recording.width} × {recording.height} pixels"
@@ -118,11 +217,13 @@ def _judge_scale(settings: ExperimentSettings, folder: Path, opened: dict[Trial,
             message = f"leaves the picture of {outside[0].path.name}, {outside[0].width} × {outside[0].height} pixels"
             remedy = "give two points inside it"
             problems.append(Problem(message=message, file=SETTINGS, column="axis", remedy=remedy))
-    return problems
+    return problems, calibrations
 
 
-def _judge_calibration(settings: ExperimentSettings, folder: Path, sizes: list[tuple[int, int]]) -> list[Problem]:
-    """Read the calibration for each size of recording; the first complaint is enough."""
+def _judge_calibration(
+    settings: ExperimentSettings, folder: Path, sizes: list[tuple[int, int]], calibrations: Calibrations
+) -> list[Problem]:
+    """Read the calibration for each size of recording into `calibrations`; the first complaint is enough."""
     from vinetrack.video.calibration import CalibrationError, calibrate
 
     image = getattr(settings.calibration, "image", None)
@@ -133,6 +234,7 @@ def _judge_calibration(settings: ExperimentSettings, folder: Path, sizes: list[t
     for width_px, height_px in sizes:
         try:
             calibration = calibrate(settings.calibration, folder, width_px, height_px)
+            calibrations[width_px, height_px] = calibration
         except CalibrationError as error:
             message, _, remedy = str(error).removeprefix("calibration: ").rpartition("; ")
             return [Problem(message=f"cannot be used: {message or remedy}", remedy=remedy if message else "", **place)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -11,12 +12,12 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
-from vinetrack.video.frames import Frames, RecordingError, inspect_recording, read_frames
+from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording, read_frames
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
 if TYPE_CHECKING:
-    from vinetrack.video.edge import EdgeFit
+    from vinetrack.video.edge import EdgeFit, Outline
 
 Floats = NDArray[np.float64]
 
@@ -25,6 +26,9 @@ GROWN_TOLERANCE = 0.03
 """Part of a vine's length by which travel and length may differ, for the vine to have grown whole."""
 CENTRINGS = 3
 """Times the strip may be cut anew: what lay outside the first shows only in the second."""
+SAME_RATE = 0.005
+"""Derived: 29.97 and 30 frames a second differ by 0.1 %, 23.976 and 24 likewise; a rate of capture that is no rate of
+playback but within 0.5 % of one is 30.1 for 30, which no camera offers."""
 APART_PX = 1.0
 """Bands of the edge that disagree by more cannot all be its own."""
 MOSTLY_LOST = 0.5
@@ -44,6 +48,8 @@ class Tracking:
     `j` px from `axis.from_px`. `edge_px` of the track counts along the same axis. `pictures` are (frame number,
     picture) of the first, middle and last moving frame, full region, as the camera wrote them. `shake_px`, shape
     (n_frames,), is how far along the axis a shaken camera moved each picture: what is drawn on it goes along.
+    `tube_width_px` is the width of the tube behind the edge and `tube_width_sigma_px` its standard error, NaN for a
+    body and for a tube that leaves the axis; `seen_exposure_frames`, `fast_px_per_frame` see `edge.EdgeFit`.
     """
 
     track: Track
@@ -53,6 +59,10 @@ class Tracking:
     blur_px: float
     exposure_frames: float
     shake_px: Floats
+    tube_width_px: float = math.nan
+    tube_width_sigma_px: float = math.nan
+    seen_exposure_frames: float = math.nan
+    fast_px_per_frame: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -67,6 +77,8 @@ class _Edge:
     reach_px: float
     apart_sigma_px: Floats | float = 0.0
     notes: tuple[str, ...] = ()
+    width_px: tuple[float, float] = (math.nan, math.nan)
+    seen_exposure: tuple[float, float] = (math.nan, math.nan)
 
 
 def track_recording(
@@ -97,7 +109,7 @@ def track_recording(
     if trial.video is None:
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
-    capture_fps = capture_rate(trial, recording.capture_fps)
+    capture_fps = capture_rate(trial, recording)
     frames = read_frames(recording)
     return track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
 
@@ -126,7 +138,7 @@ def track_frames(
     kept = np.flatnonzero(used & ~rejected)
     luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
     try:
-        axis, orderly = _whereabouts(luma, axis, trial, m_per_px)
+        axis, orderly = whereabouts(luma, axis, trial, m_per_px)
         strip, found = _follow(luma, trial, axis, exposure_s * capture_fps, orderly)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
@@ -167,24 +179,39 @@ def track_frames(
     pictures = tuple((int(kept[i]), luma[i]) for i in chosen)
     shake_px = np.zeros(len(frames))
     shake_px[kept] = strip.shift_px[:, 0] if strip.steadied else 0.0
-    return Tracking(track, strip.axis, _kymograph(strip), pictures, found.blur_px, found.exposure_frames, shake_px)
+    return Tracking(
+        track, strip.axis, _kymograph(strip), pictures, found.blur_px, found.exposure_frames, shake_px,
+        *found.width_px, *found.seen_exposure,
+    )  # fmt: skip
 
 
-def capture_rate(trial: Trial, own: float | None) -> float:
-    """The capture rate: the user's; that of DNG frames where the sheet is blank; refused where the two differ."""
+def capture_rate(trial: Trial, recording: Recording) -> float:
+    """The capture rate: the user's; that of DNG frames where the sheet is blank.
+
+    Raises
+    ------
+    RecordingError
+        Where there is none, where sheet and DNG frames differ, and where it is the file's rate of playback.
+    """
+    own, stated = recording.capture_fps, trial.capture_fps
     if own is not None:
-        if np.isfinite(trial.capture_fps) and abs(trial.capture_fps / own - 1) > 1e-3:
+        if np.isfinite(stated) and abs(stated / own - 1) > 1e-3:
             raise RecordingError(
-                f"{trial.name}: capture_fps is {trial.capture_fps:g} in the sheet but {own:g} in the frames; "
-                "correct the sheet"
+                f"{trial.name}: capture_fps is {stated:g} in the sheet but {own:g} in the frames; correct the sheet"
             )
         return own
-    if not np.isfinite(trial.capture_fps):
+    if not np.isfinite(stated):
         raise RecordingError(f"{trial.name}: capture_fps is missing; the file knows its playback rate only")
-    return trial.capture_fps
+    playback = recording.playback_fps
+    if playback and abs(stated / playback - 1) < SAME_RATE and not trial.capture_fps_is_playback:
+        raise RecordingError(
+            f"{trial.name}: capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g}); "
+            "write the rate of capture, or capture_fps_is_playback: yes where the film plays as fast as it was captured"
+        )
+    return stated
 
 
-def _whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, bool]:
+def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, bool]:
     """The axis, with a width, and whether what changes along it is one front that passes once and stays."""
     given = axis is not None
     axis = axis if axis is not None else find_axis(luma)
@@ -218,8 +245,8 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
             return strip, _Edge(edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames, 2.0)
         strip = cut_strip(luma, squared(axis), 1.3 * half + 3)
         for _ in range(CENTRINGS):
-            before = strip
-            strip = _centred(luma, strip, *outline(strip))
+            before, sides = strip, outline(strip)
+            strip = centred(luma, strip, sides)
             if strip is before:
                 break
         front = track_edge(strip, exposure_frames)
@@ -228,7 +255,8 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
     reach = 3 * front.blur_px + 1
     return strip, _Edge(
         front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames, reach,
-        front.apart_sigma_px,
+        front.apart_sigma_px, width_px=(sides.width_px, sides.width_sigma_px),
+        seen_exposure=(front.seen_exposure_frames, front.fast_px_per_frame),
     )  # fmt: skip
 
 
@@ -242,11 +270,18 @@ def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
     return 0.1 * axis.length_px
 
 
-def _centred(luma: NDArray[Any], strip: Strip, shift: float, slope: float, half: float) -> Strip:
+def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
     """The strip about the tube's own centreline; the same one where it is centred already.
 
     A given axis keeps its ends' places along itself: only what lies across is corrected.
+
+    Parameters
+    ----------
+    luma : array, shape (n_frames, height, width), brightness.
+    strip : cut from it.
+    sides : of the tube in that strip.
     """
+    shift, slope, half = sides.shift_px, sides.slope, sides.half_px
     tilt = slope * strip.axis.length_px
     middle = shift + tilt / 2
     room = (strip.values.shape[1] - 1) / 2 - half - 3

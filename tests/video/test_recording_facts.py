@@ -1,0 +1,148 @@
+"""Sizes in the picture against the sheet: each slip is caught, right campaigns are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vinetrack.core.records import Trial
+from vinetrack.experiment.folder import check_experiment
+from vinetrack.laboratory.render import render_recording
+from vinetrack.laboratory.scene import Tube, preset
+from vinetrack.video.frames import RecordingError, inspect_recording
+from vinetrack.video.quick_look import look_at
+from vinetrack.video.recording_facts import RecordingFacts, exposure_problems, size_problems
+from vinetrack.video.survey import Surveyor
+from vinetrack.video.track import capture_rate, track_recording
+
+FPS, SCALE_MM = 1069.0, 0.24
+VINE = Trial(name="a", diameter_m=0.012, length_m=0.14)
+FACTS = RecordingFacts(
+    trial="a", n_frames=100, capture_fps=FPS, playback_fps=60.0, mm_per_px=SCALE_MM, picture_mm=230.0, axis=None,
+    tube_width_mm=12.1, tube_width_sigma_mm=0.25, growth_mm=138.0, tracked=True,
+)  # fmt: skip
+
+
+def test_sizes_that_agree_bring_nothing() -> None:
+    assert size_problems(VINE, FACTS) == []
+
+
+@pytest.mark.parametrize(("scale", "severity"), [(0.1, "error"), (0.8, "warning"), (1.2, "warning"), (10, "error")])
+def test_a_wrong_scale_is_named_once_with_numbers_and_factor(scale: float, severity: str) -> None:
+    facts = replace(FACTS, tube_width_mm=12 * scale, tube_width_sigma_mm=0.25 * scale, growth_mm=139 * scale)
+    (problem,) = size_problems(VINE, facts)
+    assert problem.severity == severity
+    assert f"a factor {max(scale, 1 / scale):.3g}" in problem.message
+    assert "check the scale" in problem.remedy
+
+
+def test_diameter_and_length_in_each_others_place_are_named() -> None:
+    swapped = replace(VINE, diameter_m=VINE.length_m, length_m=VINE.diameter_m)
+    problems = size_problems(swapped, FACTS)
+    assert [problem.column for problem in problems] == ["diameter_mm", "length_mm"]
+    assert all(problem.severity == "error" for problem in problems)
+    assert all("in each other's place" in problem.remedy for problem in problems)
+
+
+def test_a_vine_that_stops_early_is_no_slip() -> None:
+    assert size_problems(VINE, replace(FACTS, growth_mm=60.0)) == []
+
+
+def test_a_vine_that_grows_beyond_its_length_is_one() -> None:
+    (problem,) = size_problems(VINE, replace(FACTS, growth_mm=168.0))
+    assert (problem.column, problem.severity) == ("length_mm", "warning")
+
+
+def test_a_body_and_a_sheet_that_declines_are_not_compared() -> None:
+    wrong = replace(FACTS, tube_width_mm=120.0)
+    assert size_problems(replace(VINE, travel_ratio=1), wrong) == []
+    assert size_problems(replace(VINE, compare_sizes=False), wrong) == []
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tube of 12 mm that grows 140 mm at 6 m/s, with an exposure of half a frame, as a film of 60 a second."""
+    scene = preset("half_frame_exposure")
+    assert isinstance(scene.subject, Tube)
+    tube = replace(scene.subject, diameter_m=0.012, length_m=0.14)
+    scene = replace(scene, subject=tube, camera=replace(scene.camera, m_per_px=SCALE_MM / 1e3))
+    path = tmp_path_factory.mktemp("clip") / "a.mp4"
+    motion = np.linspace(0, 0.06, 400), np.clip(6.0 * (np.linspace(0, 0.06, 400) - 0.015), 0, 0.14)
+    render_recording(scene, motion, n_frames=60, capture_fps=FPS, out_path=path, seed=20950)
+    return path
+
+
+def test_a_look_sees_width_and_growth_without_the_sheet(clip: Path) -> None:
+    recording = inspect_recording(clip)
+    look = look_at(recording, replace(VINE, diameter_m=1.0), None, recording.declared_frames)
+    assert look.tube_width_px * SCALE_MM == pytest.approx(12, rel=0.04)
+    assert look.growth_px * SCALE_MM == pytest.approx(140, rel=0.06)
+    assert look.px_per_frame * SCALE_MM * FPS / 1e3 == pytest.approx(6, rel=0.1)
+
+
+def test_the_rate_of_playback_is_refused_unless_it_is_said_to_be_that_of_capture(clip: Path) -> None:
+    recording = inspect_recording(clip)
+    assert recording.playback_fps == 60
+    with pytest.raises(RecordingError, match="the rate at which the file plays"):
+        capture_rate(replace(VINE, capture_fps=60.0), recording)
+    assert capture_rate(replace(VINE, capture_fps=60.0, capture_fps_is_playback=True), recording) == 60
+    assert capture_rate(replace(VINE, capture_fps=61.0), recording) == 61
+
+
+def tracked(clip: Path, exposure_frames: float) -> tuple[Trial, object]:
+    trial = replace(VINE, video=clip, capture_fps=FPS, m_per_px=SCALE_MM / 1e3, exposure_s=exposure_frames / FPS)
+    return trial, track_recording(trial)
+
+
+def test_an_exposure_that_the_blur_bears_out_brings_nothing(clip: Path) -> None:
+    trial, tracking = tracked(clip, 0.5)
+    assert exposure_problems(trial, tracking) == []
+    assert tracking.tube_width_px * SCALE_MM == pytest.approx(12, rel=0.05)
+
+
+@pytest.mark.parametrize("stated", [0.05, 1.0])
+def test_an_exposure_that_the_blur_contradicts_is_named(clip: Path, stated: float) -> None:
+    (problem,) = exposure_problems(*tracked(clip, stated))
+    assert problem.column == "exposure_us"
+    assert "where it moves" in problem.message
+
+
+SHEET = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
+SETTINGS = "capture_fps: 1069\ngrowth_angle_deg: 0\ncalibration: {kind: mm_per_px, mm_per_px: 0.24}\n"
+
+
+def surveyed(clip: Path, folder: Path, row: str, settings: str) -> tuple[list[str], Surveyor]:
+    folder.mkdir()
+    (folder / "a.mp4").symlink_to(clip)
+    (folder / "trials.csv").write_text(SHEET + row)
+    (folder / "experiment.yaml").write_text(settings)
+    surveyor = Surveyor()
+    return [f"{p.severity} {p.column}" for p in check_experiment(folder, surveyor)], surveyor
+
+
+def test_check_understands_a_right_recording(clip: Path, tmp_path: Path) -> None:
+    problems, surveyor = surveyed(clip, tmp_path / "v", "a,a.mp4,12,100,140,36,3\n", SETTINGS)
+    assert problems == []
+    (facts,) = surveyor.facts.values()
+    assert (facts.n_frames, facts.capture_fps, facts.playback_fps) == (60, 1069, 60)
+    assert facts.picture_mm == pytest.approx(0.24 * 960)
+    assert facts.tube_width_mm == pytest.approx(12, rel=0.04)
+
+
+@pytest.mark.parametrize(
+    ("row", "settings", "expected"),
+    [
+        ("a,a.mp4,12,100,140,36,3\n", SETTINGS.replace("1069", "60"), ["error capture_fps"]),
+        ("a,a.mp4,12,100,140,36,3\n", SETTINGS.replace("0.24", "0.024"), ["error diameter_mm"]),
+        ("a,a.mp4,12,100,140,36,3\n", SETTINGS.replace("0.24", "0.288"), ["warning diameter_mm"]),
+        ("a,a.mp4,140,100,12,36,3\n", SETTINGS, ["error diameter_mm", "error length_mm"]),
+        ("a,a.mp4,12,100,140,36,3\n", SETTINGS + "exposure_us: 0.0935\n", ["warning exposure_us"]),
+        ("a,a.mp4,12,100,140,36,3\n", SETTINGS + "exposure_ms: 93.5\n", ["warning exposure_ms", "error exposure_us"]),
+    ],
+    ids=["rate", "scale ×10", "scale 20 %", "sizes swapped", "ms as µs", "µs as ms"],
+)
+def test_check_catches_a_slip(clip: Path, tmp_path: Path, row: str, settings: str, expected: list[str]) -> None:
+    assert surveyed(clip, tmp_path / "v", row, settings)[0] == expected

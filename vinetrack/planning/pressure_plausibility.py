@@ -1,0 +1,86 @@
+"""Whether speeds agree with the stated pressures, as far as damping coefficients of such tubes are known.
+
+The damping coefficient that a trial implies, B = (P − P_y) A / (2 ẏ)ⁿ with the printed n, is compared with the scaling
+prior (`vinetrack.planning.scaling_priors`). A pressure in psi under the name of kPa is 6.9 times too low, and P − P_y
+lower still.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from vinetrack.core import published
+from vinetrack.core.numbers import number
+from vinetrack.core.problems import Problem
+from vinetrack.core.records import Trial
+from vinetrack.core.units import convert
+from vinetrack.planning.scaling_priors import damping_prior
+
+FAR_OFF = 4.0
+"""Chosen: factor between implied and prior damping from which another unit is tried. The four printed values lie within
+1.2 of the prior, films of other makers may lie further off: at 2 they would be asked, at 7 psi would not."""
+NEAR = 2.5
+"""Chosen: factor to the prior within which the other unit explains the speeds."""
+
+
+def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield_pressure_Pa: float) -> float:
+    """Damping coefficient that a trial implies over that of the scaling prior; NaN without growth or drive.
+
+    Parameters
+    ----------
+    trial : its tube.
+    mean_speed_m_s : of the leading edge over the middle of its growth.
+    pressure_Pa, yield_pressure_Pa : gauge pressures.
+    """
+    drive_N = (pressure_Pa - yield_pressure_Pa) * trial.area_m2
+    if not (drive_N > 0 and mean_speed_m_s > 0 and math.isfinite(mean_speed_m_s)):
+        return math.nan
+    damping = drive_N / (trial.travel_ratio * mean_speed_m_s) ** published.EXPONENT
+    return damping / damping_prior(trial.diameter_m, trial.thickness_m)
+
+
+def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
+    """A warning where the speeds contradict the pressures as stated and agree with them in psi, or the reverse.
+
+    Parameters
+    ----------
+    speeds : trials of everting vines with the mean speed of the leading edge, m/s; others are passed over.
+
+    Returns
+    -------
+    problems : one warning or none.
+    """
+    pairs = [(trial, speed) for trial, speed in speeds if trial.travel_ratio == 2 and trial.pressure_trace is None]
+    as_stated = _middle_ratio(pairs, 1.0, 1.0)
+    if not (as_stated < 1 / FAR_OFF or as_stated > FAR_OFF):
+        return []
+    psi = convert(1.0, "psi", "kPa")
+    factor, wrong = (psi, "psi, not kPa") if as_stated < 1 else (1 / psi, "kPa, not psi")
+    for yield_factor in (1.0, factor):
+        converted = _middle_ratio(pairs, factor, yield_factor)
+        if 1 / NEAR < converted < NEAR:
+            message = (
+                f"looks like {wrong} (1 psi is {psi:.4g} kPa): the speeds seen imply {number(as_stated, 2)} times the "
+                f"damping that tubes of this size have, and {number(converted, 2)} times in the other unit"
+            )
+            remedy = "name the column pressure_psi" if factor > 1 else "name the column pressure_kPa"
+            place: dict[str, Any] = {"file": "trials.csv", "column": "pressure_kPa"}
+            return [Problem(message=message, severity="warning", remedy=remedy, **place)]
+    return []
+
+
+def _middle_ratio(pairs: list[tuple[Trial, float]], factor: float, yield_factor: float) -> float:
+    """Median over the trials of `implied_ratio`, pressures multiplied by `factor`; NaN where none says anything.
+
+    A trial that moves although the pressure does not exceed the yield pressure implies no damping at all.
+    """
+    ratios = []
+    for trial, speed in pairs:
+        ratio = implied_ratio(trial, speed, factor * trial.pressure_Pa, yield_factor * trial.yield_pressure_Pa)
+        ratios.append(0.0 if math.isnan(ratio) and speed > 0 else ratio)
+    known = [ratio for ratio in ratios if math.isfinite(ratio)]
+    return float(np.median(known)) if known else math.nan

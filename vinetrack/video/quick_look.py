@@ -1,0 +1,80 @@
+"""A recording looked at before any work: axis, width of the tube and growth, from about a hundred of its frames.
+
+A second a recording, no edge fitted: the widths agree with those of the tracker, growth is known to some per cent.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+
+from vinetrack.core.records import Trial
+from vinetrack.video.axis import Axis
+from vinetrack.video.edge import outline, rough_growth
+from vinetrack.video.frames import Recording, RecordingError, iterate_frames
+from vinetrack.video.strip import cut_strip, squared
+from vinetrack.video.track import CENTRINGS, centred, whereabouts
+
+LOOKED_AT = 100
+"""Chosen: frames of a recording that are looked at. At half of them a vine that grows within a tenth of the recording
+shows in five frames; at twice as many a look takes twice the time."""
+MOST_BYTES = 200_000_000
+"""Chosen: memory for those frames, as a laptop has it to spare; 100 frames of 2 megapixels fit."""
+MOST_DECODED = 4000
+"""Chosen: frames that are decoded, some three seconds' work; of a longer recording the beginning is looked at."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """Axis in the picture, width of the tube and its standard error, growth, greatest speed; NaN where not seen.
+
+    `growth_px` is NaN as well where the recording is longer than what was looked at; `px_per_frame` is the mean speed
+    over the middle of the growth.
+    """
+
+    axis: Axis | None = None
+    tube_width_px: float = math.nan
+    tube_width_sigma_px: float = math.nan
+    growth_px: float = math.nan
+    px_per_frame: float = math.nan
+
+
+def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | None) -> Look:
+    """Look for the axis, the width of the tube and its growth.
+
+    The sheet's diameter is not used: what it is compared with must not depend on it.
+
+    Parameters
+    ----------
+    recording : opened.
+    trial : its travel ratio.
+    axis : growth axis in the picture, px; found from the motion where None.
+    count : frames of the recording as far as they are known; None where they are not.
+
+    Returns
+    -------
+    look : without numbers where nothing grows along one line.
+    """
+    most = int(np.clip(MOST_BYTES // (recording.width * recording.height), LOOKED_AT // 4, LOOKED_AT))
+    every = max(1, -(-min(count or MOST_DECODED, MOST_DECODED) // most))
+    luma = np.stack(list(islice(iterate_frames(recording), 0, MOST_DECODED, every)))
+    try:
+        found, orderly = whereabouts(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
+        if trial.travel_ratio == 1 or not orderly:
+            return Look(found)
+        strip = cut_strip(luma, squared(found), 0.65 * found.width_px + 3)
+        for _ in range(2 * CENTRINGS):
+            before, sides = strip, outline(strip)
+            strip = centred(luma, strip, sides)
+            if strip is before:
+                break
+        growth_px, px_per_frame = rough_growth(strip)
+    except (RecordingError, ValueError):
+        return Look()
+    whole = count is None or count <= MOST_DECODED
+    return Look(
+        strip.axis, sides.width_px, sides.width_sigma_px, growth_px if whole else math.nan, px_per_frame / every
+    )

@@ -1,0 +1,221 @@
+"""What was understood of a recording, and whether that agrees with the sheet.
+
+A ruler wrong by ten, a diameter in the column of the length or a rate of playback would otherwise come out as physics.
+`vinetrack.video.quick_look` sees width and growth before any work, the tracker sees them better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vinetrack.core.numbers import number
+from vinetrack.core.problems import Problem
+from vinetrack.core.records import Trial
+from vinetrack.core.terminal import table
+from vinetrack.video.axis import Axis
+from vinetrack.video.measure import Measurement
+from vinetrack.video.track import Tracking
+
+WIDTH_PART = 0.08
+"""Part of the diameter by which the width in the picture may miss it beyond its stated error. Measured
+(benchmarks/seen_sizes.py, seeds 20900 and up): 0.96 to 1.02 of it is seen. Beyond a ruler that lies 10 cm nearer to a
+camera 1.5 m away a tube looks 7 % narrower."""
+GROWTH_PART = {True: 0.06, False: 0.12}
+"""Part of the length by which growth may exceed it, as the tracker (True) or a quick look (False) sees it. Measured
+(as above): up to 1.00 and 1.02 of it are seen; the rest is for a ruler beside the plane of growth."""
+BLUR_PX = 3.0
+"""Blur, over its length, by which a stated exposure may miss what is seen; twice that is an error. Measured (seeds
+20900 and up): true exposures miss it by up to 0.8 px, one of a whole frame for a tenth by 3.4 to 34 px at 7 to 45 px a
+frame."""
+ERROR_FACTOR = 1.5
+"""Factor between picture and sheet that no lens or ruler makes: an error."""
+SIGMAS = 3.0
+"""Standard errors of the width that are allowed for."""
+SAME_FACTOR = 0.1
+"""Width and growth that are off by factors within a tenth of each other are off by one factor: the scale."""
+LEAVE_OUT = "or write compare_sizes: no where only part of the tube is seen"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingFacts:
+    """Numbers of one recording; NaN (None) where not known.
+
+    `tracked` tells whether width and growth come from the tracker or from a quick look; `picture_mm` is the width of
+    the picture; `mean_speed_m_s` that of the leading edge over the middle of its growth.
+    """
+
+    trial: str
+    n_frames: int | None
+    capture_fps: float
+    playback_fps: float | None
+    mm_per_px: float
+    scale_rel_sigma: float = math.nan
+    picture_mm: float
+    axis: Axis | None
+    tube_width_mm: float = math.nan
+    tube_width_sigma_mm: float = math.nan
+    growth_mm: float = math.nan
+    mean_speed_m_s: float = math.nan
+    tracked: bool = False
+
+    @property
+    def duration_s(self) -> float:
+        """From the first frame to the last."""
+        return math.nan if self.n_frames is None else (self.n_frames - 1) / self.capture_fps
+
+
+def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
+    """What the tracker understood of a recording.
+
+    Parameters
+    ----------
+    trial : as the sheet has it.
+    measurement : its recording, tracked.
+    """
+    tracking = measurement.tracking
+    mm_per_px = 1e3 * measurement.m_per_px
+    return RecordingFacts(
+        trial=trial.name,
+        n_frames=len(tracking.track.time_s),
+        capture_fps=measurement.capture_fps,
+        playback_fps=measurement.recording.playback_fps,
+        mm_per_px=mm_per_px,
+        scale_rel_sigma=measurement.scale_rel_sigma,
+        picture_mm=mm_per_px * measurement.recording.width,
+        axis=tracking.axis,
+        tube_width_mm=mm_per_px * tracking.tube_width_px,
+        tube_width_sigma_mm=mm_per_px * tracking.tube_width_sigma_px,
+        growth_mm=1e3 * measurement.growth_m,
+        tracked=True,
+    )
+
+
+def size_problems(trial: Trial, facts: RecordingFacts) -> list[Problem]:
+    """Sizes in the picture that the sheet contradicts: warnings, beyond a factor 1.5 errors.
+
+    A body that moves as a whole has no tube; `compare_sizes: no` in the sheet leaves the comparison out.
+
+    Parameters
+    ----------
+    trial : as the sheet has it.
+    facts : what the picture shows of it.
+
+    Returns
+    -------
+    problems : with both numbers and the factor.
+    """
+    if trial.travel_ratio == 1 or not trial.compare_sizes:
+        return []
+    diameter_mm, length_mm = 1e3 * trial.diameter_m, 1e3 * trial.length_m
+    width, growth = facts.tube_width_mm / diameter_mm, facts.growth_mm / length_mm
+    sigma = math.hypot(facts.tube_width_sigma_mm / diameter_mm, float(np.nan_to_num(facts.scale_rel_sigma)))
+    wide = abs(width - 1) > WIDTH_PART + SIGMAS * sigma
+    long = growth > 1 + GROWTH_PART[facts.tracked]
+    of_width = f"the tube in the picture is {number(facts.tube_width_mm)} mm wide, a factor {_factor(width)}"
+    of_growth = f"the growth in the picture is {number(facts.growth_mm)} mm, a factor {_factor(growth)}"
+    remedy = f"check it, its unit and the scale, {LEAVE_OUT}"
+    if wide and _near(facts.tube_width_mm / length_mm) and _near(facts.growth_mm / diameter_mm):
+        remedy = "diameter_mm and length_mm stand in each other's place"
+    elif wide and growth > 0 and abs(math.log(width / growth)) < SAME_FACTOR:
+        both = f"{of_width}, and {of_growth} ({length_mm:g} in the sheet)"
+        return [_problem("diameter_mm", diameter_mm, both, width, "check the scale: calibration, mm_per_px")]
+    problems = [_problem("diameter_mm", diameter_mm, of_width, width, remedy)] if wide else []
+    return [*problems, *([_problem("length_mm", length_mm, of_growth, growth, remedy)] if long else [])]
+
+
+def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
+    """A stated exposure that the blur of the moving edge contradicts: a warning, of many pixels an error.
+
+    Parameters
+    ----------
+    trial : as the sheet has it.
+    tracking : of its recording.
+
+    Returns
+    -------
+    problems : one or none.
+    """
+    stated, seen = tracking.exposure_frames, tracking.seen_exposure_frames
+    apart_px = abs(stated - seen) * tracking.fast_px_per_frame
+    if not (apart_px > BLUR_PX and max(stated / seen, seen / stated) > ERROR_FACTOR and trial.exposure_s > 0):
+        return []
+    stated_us, seen_us = 1e6 * trial.exposure_s, 1e6 * trial.exposure_s * seen / stated
+    message = (
+        f"differs: the edge is blurred as by {number(seen_us, 2)} µs, a factor {_factor(stated / seen)}, where it "
+        f"moves {number(tracking.fast_px_per_frame, 2)} px a frame"
+    )
+    severity = "error" if apart_px > 2 * BLUR_PX else "warning"
+    remedy = "check exposure_us, its unit and capture_fps"
+    return [Problem(message=message, severity=severity, column="exposure_us", value=f"{stated_us:g}", remedy=remedy)]
+
+
+def _near(ratio: float) -> bool:
+    return abs(ratio - 1) < 0.2
+
+
+def _factor(ratio: float) -> str:
+    return f"{max(ratio, 1 / ratio):.3g}"
+
+
+def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str) -> Problem:
+    severity = "error" if max(ratio, 1 / ratio) > ERROR_FACTOR else "warning"
+    return Problem(message=f"differs: {seen}", severity=severity, column=column, value=f"{stated_mm:g}", remedy=remedy)
+
+
+def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
+    """A table for the terminal, a line a recording, sizes of the picture beside those of the sheet.
+
+    Parameters
+    ----------
+    facts, trials : of the same recordings, in the same order.
+    """
+    rows = [_cells(fact, trial) for fact, trial in zip(facts, trials, strict=True)]
+    head = (
+        "recording",
+        "frames",
+        "rate",
+        "plays",
+        "lasts",
+        "scale",
+        "picture",
+        "axis",
+        "tube",
+        "sheet",
+        "growth",
+        "sheet",
+    )
+    units = ("", "", "1/s", "1/s", "s", "mm/px", "mm", "px", "mm", "mm", "mm", "mm")
+    return table(rows, head, units, align="<>>>>>><>>>>")
+
+
+def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
+    """The numbers of a recording as JSON holds them."""
+    entry = {key: value for key, value in vars(facts).items() if key != "axis"}
+    axis = None if facts.axis is None else {"from_px": facts.axis.from_px, "to_px": facts.axis.to_px}
+    return entry | {"duration_s": facts.duration_s, "axis": axis}
+
+
+def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
+    axis = "–"
+    if facts.axis is not None:
+        ends = (*facts.axis.from_px, *facts.axis.to_px)
+        axis = "{},{} → {},{}".format(*(round(end) for end in ends))
+    return (
+        facts.trial,
+        "–" if facts.n_frames is None else str(facts.n_frames),
+        f"{facts.capture_fps:g}",
+        "–" if facts.playback_fps is None else f"{facts.playback_fps:.4g}",
+        number(facts.duration_s),
+        number(facts.mm_per_px, 4),
+        number(facts.picture_mm),
+        axis,
+        number(facts.tube_width_mm),
+        number(1e3 * trial.diameter_m),
+        number(facts.growth_mm),
+        number(1e3 * trial.length_m),
+    )
