@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any
@@ -30,7 +30,7 @@ class Should:
     none_of : none of these stands in the answer set, whatever the verdict
     only : unless empty, the answer set holds nothing else
     true : names that are true of the campaign, so that to name one alone is never wrong
-    holds : parameters whose 95 % interval holds the true size, where it is stated as found
+    holds : parameters whose 95 % interval holds the true size where it is named, with what it may include left open
     """
 
     verdicts: tuple[str, ...]
@@ -66,17 +66,21 @@ class Answer:
     final_answer: tuple[str, ...] = ()
     numbers: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     parameters: tuple[Mapping[str, Any], ...] = ()
+    confounders: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, said: Mapping[str, Any]) -> Answer:
         """From the file. Sizes come from the first round that states them, else from the last model."""
         rounds = said["rounds"]
         numbers: dict[str, Mapping[str, Any]] = {}
+        confounders: dict[str, list[Mapping[str, Any]]] = {}
         for one in rounds:
             for candidate in one["ranking"]:
                 if candidate["in_answer_set"]:
                     for number in candidate["numbers"]:
                         numbers.setdefault(number["parameter"], number)
+                    for other in candidate.get("confounded_by", ()):
+                        confounders.setdefault(other["parameter"], []).append(other)
         return cls(
             said["verdict"],
             tuple(said["answer_set"]),
@@ -85,6 +89,7 @@ class Answer:
             tuple(rounds[-1]["answer_set"]),
             numbers,
             tuple(said["parameters"]),
+            confounders,
         )
 
 
@@ -134,6 +139,8 @@ def _missed_size(answer: Answer, should: Should, truths: Mapping[str, float]) ->
         if number is None or key not in truths:
             continue
         low, high = number["low_95"], number["high_95"]
+        for other in answer.confounders.get(key, ()):
+            low, high = min(low, other["low_95"]), max(high, other["high_95"])
         if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
             continue
         if not low <= truths[key] <= high:

@@ -103,7 +103,11 @@ class CandidateFits:
         return tests
 
     def singles(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
-        """Fit the hypotheses that may be the best or near it, each effect alone."""
+        """Fit the hypotheses that may be the best or near it, each effect alone.
+
+        With `all_of_them` every candidate is fitted to one trial of every condition, and to all trials unless that
+        leaves it out of reach of the best.
+        """
         if self.weak:
             return self._fit_weak(all_of_them=all_of_them)
         self._climb_all(self.names if all_of_them else self._worth_a_climb())
@@ -120,7 +124,7 @@ class CandidateFits:
             one for one in leaders if one.deviance - best.deviance < (ALIKE_REACH * reach if one in alike else reach)
         ]
         chosen = [one for one in near if not one.hopeless] or near
-        for climb in chosen[: self.most_fitted + 3 * all_of_them]:
+        for climb in chosen if all_of_them else chosen[: self.most_fitted]:
             self._fit(climb)
         self._fit_what_is_contained()
         return list(self.fitted.values())

@@ -18,6 +18,7 @@ import numpy as np
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import candidates_of, host_for, testable
+from vinetrack.diagnosis.contradictions import contradictions
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, weights_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (
@@ -133,6 +134,10 @@ def diagnose(
         result = replace(result, notes=(*result.notes, wild))
     if ladder:
         result = _with_ladder(result, report)
+    if ladder and result.final_verdict == ADEQUATE:
+        report("what speaks against it")
+        doubts = contradictions(result.fits, result.effects, result.ladder)
+        result = replace(result, notes=(*result.notes, *(f"Against this verdict: {one}" for one in doubts)))
     if advice:
         result = _with_advice(result, limits, report)
     return result
@@ -266,6 +271,7 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     largest,
                     one.others if effect.name in finding.answer else (),
                     weights[effect.name],
+                    tuple(one for one in finding.confounded if one.number.key.split(".")[0] == effect.name),
                 )
             )
         elif finding.verdict == ADEQUATE and not shows and z < questions.threshold:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from vinetrack.diagnosis.confounded_sizes import Confounder
     from vinetrack.diagnosis.locate import Failure
 
 ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
@@ -59,6 +60,7 @@ class Candidate:
     each parameter to the largest size that could still hide, one-sided 95 %.
     `reason` says in words why it is not testable, or not plausible, or another's limit. `posterior_weight` is its
     probability among all that were refitted, had they been equally likely beforehand, with plausible ranges as priors.
+    `confounded_by` are other effects that its sizes may hold a part of.
     """
 
     effect: str
@@ -73,6 +75,7 @@ class Candidate:
     largest: Mapping[str, float] = field(default_factory=dict)
     along: tuple[Number, ...] = ()
     posterior_weight: float = math.nan
+    confounded_by: tuple[Confounder, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
@@ -88,6 +91,7 @@ class Candidate:
             "reason": self.reason,
             "largest": dict(self.largest),
             "posterior_weight": self.posterior_weight,
+            "confounded_by": [one.to_json() for one in self.confounded_by],
             "along": [number.to_json() for number in self.along],
         }
 

@@ -119,23 +119,71 @@ def products_of(found: Fit, answers: EffectSensitivities, doubts: Sequence[Float
     return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes), doubts[0].shape[1])
 
 
-def scores_of(found: Fit, sums: Products, state: FitState | None = None) -> Scores:
-    """Scores at a fit, or with the noise and spreads of another `state`."""
-    solution = found.solution
-    frame, state = solution.frame, state or solution.state
-    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, solution.frame, state)
+def _projected(found: Fit, sums: Products, state: FitState) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.intp]]:
+    """Project shapes and residual on the free numbers of a fit, trial effects eliminated.
+
+    Returns
+    -------
+    blocks : (n_trials, q, q)
+        Cross products: keys, residual, shapes, systematic errors.
+    cross, lever : (n_free, n_shapes + n_doubts)
+        I_θs, and I_θθ⁻¹ I_θs.
+    step : (n_free,)
+        Newton step of the free numbers.
+    moving : indices
+        Of the free numbers that can give way.
+    """
+    frame = found.solution.frame
+    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, frame, state)
     p, size = sums.n_keys, frame.prior_mean.size
-    index = frame.index
     asked = sums.n_shapes + sums.n_doubts
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
     square = cross_products(blocks[:, X, X], frame) + np.diag(frame.prior_precision)
     slope = cross_products_vector(blocks[:, X, r], frame) - frame.prior_precision * (state.theta - frame.prior_mean)
     cross = np.zeros((size + 1, asked))
-    np.add.at(cross, index, blocks[:, X, C])
+    np.add.at(cross, frame.index, blocks[:, X, C])
     cross = cross[:size]
     moving = np.flatnonzero(frame.free & (np.diag(square) > 0) & ~_pressed(found))
     inverse = inverse_among(square, moving)
-    lever, step = inverse @ cross, inverse @ slope
+    return blocks, cross, inverse @ cross, inverse @ slope, moving
+
+
+def levers_of(found: Fit, sums: Products) -> Floats:
+    """How far each number of a fit falls for each unit of another effect's size, by linear algebra.
+
+    Parameters
+    ----------
+    found
+        The fit.
+    sums
+        Its products with the shapes.
+
+    Returns
+    -------
+    ndarray, shape (n_numbers, n_shapes)
+        I_θθ⁻¹ I_θs with systematic errors integrated out, in units of the number over those of the size.
+    """
+    lever = _projected(found, sums, found.solution.state)[2]
+    lever = lever @ _systematics_turn(scores_with_systematics(found, sums).information, sums.n_shapes)
+    free = found.predictor.layout.free
+    slopes = [
+        number.value if parameter.logarithmic else parameter.scale
+        for parameter, number in zip(free, found.numbers, strict=True)
+    ]
+    return np.asarray(lever[: len(free)] * np.array(slopes)[:, None])
+
+
+def scores_of(found: Fit, sums: Products, state: FitState | None = None) -> Scores:
+    """Scores at a fit, or with the noise and spreads of another `state`."""
+    return _systematics_aside(scores_with_systematics(found, sums, state), sums.n_shapes)
+
+
+def scores_with_systematics(found: Fit, sums: Products, state: FitState | None = None) -> Scores:
+    """Scores of the shapes and, behind them, of the systematic errors, none integrated out."""
+    frame, state = found.solution.frame, state or found.solution.state
+    blocks, cross, lever, step, moving = _projected(found, sums, state)
+    index, asked, p = frame.index, sums.n_shapes + sums.n_doubts, sums.n_keys
+    X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
     total = blocks[:, C, C].sum(axis=0)
     information = total - cross.T @ lever
     # What rounding leaves of a shape that the free numbers imitate exactly is nothing.
@@ -152,17 +200,26 @@ def scores_of(found: Fit, sums: Products, state: FitState | None = None) -> Scor
     score = blocks[:, C, r].sum(axis=0) - cross.T @ step
     score[gone] = 0.0
     degrees = max(len(single) - moving.size, 1)
-    return _doubts_aside(Scores(score, information, single, alone, float(degrees)), sums.n_shapes)
+    return Scores(score, information, single, alone, float(degrees))
 
 
-def _doubts_aside(scores: Scores, n_shapes: int) -> Scores:
-    """What is left of the shapes once all that is in doubt, each of standard deviation 1, is integrated out."""
-    asked = scores.score.size
+def _systematics_turn(information: Floats, n_shapes: int) -> Floats:
+    """What turns shapes and systematic errors into what is left of the shapes, shape (n_asked, n_shapes).
+
+    Systematic errors have standard deviation 1 and are integrated out.
+    """
+    asked = len(information)
     turn = np.zeros((asked, n_shapes))
     turn[:n_shapes] = np.eye(n_shapes)
     if asked > n_shapes:
-        inner = scores.information[n_shapes:, n_shapes:] + np.eye(asked - n_shapes)
-        turn[n_shapes:] = -np.linalg.solve(inner, scores.information[n_shapes:, :n_shapes])
+        inner = information[n_shapes:, n_shapes:] + np.eye(asked - n_shapes)
+        turn[n_shapes:] = -np.linalg.solve(inner, information[n_shapes:, :n_shapes])
+    return turn
+
+
+def _systematics_aside(scores: Scores, n_shapes: int) -> Scores:
+    """What is left of the shapes once systematic errors are integrated out."""
+    turn = _systematics_turn(scores.information, n_shapes)
     score, information = turn.T @ scores.score, scores.information[:n_shapes] @ turn
     gone = np.diag(information) < 1e-9 * np.maximum(np.diag(scores.information)[:n_shapes], 1e-300)
     information[gone, :] = information[:, gone] = 0.0

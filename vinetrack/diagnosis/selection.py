@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 from vinetrack.diagnosis.between_trials import between_fits, called, differences
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report, pairs
+from vinetrack.diagnosis.confounded_sizes import Confounder, confounders_of
+from vinetrack.diagnosis.contradictions import displacement_m, is_within_position_errors
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET,
     MOST_INFLATION,
@@ -51,7 +53,7 @@ class SelectionStep:
     """One round before it is put in words.
 
     `kept` are the hypotheses in the answer set (of pairs: the partners, given what was added before), `tried` all that
-    were fitted, `aside` what was set aside and why, by name.
+    were fitted, `aside` what was set aside and why, by name; `confounded` are sizes that may hold another effect.
     """
 
     verdict: str
@@ -62,6 +64,7 @@ class SelectionStep:
     answer: tuple[str, ...] = ()
     search: CandidateFits | None = None
     note: str = ""
+    confounded: tuple[Confounder, ...] = ()
 
 
 def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[SelectionStep]:
@@ -92,9 +95,10 @@ def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, aga
         rival = without(found, best_of(tried).fit)
         if rival.log_likelihood > found.log_likelihood + NO_BETTER:
             return select_effects(rival, effects, report, again=again + 1)
-    alone = _alone(questions, search, tried)
+    alone = None if questions.far_off else _alone(questions, search, tried)
     if alone is not None:
         return alone
+    # Linear promises choose well near the truth, not far off: there, and before `unexplained`, all are fitted.
     tried = [*search.singles(all_of_them=True), *between]
     alone = _alone(questions, search, tried)
     if alone is not None:
@@ -148,6 +152,10 @@ def _alone(
     if after is None:
         return None
     verdict = verdict_of(kept)
+    if verdict == MISSING and is_within_position_errors(questions.found, kept[0].fit):
+        return [
+            SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search, note=_too_small(kept[0], questions))
+        ]
     first = SelectionStep(
         verdict,
         questions,
@@ -156,8 +164,17 @@ def _alone(
         tuple(aside.items()),
         tuple(one.names[0] for one in kept),
         search,
+        confounded=confounders_of(after, kept[0].names) if verdict == MISSING else (),
     )
     return [first, SelectionStep(ADEQUATE, after)] if verdict == MISSING else [first]
+
+
+def _too_small(best: LikelihoodRatio, questions: MisfitTests) -> str:
+    moved_mm = 1e3 * displacement_m(questions.found, best.fit)
+    return (
+        f"{best.label} would improve the fit by {best.sigma:.1f} σ, but it moves positions by only {moved_mm:.2g} mm, "
+        "less than their systematic errors, and does not lower the error on left-out conditions; it is not counted"
+    )
 
 
 def _mending(
@@ -262,7 +279,8 @@ def _in_order(
     seconds = tuple(likelihood_ratio(later.found, one.effects[1:], one.fit) for one in turned)
     second_verdict = verdict_of(seconds)
     names = tuple(one.names[0] for one in seconds)
-    second = SelectionStep(second_verdict, later, seconds, seconds, answer=names)
+    confounded = confounders_of(after, kept[0].names) if second_verdict == MISSING else ()
+    second = SelectionStep(second_verdict, later, seconds, seconds, answer=names, confounded=confounded)
     return [first, second, SelectionStep(ADEQUATE, after)] if second_verdict == MISSING else [first, second]
 
 

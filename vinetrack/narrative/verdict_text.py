@@ -28,6 +28,7 @@ from vinetrack.narrative.verdict_summary import joined, size
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.confounded_sizes import Confounder
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.selection import SelectionStep
     from vinetrack.inference.fit_result import Fit
@@ -90,7 +91,7 @@ def explain(finding: SelectionStep) -> str:
             )
             return text
         text += " With it in the model, no other candidate and no smooth force improves the fit."
-        return text + _runner_up(finding)
+        return text + confounders_in_words(finding.confounded) + _runner_up(finding)
     names = list(finding.answer)
     if finding.verdict == AMBIGUOUS:
         return (
@@ -116,6 +117,47 @@ def explain(finding: SelectionStep) -> str:
     for name, why in finding.aside:
         text += f" The nearest is {name.replace('+', ' with ')}: {why}."
     return text
+
+
+def confounders_in_words(confounders: Sequence[Confounder]) -> str:
+    """Say how much of each size another effect may be that the data cannot exclude.
+
+    Parameters
+    ----------
+    confounders
+        Of the sizes that were added.
+
+    Returns
+    -------
+    str
+        A sentence for each, a blank before it; blank where there are none.
+    """
+    text = ""
+    for name in dict.fromkeys(confounder.number.name for confounder in confounders):
+        alike = [confounder for confounder in confounders if confounder.number.name == name]
+        number = alike[0].number
+        unit, factor = display_unit(number.unit)
+        tail, digits = f" {unit}" if unit else "", decimals(number.sigma * factor)
+        smaller = [_part_in_words(one, digits, "of") for one in alike if abs(one.value) < abs(number.value)]
+        larger = [_part_in_words(one, digits, "beside") for one in alike if abs(one.value) >= abs(number.value)]
+        parts = [f"includes up to {joined(smaller, 'or')}"] if smaller else []
+        parts += [f"would be larger by up to {joined(larger, 'or')}"] if larger else []
+        low, high = min(one.low_95 for one in alike) * factor, max(one.high_95 for one in alike) * factor
+        text += (
+            f" This {number.title} {', or '.join(parts)}: the data do not exclude that. "
+            f"With {joined([one.effect for one in alike])} left open, {number.title} lies between {low:.{digits}f} and "
+            f"{high:.{digits}f}{tail} (95 %)."
+        )
+    return text
+
+
+def _part_in_words(confounder: Confounder, digits: int, preposition: str) -> str:
+    """`0.061 of air_drag (C_D up to 4.1)`: what the other effect changes, and up to which size."""
+    unit, factor = display_unit(confounder.number.unit)
+    limit_unit, limit_factor = display_unit(confounder.unit)
+    change = f"{abs(confounder.value - confounder.number.value) * factor:.{digits}f}{' ' + unit if unit else ''}"
+    limit = f"{confounder.symbol} up to {confounder.limit * limit_factor:.2g}{' ' + limit_unit if limit_unit else ''}"
+    return f"{change} {preposition} {confounder.effect} ({limit})"
 
 
 def _weights(kept: Sequence[LikelihoodRatio]) -> str:
@@ -153,6 +195,8 @@ def _remedies(finding: SelectionStep) -> str:
 
 def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
     questions = finding.questions
+    if finding.note:
+        return f"{model} explains {trials} as well as positions are known. {finding.note[0].upper()}{finding.note[1:]}."
     text = f"{model} explains {trials}: no missing effect can be detected."
     if questions.possible.size:
         place = int(questions.possible.argmax())
