@@ -14,16 +14,15 @@ from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, moved, one_round, 
 from vinetrack.diagnosis.result import Round
 from vinetrack.figures.style import render
 from vinetrack.pipeline.diagnosis_tables import (
-    draw_diagnosed,
     figure_tables,
     in_order_of_rank,
     predicted_trials,
     question,
     ranking_table,
     read_diagnosed,
-    with_after,
     worst_condition,
 )
+from vinetrack.pipeline.figures_stage import draw_diagnosed, with_after
 from vinetrack.results.folder_layout import Results
 
 RELEASE_S, ORIGIN_M = 0.05, 0.2

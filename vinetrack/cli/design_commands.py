@@ -46,7 +46,7 @@ from vinetrack.cli.design_options import (
     "inlet_mm",
     meanings={"yield_pressure_kPa": GUESSED_YIELD},
 )
-def predict(
+def _predict(
     sheet: Annotated[
         Path | None,
         typer.Argument(help="An experiment's folder or a sheet; else the options below.", metavar="SHEET",
@@ -83,7 +83,7 @@ def predict(
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
-        from vinetrack.pipeline.predict_stage import foretell
+        from vinetrack.pipeline.predict_stage import predict_conditions
         from vinetrack.pipeline.prediction_inputs import Asked
 
         if tail_slack not in (None, "taut", "free"):
@@ -99,7 +99,11 @@ def predict(
             n=math.nan if n is None else n,
             n_error=n_error,
         )
-        say(foretell(asked, samples=samples, seed=seed, at_fraction=at_fraction, figure=figure, csv=csv, json=json))
+        say(
+            predict_conditions(
+                asked, samples=samples, seed=seed, at_fraction=at_fraction, figure=figure, csv=csv, json=json
+            )
+        )
 
 
 @column_options(
@@ -112,7 +116,7 @@ def predict(
     "inlet_mm",
     meanings={"pressure_kPa": "Highest gauge pressure of the supply.", "yield_pressure_kPa": GUESSED_YIELD},
 )
-def vine(
+def _vine(
     films: Annotated[
         str, typer.Option("--films-um", metavar="UM,…", help="Films to choose from.", rich_help_panel=VINE)
     ] = "50,100,150,200",
@@ -191,7 +195,7 @@ def vine(
         "yield_pressure_kPa": GUESSED_YIELD,
     },
 )
-def reservoir(
+def _reservoir(
     *,
     cells: dict[str, str],
     within: Annotated[
@@ -237,7 +241,7 @@ def reservoir(
     "inlet_mm",
     meanings={"yield_pressure_kPa": GUESSED_YIELD},
 )
-def campaign(
+def _campaign(
     vines: Annotated[
         list[str] | None,
         typer.Option("--vine", metavar="MMxUMxMM", help="Diameter, wall, length of a vine. May be repeated.",
@@ -316,7 +320,7 @@ def campaign(
             results=results,
             effects=tuple(effects or ()),
             n=math.nan if n is None else n,
-            spreads=spreads(pressure_spread, damping_spread),
+            spreads=_spreads(pressure_spread, damping_spread),
         )
         wanted = Wanted(
             vines=tuple(vines or ()),
@@ -328,8 +332,8 @@ def campaign(
             noise_mm=noise,
             correlation=correlation,
             longest_s=longest,
-            pressures=counts(pressures, "--pressures", 2, 13),
-            replicates=counts(replicates, "--replicates", 1, 50),
+            pressures=_counts(pressures, "--pressures", 2, 13),
+            replicates=_counts(replicates, "--replicates", 1, 50),
             most_trials=most_trials,
             burst_share=burst_share,
             check=check,
@@ -338,14 +342,14 @@ def campaign(
         say(design_campaign(asked, wanted, sheet=sheet, figure=figure))
 
 
-def spreads(pressure: float | None, damping: float | None) -> tuple[float, float] | None:
+def _spreads(pressure: float | None, damping: float | None) -> tuple[float, float] | None:
     """Relative spreads from trial to trial, where either is given; the other as a batch of vines shows it."""
     if pressure is None and damping is None:
         return None
     return (1.0 if pressure is None else pressure) / 100, (3.0 if damping is None else damping) / 100
 
 
-def counts(text: str, name: str, least: int, most: int) -> tuple[int, int]:
+def _counts(text: str, name: str, least: int, most: int) -> tuple[int, int]:
     """Two numbers of things from `low:high` or one number."""
     try:
         values = [int(part) for part in text.split(":")]
@@ -363,12 +367,18 @@ design_app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-design_app.command(cls=RenamedOptions)(vine)
-design_app.command(cls=RenamedOptions)(reservoir)
-design_app.command(cls=RenamedOptions)(campaign)
+design_app.command("vine", cls=RenamedOptions)(_vine)
+design_app.command("reservoir", cls=RenamedOptions)(_reservoir)
+design_app.command("campaign", cls=RenamedOptions)(_campaign)
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command(cls=RenamedOptions)(predict)
+    """Add the commands to the command line.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        The command line.
+    """
+    app.command("predict", cls=RenamedOptions)(_predict)
     app.add_typer(design_app)

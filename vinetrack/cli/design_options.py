@@ -37,7 +37,20 @@ class RenamedOptions(typer.core.TyperCommand):
     """A command that also reads options by their former names."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Read the options, former names replaced, with a line to the terminal for each."""
+        """Read the options, former names replaced, with a line to the terminal for each.
+
+        Parameters
+        ----------
+        ctx
+            Context of the command.
+        args : list of str
+            What stands on the command line.
+
+        Returns
+        -------
+        list of str
+            Arguments that no option took.
+        """
         current = []
         for argument in args:
             name, equals, value = argument.partition("=")
@@ -60,8 +73,15 @@ def column_options(*columns: str, meanings: Mapping[str, str] | None = None) -> 
 
     Parameters
     ----------
-    columns : names of columns, in the order of the help.
-    meanings : what a column is for this command, where that is not its meaning in the sheet.
+    columns : str
+        Names of columns, in the order of the help.
+    meanings : mapping, optional
+        What a column is for this command, where that is not its meaning in the sheet.
+
+    Returns
+    -------
+    callable
+        Decorator.
     """
     words = meanings or {}
     options = [_column_option(COLUMNS[name], words.get(name)) for name in columns]
@@ -142,6 +162,11 @@ LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages a
 
 
 def say(lines: Iterable[str]) -> None:
-    """Print lines."""
+    """Print lines.
+
+    Parameters
+    ----------
+    lines : iterable of str
+    """
     for line in lines:
         typer.echo(line)

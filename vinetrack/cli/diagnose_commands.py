@@ -20,13 +20,19 @@ LogFile = Annotated[Path | None, typer.Option("--log", help="File for messages a
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command()(diagnose)
-    app.command()(add)
-    app.command(name="diagnosis", rich_help_panel="Stages of the workflow")(diagnosis_stage)
+    """Add the commands to the command line.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        The command line.
+    """
+    app.command("diagnose")(_diagnose)
+    app.command("add")(_add)
+    app.command("diagnosis", rich_help_panel="Stages of the workflow")(_diagnosis)
 
 
-def diagnose(
+def _diagnose(
     target: Annotated[Path, typer.Argument(help="A results folder, or an experiment.", metavar="TARGET")],
     json_file: Annotated[
         Path | None, typer.Option("--json", help="Write the answer to this file, and no other.", show_default=False)
@@ -38,7 +44,7 @@ def diagnose(
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
-        from vinetrack.diagnosis.diagnose import diagnose as ask
+        from vinetrack.diagnosis.diagnose import diagnose
         from vinetrack.experiment.provenance import PROVENANCE
         from vinetrack.pipeline.workflow import find_experiment
 
@@ -50,19 +56,19 @@ def diagnose(
                 from vinetrack.results.folder_layout import Results
 
                 read = experiment_behind(target, experiment)
-                found = diagnose_pairs(read, measured(read, Results(target))[0], report)
+                diagnosis = diagnose_pairs(read, measured(read, Results(target))[0], report)
                 if json_file is None:
-                    write_diagnosis(Results(target), found)
+                    write_diagnosis(Results(target), diagnosis)
             else:
-                found = ask(_tracks_only(find_experiment(target)), report=report)
+                diagnosis = diagnose(_tracks_only(find_experiment(target)), report=report)
         if json_file is not None:
             from vinetrack.core.tables import write_json
 
-            write_json(json_file, found.to_json())
-        typer.echo(str(found))
+            write_json(json_file, diagnosis.to_json())
+        typer.echo(str(diagnosis))
 
 
-def add(
+def _add(
     effect: Annotated[str, typer.Argument(help="Name of the effect.", metavar="EFFECT")],
     results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
     save: Annotated[bool, typer.Option("--save", help="Write it to `model:` of the experiment.")] = False,
@@ -88,7 +94,7 @@ def add(
             typer.echo(f"Saved to {path}; run snakemake again to have everything with it.")
 
 
-def diagnosis_stage(
+def _diagnosis(
     experiment: Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")],
     results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
     settings: Annotated[

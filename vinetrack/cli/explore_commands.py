@@ -21,11 +21,17 @@ Exports = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the command line."""
-    app.command(name="explore")(explore)
+    """Add the command to the command line.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        The command line.
+    """
+    app.command("explore")(_explore)
 
 
-def explore(
+def _explore(
     results: ResultsPath,
     add: Names = None,
     drop: Drops = None,
@@ -46,8 +52,7 @@ def explore(
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
-        from vinetrack.explorer.command import ExploreOptions
-        from vinetrack.explorer.command import explore as run
+        from vinetrack.explorer.command import ExploreOptions, explore
 
         asked = ExploreOptions(add or (), drop or (), sizes or (), refit, export or (), save, port, browser)
-        run(results, experiment, asked, typer.echo)
+        explore(results, experiment, asked, typer.echo)

@@ -62,8 +62,8 @@ def _options(
     """See the commands below."""
 
 
-@app.command()
-def check(experiment: ExperimentPath) -> None:
+@app.command("check")
+def _check(experiment: ExperimentPath) -> None:
     """Check sheet, settings, effects, tracks and recordings, in seconds; say what was understood of each recording."""
     with _sentences(None):
         from vinetrack.core.terminal import severity_first
@@ -79,8 +79,8 @@ def check(experiment: ExperimentPath) -> None:
             typer.echo(f"{experiment}: no problems found.")
 
 
-@app.command()
-def settings() -> None:
+@app.command("settings")
+def _settings() -> None:
     """Every column of the sheet and every key of the settings, with unit, default, bounds and meaning."""
     with _sentences(None):
         from vinetrack.experiment.reference import reference_lines
@@ -89,8 +89,8 @@ def settings() -> None:
             typer.echo(line)
 
 
-@app.command()
-def effects(
+@app.command("effects")
+def _effects(
     name: Annotated[str | None, typer.Argument(help="Explain this one.", metavar="NAME", show_default=False)] = None,
     experiment: Annotated[
         Path | None, typer.Option("--experiment", help="Folder whose own effects to include.", show_default=False)
@@ -109,8 +109,8 @@ def effects(
             typer.echo(line)
 
 
-@app.command()
-def compare(results: ResultsPath) -> None:
+@app.command("compare")
+def _compare(results: ResultsPath) -> None:
     """The model against the measurement of every condition, beside what repeated trials differ by."""
     with _sentences(None):
         from vinetrack.pipeline.model_stage import comparison_lines
@@ -119,8 +119,8 @@ def compare(results: ResultsPath) -> None:
             typer.echo(line)
 
 
-@app.command()
-def overlay(
+@app.command("overlay")
+def _overlay(
     results: ResultsPath,
     trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],
     experiment: Annotated[
@@ -139,8 +139,8 @@ def overlay(
         typer.echo(f"Clip: {path}")
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def overlays(
+@app.command("overlays", rich_help_panel="Stages of the workflow")
+def _overlays(
     experiment: ExperimentPath,
     results: ResultsPath,
     settings: SettingsText = "{}",
@@ -160,8 +160,8 @@ register_diagnose(app)
 register_design(app)
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def recording(
+@app.command("recording", rich_help_panel="Stages of the workflow")
+def _recording(
     experiment: ExperimentPath,
     trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],
     results: ResultsPath,
@@ -173,15 +173,15 @@ def recording(
         from vinetrack.pipeline.recordings_stage import analyse_recording
 
         read = _read(experiment)
-        if trial not in [one.name for one in read.trials if one.video is not None]:
+        if trial not in [filmed.name for filmed in read.trials if filmed.video is not None]:
             raise typer.BadParameter(f"{trial!r} is no trial with a recording in {experiment}", param_hint="TRIAL")
         with _busy(f"tracking {trial}", log):
-            said = analyse_recording(read, trial, results, _run_settings(settings))
-        typer.echo(said)
+            outcome = analyse_recording(read, trial, results, _run_settings(settings))
+        typer.echo(outcome)
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def tracks(
+@app.command("tracks", rich_help_panel="Stages of the workflow")
+def _tracks(
     experiment: ExperimentPath,
     results: ResultsPath,
     settings: SettingsText = "{}",
@@ -197,8 +197,8 @@ def tracks(
             typer.echo(f"  {line}")
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def gather(
+@app.command("gather", rich_help_panel="Stages of the workflow")
+def _gather(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """What every trial gave, as trials.csv, conditions.csv, steady.csv and damping_points.csv."""
@@ -209,8 +209,8 @@ def gather(
         typer.echo(f"{len(table)} trials, {int((table['status'] == 'failed').sum())} failed.")
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+@app.command("damping", rich_help_panel="Stages of the workflow")
+def _damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
     """Steady points to the damping law, damping.json."""
     with _sentences(log):
         from vinetrack.narrative.law_text import headline
@@ -221,8 +221,10 @@ def damping(results: ResultsPath, settings: SettingsText = "{}", log: LogPath = 
         typer.echo(headline(law))
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def model(experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+@app.command("model", rich_help_panel="Stages of the workflow")
+def _model(
+    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
+) -> None:
     """The model in use fitted to the tracks: fit.json, comparison.csv, model_check.csv, audit.csv."""
     with _sentences(log):
         from vinetrack.pipeline.model_stage import comparison_lines, fit_model
@@ -233,8 +235,8 @@ def model(experiment: ExperimentPath, results: ResultsPath, settings: SettingsTe
             typer.echo(line)
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def figures(
+@app.command("figures", rich_help_panel="Stages of the workflow")
+def _figures(
     experiment: ExperimentPath,
     results: ResultsPath,
     of: Annotated[str, typer.Option("--of", help="`trials`, `campaign` or `all`.")] = "all",
@@ -257,8 +259,10 @@ def figures(
                 draw_campaign(read, results, chosen)
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def paper(experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None) -> None:
+@app.command("paper", rich_help_panel="Stages of the workflow")
+def _paper(
+    experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
+) -> None:
     """Set the paper's published numbers and figures beside ours: paper.csv."""
     with _sentences(log):
         from vinetrack.pipeline.paper_stage import draw_paper, set_beside_paper
@@ -268,8 +272,8 @@ def paper(experiment: ExperimentPath, results: ResultsPath, settings: SettingsTe
         draw_paper(results, _run_settings(settings).figures)
 
 
-@app.command(rich_help_panel="Stages of the workflow")
-def report(
+@app.command("report", rich_help_panel="Stages of the workflow")
+def _report(
     experiment: ExperimentPath, results: ResultsPath, settings: SettingsText = "{}", log: LogPath = None
 ) -> None:
     """Put everything in report.html, and what it was made with in provenance.json."""

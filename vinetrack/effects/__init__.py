@@ -9,6 +9,7 @@ from __future__ import annotations
 from vinetrack.effects._base import HOOKS, Effect, Parameter, State, TrialInputs, Worked
 from vinetrack.effects._catalogue import BASE_EFFECTS, EffectError, catalogue, find_effect, load_effect
 from vinetrack.effects._own import own_effects
+from vinetrack.effects._words import explanation, listing, remedy, told_apart
 
 __all__ = [
     "BASE_EFFECTS",
@@ -20,9 +21,13 @@ __all__ = [
     "TrialInputs",
     "Worked",
     "catalogue",
+    "explanation",
     "find_effect",
+    "listing",
     "load_effect",
     "own_effects",
+    "remedy",
+    "told_apart",
 ]
 
 

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack.effects import Effect
-from vinetrack.effects._words import remedy, told_apart
+from vinetrack.effects import Effect, remedy, told_apart
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.verdict_summary import joined

@@ -53,10 +53,10 @@ class Wanted:
     seed: int
 
 
-def read_vine(text: str) -> dict[str, str]:
+def _read_vine(text: str) -> dict[str, str]:
     """Cells of a vine from `diameter×wall×length` in mm, µm, mm.
 
-    >>> read_vine("24x200x280")
+    >>> _read_vine("24x200x280")
     {'diameter_mm': '24', 'thickness_um': '200', 'length_mm': '280'}
 
     Raises
@@ -78,6 +78,21 @@ def design_campaign(
 ) -> list[str]:
     """Lines for the terminal about the campaign; a sheet to film it by and a figure are written where asked for.
 
+    Parameters
+    ----------
+    asked
+        Numbers, sheet, fit and effects of the command line.
+    wanted
+        What the campaign must reach and may consist of.
+    sheet : Path, optional
+        Where the trial sheet of the campaign is written.
+    figure : Path, optional
+        Where its figure is written; the ending names the format.
+
+    Returns
+    -------
+    list of str
+
     Raises
     ------
     ExperimentError, ResultsError, EffectError
@@ -91,31 +106,31 @@ def design_campaign(
     from vinetrack.planning.campaign_information import FilmingPlan
 
     check_figure(figure)
-    vine_inputs = _beliefs(asked, wanted)
+    vine_inputs = _vine_inputs(asked, wanted)
     scope = _scope(wanted)
     camera = FilmingPlan(wanted.capture_fps, wanted.noise_mm / 1e3, wanted.correlation, wanted.longest_s)
     try:
         with waiting("weighing conditions"):
-            found = plan(candidates(vine_inputs, scope, camera), scope, wanted.n_error, wanted.B_error)
-        rehearsal = _rehearsed(found, vine_inputs, camera, wanted)
+            planned = plan(candidates(vine_inputs, scope, camera), scope, wanted.n_error, wanted.B_error)
+        rehearsal = _rehearsed(planned, vine_inputs, camera, wanted)
     except EffectError as error:
         raise as_option(error) from None
     except (SimulationError, FitError, CampaignError) as error:
         raise ResultsError(str(error)) from None
-    lines = list(campaign_lines(found, vine_inputs, camera, wanted.n_error, wanted.B_error, wanted.most_trials))
+    lines = list(campaign_lines(planned, vine_inputs, camera, wanted.n_error, wanted.B_error, wanted.most_trials))
     if rehearsal is not None:
-        lines += rehearsal_lines(found, rehearsal)
-    shown = found.best or found.nearest
+        lines += rehearsal_lines(planned, rehearsal)
+    shown = planned.best or planned.nearest
     if sheet is not None:
-        write_csv(sheet, film_sheet(found.candidates, shown, wanted))
+        write_csv(sheet, _film_sheet(planned.candidates, shown, wanted))
         lines.append(f"Sheet, in an order drawn at random: {sheet}")
     if figure is not None:
-        write_figure(_picture(found.candidates, shown, wanted.longest_s), figure)
+        write_figure(_picture(planned.candidates, shown, wanted.longest_s), figure)
         lines.append(f"Figure: {figure}")
     return lines
 
 
-def _beliefs(asked: Asked, wanted: Wanted) -> list[PredictiveInputs]:
+def _vine_inputs(asked: Asked, wanted: Wanted) -> list[PredictiveInputs]:
     """One for each vine."""
     if not wanted.vines:
         raise ExperimentError(
@@ -123,7 +138,7 @@ def _beliefs(asked: Asked, wanted: Wanted) -> list[PredictiveInputs]:
         )
     vine_inputs = []
     for text in dict.fromkeys(wanted.vines):
-        cells = {**asked.cells, **read_vine(text), "pressure_kPa": STAND_IN_KPA}
+        cells = {**asked.cells, **_read_vine(text), "pressure_kPa": STAND_IN_KPA}
         vine_inputs += inputs_of(read_ground(replace(asked, cells=cells)))
     return vine_inputs
 
@@ -143,20 +158,20 @@ def _scope(wanted: Wanted) -> Scope:
 
 
 def _rehearsed(
-    found: Planned, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: Wanted
+    planned: Planned, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: Wanted
 ) -> SimulatedCampaigns | None:
     """The campaign made so many times and fitted; None where there is none to make."""
     from vinetrack.core.terminal import Progress, progress
     from vinetrack.planning.campaign_design import trials_of
     from vinetrack.planning.simulated_campaigns import simulate_campaign
 
-    if found.best is None or wanted.check == 0:
+    if planned.best is None or wanted.check == 0:
         return None
-    trials = trials_of(found.candidates, found.best)
+    trials = trials_of(planned.candidates, planned.best)
     bar: Progress[None]
     with progress(wanted.check, "rehearsing", unit="campaign") as bar:
         return simulate_campaign(
-            found.candidates.model,
+            planned.candidates.model,
             trials,
             camera,
             vine_inputs[0].spreads,
@@ -166,13 +181,13 @@ def _rehearsed(
         )
 
 
-def film_sheet(shown: Candidates, one: Plan, wanted: Wanted) -> pd.DataFrame:
+def _film_sheet(shown: Candidates, design: Plan, wanted: Wanted) -> pd.DataFrame:
     """A trial sheet to film the campaign by, in an order drawn at random: what drifts must not look like pressure."""
     import pandas as pd
 
     from vinetrack.planning.campaign_design import trials_of
 
-    trials = trials_of(shown, one)
+    trials = trials_of(shown, design)
     order = np.random.default_rng(wanted.seed).permutation(len(trials))
     rows: list[Mapping[str, object]] = [
         {
@@ -191,15 +206,15 @@ def film_sheet(shown: Candidates, one: Plan, wanted: Wanted) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _picture(shown: Candidates, one: Plan, longest_s: float) -> Figure:
+def _picture(shown: Candidates, design: Plan, longest_s: float) -> Figure:
     from vinetrack.figures.design_figures import draw_campaign
     from vinetrack.planning.campaign_design import trials_of
     from vinetrack.planning.campaign_information import final_lead_speeds
 
-    trials = trials_of(shown, one)
+    trials = trials_of(shown, design)
     speeds = final_lead_speeds(shown.model, trials, longest_s)
     points = [
         (trial.vine, trial.pressure_Pa / 1e3, trial.payload_kg * 1e3, float(speed))
         for trial, speed in zip(trials, speeds, strict=True)
     ]
-    return draw_campaign(points, one.n_error, one.B_errors)
+    return draw_campaign(points, design.n_error, design.B_errors)

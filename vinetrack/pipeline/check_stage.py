@@ -46,7 +46,12 @@ def check_folder(folder: Path) -> Checked:
 
     Parameters
     ----------
-    folder : of the experiment.
+    folder
+        Folder of the experiment.
+
+    Returns
+    -------
+    Checked
     """
     from vinetrack.experiment.folder import check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
@@ -60,7 +65,7 @@ def check_folder(folder: Path) -> Checked:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError:
         return Checked(tuple(problems), (), (), ())
-    facts = {trial.name: one for trial, one in surveyor.facts.items()}
+    facts = {trial.name: known for trial, known in surveyor.facts.items()}
     trials = [trial for trial in experiment.trials if trial.name in facts]
     speeds = [(trial, facts[trial.name].mean_speed_m_s) for trial in trials]
     speeds += [(trial, _track_speed(trial)) for trial in experiment.trials if trial.track is not None]

@@ -18,10 +18,22 @@ log = logging.getLogger(__name__)
 def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
     """Fit the damping law to `damping_points.csv` and write `damping.json`, and `scaling.json` with `conditions.csv`.
 
+    Parameters
+    ----------
+    folder
+        Results folder.
+    settings
+        Resamples of the bootstrap and their seed.
+
     Returns
     -------
     dict
         `damping.json` as written.
+
+    Raises
+    ------
+    ResultsError
+        If a stage before this one has not run.
     """
     results = Results(folder)
     points = read_result(results.points)

@@ -31,19 +31,34 @@ if TYPE_CHECKING:
     from vinetrack.planning.reservoir_design import Chamber
 
 MOST_FILMS = 12
+"""Chosen for time: each film takes a search of its own. Half still covers what a shop sells; twice doubles the wait."""
+
 FILMS = "--films-um"
 
 
 def read_range(column: str, text: str) -> tuple[float, float]:
     """Two ends of a range, SI, from `low:high` or one number, each judged as a cell of the column.
 
-    >>> read_range("diameter_mm", "5:25")
-    (0.005, 0.025)
+    Parameters
+    ----------
+    column : str
+        Column of the sheet.
+    text : str
+        As the user wrote it.
+
+    Returns
+    -------
+    low, high : float, SI
 
     Raises
     ------
     ExperimentError
         If it is none.
+
+    Examples
+    --------
+    >>> read_range("diameter_mm", "5:25")
+    (0.005, 0.025)
     """
     values = [_cell(column, part) for part in text.split(":")]
     if len(values) > 2:
@@ -54,7 +69,27 @@ def read_range(column: str, text: str) -> tuple[float, float]:
 
 
 def read_list(column: str, text: str, name: str = "") -> tuple[float, ...]:
-    """Values, SI, from numbers joined by commas; see `read_range`. `name` is the option's, if not the column's."""
+    """Values, SI, from numbers joined by commas; see `read_range`. `name` is the option's, if not the column's.
+
+    Parameters
+    ----------
+    column : str
+        Column of the sheet.
+    text : str
+        Numbers joined by commas.
+    name : str
+        Option named in messages; that of the column where blank.
+
+    Returns
+    -------
+    tuple of float, SI
+        Without repetitions.
+
+    Raises
+    ------
+    ExperimentError
+        If a number is none.
+    """
     return tuple(dict.fromkeys(_cell(column, part, name) for part in text.split(",") if part.strip()))
 
 
@@ -91,6 +126,29 @@ def design_vine(
 ) -> list[str]:
     """Lines for the terminal about the best vine of every film; its figure is written where asked for.
 
+    Parameters
+    ----------
+    asked
+        Numbers, fit and effects of the command line.
+    films : str
+        Wall thicknesses, µm, joined by commas.
+    diameter, length : str
+        `low:high`, mm.
+    burst_share : float
+        Share of the burst stress that the wall may carry.
+    burst_stress_MPa : float
+        Burst stress of the film.
+    samples, seed : int
+        Draws, and the seed of the random numbers.
+    at_fraction : float
+        y/L at which a bare vine's final speed is taken.
+    figure : Path, optional
+        Where the figure is written; the ending names the format.
+
+    Returns
+    -------
+    list of str
+
     Raises
     ------
     ExperimentError, ResultsError, EffectError
@@ -116,15 +174,15 @@ def design_vine(
     _check(room, films, diameter)
     try:
         with waiting("looking for the fastest vine"):
-            found = fastest(room, ground.said, ground.fit, samples=samples, seed=seed, at_fraction=at_fraction)
+            choices = fastest(room, ground.stated, ground.fit, samples=samples, seed=seed, at_fraction=at_fraction)
     except EffectError as error:
         raise as_option(error) from None
     except (SimulationError, FitError) as error:
         raise ResultsError(str(error)) from None
-    _refuse_standstill(room, found)
-    lines = list(_vine_lines(room, found))
+    _refuse_standstill(room, choices)
+    lines = list(_vine_lines(room, choices))
     if figure is not None:
-        write_figure(_vine_picture(found), figure)
+        write_figure(_vine_picture(choices), figure)
         lines.append(f"Figure: {figure}")
     return lines
 
@@ -139,12 +197,12 @@ def _check(room: Room, films: str, diameter: str) -> None:
         raise _refusal("diameter_mm", diameter, words, f"begin at {4e3 * max(room.films_m):g} mm or more")
 
 
-def _refuse_standstill(room: Room, found: Sequence[Choice]) -> None:
+def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
     """There is no fastest of vines that do not move, at the medians of what is believed."""
-    if found[0].sight.final.median > 0:
+    if choices[0].sight.final.median > 0:
         return
-    highest_Pa = max(choice.sight.inputs.trial.pressure_Pa for choice in found)
-    yield_kPa = found[0].sight.inputs.trial.yield_pressure_Pa / 1e3
+    highest_Pa = max(choice.sight.inputs.trial.pressure_Pa for choice in choices)
+    yield_kPa = choices[0].sight.inputs.trial.yield_pressure_Pa / 1e3
     message = f"moves none of these vines to its end, against a yield pressure of {yield_kPa:.3g} kPa"
     remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
     if highest_Pa < 0.995 * room.pressure_Pa:
@@ -153,12 +211,12 @@ def _refuse_standstill(room: Room, found: Sequence[Choice]) -> None:
     raise _refusal("pressure_kPa", f"{room.pressure_Pa / 1e3:g}", message, remedy)
 
 
-def _vine_lines(room: Room, found: Sequence[Choice]) -> Iterator[str]:
+def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     from vinetrack.core.terminal import table
     from vinetrack.planning.design_checks import design_checks
     from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
-    best = found[0].sight
+    best = choices[0].sight
     yield (
         f"fastest by {best.final.name}"
         + ("" if best.final.y_over_L == 1 else f" at y/L = {best.final.y_over_L:g}")
@@ -167,7 +225,7 @@ def _vine_lines(room: Room, found: Sequence[Choice]) -> Iterator[str]:
     )
     yield ""
     rows = []
-    for choice in found:
+    for choice in choices:
         trial, final = choice.sight.inputs.trial, choice.sight.final
         rows.append(
             (
@@ -185,21 +243,22 @@ def _vine_lines(room: Room, found: Sequence[Choice]) -> Iterator[str]:
     head = ("film", "diameter", "length", "pressure", "PD/2t", "speed", "90 % band", "fastest", "held back by")
     yield from table(rows, head, ("µm", "mm", "mm", "kPa", "MPa", "m/s", "m/s", "of draws", ""), align=">>>>>><><")
     yield ""
-    if found[0].odds < 0.8 and len(found) > 1:
+    if choices[0].odds < 0.8 and len(choices) > 1:
         yield (
-            f"the choice of film is open: {1e6 * found[0].thickness_m:g} µm is the fastest in {found[0].odds:.0%} of "
-            "the draws only; measuring B and P_y of the first two would decide it"
+            f"the choice of film is open: {1e6 * choices[0].thickness_m:g} µm is the fastest in {choices[0].odds:.0%} "
+            "of the draws only; measuring B and P_y of the first two would decide it"
         )
     yield f"uncertainties of the fastest, {trial_words(best.inputs.trial)}: final speed by each alone"
     rows_of = [
-        (f"  {one.name}", f"{shown(one.low, 'm/s')} to {shown(one.high, 'm/s')} m/s", one.words) for one in best.shares
+        (f"  {share.name}", f"{shown(share.low, 'm/s')} to {shown(share.high, 'm/s')} m/s", share.words)
+        for share in best.shares
     ]
     yield from table(rows_of)
     yield "  not included: the burst stress, a guess from one vine, and what the model leaves out (`vinetrack predict`)"
     yield from (f"! {words}" for words in design_checks(best))
 
 
-def _vine_picture(found: Sequence[Choice]) -> Figure:
+def _vine_picture(choices: Sequence[Choice]) -> Figure:
     from vinetrack.figures.design_figures import FilmChoice, draw_choice
 
     films = [
@@ -211,9 +270,9 @@ def _vine_picture(found: Sequence[Choice]) -> Figure:
             band=(choice.sight.final.low, choice.sight.final.high),
             odds=choice.odds,
         )
-        for choice in found
+        for choice in choices
     ]
-    return draw_choice(films, found[0].sight.final.name, found[0].sight.final.y_over_L)
+    return draw_choice(films, choices[0].sight.final.name, choices[0].sight.final.y_over_L)
 
 
 SIZED = ("diameter_mm", "length_mm", "pressure_kPa")
@@ -225,6 +284,23 @@ def design_reservoir(
     """Lines for the terminal about the chambers worth looking at; the figure is written where asked for.
 
     Speeds are told where the wall is given, so that there is a vine to simulate.
+
+    Parameters
+    ----------
+    asked
+        Numbers, fit and effects of the command line.
+    within_percent : float
+        Share of the gauge pressure that may be lost, %.
+    supply_s : float, optional
+        Time constant of a supply that refills the chamber, s.
+    at_fraction : float
+        y/L at which a bare vine's final speed is taken.
+    figure : Path, optional
+        Where the figure is written; the ending names the format.
+
+    Returns
+    -------
+    list of str
 
     Raises
     ------
@@ -266,8 +342,8 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     yield f"{words}: it sweeps {litres(swept_m3(trial))}"
     yield f"closed chamber that keeps the gauge pressure within {100 * loss:g} %, by the gas law in absolute pressure"
     yield ""
-    found = chambers(trial, loss)
-    rows = [_row(one, inputs, at_fraction) for one in found]
+    listed = chambers(trial, loss)
+    rows = [_row(chamber, inputs, at_fraction) for chamber in listed]
     laws = [law.split(",")[0] for law in GAMMAS]
     speeds = [f"speed, {law}" for law in laws] if inputs is not None else []
     head = ("chamber", "volume", *(f"loses, {law}" for law in laws), *speeds)
@@ -279,16 +355,16 @@ def _reservoir_lines(trial: Trial, inputs: PredictiveInputs | None, loss: float,
     yield ("slow: γ = 1, the gas stays at room temperature; fast: γ = 1.4, it takes up no heat, as within milliseconds")
 
 
-def _row(one: Chamber, inputs: PredictiveInputs | None, at_fraction: float) -> tuple[str, ...]:
+def _row(chamber: Chamber, inputs: PredictiveInputs | None, at_fraction: float) -> tuple[str, ...]:
     from vinetrack.planning.reservoir_design import GAMMAS
 
-    losses = [f"{100 * share:.1f}" for share in one.losses.values()]
+    losses = [f"{100 * share:.1f}" for share in chamber.losses.values()]
     speeds = (
         []
         if inputs is None
-        else [shown(_final(inputs, one.volume_m3, gamma, at_fraction), "m/s") for gamma in GAMMAS.values()]
+        else [shown(_final(inputs, chamber.volume_m3, gamma, at_fraction), "m/s") for gamma in GAMMAS.values()]
     )
-    return one.name, litres(one.volume_m3), *losses, *speeds
+    return chamber.name, litres(chamber.volume_m3), *losses, *speeds
 
 
 def _final(inputs: PredictiveInputs, volume_m3: float, gamma: float, at_fraction: float) -> float:
@@ -326,5 +402,5 @@ def _reservoir_picture(trial: Trial, loss: float) -> Figure:
         )
         for name, gamma in GAMMAS.items()
     ]  # fmt: skip
-    asked = [one for one in chambers(trial, loss) if one.name == "asked about"]
+    asked = [chamber for chamber in chambers(trial, loss) if chamber.name == "asked about"]
     return draw_reservoir(volumes, laws, loss, swept, asked[0].volume_m3 if asked else None)

@@ -43,6 +43,17 @@ def diagnose_results(
 ) -> dict[str, Any]:
     """Diagnose what a results folder holds; write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`.
 
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    report : callable
+        Called with a sentence at each step.
+    settings : optional
+        Of the run, for steady windows; defaults where None.
+
     Returns
     -------
     dict
@@ -56,18 +67,31 @@ def diagnose_results(
     results = Results(folder)
     pairs, _ = measured(experiment, results)
     try:
-        found = diagnose_pairs(experiment, pairs, report)
+        diagnosis = diagnose_pairs(experiment, pairs, report)
     except Exception as error:
         return _write_refusal(results, experiment, _reason(error))
-    log.info("%s: %s", found.verdict, found.explanation)
-    content = write_diagnosis(results, found)
+    log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
+    content = write_diagnosis(results, diagnosis)
     report("the damping law with the pressure of every model")
-    _write_laws(results, found, pairs, settings)
+    _write_laws(results, diagnosis, pairs, settings)
     return content
 
 
 def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report = _quiet) -> Diagnosis:
-    """Diagnose trials with their tracks by what the experiment says of model, candidates, own effects and limits."""
+    """Diagnose trials with their tracks by what the experiment says of model, candidates, own effects and limits.
+
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    pairs : sequence of (Trial, Track)
+    report : callable
+        Called with a sentence at each step.
+
+    Returns
+    -------
+    Diagnosis
+    """
     from vinetrack.diagnosis.diagnose import diagnose
 
     return diagnose(experiment, tracks={trial.name: track for trial, track in pairs}, report=report)
@@ -86,8 +110,8 @@ def _write_refusal(results: Results, experiment: Experiment, reason: str) -> dic
     from vinetrack.diagnosis.result import Diagnosis
 
     words = f"No diagnosis could be made: {reason}"
-    found = Diagnosis(rounds=(), effects=(), explanation=words, refused=reason)
-    content = {**found.to_json(), "model": list(experiment.settings.model)}
+    refusal = Diagnosis(rounds=(), effects=(), explanation=words, refused=reason)
+    content = {**refusal.to_json(), "model": list(experiment.settings.model)}
     _emptied(results)
     write_csv(results.ladder, empty_table(LADDER_COLUMNS))
     write_json(results.diagnosis, content)
@@ -102,36 +126,49 @@ def _emptied(results: Results) -> Path:
     return folder
 
 
-def write_diagnosis(results: Results, found: Diagnosis) -> dict[str, Any]:
-    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; return the first."""
+def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
+    """Write `diagnosis.json`, `ladder.csv` and the folder `diagnosis`; return the first.
+
+    Parameters
+    ----------
+    results
+        Results folder; its folder `diagnosis` is written anew.
+    diagnosis
+        What is written.
+
+    Returns
+    -------
+    dict
+        `diagnosis.json` as written.
+    """
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS, MOVED_COLUMNS, moved
 
     folder = _emptied(results)
-    for name, table in tables_of(found).items():
+    for name, table in _tables_of(diagnosis).items():
         write_csv(folder / name, table)
-    numbers = moved(found.fits, ("", *found.effects)) if len(found.fits) > 1 else empty_table(MOVED_COLUMNS)
+    numbers = moved(diagnosis.fits, ("", *diagnosis.effects)) if len(diagnosis.fits) > 1 else empty_table(MOVED_COLUMNS)
     write_csv(folder / "moved.csv", numbers)
-    for name, table in predictions(found.fits[0], found.fits[-1]).items():
+    for name, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]).items():
         path = results.predictions(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_csv(path, table)
-    write_csv(results.ladder, empty_table(LADDER_COLUMNS) if found.ladder is None else found.ladder)
-    content = found.to_json()
+    write_csv(results.ladder, empty_table(LADDER_COLUMNS) if diagnosis.ladder is None else diagnosis.ladder)
+    content = diagnosis.to_json()
     write_json(results.diagnosis, content)
     return content
 
 
 def _write_laws(
-    results: Results, found: Diagnosis, pairs: Sequence[tuple[Trial, Track]], settings: RunSettings | None
+    results: Results, diagnosis: Diagnosis, pairs: Sequence[tuple[Trial, Track]], settings: RunSettings | None
 ) -> None:
     """The damping law redone with the pressure that every model of the ladder gives: how n and B come home."""
     from vinetrack.kinematics.summary import LAW_COLUMNS, law_table, look_at_motions, redo_damping
 
     path = results.folder / "diagnosis" / "damping_laws.csv"
     laws: dict[str, Any] = {}
-    if len(found.fits) > 1:
+    if len(diagnosis.fits) > 1:
         motions = look_at_motions(pairs, settings)
-        for fit in found.fits:
+        for fit in diagnosis.fits:
             try:
                 laws["+".join(fit.model.names)] = redo_damping(fit.model, motions, settings).laws
             except ValueError as error:
@@ -139,24 +176,24 @@ def _write_laws(
     write_csv(path, law_table(laws) if laws else empty_table(LAW_COLUMNS))
 
 
-def tables_of(found: Diagnosis) -> dict[str, pd.DataFrame]:
+def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     """Tables of where the first model fails, and the force that is missing, by name of file."""
     tables: dict[str, pd.DataFrame] = {}
-    failure: Failure | None = found.failure
+    failure: Failure | None = diagnosis.failure
     if failure is not None:
         tables |= {
             "conditions.csv": failure.by_condition,
             "along_time.csv": failure.along_time,
             "along_position.csv": failure.along_position,
             "along_speed.csv": failure.along_speed,
-            "drift_groups.csv": drift_groups(failure, found.fits[-1] if len(found.fits) > 1 else None),
+            "drift_groups.csv": _drift_groups(failure, diagnosis.fits[-1] if len(diagnosis.fits) > 1 else None),
         }
-    if found.force_table is not None:
-        tables["missing_force.csv"] = found.force_table
+    if diagnosis.force_table is not None:
+        tables["missing_force.csv"] = diagnosis.force_table
     return tables
 
 
-def drift_groups(failure: Failure, after: Fit | None) -> pd.DataFrame:
+def _drift_groups(failure: Failure, after: Fit | None) -> pd.DataFrame:
     """What suits every group of trials best under the first model and, where something was added, under the last."""
     import pandas as pd
 
@@ -176,6 +213,18 @@ def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
 
     As in `comparison.csv` and the ladder: a release and an origin of the trial's own, and nothing else.
     `model_after_m` is NaN where nothing was added.
+
+    Parameters
+    ----------
+    before
+        Fit of the first model.
+    after
+        Fit of the last model; the same object where nothing was added.
+
+    Returns
+    -------
+    dict of DataFrame
+        By name of trial, columns `PREDICTION_COLUMNS`: s and m.
     """
     import pandas as pd
 
@@ -184,15 +233,31 @@ def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
     first = in_sample(before).trials
     last = in_sample(after).trials if after is not before else first
     tables = {}
-    for one, other in zip(first, last, strict=True):
-        later = other.predicted_position_m if after is not before else np.full(one.time_s.size, np.nan)
-        columns = (one.time_s, one.lead_position_m, one.predicted_position_m, later)
-        tables[one.name] = pd.DataFrame(dict(zip(PREDICTION_COLUMNS, columns, strict=True)))
+    for under_first, under_last in zip(first, last, strict=True):
+        later = under_last.predicted_position_m if after is not before else np.full(under_first.time_s.size, np.nan)
+        columns = (under_first.time_s, under_first.lead_position_m, under_first.predicted_position_m, later)
+        tables[under_first.name] = pd.DataFrame(dict(zip(PREDICTION_COLUMNS, columns, strict=True)))
     return tables
 
 
 def add_effect(experiment: Experiment, folder: Path, name: str, report: Report = _quiet) -> list[str]:
     """Put an effect in the model, refit, and say what became of errors and numbers; the ladder keeps the history.
+
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    name : str
+        Name of the effect.
+    report : callable
+        Called with a sentence at each step.
+
+    Returns
+    -------
+    list of str
+        Lines for the terminal.
 
     Raises
     ------
@@ -224,14 +289,23 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
 def diagnosis_lines(folder: Path) -> list[str]:
     """What `diagnosis.json` of a results folder says, in few words.
 
+    Parameters
+    ----------
+    folder
+        Results folder.
+
+    Returns
+    -------
+    list of str
+
     Raises
     ------
     ResultsError
         If it has not been diagnosed.
     """
-    found = read_diagnosis(Results(folder))
-    if found is None:
+    diagnosis = read_diagnosis(Results(folder))
+    if diagnosis is None:
         raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
-    if not found.verdict:
-        return [found.explanation]
-    return [f"{found.verdict}: {found.explanation}", *(f"! {note}" for note in found.notes)]
+    if not diagnosis.verdict:
+        return [diagnosis.explanation]
+    return [f"{diagnosis.verdict}: {diagnosis.explanation}", *(f"! {note}" for note in diagnosis.notes)]

@@ -21,7 +21,6 @@ from vinetrack.results.folder_layout import Results, read_result
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from vinetrack.diagnosis.result import Round
     from vinetrack.effects import Effect
@@ -29,7 +28,8 @@ if TYPE_CHECKING:
     from vinetrack.report.diagnosis_section import DiagnosisResult
 
 STRETCHES = 8
-"""Parts of the growth in which misfits are averaged where the diagnosis did not say."""
+"""Parts of the growth in which misfits are averaged where the diagnosis did not say. Chosen: as many as a page shows
+side by side. At half a misfit at the start alone is averaged away, at twice each mean rests on few frames."""
 
 CURVE_COLUMNS = ("trial", "condition", "time_s", "lead_position_m", "model_before_m", "model_after_m")
 
@@ -61,45 +61,64 @@ def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTable
 
     Parameters
     ----------
-    conditions : `trial, vine, condition, condition_label` of every trial, vines and pressures in their order.
+    results
+        Results folder.
+    conditions : DataFrame
+        `trial, vine, condition, condition_label` of every trial, vines and pressures in their order.
+
+    Returns
+    -------
+    DiagnosisTables or None
     """
-    found = stored.read_diagnosis(results)
-    if found is None or not found.verdict:
+    diagnosis = stored.read_diagnosis(results)
+    if diagnosis is None or not diagnosis.verdict:
         return None
     labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
     trials = predicted_trials(results, conditions)
     worst = worst_condition(trials)
-    names, matrix = in_order_of_rank(found.rounds[0])
+    names, matrix = in_order_of_rank(diagnosis.rounds[0])
     return DiagnosisTables(
         ladder=_table(results.ladder),
         trials=trials,
         before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
-        where=where_table(trials, labels, _table(results.diagnosed("along_position.csv"))),
-        cells=cosine_cells(names, matrix),
+        where=_where_table(trials, labels, _table(results.diagnosed("along_position.csv"))),
+        cells=_cosine_cells(names, matrix),
         drift=_table(results.diagnosed("drift_groups.csv")),
         force=_table(results.diagnosed("missing_force.csv")),
-        rounds=[(question(i, found.rounds), ranking_table(one)) for i, one in enumerate(found.rounds)],
+        rounds=[(question(i, diagnosis.rounds), ranking_table(ranked)) for i, ranked in enumerate(diagnosis.rounds)],
         cosines=(names, matrix),
         worst=worst,
-        added=listed(found.effects),
+        added=listed(diagnosis.effects),
         labels=labels,
     )
 
 
 def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult | None:
-    """What the page says of the diagnosis; None where there is none."""
+    """What the page says of the diagnosis; None where there is none.
+
+    Parameters
+    ----------
+    results
+        Results folder.
+    experiment
+        Names the files of the user's effects.
+
+    Returns
+    -------
+    DiagnosisResult or None
+    """
     from vinetrack.report.diagnosis_section import DiagnosisResult
 
-    found = stored.read_diagnosis(results)
-    if found is None:
+    diagnosis = stored.read_diagnosis(results)
+    if diagnosis is None:
         return None
     paths = (results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))
     moved, laws = (table if len(table := _table(path)) else None for path in paths)
-    named = [*found.effects, *found.answer_set]
-    effects = _effects([*named, *(row.effect for one in found.rounds for row in one.ranking)], experiment)
+    named = [*diagnosis.effects, *diagnosis.answer_set]
+    effects = _effects([*named, *(row.effect for ranked in diagnosis.rounds for row in ranked.ranking)], experiment)
     return DiagnosisResult(
-        found,
-        found.ladder,
+        diagnosis,
+        diagnosis.ladder,
         moved,
         laws,
         {name: effects[name].summary for name in named if name in effects},
@@ -112,63 +131,41 @@ def _effects(names: Sequence[str], experiment: Experiment) -> dict[str, Effect]:
     from vinetrack.effects import EffectError, find_effect, own_effects
 
     try:
-        own = own_effects([experiment.folder / path for path in experiment.settings.effects])
+        user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
     except EffectError:
-        own = {}
-    found = {}
+        user_effects = {}
+    effects = {}
     for name in dict.fromkeys(names):
         with contextlib.suppress(EffectError):
-            found[name] = find_effect(name, own)
-    return found
+            effects[name] = find_effect(name, user_effects)
+    return effects
 
 
-def draw_diagnosed(tables: DiagnosisTables | None) -> dict[str, Figure]:
-    """Draw all figures of a diagnosis, by name; those without data state so."""
-    from vinetrack.figures.registry import DIAGNOSIS_FIGURES, draw
-    from vinetrack.figures.style import blank
+def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
+    """The table behind each picture that has something in it, by name of the picture.
 
-    if tables is None:
-        return {name: blank("There is no diagnosis of this model.") for name in DIAGNOSIS_FIGURES}
-    inputs: dict[str, tuple[Any, ...]] = {
-        "ladder": (tables.ladder,),
-        "before_after": (tables.labels.get(tables.worst, tables.worst), tables.before_after, tables.added),
-        "where": (tables.where, tables.added),
-        "missing_force": (tables.force,),
-        "candidates": (tables.rounds,),
-        "cosines": tables.cosines,
-        "drift": (tables.drift, tables.added),
-    }
-    return {name: draw(name, *inputs[name]) for name in DIAGNOSIS_FIGURES}
+    Parameters
+    ----------
+    diagnosed
+        From `read_diagnosed`.
 
-
-def with_after(trajectories: Mapping[str, pd.DataFrame], found: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
-    """Trajectories by condition with what the last model says of them, where effects were added."""
-    if found is None or not found.added or not len(found.trials):
-        return dict(trajectories)
-    later = {str(trial): part["model_after_m"].to_numpy() for trial, part in found.trials.groupby("trial", sort=False)}
-    whole = {}
-    for condition, table in trajectories.items():
-        parts = [later.get(str(trial), np.empty(0)) for trial in dict.fromkeys(table["trial"])]
-        after_m = np.concatenate(parts)
-        whole[condition] = table.assign(model_after_m=after_m) if after_m.size == len(table) else table
-    return whole
-
-
-def figure_tables(found: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
-    """The table behind each picture that has something in it, by name of the picture."""
+    Returns
+    -------
+    dict of DataFrame
+    """
     import pandas as pd
 
-    if found is None:
+    if diagnosed is None:
         return {}
-    parts = [table.assign(round=i + 1) for i, (_, table) in enumerate(found.rounds) if len(table)]
+    parts = [table.assign(round=i + 1) for i, (_, table) in enumerate(diagnosed.rounds) if len(table)]
     tables = {
-        "ladder": found.ladder,
-        "before_after": found.before_after,
-        "where": found.where,
-        "missing_force": found.force,
-        "candidates": pd.concat(parts, ignore_index=True) if parts else found.ladder.iloc[:0],
-        "cosines": found.cells,
-        "drift": found.drift,
+        "ladder": diagnosed.ladder,
+        "before_after": diagnosed.before_after,
+        "where": diagnosed.where,
+        "missing_force": diagnosed.force,
+        "candidates": pd.concat(parts, ignore_index=True) if parts else diagnosed.ladder.iloc[:0],
+        "cosines": diagnosed.cells,
+        "drift": diagnosed.drift,
     }
     return {name: table for name, table in tables.items() if len(table)}
 
@@ -180,7 +177,19 @@ def _table(path: Any) -> pd.DataFrame:
 
 
 def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame:
-    """Every trial with predictions, columns `CURVE_COLUMNS`: time since release, positions from the origin."""
+    """Every trial with predictions, columns `CURVE_COLUMNS`: time since release, positions from the origin.
+
+    Parameters
+    ----------
+    results
+        Results folder.
+    conditions : DataFrame
+        `trial` and `condition` of every trial.
+
+    Returns
+    -------
+    DataFrame
+    """
     import pandas as pd
 
     parts = []
@@ -216,7 +225,17 @@ def _first_moving_s(table: pd.DataFrame, origin_m: float) -> float:
 
 
 def worst_condition(trials: pd.DataFrame) -> str:
-    """The condition where the model that the user came with is farthest off; blank without predictions."""
+    """The condition where the model that the user came with is farthest off; blank without predictions.
+
+    Parameters
+    ----------
+    trials : DataFrame
+        From `predicted_trials`.
+
+    Returns
+    -------
+    str
+    """
     from vinetrack.figures.ladder_figures import rms_m
 
     if not len(trials):
@@ -226,7 +245,7 @@ def worst_condition(trials: pd.DataFrame) -> str:
     return str(max(usable, key=usable.__getitem__)) if usable else ""
 
 
-def where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
+def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.DataFrame) -> pd.DataFrame:
     """Mean misfit of every condition in stretches of its growth, as `misfit_figures.draw_where` draws it.
 
     Where the diagnosis found the misfit of the first model itself, with its error, that is taken.
@@ -239,19 +258,19 @@ def where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.Dat
         members = trials[trials["condition"] == condition]
         if not len(members):
             continue
-        own = known_rows[known_rows["condition"] == condition] if len(known_rows) else known_rows
+        of_condition = known_rows[known_rows["condition"] == condition] if len(known_rows) else known_rows
         rows += [
             {"condition": condition, "condition_label": labels[condition], **row}
-            for row in (_located(own, located, members) if len(own) else _stretched(members))
+            for row in (_located(of_condition, located, members) if len(of_condition) else _stretched(members))
         ]
     return pd.DataFrame(rows)
 
 
-def _located(own: pd.DataFrame, located: pd.DataFrame, members: pd.DataFrame) -> list[dict[str, Any]]:
-    vine = str(own["vine"].iloc[0])
+def _located(of_condition: pd.DataFrame, located: pd.DataFrame, members: pd.DataFrame) -> list[dict[str, Any]]:
+    vine = str(of_condition["vine"].iloc[0])
     whole_m = float(located.loc[located["vine"] == vine, "to_m"].max())
     rows = []
-    for row in iter_rows(own):
+    for row in iter_rows(of_condition):
         after = _means(members, "model_before_m", float(row.from_m), float(row.to_m))["model_after_m"]
         rows.append(
             {
@@ -294,45 +313,79 @@ def _stretched(members: pd.DataFrame) -> list[dict[str, Any]]:
 def _means(members: pd.DataFrame, along: str, low: float, high: float) -> dict[str, np.ndarray]:
     """Mean misfit of each trial, by model, where `along` lies from `low` to `high`; NaN for one that never does."""
     chosen = members[(members["time_s"] >= 0) & (members[along] >= low) & (members[along] < high)]
-    found: dict[str, list[float]] = {"model_before_m": [], "model_after_m": []}
+    means: dict[str, list[float]] = {"model_before_m": [], "model_after_m": []}
     for trial in dict.fromkeys(members["trial"]):
         part = chosen[chosen["trial"] == trial]
-        for model, values in found.items():
+        for model, values in means.items():
             misfit = (part["lead_position_m"] - part[model]).to_numpy(dtype=float)
             misfit = misfit[np.isfinite(misfit)]
             values.append(float(misfit.mean()) if misfit.size else math.nan)
-    return {model: np.array(values) for model, values in found.items()}
+    return {model: np.array(values) for model, values in means.items()}
 
 
 def question(index: int, rounds: Sequence[Round]) -> str:
-    """What a round asks, in words."""
+    """What a round asks, in words.
+
+    Parameters
+    ----------
+    index : int
+        Number of the round, from 0.
+    rounds
+        Of the diagnosis.
+
+    Returns
+    -------
+    str
+    """
     if index == 0:
         return "Which effect is missing from the initial model?"
     added = [name for name in rounds[index].model if name not in rounds[0].model]
     return f"Which is missing with {listed(added)} added?"
 
 
-def ranking_table(one: Round) -> pd.DataFrame:
-    """The ranking of a round as a table; Δχ² of those not testable is NaN."""
+def ranking_table(ranked: Round) -> pd.DataFrame:
+    """The ranking of a round as a table; Δχ² of those not testable is NaN.
+
+    Parameters
+    ----------
+    ranked
+        One round of the diagnosis.
+
+    Returns
+    -------
+    DataFrame
+        A row a candidate.
+    """
     import pandas as pd
 
     columns = ["effect", "kind", "status", "delta_chi2", "sigma", "in_answer_set", "plausible", "size", "reason"]
     rows = [
         (c.effect, c.kind, c.status, c.delta_chi2, c.sigma, c.in_answer_set, c.plausible, sizes(c), c.reason)
-        for c in one.ranking
+        for c in ranked.ranking
     ]
     return pd.DataFrame(rows, columns=columns)
 
 
-def in_order_of_rank(one: Round) -> tuple[list[str], list[list[float]]]:
-    """Names and matrix of the cosines of a round with the answer first, then as it ranks its candidates."""
-    names, matrix = one.cosine_names, one.cosines
-    places = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(one.ranking)}
-    order = sorted(range(len(matrix)), key=lambda i: places.get(names[i], (True, len(one.ranking))))
+def in_order_of_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
+    """Names and matrix of the cosines of a round with the answer first, then as it ranks its candidates.
+
+    Parameters
+    ----------
+    ranked
+        The first round of the diagnosis.
+
+    Returns
+    -------
+    names : list of str
+    matrix : list of lists of float
+    """
+    names, matrix = ranked.cosine_names, ranked.cosines
+    places = {row.effect: (not row.in_answer_set, i) for i, row in enumerate(ranked.ranking)}
+    order = sorted(range(len(matrix)), key=lambda i: places.get(names[i], (True, len(ranked.ranking))))
     return [names[i] for i in order], [[matrix[i][j] for j in order] for i in order]
 
 
-def cosine_cells(names: Sequence[str], matrix: Sequence[Sequence[float]]) -> pd.DataFrame:
+def _cosine_cells(names: Sequence[str], matrix: Sequence[Sequence[float]]) -> pd.DataFrame:
     """The matrix of cosines as rows of pairs, each once."""
     import pandas as pd
 

@@ -17,6 +17,19 @@ FORMATS = (".png", ".svg", ".pdf")
 def describe_effects(name: str | None, experiment: Path | None, figure: Path | None) -> list[str]:
     """Lines for the terminal: all effects, or the one named; with `figure`, its picture is written there.
 
+    Parameters
+    ----------
+    name : str or None
+        Name of an effect.
+    experiment : Path or None
+        Folder whose own effects are listed too.
+    figure : Path or None
+        Where the picture of the effect is written.
+
+    Returns
+    -------
+    list of str
+
     Raises
     ------
     ExperimentError
@@ -24,26 +37,45 @@ def describe_effects(name: str | None, experiment: Path | None, figure: Path | N
     EffectError
         If there is no such effect, or one of the user's own is none.
     """
-    from vinetrack.effects import catalogue, find_effect
-    from vinetrack.effects._words import explanation, listing
+    from vinetrack.effects import catalogue, explanation, find_effect, listing
 
-    own = {} if experiment is None else effects_of(experiment)
+    user_effects = {} if experiment is None else effects_of(experiment)
     if name is None:
         if figure is not None:
             raise ExperimentError([Problem(message="is a picture of one effect", file=str(figure), remedy="name it")])
-        return listing([*(e for e in catalogue().values() if e.name not in own), *own.values()], own)
-    effect = find_effect(name, own)
+        return listing(
+            [*(e for e in catalogue().values() if e.name not in user_effects), *user_effects.values()], user_effects
+        )
+    effect = find_effect(name, user_effects)
     lines = explanation(effect)
     if figure is not None:
-        write_picture(effect, figure)
+        _write_picture(effect, figure)
         lines.append(f"Picture: {figure}")
     return lines
 
 
 def effects_of(experiment: Path) -> Mapping[str, Effect]:
-    """The user's own effects of an experiment, read from the files its settings name, and tried out."""
+    """The user's own effects of an experiment, read from the files its settings name, and tried out.
+
+    Parameters
+    ----------
+    experiment : Path
+        Folder with `experiment.yaml`.
+
+    Returns
+    -------
+    dict of Effect
+        By name.
+
+    Raises
+    ------
+    ExperimentError
+        If the settings cannot be read, or a file lies outside the folder.
+    EffectError
+        If a file is no effect.
+    """
     from vinetrack.core.tables import TableError, safe_join
-    from vinetrack.effects._own import own_effects
+    from vinetrack.effects import own_effects
     from vinetrack.experiment.settings import read_experiment_settings
 
     settings = read_experiment_settings(experiment / "experiment.yaml")
@@ -57,6 +89,15 @@ def model_problems(experiment: Path) -> list[Problem]:
     """What is wrong with the effects that an experiment names, in its model, its candidates or as files of its own.
 
     Nothing where it keeps to the base model, or cannot be read, which the check of the sheet says.
+
+    Parameters
+    ----------
+    experiment : Path
+        Experiment folder.
+
+    Returns
+    -------
+    list of Problem
     """
     from vinetrack.dynamics.model import make_model
     from vinetrack.dynamics.trial_inputs import check_needs
@@ -75,19 +116,19 @@ def model_problems(experiment: Path) -> list[Problem]:
         return []
     column = "effects"
     try:
-        own = effects_of(experiment)
+        user_effects = effects_of(experiment)
         column = "candidates"
         for name in settings.candidates or ():
-            find_effect(name, own)
+            find_effect(name, user_effects)
         column = "model"
-        check_needs(make_model(settings.model, own), *read.trials)
+        check_needs(make_model(settings.model, user_effects), *read.trials)
     except EffectError as error:
         message, _, remedy = str(error).rstrip(".").partition(": ")
         return [Problem(message=message, file="experiment.yaml", column=column, remedy=remedy)]
     return []
 
 
-def write_picture(effect: Effect, path: Path) -> None:
+def _write_picture(effect: Effect, path: Path) -> None:
     """Draw what an effect does to the reference vine; the file's ending says in which form."""
     from vinetrack.core.tables import write_bytes
     from vinetrack.dynamics.effect_motion import effect_motion, reference_words, size_words

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from vinetrack.core.tables import write_bytes
 from vinetrack.pipeline.pool import map_trials
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Trial
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import FigureSettings
+    from vinetrack.pipeline.diagnosis_tables import DiagnosisTables
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +38,23 @@ class _TrialPicture:
 
 
 def draw_trials(experiment: Experiment, folder: Path, settings: FigureSettings, n_workers: int = 1) -> int:
-    """Draw `figures/trial_<trial>` for every trial that is not left out; return how many."""
+    """Draw `figures/trial_<trial>` for every trial that is not left out; return how many.
+
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    settings
+        Formats and resolution.
+    n_workers : int
+        Number of processes.
+
+    Returns
+    -------
+    int
+    """
     results = Results(folder)
     by_trial = dict(iter(read_result(results.steady).groupby("trial", sort=False)))
     nothing = read_result(results.steady).iloc[:0]
@@ -43,7 +62,7 @@ def draw_trials(experiment: Experiment, folder: Path, settings: FigureSettings, 
     pictures = [
         _TrialPicture(
             name,
-            describe_trial(known[name]) if name in known else name,
+            _describe_trial(known[name]) if name in known else name,
             known[name].travel_ratio if name in known else 2.0,
             by_trial.get(name, nothing),
         )
@@ -63,10 +82,20 @@ def _draw_trial(picture: _TrialPicture, results: Results, settings: FigureSettin
 
 
 def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> None:
-    """Draw the figures of the whole experiment."""
+    """Draw the figures of the whole experiment.
+
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    settings
+        Formats and resolution.
+    """
     from vinetrack.figures.registry import draw
     from vinetrack.narrative.law_text import METHOD_NAMES
-    from vinetrack.pipeline.diagnosis_tables import draw_diagnosed, read_diagnosed, with_after
+    from vinetrack.pipeline.diagnosis_tables import read_diagnosed
 
     results = Results(folder)
     damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)
@@ -77,7 +106,7 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
     }
     in_fit = [vine for method in METHOD_NAMES for vine in damping[method]["vines"]]
     points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
-    compared = label_conditions(read_result(results.comparison), described)
+    compared = _label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
     scaling, diagnosed = read_json(results.scaling), read_diagnosed(results, described)
     inputs: dict[str, tuple[Any, ...]] = {
@@ -104,7 +133,7 @@ def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings
         write_bytes(path(f".{form}"), data)
 
 
-def describe_trial(trial: Trial) -> str:
+def _describe_trial(trial: Trial) -> str:
     """A trial in a line: name, vine, pressure and payload."""
     return f"{trial.name} · {' · '.join(_features(trial))}"
 
@@ -122,7 +151,20 @@ def _features(trial: Trial) -> list[str]:
 
 
 def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.DataFrame:
-    """`trials.csv` with the pressure and a short label of each trial's condition, for the panels of the overview."""
+    """`trials.csv` with the pressure and a short label of each trial's condition, for the panels of the overview.
+
+    Parameters
+    ----------
+    trials : DataFrame
+        `trials.csv`.
+    known : tuple of Trial
+        Trials of the sheet that could be read.
+
+    Returns
+    -------
+    DataFrame
+        With columns `condition_label` and `pressure_kPa`, NaN for a trial that could not be read.
+    """
     by_name: dict[str, Any] = {trial.name: trial for trial in known}
     labels, pressures = [], []
     for row in trials.itertuples():
@@ -137,7 +179,7 @@ def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.Da
     return trials.assign(condition_label=labels, pressure_kPa=pressures)
 
 
-def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
+def _label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
     """`comparison.csv` with the vine and the short label of each condition, vines together, pressure rising."""
     first = described.drop_duplicates("condition").set_index("condition")
     vines = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
@@ -146,3 +188,60 @@ def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.Da
     table = known.assign(vine=of["vine"].to_numpy(), condition_label=of["condition_label"].to_numpy())
     order = sorted(range(len(table)), key=lambda i: (vines[table["vine"].iloc[i]], of["pressure_kPa"].iloc[i]))
     return table.iloc[order].reset_index(drop=True)
+
+
+def draw_diagnosed(tables: DiagnosisTables | None) -> dict[str, Figure]:
+    """Draw all figures of a diagnosis, by name; those without data state so.
+
+    Parameters
+    ----------
+    tables
+        From `read_diagnosed`.
+
+    Returns
+    -------
+    dict of Figure
+    """
+    from vinetrack.figures.registry import DIAGNOSIS_FIGURES, draw
+    from vinetrack.figures.style import blank
+
+    if tables is None:
+        return {name: blank("There is no diagnosis of this model.") for name in DIAGNOSIS_FIGURES}
+    inputs: dict[str, tuple[Any, ...]] = {
+        "ladder": (tables.ladder,),
+        "before_after": (tables.labels.get(tables.worst, tables.worst), tables.before_after, tables.added),
+        "where": (tables.where, tables.added),
+        "missing_force": (tables.force,),
+        "candidates": (tables.rounds,),
+        "cosines": tables.cosines,
+        "drift": (tables.drift, tables.added),
+    }
+    return {name: draw(name, *inputs[name]) for name in DIAGNOSIS_FIGURES}
+
+
+def with_after(trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
+    """Trajectories by condition with what the last model says of them, where effects were added.
+
+    Parameters
+    ----------
+    trajectories : dict of DataFrame
+        By condition, as `comparison/` holds them.
+    diagnosed
+        From `read_diagnosed`.
+
+    Returns
+    -------
+    dict of DataFrame
+        With a column `model_after_m`, m, where the table has as many rows as the prediction.
+    """
+    if diagnosed is None or not diagnosed.added or not len(diagnosed.trials):
+        return dict(trajectories)
+    later = {
+        str(trial): part["model_after_m"].to_numpy() for trial, part in diagnosed.trials.groupby("trial", sort=False)
+    }
+    whole = {}
+    for condition, table in trajectories.items():
+        parts = [later.get(str(trial), np.empty(0)) for trial in dict.fromkeys(table["trial"])]
+        after_m = np.concatenate(parts)
+        whole[condition] = table.assign(model_after_m=after_m) if after_m.size == len(table) else table
+    return whole

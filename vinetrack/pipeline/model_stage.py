@@ -38,6 +38,15 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
 
     `payload_model.csv` too: final speed against payload as the model has it.
 
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    settings
+        Of the run.
+
     Returns
     -------
     dict
@@ -60,7 +69,7 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     pairs, kinematics = measured(experiment, results)
     tables = {results.comparison: COMPARISON_COLUMNS, results.model_check: CHECK_COLUMNS, results.audit: AUDIT_COLUMNS}
     tables[results.payload_model] = CURVE_COLUMNS
-    found: dict[Path, pd.DataFrame] = {}
+    written: dict[Path, pd.DataFrame] = {}
     content: dict[str, Any] = {}
     trajectories: dict[str, pd.DataFrame] = {}
     try:
@@ -72,11 +81,11 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
         content = FitSummary(names=tuple(experiment.settings.model), refused=_reason(error)).to_json()
     else:
         content = summary_of(fit, weighed.warnings, (check_message,) if check_message else ()).to_json()
-        found = {results.comparison: comparison.table, results.model_check: checked, results.audit: weighed.table}
-        found[results.payload_model] = curves
+        written = {results.comparison: comparison.table, results.model_check: checked, results.audit: weighed.table}
+        written[results.payload_model] = curves
         trajectories = dict(comparison.trajectories)
     for path, columns in tables.items():
-        write_csv(path, found.get(path, empty_table(columns)))
+        write_csv(path, written.get(path, empty_table(columns)))
     _write_trajectories(results, trajectories)
     write_json(results.fit, content)
     log.info("%s", content["refused"] or f"fitted {len(content['trials'])} trials")
@@ -85,6 +94,19 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
 
 def measured(experiment: Experiment, results: Results) -> tuple[list[tuple[Trial, Track]], dict[str, Kinematics]]:
     """Trials with the tracks and kinematics that the results folder holds; those that failed have none.
+
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    results
+        Results folder.
+
+    Returns
+    -------
+    pairs : list of (Trial, Track)
+    kinematics : dict of Kinematics
+        By name of trial.
 
     Raises
     ------
@@ -104,6 +126,23 @@ def read_back(trial: Trial, table: pd.DataFrame) -> Track:
     """A track as `tracks/<trial>.csv` holds it, with the pressure that was measured along with it.
 
     The pressure stands with what the user brought: in the track itself, or in a trace beside it.
+
+    Parameters
+    ----------
+    trial
+        Names the file of its pressure, if there is one.
+    table : DataFrame
+        `tracks/<trial>.csv`.
+
+    Returns
+    -------
+    Track
+        With `pressure_Pa` where it was measured.
+
+    Raises
+    ------
+    ResultsError
+        If the pressure cannot be read.
     """
     from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
 
@@ -150,11 +189,11 @@ def _fitted(
 
     model = model_of(experiment)
     # A falling body has nothing else to find: its g tries the whole chain, from the recording to the fit.
-    found = fit(model, pairs, free=("gravity.g",) if model.names == ("gravity",) else ())
-    return found, compare(found, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
+    fit_result = fit(model, pairs, free=("gravity.g",) if model.names == ("gravity",) else ())
+    return fit_result, compare(fit_result, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
 
 
-def _checked(found: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
+def _checked(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
     """`model_check.csv`, and why it is empty where it is."""
     from vinetrack.inference.fit_data import FitError
     from vinetrack.inference.model_check import CHECK_COLUMNS, check_damping
@@ -162,13 +201,13 @@ def _checked(found: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:
 
     method = "log_log" if damping["both_axes"].get("refused") else "both_axes"
     try:
-        return check_damping(found, damping[method]), ""
+        return check_damping(fit, damping[method]), ""
     except FitError as error:
         return empty_table(CHECK_COLUMNS), str(error)
 
 
 def _audited(
-    found: Fit, comparison: Comparison, pairs: list[tuple[Trial, Track]], kinematics: dict[str, Kinematics]
+    fit: Fit, comparison: Comparison, pairs: list[tuple[Trial, Track]], kinematics: dict[str, Kinematics]
 ) -> Audit:
     from vinetrack.dynamics.audit import audit, measured_motion
 
@@ -178,7 +217,7 @@ def _audited(
         track = tracks[trial.name]
         trace = None if track.pressure_Pa is None else (track.time_s - trial.release_s, track.pressure_Pa)
         motions.append(measured_motion(trial.trial, kinematics[trial.name], trial.release_s, trace))
-    return audit(found.model, motions)
+    return audit(fit.model, motions)
 
 
 def model_errors() -> tuple[type[Exception], ...]:
@@ -209,6 +248,15 @@ def _write_trajectories(results: Results, trajectories: dict[str, pd.DataFrame])
 
 def comparison_lines(folder: Path) -> list[str]:
     """`comparison.csv` as lines for the terminal, aligned, with units; or why there is nothing in it.
+
+    Parameters
+    ----------
+    folder
+        Results folder.
+
+    Returns
+    -------
+    list of str
 
     Raises
     ------

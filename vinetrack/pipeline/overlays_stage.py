@@ -31,26 +31,45 @@ log = logging.getLogger(__name__)
 Floats = NDArray[np.float64]
 
 FASTEST_FPS, SLOWEST_FPS = 30.0, 4.0
-"""Pictures a second between which a clip plays: faster is lost on a screen, slower is a slide show."""
+"""Pictures a second between which a clip plays: faster is lost on a screen, slower is a slide show. Chosen: 30 a second
+is what players and eyes follow, 4 still reads as motion. At half or twice clips play jerkily or skip frames; nothing
+else depends on it."""
 
 REST_FRAMES = 8
-"""Frames of rest before and after the motion that a clip shows."""
+"""Frames of rest before and after the motion that a clip shows. Chosen: a third of a second at 25 a second, so that
+start and end are seen."""
 
 FEWEST_PAIRS = 5
-"""Points known in pixels and in metres without which a prediction has no place in the picture."""
+"""Points known in pixels and in metres without which a prediction has no place in the picture. Derived: a parabola
+takes three, two more show whether it fits."""
 
 
 def draw_overlays(experiment: Experiment, folder: Path, settings: OverlaySettings, n_workers: int = 1) -> list[str]:
     """Write the clips that the settings ask for; return a line for every one that could not be made.
 
     A recording that cannot be drawn never stops the others. The folder is there afterwards, with or without clips.
+
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    settings
+        Which trials, width and duration.
+    n_workers : int
+        Number of processes.
+
+    Returns
+    -------
+    list of str
     """
     results = Results(folder)
     results.overlays.mkdir(parents=True, exist_ok=True)
     chosen = chosen_trials(experiment, results, settings.of)
     work = partial(_try_overlay, results=results, settings=settings)
-    said = map_trials(work, [experiment.trial(name) for name in chosen], n_workers, "overlay clips")
-    return [line for line in said if line]
+    messages = map_trials(work, [experiment.trial(name) for name in chosen], n_workers, "overlay clips")
+    return [line for line in messages if line]
 
 
 def overlay_one(folder: Path, trial: str, experiment: Path | None = None, seconds: float | None = None) -> Path:
@@ -58,8 +77,18 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
 
     Parameters
     ----------
-    experiment : where the results came from; None for where the folder itself says.
-    seconds : about how long the clip is to play; None for what the run was set to.
+    folder
+        Results folder.
+    trial : str
+        Name of the trial.
+    experiment : Path, optional
+        Where the results came from; None for where the folder itself says.
+    seconds : float, optional
+        About how long the clip is to play, s; None for what the run was set to.
+
+    Returns
+    -------
+    Path
 
     Raises
     ------
@@ -72,20 +101,35 @@ def overlay_one(folder: Path, trial: str, experiment: Path | None = None, second
     from vinetrack.experiment.settings import OverlaySettings
 
     results = Results(folder)
-    said = read_json(results.provenance)
-    read = read_experiment(experiment or Path(str(said["experiment"])))
-    filmed = [one.name for one in read.trials if one.video is not None]
+    provenance = read_json(results.provenance)
+    read = read_experiment(experiment or Path(str(provenance["experiment"])))
+    filmed = [filmed_trial.name for filmed_trial in read.trials if filmed_trial.video is not None]
     if trial not in filmed:
         known = f"there are {', '.join(filmed[:6])}{' …' if len(filmed) > 6 else ''}" if filmed else "there is none"
         raise ResultsError(f"{trial!r} is no trial with a recording in {read.folder}: {known}")
-    settings = OverlaySettings(**(said.get("settings") or {}).get("overlays") or {})
+    settings = OverlaySettings(**(provenance.get("settings") or {}).get("overlays") or {})
     if seconds is not None:
         settings = settings.model_copy(update={"seconds": seconds})
-    return write_overlay(read.trial(trial), results, settings)
+    return _write_overlay(read.trial(trial), results, settings)
 
 
 def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str]:
-    """Filmed trials to draw: of every condition the first that was tracked, or all of those, or none."""
+    """Filmed trials to draw: of every condition the first that was tracked, or all of those, or none.
+
+    Parameters
+    ----------
+    experiment
+        Sheet.
+    results
+        Results folder.
+    of : {'one_per_condition', 'all', 'none'}
+        Setting `overlays.of`.
+
+    Returns
+    -------
+    list of str
+        Names of trials.
+    """
     if of == "none":
         return []
     trials = read_result(results.trials)
@@ -101,7 +145,7 @@ def chosen_trials(experiment: Experiment, results: Results, of: str) -> list[str
 
 def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> str:
     try:
-        write_overlay(trial, results, settings)
+        _write_overlay(trial, results, settings)
     except ResultsError as error:
         log.warning("%s: no clip: %s", trial.name, error)
         return f"{trial.name}: no clip: {error}"
@@ -111,7 +155,7 @@ def _try_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> s
     return ""
 
 
-def write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
+def _write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> Path:
     """Write the clip of one trial; return its path.
 
     Raises
@@ -140,6 +184,15 @@ def write_overlay(trial: Trial, results: Results, settings: OverlaySettings) -> 
 def frames_to_show(track: pd.DataFrame) -> range:
     """Frames from a little before the edge moves until a little after it has stopped.
 
+    Parameters
+    ----------
+    track : DataFrame
+        `tracks/<trial>.csv`.
+
+    Returns
+    -------
+    range
+
     Raises
     ------
     ResultsError
@@ -158,6 +211,20 @@ def frames_to_show(track: pd.DataFrame) -> range:
 def pace(n_frames: int, seconds: float) -> tuple[float, int]:
     """Pictures a second, and every how many frames one is taken, so that the clip lasts about `seconds`.
 
+    Parameters
+    ----------
+    n_frames : int
+        Frames to show.
+    seconds : float
+        Wanted duration, s.
+
+    Returns
+    -------
+    play_fps : float
+    stride : int
+
+    Examples
+    --------
     >>> pace(120, 6.0)
     (20.0, 1)
     >>> pace(3000, 6.0)
@@ -211,16 +278,38 @@ def shake_along(line: Mapping[str, Any], n_frames: int) -> Floats:
 
     Parameters
     ----------
-    line : `axis` of `analysed/<trial>.json`; it says nothing of a camera that stood still.
+    line : mapping
+        `axis` of `analysed/<trial>.json`; it says nothing of a camera that stood still.
+    n_frames : int
+        Frames of the recording.
+
+    Returns
+    -------
+    array, shape (n_frames,)
     """
     shake_px = np.zeros(n_frames)
-    said = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
-    shake_px[: said.size] = said
+    known_px = np.asarray(line.get("shake_px", ()), dtype=float)[:n_frames]
+    shake_px[: known_px.size] = known_px
     return shake_px
 
 
 def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Edge], float]:
-    """The tracked edge, those that were predicted where there are any, and the time of release, s."""
+    """The tracked edge, those that were predicted where there are any, and the time of release, s.
+
+    Parameters
+    ----------
+    trial : str
+        Name of the trial.
+    results
+        Results folder.
+    track : DataFrame
+        `tracks/<trial>.csv`.
+
+    Returns
+    -------
+    edges : list of Edge
+    release_s : float
+    """
     from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge
 
     edge_px = track["edge_px"].to_numpy(dtype=float)
@@ -228,13 +317,13 @@ def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Ed
     path = results.predictions(trial)
     if not path.exists():
         return edges, float(_first_moving_s(track))
-    said = read_result(path)
+    predicted = read_result(path)
     to_px = metres_to_px(track)
-    added = added_effects(results)
+    added = _added_effects(results)
     names = {"model_before_m": "initial model", "model_after_m": f"with {added}" if added else ""}
     time_s, measured_m = (track[name].to_numpy(dtype=float) for name in ("time_s", "lead_position_m"))
     for column, name in names.items():
-        known = said[["time_s", column]].dropna()
+        known = predicted[["time_s", column]].dropna()
         if not name or known.empty:
             continue
         # The model ends with its last prediction; before its first the vine rests where it begins.
@@ -246,6 +335,16 @@ def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Ed
 
 def metres_to_px(track: pd.DataFrame) -> Any:
     """A function from metres to pixels along the axis, by what the track holds in both: lens and tilt bend it a little.
+
+    Parameters
+    ----------
+    track : DataFrame
+        `tracks/<trial>.csv`.
+
+    Returns
+    -------
+    numpy.polynomial.Polynomial
+        Of second degree, fitted by least squares.
 
     Raises
     ------
@@ -261,10 +360,10 @@ def metres_to_px(track: pd.DataFrame) -> Any:
     return bent
 
 
-def added_effects(results: Results) -> str:
+def _added_effects(results: Results) -> str:
     """The effects that the diagnosis added, in words; blank where there is none."""
-    found = read_diagnosis(results)
-    return " and ".join(map(plain, found.effects)) if found is not None else ""
+    diagnosis = read_diagnosis(results)
+    return " and ".join(map(plain, diagnosis.effects)) if diagnosis is not None else ""
 
 
 def _release_s(trial: str, results: Results, track: pd.DataFrame) -> float:

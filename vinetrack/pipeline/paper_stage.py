@@ -39,6 +39,17 @@ FIG9_NOTE = "Alvarez et al. (2025): higher for thinner walls, no clear trend wit
 def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     """Write `paper.csv` and the tables behind the figures; return `paper.csv` as written.
 
+    Parameters
+    ----------
+    experiment
+        Its setting `published` asks for the comparison.
+    folder
+        Results folder.
+
+    Returns
+    -------
+    DataFrame
+
     Raises
     ------
     ResultsError
@@ -56,16 +67,16 @@ def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     results = Results(folder)
     mark = SIMULATED if kind == "simulated" else MEASURED
     tables = _tables(experiment, results)
-    found = _found(mark, results, tables)
+    results_given = _found(mark, results, tables)
     rows = [
         *protocol_rows(experiment.trials, read_result(results.steady), mark),
-        *found_rows(found),
+        *found_rows(results_given),
         *computed_rows(),
         *foretold_rows(experiment.trials),
     ]
     table = as_table(rows)
-    for name, one in tables.items():
-        write_csv(folder / f"{name}.csv", one)
+    for name, table_of_figure in tables.items():
+        write_csv(folder / f"{name}.csv", table_of_figure)
     write_csv(folder / "paper.csv", table)
     for mark in MARKS:
         log.info("%s: %d rows", mark, int((table["mark"] == mark).sum()))
@@ -79,8 +90,11 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
 
     trials = experiment.trials
     positions, speeds = beside.position_conditions(trials), beside.speed_conditions(trials)
-    found = {name: beside.Rest(one.release_s, one.origin_m) for name, one in read_fit(results).trials.items()}
-    rests = {name: rest for name, rest in found.items() if math.isfinite(rest.release_s + rest.origin_m)}
+    starts = {
+        name: beside.Rest(fitted_trial.release_s, fitted_trial.origin_m)
+        for name, fitted_trial in read_fit(results).trials.items()
+    }
+    rests = {name: start for name, start in starts.items() if math.isfinite(start.release_s + start.origin_m)}
     kinematics = {
         trial.name: read_result(results.kinematics(trial.name))
         for of_one in (*positions.values(), *speeds.values())
@@ -100,7 +114,15 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
 
 
 def draw_paper(folder: Path, settings: FigureSettings) -> None:
-    """Draw the figures that stand beside the paper's, from the tables of `set_beside_paper`."""
+    """Draw the figures that stand beside the paper's, from the tables of `set_beside_paper`.
+
+    Parameters
+    ----------
+    folder
+        Results folder.
+    settings
+        Formats and resolution.
+    """
     from vinetrack.figures.registry import draw
     from vinetrack.figures.style import render
 

@@ -32,20 +32,24 @@ if TYPE_CHECKING:
     from vinetrack.planning.prediction import Quantity, VinePrediction
 
 LEAST_N = 0.01
+"""Largest force below which forces are shown in mN, N. Chosen: three digits then need no leading zeros."""
+
 WORTH_SHOWING = 0.005
-"""Relative change of the final speed below which an effect that is left out is not listed."""
+"""Relative change of the final speed below which an effect that is left out is not listed. Chosen: half a per cent is a
+tenth of what a good measurement of speed resolves. At half the list grows by effects without weight, at twice some of
+one per cent are missing."""
 
 
 @dataclass(frozen=True)
-class Foretold:
-    """One condition: what is foretold, what speaks against it, and what effects left out would change."""
+class ConditionPrediction:
+    """One condition: its prediction, what speaks against it, and what effects left out would change."""
 
     sight: VinePrediction
     hazards: tuple[str, ...]
     neglected: tuple[Neglected, ...]
 
 
-def foretell(
+def predict_conditions(
     asked: Asked,
     *,
     samples: int,
@@ -57,6 +61,21 @@ def foretell(
 ) -> list[str]:
     """Lines for the terminal; figure, curves and everything said are written where asked for.
 
+    Parameters
+    ----------
+    asked
+        Numbers, sheet, fit and effects of the command line.
+    samples, seed : int
+        Draws, and the seed of the random numbers.
+    at_fraction : float
+        y/L at which a bare vine's final speed is taken.
+    figure, csv, json : Path, optional
+        Where the figure, the curves and all numbers are written.
+
+    Returns
+    -------
+    list of str
+
     Raises
     ------
     ExperimentError, ResultsError, EffectError
@@ -66,25 +85,25 @@ def foretell(
 
     check_figure(figure)
     ground = read_ground(asked)
-    found = foresee_all(ground, samples, seed, at_fraction)
-    lines = [*_one(found[0])] if len(found) == 1 else [*_several(found)]
+    predictions = _predict_all(ground, samples, seed, at_fraction)
+    lines = [*_one(predictions[0])] if len(predictions) == 1 else [*_several(predictions)]
     lines += [f"! {words}" for words in warnings_of(ground)]
     if figure is not None:
         from vinetrack.figures.prediction_figures import draw_foresight
 
-        write_figure(draw_foresight([_picture(one.sight) for one in found], at_fraction), figure)
+        write_figure(draw_foresight([_picture(prediction.sight) for prediction in predictions], at_fraction), figure)
         lines.append(f"Figure: {figure}")
     if csv is not None:
-        write_csv(csv, pd.concat([one.sight.curve for one in found], ignore_index=True))
+        write_csv(csv, pd.concat([prediction.sight.curve for prediction in predictions], ignore_index=True))
         lines.append(f"Curves: {csv}")
     if json is not None:
-        write_json(json, [_entry(one) for one in found])
+        write_json(json, [_entry(prediction) for prediction in predictions])
         lines.append(f"Everything: {json}")
     return lines
 
 
-def foresee_all(ground: Ground, samples: int, seed: int, at_fraction: float) -> list[Foretold]:
-    """Foretell every condition.
+def _predict_all(ground: Ground, samples: int, seed: int, at_fraction: float) -> list[ConditionPrediction]:
+    """Predict every condition.
 
     Raises
     ------
@@ -97,103 +116,106 @@ def foresee_all(ground: Ground, samples: int, seed: int, at_fraction: float) -> 
     from vinetrack.planning.design_checks import design_checks, neglected
     from vinetrack.planning.prediction import predict_vine
 
-    found = []
+    predictions = []
     try:
         for inputs in progress(inputs_of(ground), "predicting", unit="condition"):
             sight = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
-            found.append(Foretold(sight, design_checks(sight), neglected(inputs, at_fraction)))
+            predictions.append(ConditionPrediction(sight, design_checks(sight), neglected(inputs, at_fraction)))
     except SimulationError as error:
         raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
     except EffectError as error:
         raise as_option(error) from None
-    return found
+    return predictions
 
 
-def _one(found: Foretold) -> Iterator[str]:
+def _one(prediction: ConditionPrediction) -> Iterator[str]:
     """Everything about one condition."""
     from vinetrack.core.terminal import table
 
-    sight = found.sight
+    sight = prediction.sight
     inputs = sight.inputs
     yield f"{trial_words(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
     yield from table(input_rows(inputs.bands()), ("what goes in", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
-    rows = [_quantity_row(one) for one in sight.quantities]
+    rows = [_quantity_row(quantity) for quantity in sight.quantities]
     yield from table(rows, ("what comes out", "at y/L", "median", "90 % band", "unit"), align="<<><<")
     yield ""
     head = (f"uncertainties included ({sight.samples} draws)", "final speed by it alone", "why")
     yield from table([_share_row(share.name, share.low, share.high, share.words) for share in sight.shares], head)
-    yield from _left_out(found)
+    yield from _left_out(prediction)
     yield ""
-    yield from (f"! {words}" for words in found.hazards)
+    yield from (f"! {words}" for words in prediction.hazards)
 
 
-def _quantity_row(one: Quantity) -> tuple[str, str, str, str, str]:
+def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
     """Name, place, median, band and unit; stresses in MPa, and forces in mN where all of them are that small."""
-    place = "" if math.isnan(one.y_over_L) else f"{one.y_over_L:g}"
-    values, unit = (one.low, one.median, one.high), one.unit
+    place = "" if math.isnan(quantity.y_over_L) else f"{quantity.y_over_L:g}"
+    values, unit = (quantity.low, quantity.median, quantity.high), quantity.unit
     if unit == "Pa":
         texts, unit = [number(value / 1e6) for value in values], "MPa"
     elif unit == "N" and max(abs(value) for value in values) < LEAST_N:
         texts, unit = [number(1e3 * value) for value in values], "mN"
     else:
         texts, unit = [shown(value, unit) for value in values], unit_of(unit)
-    no_band = one.low == one.high or math.isnan(one.median)
-    return one.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
+    no_band = quantity.low == quantity.high or math.isnan(quantity.median)
+    return quantity.name, place, texts[1], "–" if no_band else f"{texts[0]} to {texts[2]}", unit
 
 
 def _share_row(name: str, low: float, high: float, words: str) -> tuple[str, str, str]:
     return name, f"{shown(low, 'm/s')} to {shown(high, 'm/s')} m/s", words
 
 
-def _left_out(found: Foretold) -> Iterator[str]:
+def _left_out(prediction: ConditionPrediction) -> Iterator[str]:
     """Effects that no vine is free of and the model leaves out, with what they would make of the final speed."""
     from vinetrack.core.terminal import table
 
     rows = [
         (
-            one.effect,
-            one.size,
-            f"{shown(one.without_m_s, 'm/s')} → {shown(one.final_m_s, 'm/s')} m/s",
-            f"{one.change:+.1%}",
+            effect_left_out.effect,
+            effect_left_out.size,
+            f"{shown(effect_left_out.without_m_s, 'm/s')} → {shown(effect_left_out.final_m_s, 'm/s')} m/s",
+            f"{effect_left_out.change:+.1%}",
         )
-        for one in found.neglected
-        if abs(one.change) >= WORTH_SHOWING
+        for effect_left_out in prediction.neglected
+        if abs(effect_left_out.change) >= WORTH_SHOWING
     ]
     if rows:
         yield ""
         yield from table(rows, ("left out of the model", "if it were", "the final speed went", ""))
 
 
-def _several(found: Sequence[Foretold]) -> Iterator[str]:
+def _several(predictions: Sequence[ConditionPrediction]) -> Iterator[str]:
     """A row a condition."""
     from vinetrack.core.terminal import table
     from vinetrack.planning.prediction import TIME
 
-    yield f"{' + '.join(found[0].sight.inputs.model.names)}; medians and 90 % bands of {found[0].sight.samples} draws"
+    first = predictions[0].sight
+    yield f"{' + '.join(first.inputs.model.names)}; medians and 90 % bands of {first.samples} draws"
     rows = [
         (
-            one.sight.inputs.trial.condition,
-            *_quantity_row(one.sight.final)[1:4],
-            *_quantity_row(one.sight[TIME])[2:4],
-            f"{one.sight.slack:.0%}",
+            prediction.sight.inputs.trial.condition,
+            *_quantity_row(prediction.sight.final)[1:4],
+            *_quantity_row(prediction.sight[TIME])[2:4],
+            f"{prediction.sight.slack:.0%}",
         )
-        for one in found
+        for prediction in predictions
     ]
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
-    if any(one.sight.inputs.trial.payload_kg > 0 for one in found):
+    if any(prediction.sight.inputs.trial.payload_kg > 0 for prediction in predictions):
         yield "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine"
     yield ""
     yield "uncertainties included:"
-    words = dict.fromkeys((share.name, share.words) for one in found for share in one.sight.shares)
+    words = dict.fromkeys((share.name, share.words) for prediction in predictions for share in prediction.sight.shares)
     yield from (f"  {name}: {text}" for name, text in words)
     yield ""
-    said = dict.fromkeys(text for one in found for text in one.hazards)
-    for text in said:
-        conditions = [one.sight.inputs.trial.condition for one in found if text in one.hazards]
-        yield f"! {'all conditions' if len(conditions) == len(found) else ', '.join(conditions)}: {text}"
+    hazards = dict.fromkeys(text for prediction in predictions for text in prediction.hazards)
+    for text in hazards:
+        conditions = [
+            prediction.sight.inputs.trial.condition for prediction in predictions if text in prediction.hazards
+        ]
+        yield f"! {'all conditions' if len(conditions) == len(predictions) else ', '.join(conditions)}: {text}"
 
 
 def _picture(sight: VinePrediction) -> PredictionPicture:
@@ -208,9 +230,9 @@ def _picture(sight: VinePrediction) -> PredictionPicture:
     )
 
 
-def _entry(found: Foretold) -> dict[str, Any]:
+def _entry(prediction: ConditionPrediction) -> dict[str, Any]:
     """One condition as JSON holds it, SI."""
-    sight = found.sight
+    sight = prediction.sight
     return {
         "condition": sight.inputs.trial.condition,
         "model": list(sight.inputs.model.names),
@@ -236,9 +258,9 @@ def _entry(found: Foretold) -> dict[str, Any]:
         ],
         "left_out": [
             {"effect": n.effect, "size": n.size, "final_m_s": n.final_m_s, "without_m_s": n.without_m_s}
-            for n in found.neglected
+            for n in prediction.neglected
         ],
         "arrives": sight.arrives,
         "slack": sight.slack,
-        "warnings": list(found.hazards),
+        "warnings": list(prediction.hazards),
     }

@@ -52,15 +52,26 @@ class Asked:
 
 @dataclass(frozen=True)
 class Ground:
-    """What beliefs stand on: trials that are planned, what is said of their numbers, and a fit where there is one."""
+    """What predictive inputs are made from: planned trials, stated values, and a fit where there is one."""
 
     planned: Planned
-    said: StatedValues
+    stated: StatedValues
     fit: FitNumbers | None
 
 
 def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
     """Read the sheet or the options, the fit, and the effects that are asked for.
+
+    Parameters
+    ----------
+    asked
+        What stands on the command line.
+    needed : sequence of str, optional
+        Columns that must be given; by default all that a prediction needs.
+
+    Returns
+    -------
+    Ground
 
     Raises
     ------
@@ -82,10 +93,12 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
     else:
         planned = planned_trial(asked.cells, ExperimentSettings(), NEEDED if needed is None else needed)
     if asked.tail_slack is not None:
-        planned = replace(planned, trials=tuple(replace(one, tail_slack=asked.tail_slack) for one in planned.trials))
-    fit, own = (None, _own(planned)) if asked.results is None else read_fit(asked.results)
-    sizes = [read_sizes(text, own) for text in asked.effects]
-    said = StatedValues(
+        planned = replace(
+            planned, trials=tuple(replace(trial, tail_slack=asked.tail_slack) for trial in planned.trials)
+        )
+    fit, user_effects = (None, _own(planned)) if asked.results is None else _read_fit(asked.results)
+    sizes = [read_sizes(text, user_effects) for text in asked.effects]
+    stated = StatedValues(
         B=asked.B,
         B_error=asked.B_error,
         n=asked.n,
@@ -93,10 +106,10 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
         model=planned.settings.model,
         effects=tuple(name for name, _ in sizes),
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
-        experiment_effects=own,
+        experiment_effects=user_effects,
         spreads=asked.spreads,
     )
-    return Ground(planned, said, fit)
+    return Ground(planned, stated, fit)
 
 
 def _refuse_beside_sheet(asked: Asked) -> None:
@@ -115,7 +128,7 @@ def _own(planned: Planned) -> Mapping[str, Effect]:
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
-def read_fit(results: Path) -> tuple[FitNumbers, Mapping[str, Effect]]:
+def _read_fit(results: Path) -> tuple[FitNumbers, Mapping[str, Effect]]:
     """The fit of a results folder, and the own effects of the experiment that it belongs to.
 
     Raises
@@ -137,17 +150,27 @@ def read_fit(results: Path) -> tuple[FitNumbers, Mapping[str, Effect]]:
     if not lacking:
         return fit, {}
     experiment = Path(str(read_json(paths.provenance).get("experiment", "")))
-    own = effects_of(experiment) if experiment.is_dir() else {}
-    if not set(lacking) <= set(own):
+    user_effects = effects_of(experiment) if experiment.is_dir() else {}
+    if not set(lacking) <= set(user_effects):
         raise ResultsError(
             f"{results} was fitted with {', '.join(lacking)}, an effect of its experiment's own, which is no longer in "
             f"{experiment}: put the folder back, or fit again"
         )
-    return fit, own
+    return fit, user_effects
 
 
 def inputs_of(ground: Ground) -> list[PredictiveInputs]:
-    """A belief for every trial.
+    """Predictive inputs of every trial.
+
+    Parameters
+    ----------
+    ground
+        From `read_ground`.
+
+    Returns
+    -------
+    list of PredictiveInputs
+        In the order of the trials.
 
     Raises
     ------
@@ -158,13 +181,23 @@ def inputs_of(ground: Ground) -> list[PredictiveInputs]:
     from vinetrack.planning.input_sources import predictive_inputs
 
     try:
-        return [predictive_inputs(trial, ground.said, ground.fit) for trial in ground.planned.trials]
+        return [predictive_inputs(trial, ground.stated, ground.fit) for trial in ground.planned.trials]
     except FitError as error:
         raise ResultsError(str(error)) from None
 
 
 def as_option(error: Exception) -> Exception:
-    """What an effect needs, said of the option or the column that is missing; any other error as it is."""
+    """What an effect needs, said of the option or the column that is missing; any other error as it is.
+
+    Parameters
+    ----------
+    error
+        Of an effect.
+
+    Returns
+    -------
+    Exception
+    """
     match = re.search(r"the effect (\w+) needs `(\w+)`", str(error))
     if match is None:
         return error
@@ -175,13 +208,34 @@ def as_option(error: Exception) -> Exception:
 
 
 def warnings_of(ground: Ground) -> list[str]:
-    """What is legal in the sheet or the options, but hardly meant."""
+    """What is legal in the sheet or the options, but hardly meant.
+
+    Parameters
+    ----------
+    ground
+        From `read_ground`.
+
+    Returns
+    -------
+    list of str
+    """
     return [str(problem) for problem in ground.planned.problems]
 
 
 def litres(volume_m3: float) -> str:
     """A volume as people say it: litres, or millilitres where they are few.
 
+    Parameters
+    ----------
+    volume_m3 : float
+        m³.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> litres(3.7e-3), litres(3.534e-6)
     ('3.7 L', '3.53 mL')
     """
@@ -191,6 +245,17 @@ def litres(volume_m3: float) -> str:
 def trial_words(trial: Trial) -> str:
     """A trial as a person would write it.
 
+    Parameters
+    ----------
+    trial
+        What is described.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
     >>> from vinetrack.core.records import Trial
     >>> trial_words(Trial(name="a", diameter_m=0.025, thickness_m=1e-4, length_m=0.4, pressure_Pa=62e3))
     '25 mm × 100 µm × 400 mm at 62 kPa, no payload, growing straight down'
@@ -206,31 +271,74 @@ def trial_words(trial: Trial) -> str:
 
 
 def shown(value: float, unit: str, digits: int = 3) -> str:
-    """An SI value in the unit people use, to so many digits; a time that never comes is `never`."""
+    """An SI value in the unit people use, to so many digits; a time that never comes is `never`.
+
+    Parameters
+    ----------
+    value : float
+        SI.
+    unit : str
+        SI unit.
+    digits : int
+        Significant digits.
+
+    Returns
+    -------
+    str
+    """
     if math.isinf(value):
         return NEVER
     return number(value * display_unit(unit, PREDICTION_UNITS)[1], digits)
 
 
 def unit_of(unit: str) -> str:
-    """The unit that `shown` uses."""
+    """The unit that `shown` uses.
+
+    Parameters
+    ----------
+    unit : str
+        SI unit.
+
+    Returns
+    -------
+    str
+    """
     return display_unit(unit, PREDICTION_UNITS)[0]
 
 
 def input_rows(inputs: Sequence[Input]) -> list[tuple[str, str, str, str, str]]:
-    """Rows of a table: symbol, median, 90 % band, unit, where from; constants of nature are left out."""
+    """Rows of a table: symbol, median, 90 % band, unit, where from; constants of nature are left out.
+
+    Parameters
+    ----------
+    inputs : sequence of Input
+        Inputs of one prediction.
+
+    Returns
+    -------
+    list of tuple of str
+    """
     rows = []
-    for one in inputs:
-        if one.origin == "constant":
+    for entry in inputs:
+        if entry.origin == "constant":
             continue
-        exact = one.low == one.high
-        spread = "–" if exact else f"{shown(one.low, one.unit)} to {shown(one.high, one.unit)}"
-        rows.append((one.symbol, shown(one.median, one.unit), spread, unit_of(one.unit), one.origin))
+        exact = entry.low == entry.high
+        spread = "–" if exact else f"{shown(entry.low, entry.unit)} to {shown(entry.high, entry.unit)}"
+        rows.append((entry.symbol, shown(entry.median, entry.unit), spread, unit_of(entry.unit), entry.origin))
     return rows
 
 
 def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
     """Write a figure in the form its ending names.
+
+    Parameters
+    ----------
+    fig
+        Matplotlib figure.
+    path
+        The ending names the format.
+    dpi : float
+        Resolution of a bitmap.
 
     Raises
     ------
@@ -245,7 +353,18 @@ def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
 
 
 def check_figure(path: Path | None) -> None:
-    """Refuse a picture whose ending names no form, before anything is computed."""
+    """Refuse a picture whose ending names no form, before anything is computed.
+
+    Parameters
+    ----------
+    path : Path or None
+        Where a figure is to be written.
+
+    Raises
+    ------
+    ExperimentError
+        If the ending names no format.
+    """
     if path is not None and path.suffix.lower() not in FIGURE_FORMATS:
         remedy = f"let it end in {', '.join(FIGURE_FORMATS)}"
         raise ExperimentError([Problem(message="is no picture's name", file=str(path), remedy=remedy)])

@@ -28,6 +28,17 @@ log = logging.getLogger(__name__)
 def analyse_recording(experiment: Experiment, name: str, folder: Path, settings: RunSettings) -> str:
     """Track the recording of one trial and analyse its motion; write all files of the trial.
 
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    name : str
+        Name of the trial.
+    folder
+        Results folder.
+    settings
+        Of the run.
+
     Returns
     -------
     str
@@ -109,16 +120,16 @@ def _with_size_notes(trial: Trial, measurement: Measurement) -> Track:
 
 def _add_view(results: Results, name: str, measurement: Measurement, image: str | None) -> None:
     """Add to the file of a trial what the scale of its recording rests on, and the axis its `edge_px` counts along."""
-    found = measurement.calibration
+    calibration = measurement.calibration
     entry: dict[str, Any] = {
-        "kind": "sheet" if found is None else found.kind,
-        "image": image if found is not None else None,
+        "kind": "sheet" if calibration is None else calibration.kind,
+        "image": image if calibration is not None else None,
         "mm_per_px": 1e3 * measurement.m_per_px,
         "scale_rel_sigma": measurement.scale_rel_sigma,
-        "reprojection_px": None if found is None else found.reprojection_px,
-        "n_corners": 0 if found is None else found.n_corners,
-        "n_pictures": 0 if found is None else found.n_pictures,
-        "notes": [] if found is None else found.notes,
+        "reprojection_px": None if calibration is None else calibration.reprojection_px,
+        "n_corners": 0 if calibration is None else calibration.n_corners,
+        "n_pictures": 0 if calibration is None else calibration.n_pictures,
+        "notes": [] if calibration is None else calibration.notes,
     }
     axis = measurement.tracking.axis
     shake_px = measurement.tracking.shake_px

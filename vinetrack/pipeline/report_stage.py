@@ -30,6 +30,19 @@ MOST_CURVE_ROWS = 6000
 def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> Path:
     """Write `provenance.json` and `report.html`; return the path of the report.
 
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    settings : mapping
+        Settings of the run, for `provenance.json`.
+
+    Returns
+    -------
+    Path
+
     Raises
     ------
     ResultsError
@@ -47,6 +60,19 @@ def write_report(experiment: Experiment, folder: Path, settings: Mapping[str, An
 
 def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, Any]) -> ReportContent:
     """Everything that a results folder has for the page.
+
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    settings : mapping
+        Settings of the run, for `provenance.json`.
+
+    Returns
+    -------
+    ReportContent
 
     Raises
     ------

@@ -17,8 +17,14 @@ def experiment_behind(folder: Path, experiment: Path | None = None) -> Experimen
 
     Parameters
     ----------
-    experiment
-        Where it is now, if it has moved.
+    folder
+        Results folder.
+    experiment : Path, optional
+        Where the experiment is now, if it has moved.
+
+    Returns
+    -------
+    Experiment
 
     Raises
     ------
@@ -48,6 +54,17 @@ def save_model(folder: Path, names: Sequence[str]) -> Path:
     """Set `model:` of an experiment, in a whole file or not at all; return the path of the settings.
 
     A mark at the beginning of the file and its line ends stay; a file in another encoding becomes UTF-8.
+
+    Parameters
+    ----------
+    folder
+        Experiment folder.
+    names : sequence of str
+        Effects of the model.
+
+    Returns
+    -------
+    Path
 
     Raises
     ------

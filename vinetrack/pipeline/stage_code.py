@@ -63,7 +63,19 @@ def code_hash(stage: str, package: Path = PACKAGE) -> str:
 
 
 def stage_files(stage: str, package: Path = PACKAGE) -> list[Path]:
-    """Every file of the package that a stage runs or reads, sorted; see `code_hash` for the parameters."""
+    """Every file of the package that a stage runs or reads, sorted; see `code_hash` for the parameters.
+
+    Parameters
+    ----------
+    stage : str
+        A key of `STAGE_MODULES`.
+    package : Path
+        Folder of the package, by default the one that is running.
+
+    Returns
+    -------
+    list of Path
+    """
     waiting = [path for name in STAGE_MODULES[stage] for path in _module_files(name, package)]
     reached: set[Path] = set()
     while waiting:
@@ -91,6 +103,18 @@ def imported_names(text: str) -> set[str]:
 
     `from vinetrack.core import published` gives `core` and `core.published`: only the files tell which is a module.
 
+    Parameters
+    ----------
+    text : str
+        Source code.
+
+    Returns
+    -------
+    set of str
+        Dotted names without `vinetrack.`.
+
+    Examples
+    --------
     >>> sorted(imported_names("from vinetrack.core import published\nimport numpy"))
     ['core', 'core.published']
     """

@@ -47,6 +47,17 @@ def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, 
 
     Trials whose row of the sheet is at fault get empty files here too.
 
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    settings
+        Of the run.
+    n_workers : int
+        Number of processes.
+
     Returns
     -------
     list of str
@@ -54,16 +65,16 @@ def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, 
     """
     results = Results(folder)
     for name, reason in experiment.failed.items():
-        write_empty(results, name, bare_row(name, "failed", reason))
+        write_empty(results, name, _bare_row(name, "failed", reason))
     model_of(experiment)
     work = partial(_analyse_track, results=results, settings=settings, experiment=experiment)
     trials = [trial for trial in experiment.trials if trial.video is None]
-    said = list(map_trials(work, trials, n_workers, "tracks"))
-    for trial, (reason, fault) in zip(trials, said, strict=True):
+    outcomes = list(map_trials(work, trials, n_workers, "tracks"))
+    for trial, (reason, fault) in zip(trials, outcomes, strict=True):
         log.info("%s: %s", trial.name, reason or "analysed")
         if fault:
             log.error("trial %s:\n%s", trial.name, fault)
-    failed = {trial.name: reason for trial, (reason, _) in zip(trials, said, strict=True) if reason}
+    failed = {trial.name: reason for trial, (reason, _) in zip(trials, outcomes, strict=True) if reason}
     return [f"{name}: {reason}" for name, reason in (*experiment.failed.items(), *failed.items())]
 
 
@@ -85,10 +96,27 @@ def analyse(
 ) -> tuple[str, str]:
     """From a track to the files of one trial; `columns` of `trials.csv` are known to the caller alone.
 
+    Parameters
+    ----------
+    trial
+        Row of the sheet.
+    track
+        Its positions.
+    results
+        Results folder.
+    settings
+        Of the run.
+    experiment
+        Names the model in use.
+    **columns : float
+        Columns of `trials.csv` that the caller knows.
+
     Returns
     -------
-    (reason, fault)
-        Why it failed and the traceback of an unforeseen error, blank if none.
+    reason : str
+        Why the trial failed; blank where it did not.
+    fault : str
+        Traceback of an unforeseen error; blank where there was none.
     """
     from vinetrack.kinematics.summary import TrialError, summarise_trial
 
@@ -100,8 +128,8 @@ def analyse(
     except Exception:
         write_empty(results, trial.name, failed_row(trial, INTERNAL_FAULT))
         return INTERNAL_FAULT, traceback.format_exc()
-    write_csv(results.track(trial.name), track_table(summary.track))
-    write_csv(results.kinematics(trial.name), kinematics_table(summary.kinematics))
+    write_csv(results.track(trial.name), _track_table(summary.track))
+    write_csv(results.kinematics(trial.name), _kinematics_table(summary.kinematics))
     windows = [_window_row(trial.name, window) for window in summary.windows.values()]
     row = dict(summary.row) | columns
     point = dict(summary.point) | {"scale_rel_sigma": row["scale_rel_sigma"]}
@@ -111,6 +139,15 @@ def analyse(
 
 def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.DataFrame:
     """Put what every trial gave into `trials.csv`, `conditions.csv`, `steady.csv` and `damping_points.csv`.
+
+    Parameters
+    ----------
+    experiment
+        Sheet and settings.
+    folder
+        Results folder.
+    settings
+        Of the run.
 
     Returns
     -------
@@ -126,12 +163,14 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     from vinetrack.kinematics.damping import mark_half_steady
 
     results = Results(folder)
-    found = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
-    rows = {name: content["row"] for name, content in found.items()}
-    rows |= {name: bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
+    analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
+    rows = {name: content["row"] for name, content in analysed.items()}
+    rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
     table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
-    write_csv(results.steady, _frame([row for content in found.values() for row in content["windows"]], STEADY_COLUMNS))
-    points = _frame([c["point"] for c in found.values() if c["point"]], POINT_COLUMNS)
+    write_csv(
+        results.steady, _frame([row for content in analysed.values() for row in content["windows"]], STEADY_COLUMNS)
+    )
+    points = _frame([c["point"] for c in analysed.values() if c["point"]], POINT_COLUMNS)
     write_csv(results.points, mark_half_steady(points))
     places = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
     write_csv(results.conditions, condition_table(table, experiment.trials, **places))
@@ -154,38 +193,70 @@ def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame
 
 
 def model_of(experiment: Experiment) -> Model:
-    """The model in use; every process makes its own, since a user's effects cannot travel between processes."""
+    """The model in use; every process makes its own, since a user's effects cannot travel between processes.
+
+    Parameters
+    ----------
+    experiment
+        Its settings name the effects.
+
+    Returns
+    -------
+    Model
+    """
     return _model(experiment.settings.model, tuple(experiment.folder / path for path in experiment.settings.effects))
 
 
 @lru_cache(maxsize=1)
-def _model(names: tuple[str, ...], own: tuple[Path, ...]) -> Model:
+def _model(names: tuple[str, ...], paths: tuple[Path, ...]) -> Model:
     """The model in use; every process makes its own, since a user's effects cannot travel between processes."""
     from vinetrack.dynamics.model import make_model
     from vinetrack.effects import load_effect
 
-    return make_model(names, {effect.name: effect for effect in map(load_effect, own)})
+    return make_model(names, {effect.name: effect for effect in map(load_effect, paths)})
 
 
 def failed_row(trial: Trial, reason: str) -> dict[str, Any]:
-    """The row of `trials.csv` of a trial that could not be analysed."""
-    return bare_row(trial.name, "failed", reason) | {"vine": trial.vine, "condition": trial.condition}
+    """The row of `trials.csv` of a trial that could not be analysed.
+
+    Parameters
+    ----------
+    trial
+        Row of the sheet.
+    reason : str
+        Why it failed.
+
+    Returns
+    -------
+    dict
+    """
+    return _bare_row(trial.name, "failed", reason) | {"vine": trial.vine, "condition": trial.condition}
 
 
 def write_empty(results: Results, trial: str, row: dict[str, Any]) -> None:
-    """Files of a trial without results: headers alone, and its row."""
+    """Files of a trial without results: headers alone, and its row.
+
+    Parameters
+    ----------
+    results
+        Results folder.
+    trial : str
+        Name of the trial.
+    row : dict
+        Its row of `trials.csv`.
+    """
     write_csv(results.track(trial), empty_table(TRACK_COLUMNS))
     write_csv(results.kinematics(trial), empty_table(KINEMATICS_COLUMNS))
     write_json(results.analysed(trial), {"row": row, "windows": [], "point": None})
 
 
-def bare_row(trial: str, status: str, reason: str) -> dict[str, Any]:
+def _bare_row(trial: str, status: str, reason: str) -> dict[str, Any]:
     """A row of `trials.csv` for a trial without results."""
     blank: dict[str, Any] = dict.fromkeys(TRIALS_COLUMNS, np.nan)
     return blank | {"trial": trial, "vine": "", "condition": "", "status": status, "reason": reason, "steady_rule": ""}
 
 
-def track_table(track: Track) -> pd.DataFrame:
+def _track_table(track: Track) -> pd.DataFrame:
     """A track as `tracks/<trial>.csv` holds it: one row a frame, `frame` counted from 0."""
     import pandas as pd
 
@@ -200,7 +271,7 @@ def track_table(track: Track) -> pd.DataFrame:
     return pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
 
 
-def kinematics_table(kinematics: Kinematics) -> pd.DataFrame:
+def _kinematics_table(kinematics: Kinematics) -> pd.DataFrame:
     """Kinematics as `kinematics/<trial>.csv` holds them."""
     import pandas as pd
 

@@ -87,11 +87,26 @@ class Plan:
     @property
     def track_inputs(self) -> list[str]:
         """What trials that do not come as recordings are read from."""
-        own = {path for paths in self.filmed.values() for path in paths} - set(self.sheets)
-        return [path.as_posix() for path in self.inputs if path.as_posix() not in own]
+        of_recordings = {path for paths in self.filmed.values() for path in paths} - set(self.sheets)
+        return [path.as_posix() for path in self.inputs if path.as_posix() not in of_recordings]
 
     def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
-        """One result for each of these trials, by default all."""
+        """One result for each of these trials, by default all.
+
+        Parameters
+        ----------
+        folder : str
+            Folder among the results.
+        suffix : str
+            End of each file's name.
+        trials : iterable of str, optional
+            Names; all trials by default.
+
+        Returns
+        -------
+        list of str
+            Paths.
+        """
         return [self.result(folder, f"{trial}{suffix}") for trial in (self.trials if trials is None else trials)]
 
     @property
@@ -101,7 +116,18 @@ class Plan:
 
     @staticmethod
     def one_of(names: Iterable[str]) -> str:
-        """A pattern that these names match and nothing else does."""
+        """A pattern that these names match and nothing else does.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Names.
+
+        Returns
+        -------
+        str
+            Regular expression.
+        """
         return "|".join(sorted(names)) or "there-is-none"
 
     def campaign_figures(self) -> list[tuple[str, str, str]]:
@@ -144,8 +170,14 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
 
     Parameters
     ----------
-    config : Snakemake's `config`, the command line included.
-    base : folder of the Snakefile; the shipped demonstration is found from there, wherever Snakemake is run.
+    config : mapping
+        Snakemake's `config`, the command line included.
+    base : Path
+        Folder of the Snakefile; the shipped demonstration is found from there, wherever Snakemake is run.
+
+    Returns
+    -------
+    Plan
 
     Raises
     ------
@@ -158,9 +190,9 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
     paths = {key: str(config[key]) for key in ("experiment", "results") if config.get(key) is not None}
     settings = run_settings({**config, **paths})
     folder = Path(settings.experiment)
-    if not folder.exists() and find_nature(base / folder, base):
+    if not folder.exists() and _find_nature(base / folder, base):
         folder = base / folder
-    nature = find_nature(folder, base)
+    nature = _find_nature(folder, base)
     is_virtual = nature is not None
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
@@ -168,8 +200,8 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
     trials = tuple(name for name in experiment.names if name not in experiment.left_out)
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
     present = (path for path in files if path is not None and (is_virtual or path.exists()))
-    own = (folder / path for path in experiment.settings.effects)
-    shared = [path for path in (*(folder / name for name in SHARED_FILES), *own) if path.exists()]
+    effect_files = (folder / path for path in experiment.settings.effects)
+    shared = [path for path in (*(folder / name for name in SHARED_FILES), *effect_files) if path.exists()]
     target = getattr(experiment.settings.calibration, "image", None)
     targets = [folder / target] if target is not None and (is_virtual or (folder / target).exists()) else []
     inputs = dict.fromkeys([*shared, *targets, *present])
@@ -196,7 +228,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
     )
 
 
-def find_nature(folder: Path, base: Path) -> Path | None:
+def _find_nature(folder: Path, base: Path) -> Path | None:
     """What is true in an experiment that is shipped with a sheet alone; None for a folder of anybody's own.
 
     The virtual laboratory has a file for each folder of `data/` that it makes, by the same name.
@@ -228,7 +260,22 @@ def _fingerprint(inputs: Iterable[Path]) -> str:
 
 
 def find_experiment(folder: Path) -> Path:
-    """Return `folder` if it exists; else raise an ExperimentError that names the nearest folder that does."""
+    """Return `folder` if it exists; else raise an ExperimentError that names the nearest folder that does.
+
+    Parameters
+    ----------
+    folder : Path
+        As the user named it.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    ExperimentError
+        If it does not exist.
+    """
     if folder.exists():
         return folder
     parent = folder.absolute().parent
@@ -255,6 +302,17 @@ def plan_or_stop(config: Mapping[str, Any], base: Path) -> Plan:
     """`make_plan`, but what is wrong is printed in at most 20 lines and the process ends with status 1.
 
     For the Snakefile: an exception there would be printed with Snakemake's own stack.
+
+    Parameters
+    ----------
+    config : mapping
+        Snakemake's `config`.
+    base : Path
+        Folder of the Snakefile.
+
+    Returns
+    -------
+    Plan
     """
     try:
         return make_plan(config, base)
@@ -268,6 +326,13 @@ def say_where_at_exit(plan: Plan, quiet: bool = False) -> None:
     """Let the last line of this process say where the report is, if it is there and no older than what it is made of.
 
     Snakemake's own `onsuccess` comes before its closing lines, and not at all where nothing had to be done.
+
+    Parameters
+    ----------
+    plan
+        Of this run.
+    quiet : bool
+        Say nothing.
     """
     if not quiet:
         atexit.register(_say_where, plan)
