@@ -31,7 +31,7 @@ FLOORS = (
     {"figures"},
     {"report"},
     {"pipeline"},
-    {"explorer"},
+    {"explorer", "setup_page"},
     {"cli"},
 )
 """From the ground up; a room may use its own floor and those below. `experiment` looks into tracks (video)."""
@@ -39,7 +39,7 @@ FLOORS = (
 HEAVY = {"matplotlib", "cv2", "skimage", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
 HEAVY_AT_IMPORT = {
     *("dynamics", "inference", "effects", "kinematics", "laboratory", "video", "tracks", "diagnosis", "explorer"),
-    *("planning", "paper"),
+    *("planning", "paper", "setup_page"),
 }
 """Rooms that compute: whoever imports them wants what they stand on. All others must start at once."""
 

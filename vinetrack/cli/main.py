@@ -19,6 +19,7 @@ import typer
 from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.explore_commands import register as register_explore
+from vinetrack.cli.setup_commands import register as register_setup
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -156,6 +157,7 @@ def _overlays(
 
 
 register_explore(app)
+register_setup(app)
 register_diagnose(app)
 register_design(app)
 

@@ -172,7 +172,7 @@ def with_list(text: str, key: str, values: Sequence[str], file: str = "experimen
     """
     before = parse_yaml(text, file).content
     flow = f"[{', '.join(values)}]"
-    node = _value_of(text, key)
+    node = top_level_value(text, key)
     if node is None:
         gap = "" if not text or text.endswith("\n") else "\n"
         changed = f"{text}{gap}{key}: {flow}\n"
@@ -191,8 +191,18 @@ def with_list(text: str, key: str, values: Sequence[str], file: str = "experimen
     return changed
 
 
-def _value_of(text: str, key: str) -> Any:
-    """The node of a top-level key's value; None where there is no such key, or no mapping."""
+def top_level_value(text: str, key: str) -> Any:
+    """The node of a top-level key's value, with its place in the text.
+
+    Parameters
+    ----------
+    text : YAML.
+    key : a key of the first level.
+
+    Returns
+    -------
+    yaml.Node; None where there is no such key, or no mapping.
+    """
     loader = _Loader(text)
     try:
         node = loader.get_single_node()

@@ -1,0 +1,168 @@
+"""A key of a YAML file set or cleared in place: every other character, comments included, stays as it is."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import yaml
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.yaml_document import parse_yaml, top_level_value
+
+_PLAIN_WORD = re.compile(r"[A-Za-z_./][\w./ -]*")
+_SPECIAL = frozenset({"yes", "no", "true", "false", "on", "off", "null", "y", "n"})
+_Edit = tuple[int, int, str]
+"""Text to put in place of that between two indices."""
+
+
+def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -> str:
+    r"""The text with a top-level key set to a value; all else stays as it is.
+
+    Parameters
+    ----------
+    text : YAML.
+    key : a key of the first level.
+    value
+        A number, text, yes or no, a list of them, a mapping of them, or None, which leaves the key blank. Of a mapping
+        that has a line for each key, only lines whose value differs change.
+    file : its name, for messages.
+
+    Returns
+    -------
+    the text, changed.
+
+    Raises
+    ------
+    ExperimentError
+        If the text is not YAML, or what comes out would not hold just that (the key is an anchor's alias, say).
+
+    Examples
+    --------
+    >>> with_value("capture_fps:  # of the camera\n", "capture_fps", 1069)
+    'capture_fps: 1069  # of the camera\n'
+    >>> with_value("axis:\n  from_px: [1, 2]  # left\n  to_px: [9, 2]\n", "axis", {"from_px": [1, 2], "to_px": [8, 2]})
+    'axis:\n  from_px: [1, 2]  # left\n  to_px: [8, 2]\n'
+    """
+    before = parse_yaml(text, file).content
+    if before.get(key) == _plain(value):
+        return text
+    node = top_level_value(text, key)
+    if node is None:
+        gap = "" if not text or text.endswith("\n") else "\n"
+        changed = f"{text}{gap}{_new_lines(key, value)}"
+    else:
+        changed = text
+        for begin, end, new in sorted(_edits(text, node, value), reverse=True):
+            changed = changed[:begin] + new + changed[end:]
+    try:
+        correct = parse_yaml(changed, file).content == {**before, key: _plain(value)}
+    except ExperimentError:
+        correct = False
+    if not correct:
+        remedy = f"set it yourself: {key}: {_inline(value)}"
+        raise ExperimentError([Problem(message="cannot be set without harm", file=file, column=key, remedy=remedy)])
+    return changed
+
+
+def _edits(text: str, node: Any, value: Any) -> list[_Edit]:
+    """Edits that turn the value at a node into another one."""
+    is_block = isinstance(node, yaml.CollectionNode) and not node.flow_style
+    if isinstance(value, Mapping) and is_block and isinstance(node, yaml.MappingNode):
+        return _mapping_edits(text, node, value)
+    if is_block:
+        return [_lines_of(text, node.value[0], node)] if value is None and node.value else []
+    begin, end = node.start_mark.index, node.end_mark.index
+    if isinstance(value, Mapping) and begin == end:
+        # A blank key: its lines follow behind the comment that may stand after it.
+        after = text.find("\n", begin)
+        lines = "".join(f"\n  {name}: {_inline(inner)}" for name, inner in value.items())
+        return [(after, after, lines) if after >= 0 else (len(text), len(text), lines + "\n")]
+    if value is None:
+        # The blank before the value goes with it.
+        return [(begin - 1 if begin < end and text[begin - 1] == " " else begin, end, "")]
+    return [(begin, end, (" " if begin == end else "") + _inline(value))]
+
+
+def _mapping_edits(text: str, node: Any, value: Mapping[str, Any]) -> list[_Edit]:
+    """Edits of a mapping that has a line for each key."""
+    edits: list[_Edit] = []
+    present = {}
+    for name, inner in node.value:
+        present[name.value] = inner
+        if name.value not in value:
+            edits.append(_lines_of(text, name, inner))
+        elif _differs(text, inner, value[name.value]):
+            edits += _edits(text, inner, value[name.value])
+    new = [name for name in value if name not in present]
+    if new:
+        indent = " " * node.value[0][0].start_mark.column
+        begin = _line_start(text, _last_line(node.value[-1][1]) + 1)
+        gap = "" if begin == 0 or text[begin - 1] == "\n" else "\n"
+        lines = "".join(f"{indent}{name}: {_inline(value[name])}\n" for name in new)
+        edits.append((begin, begin, gap + lines))
+    return edits
+
+
+def _differs(text: str, node: Any, value: Any) -> bool:
+    """Whether the value at a node is another one."""
+    shown = text[node.start_mark.index : node.end_mark.index]
+    try:
+        return bool(parse_yaml(f"v: {shown}\n", "").content["v"] != _plain(value))
+    except ExperimentError:
+        return True
+
+
+def _lines_of(text: str, first: Any, last: Any) -> _Edit:
+    """An edit that removes the lines from one node (or pair of nodes) to another."""
+    start = first[0] if isinstance(first, tuple) else first
+    return _line_start(text, start.start_mark.line), _line_start(text, _last_line(last) + 1), ""
+
+
+def _last_line(node: Any) -> int:
+    """Line, from 0, on which what a node holds ends; a block's own mark lies behind the comments that follow it."""
+    if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
+        last = node.value[-1]
+        return _last_line(last[1] if isinstance(last, tuple) else last)
+    return int(node.end_mark.line)
+
+
+def _line_start(text: str, line: int) -> int:
+    index = 0
+    for _ in range(line):
+        index = text.find("\n", index) + 1
+        if index == 0:
+            return len(text)
+    return index
+
+
+def _new_lines(key: str, value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{key}:\n" + "".join(f"  {name}: {_inline(inner)}\n" for name, inner in value.items())
+    return f"{key}: {_inline(value)}\n" if value is not None else f"{key}:\n"
+
+
+def _inline(value: Any) -> str:
+    """A value on one line."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{name}: {_inline(inner)}" for name, inner in value.items()) + "}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return f"[{', '.join(map(_inline, value))}]"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int | float):
+        return f"{value:.15g}"
+    text = "" if value is None else str(value)
+    plain = _PLAIN_WORD.fullmatch(text) and text.strip() == text and text.lower() not in _SPECIAL
+    return text if plain else json.dumps(text, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    """The value as YAML gives it back: lists for tuples."""
+    if isinstance(value, Mapping):
+        return {name: _plain(inner) for name, inner in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return [_plain(inner) for inner in value]
+    return value

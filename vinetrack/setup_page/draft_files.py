@@ -1,0 +1,147 @@
+"""The two files of a draft: read, checked in a copy of the folder, and written whole."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import write_text
+from vinetrack.experiment.folder import SETTINGS
+from vinetrack.experiment.sheet import SHEET
+from vinetrack.setup_page.clip_names import list_recordings
+from vinetrack.setup_page.settings_draft import read_settings_text, shared_values
+from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft, with_recordings
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A sheet and settings not yet written; `stamp` tells whether the files have changed since they were read."""
+
+    sheet: SheetDraft
+    settings: str
+    stamp: str
+
+
+def open_draft(folder: Path) -> Draft:
+    """What is there, with a row for every recording that has none.
+
+    Parameters
+    ----------
+    folder : of recordings, with or without a sheet and settings.
+
+    Returns
+    -------
+    Draft
+
+    Raises
+    ------
+    ExperimentError
+        If the folder does not exist, holds no recording and no sheet, or a file in it cannot be read.
+    """
+    if not folder.is_dir():
+        message = "is a file, not a folder" if folder.exists() else "does not exist"
+        remedy = "name the folder that holds the recordings"
+        raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
+    settings = read_settings_text(folder)
+    recordings = list_recordings(folder)
+    sheet = read_draft(folder)
+    if not recordings and not sheet.rows:
+        message = "holds no recording"
+        remedy = "put films (mp4, mov, avi, mkv) or folders of pictures in it"
+        raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
+    return Draft(with_recordings(sheet, recordings, shared_values(settings)), settings, files_stamp(folder))
+
+
+def files_stamp(folder: Path) -> str:
+    """A fingerprint of the two files as they are now.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+
+    Returns
+    -------
+    hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    for name in (SHEET, SETTINGS):
+        path = folder / name
+        digest.update(path.read_bytes() if path.is_file() else b"\0absent\0")
+    return digest.hexdigest()
+
+
+def write_draft(folder: Path, sheet: SheetDraft, settings: str, stamp: str) -> list[str]:
+    """Write what differs from the files that are there; nothing else in the folder is touched.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+    sheet, settings : what the files are to hold.
+    stamp : of the files when they were read.
+
+    Returns
+    -------
+    names of the files that were written.
+
+    Raises
+    ------
+    ExperimentError
+        If somebody else has changed the files since.
+    """
+    if files_stamp(folder) != stamp:
+        message = "has changed since it was read, and is left as it is"
+        name = SHEET if (folder / SHEET).exists() else SETTINGS
+        raise ExperimentError([Problem(message=message, file=name, remedy="reload the page, and enter it again")])
+    written = []
+    if not (folder / SHEET).exists() or not same_cells(read_draft(folder), sheet):
+        write_text(folder / SHEET, sheet.text())
+        written.append(SHEET)
+    if not (folder / SETTINGS).exists() or read_settings_text(folder) != settings:
+        write_text(folder / SETTINGS, settings)
+        written.append(SETTINGS)
+    return written
+
+
+def same_cells(one: SheetDraft, other: SheetDraft) -> bool:
+    """Whether two sheets hold the same columns and cells, however they are written.
+
+    Parameters
+    ----------
+    one, other : sheets.
+    """
+    if one.columns != other.columns or len(one.rows) != len(other.rows):
+        return False
+    return all(
+        a.get(column, "") == b.get(column, "")
+        for a, b in zip(one.rows, other.rows, strict=True)
+        for column in one.columns
+    )
+
+
+@contextmanager
+def drafted(folder: Path, sheet: SheetDraft, settings: str) -> Iterator[Path]:
+    """A folder as the experiment would be with this draft: links to everything else, for `check` and the tracker.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+    sheet, settings : as they would be written.
+
+    Yields
+    ------
+    Path : a temporary folder of the same name.
+    """
+    with tempfile.TemporaryDirectory(prefix="vinetrack-setup-") as temporary:
+        copy = Path(temporary) / (folder.resolve().name or "experiment")
+        copy.mkdir()
+        for path in folder.iterdir():
+            if path.name not in (SHEET, SETTINGS):
+                (copy / path.name).symlink_to(path.resolve(), target_is_directory=path.is_dir())
+        write_text(copy / SHEET, sheet.text())
+        write_text(copy / SETTINGS, settings)
+        yield copy

@@ -1,0 +1,140 @@
+"""`experiment.yaml` as it is being filled in: a text whose comments stay, and a first one whose comments explain it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import TableError, read_text
+from vinetrack.core.units import split_unit
+from vinetrack.core.yaml_document import parse_yaml
+from vinetrack.core.yaml_edit import with_value
+from vinetrack.experiment.folder import SETTINGS
+from vinetrack.experiment.schema import COLUMNS, SHARED
+
+FIRST_KEYS = ("capture_fps", "exposure_us", "yield_pressure_kPa", "growth_angle_deg", "chamber_l")
+"""Keys of a new file: what all trials of most campaigns share."""
+
+_HEAD = """\
+# What all trials share; a column of the same name in trials.csv overrides it. Values keep the unit in their name;
+# a name may end in another one (yield_pressure_psi). `vinetrack settings` lists every key.
+"""
+_SCALE = """\
+# The scale: two marks on a ruler in the plane of growth (kind: two_points, from_px, to_px, length_mm), a printed board
+# (kind: charuco, image, squares, square_mm, marker_mm, dictionary), or the scale itself (kind: mm_per_px, mm_per_px).
+calibration:
+# The growth axis in the picture (from_px, to_px, width_mm); found from the motion where blank.
+axis:
+"""
+
+
+def read_settings_text(folder: Path) -> str:
+    """The text of `experiment.yaml`; where there is none, that of a new one with blanks to fill.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+
+    Returns
+    -------
+    YAML
+
+    Raises
+    ------
+    ExperimentError
+        If there is one that cannot be read, or is no YAML.
+    """
+    path = folder / SETTINGS
+    if not path.exists():
+        return first_settings()
+    try:
+        text = read_text(path)
+    except TableError as error:
+        message, _, remedy = str(error).partition(": ")
+        raise ExperimentError([Problem(message=message, file=SETTINGS, remedy=remedy)]) from None
+    parse_yaml(text, SETTINGS)
+    return text
+
+
+def first_settings() -> str:
+    """The text of a new `experiment.yaml`: keys without values, and behind each what it is and how it is measured."""
+    width = max(len(key) for key in FIRST_KEYS) + 3
+    lines = [f"{f'{key}:':{width}}# {_comment(key)}\n" for key in FIRST_KEYS]
+    return _HEAD + "".join(lines) + _SCALE
+
+
+def _comment(key: str) -> str:
+    column = COLUMNS[key]
+    unit = f" [{column.unit}]" if column.unit and column.unit.lower() not in column.meaning.lower() else ""
+    how = f" {column.measured}" if column.measured else ""
+    blank = "" if column.default.startswith("required") else f" Blank: {column.default or 'unknown'}."
+    return f"{column.meaning.rstrip('.')}{unit}.{how}{blank}"
+
+
+def shared_values(text: str) -> dict[str, Any]:
+    """Columns that the settings set for all trials, those in other units by the name they have there.
+
+    Parameters
+    ----------
+    text : of `experiment.yaml`.
+
+    Returns
+    -------
+    key to value as YAML has it; blank keys are left out.
+    """
+    quantities = {split_unit(name)[0] for name in SHARED}
+    content = parse_yaml(text, SETTINGS).content
+    return {
+        key: value
+        for key, value in content.items()
+        if value is not None and (key in SHARED or split_unit(str(key))[0] in quantities)
+    }
+
+
+def with_shared(text: str, values: Mapping[str, str]) -> str:
+    """The settings with columns set for all trials, or left blank; other keys and all comments stay.
+
+    Parameters
+    ----------
+    text : of `experiment.yaml`.
+    values : cells by column, which may be named in another unit; a blank cell clears the key.
+
+    Returns
+    -------
+    YAML
+
+    Raises
+    ------
+    ExperimentError
+        If a key cannot be set without harm.
+    """
+    content = parse_yaml(text, SETTINGS).content
+    for key, cell in values.items():
+        for other in [name for name in content if name != key and _same_quantity(str(name), key)]:
+            if content[other] is not None:
+                text = with_value(text, other, None, SETTINGS)
+        value = _value(cell)
+        if value is None and content.get(key) is None:
+            continue
+        if value is not None and content.get(key) is not None and str(content[key]) == str(value):
+            continue
+        text = with_value(text, key, value, SETTINGS)
+    return text
+
+
+def _same_quantity(name: str, other: str) -> bool:
+    return split_unit(name)[0] == split_unit(other)[0] and bool(split_unit(name)[1])
+
+
+def _value(cell: str) -> Any:
+    """A cell as YAML would read it, so that a number is not put in quotes; None where it is blank."""
+    cell = cell.strip()
+    if not cell:
+        return None
+    try:
+        read = parse_yaml(f"v: {cell}\n", SETTINGS).content["v"]
+    except ExperimentError:
+        return cell
+    return read if isinstance(read, int | float | bool | str) else cell

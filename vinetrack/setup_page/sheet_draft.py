@@ -1,0 +1,118 @@
+"""The trial sheet as it is being filled in: cells as text, those of a sheet that is there already kept as they are."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.tables import TableError, read_table
+from vinetrack.core.units import split_unit
+from vinetrack.experiment.sheet import SHEET
+from vinetrack.setup_page.clip_names import guess_columns, trial_names
+
+FIRST_COLUMNS = ("trial", "video", "diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "payload_g")
+"""Columns of a new sheet: what names a trial and what differs between trials of most campaigns."""
+
+
+@dataclass(frozen=True)
+class SheetDraft:
+    """Rows of cells by column, as text; `delimiter` and `decimal` are those of the sheet that was there."""
+
+    columns: tuple[str, ...]
+    rows: tuple[Mapping[str, str], ...]
+    delimiter: str = ","
+    decimal: str = "."
+
+    def text(self) -> str:
+        """The sheet as it is written to a file."""
+        out = io.StringIO()
+        writer = csv.writer(out, delimiter=self.delimiter, lineterminator="\n")
+        writer.writerow(self.columns)
+        writer.writerows([row.get(column, "") for column in self.columns] for row in self.rows)
+        return out.getvalue()
+
+
+def read_draft(folder: Path) -> SheetDraft:
+    """The sheet of a folder as a draft; without rows where there is none.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+
+    Returns
+    -------
+    SheetDraft : every column and cell that is there, known or not.
+
+    Raises
+    ------
+    ExperimentError
+        If the sheet cannot be read, or holds cells without a column, which would be lost.
+    """
+    path = folder / SHEET
+    if not path.exists():
+        return SheetDraft(FIRST_COLUMNS, ())
+    try:
+        table = read_table(path)
+    except TableError as error:
+        message, _, remedy = str(error).partition(": ")
+        raise ExperimentError([Problem(message=message, file=SHEET, remedy=remedy)]) from None
+    loose = [line for line, extra in zip(table.lines, table.extra, strict=True) if extra]
+    if loose or table.nameless:
+        message = "has cells without a column, which would be lost"
+        remedy = "name their columns in the first line, or remove them"
+        raise ExperimentError([Problem(message=message, file=SHEET, line=loose[0] if loose else 1, remedy=remedy)])
+    return SheetDraft(table.columns, table.rows, table.delimiter, table.decimal)
+
+
+def with_recordings(draft: SheetDraft, recordings: Sequence[str], shared: Mapping[str, object]) -> SheetDraft:
+    """The draft with a row for each recording that has none, filled in as far as the recordings' names tell.
+
+    Parameters
+    ----------
+    draft : whose rows stay as they are.
+    recordings : relative paths.
+    shared : what `experiment.yaml` says of all trials; a guess that says the same is left out.
+
+    Returns
+    -------
+    SheetDraft
+    """
+    named = {_path(row.get("video", "")) for row in draft.rows}
+    new = [recording for recording in recordings if _path(recording) not in named]
+    if not new:
+        return draft
+    names = trial_names(new, [row.get("trial", "") for row in draft.rows])
+    columns = list(draft.columns)
+    rows: list[Mapping[str, str]] = list(draft.rows)
+    present = {split_unit(column)[0]: column for column in columns}
+    for recording, name, guess in zip(new, names, guess_columns(new), strict=True):
+        row = {"trial": name, "video": recording}
+        for column, cell in guess.items():
+            quantity = split_unit(column)[0]
+            if str(shared.get(column, "")) == cell:
+                continue
+            if present.get(quantity, column) != column and (draft.rows or quantity not in _first_quantities()):
+                continue
+            if present.get(quantity, column) != column:
+                columns[columns.index(present[quantity])] = column
+            elif column not in columns:
+                columns.append(column)
+            present[quantity] = column
+            row[column] = cell.replace(".", draft.decimal or ".")
+        rows.append(row)
+    missing = [column for column in ("trial", "video") if column not in columns]
+    return replace(draft, columns=(*missing, *columns), rows=tuple(rows))
+
+
+def _first_quantities() -> set[str]:
+    return {split_unit(column)[0] for column in FIRST_COLUMNS}
+
+
+def _path(text: str) -> str:
+    """A path so that the same file is the same text."""
+    parts = [part for part in text.strip().replace("\\", "/").split("/") if part not in ("", ".")]
+    return "/".join(parts)
