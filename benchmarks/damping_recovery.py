@@ -31,9 +31,8 @@ from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.damping import fit_laws, mark_half_steady
 from vinetrack.kinematics.summary import summarise_trial
-from vinetrack.laboratory.campaign import PAPER_B, PAPER_N, damping_values, paper_damping
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import VirtualTrial, grow
+from vinetrack.laboratory.tracks import BASE, Nature, VirtualTrial, grow
+from vinetrack.laboratory.vine_campaigns import PAPER_B, PAPER_N, damping_values, paper_damping
 
 NATURES = {
     "plain": {},

@@ -29,9 +29,8 @@ from vinetrack.core.tables import write_text
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.__main__ import DEMO
 from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
-from vinetrack.laboratory.ground_truth import read_nature
 from vinetrack.laboratory.render import Truth
-from vinetrack.laboratory.tracks import VirtualTrial, grow
+from vinetrack.laboratory.tracks import VirtualTrial, grow, read_nature
 from vinetrack.video.measure import Measurement, measure_recording
 
 SHIPPED = Path(__file__).parents[1] / "data" / "demo"

@@ -33,9 +33,8 @@ from vinetrack.core.published import CHAMBER_L
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import VirtualTrial, grow
+from vinetrack.laboratory.tracks import BASE, Nature, VirtualTrial, grow
+from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
 NOISE_M = 1e-4
 EFFECT = "reservoir_depletion"

@@ -18,9 +18,8 @@ import numpy as np
 import vinetrack as vt
 from vinetrack.core.published import CHAMBER_L
 from vinetrack.core.records import Track, Trial
-from vinetrack.laboratory.campaign import damping_values, paper_damping
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import damping_values, paper_damping
 
 SIZES = (12, 24, 48, 100, 200)
 EFFECT = "reservoir_depletion"

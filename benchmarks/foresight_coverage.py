@@ -27,9 +27,8 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.naming import with_names
-from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
-from vinetrack.laboratory.ground_truth import Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import Nature, grow
+from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 from vinetrack.planning.fit_inputs import numbers_of
 from vinetrack.planning.input_sources import predictive_inputs
 from vinetrack.planning.prediction import run

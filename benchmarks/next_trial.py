@@ -34,9 +34,8 @@ from vinetrack.core.terminal import table
 from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.campaign import Vine, campaign
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import Vine, campaign
 from vinetrack.planning.scaling_priors import damping_prior
 
 TUBE, DAMPING, EXPONENT, GUESSED_WRONG = Vine(24.0, 200.0, 280.0), 6.44, 0.37, 1.15

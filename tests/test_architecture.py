@@ -6,8 +6,10 @@ import ast
 import importlib
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import house_rules
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -150,3 +152,24 @@ def test_a_benchmark_finds_what_it_imports(path: Path) -> None:
             for alias in node.names:
                 if not hasattr(room, alias.name):
                     importlib.import_module(f"{node.module}.{alias.name}")
+
+
+DOCUMENTED = frozenset(
+    {"core", "tracks", "effects", "experiment", "video", "dynamics", "kinematics", "laboratory", "paper", "results"}
+)
+"""Rooms in which the rules of `house_rules` hold; they are to grow to all."""
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        house_rules.undocumented,
+        house_rules.numbers_without_source,
+        house_rules.vague_names,
+        house_rules.private_imports,
+    ],
+    ids=lambda rule: rule.__name__,
+)
+def test_a_documented_room_breaks_no_rule(rule: Callable[[Path], list[house_rules.Place]]) -> None:
+    broken = [str(place) for place in rule(PACKAGE) if place.file.split("/")[0] in DOCUMENTED]
+    assert not broken

@@ -11,8 +11,7 @@ from doc_commands import Shown, pieces
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.effects import EffectError
-from vinetrack.effects._own import own_effects
+from vinetrack.effects import EffectError, own_effects
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.pipeline.tracks_stage import model_of
 

@@ -23,10 +23,9 @@ from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory.camera import Camera
 from vinetrack.laboratory.filming import Filming, film, picture_target
-from vinetrack.laboratory.ground_truth import Nature
 from vinetrack.laboratory.render import Truth
 from vinetrack.laboratory.targets import Target
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import Nature, grow
 
 HEADER = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa"
 SHARED = "capture_fps: 1069\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"

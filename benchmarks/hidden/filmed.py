@@ -14,8 +14,7 @@ from hidden.folder import write_folder
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.laboratory.camera import Camera
-from vinetrack.laboratory.filming import FINE_STEPS, Filming, picture_target, scene_of
-from vinetrack.laboratory.refilm import before_the_camera
+from vinetrack.laboratory.filming import FINE_STEPS, Filming, before_the_camera, picture_target, scene_of
 from vinetrack.laboratory.render import render_recording
 from vinetrack.laboratory.targets import Target
 

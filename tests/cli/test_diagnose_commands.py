@@ -11,9 +11,8 @@ from hidden_truth import sheet
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
-from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow, write_experiment
+from vinetrack.laboratory.tracks import BASE, Nature, grow, write_experiment
+from vinetrack.laboratory.vine_campaigns import damping_values
 
 LADDER = "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m"
 

@@ -19,9 +19,8 @@ from vinetrack.effects import find_effect
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.parameters import DAMPING, BetweenTerm
-from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import damping_values
 
 B = "eversion_damping.B"
 Change = Callable[[Trial, int], float]

@@ -6,9 +6,8 @@ import numpy as np
 from hidden_truth import Pairs, sheet
 
 import vinetrack as vt
-from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import damping_values
 
 
 def campaign(seed: int) -> Pairs:

@@ -19,9 +19,8 @@ from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, MisfitTests, misfit_te
 from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit import fit
-from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import damping_values
 from vinetrack.narrative.verdict_text import confounders_in_words
 
 DRAG, INLET = "air_drag.C_D", "inlet_loss.K"

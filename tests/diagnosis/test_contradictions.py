@@ -14,9 +14,8 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.contradictions import contradictions, displacement_m, is_within_position_errors
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import damping_values
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import vinetrack as vt
 from vinetrack.core.records import Track
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
 from vinetrack.effects import EffectError, own_effects
-from vinetrack.laboratory.campaign import damping_values
+from vinetrack.laboratory.vine_campaigns import damping_values
 
 OWN_EFFECT = '''"""Ratchet: a force that grows with the square root of the growth.
 

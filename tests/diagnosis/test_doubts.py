@@ -18,9 +18,8 @@ from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
 from vinetrack.inference.fit import fit
 from vinetrack.inference.position_errors import smooth_errors
-from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import damping_values
 
 
 def careful(payload_g: float, seed: int) -> Pairs:

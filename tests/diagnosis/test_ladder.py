@@ -25,9 +25,8 @@ from vinetrack.diagnosis.ladder import (
 )
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
 DEPLETION = "reservoir_depletion"

@@ -16,7 +16,7 @@ from vinetrack.diagnosis.force_sensitivities import force_sensitivities, motions
 from vinetrack.diagnosis.missing_force import FORCE_COLUMNS, LAW_COLUMNS, MissingForce, missing_force
 from vinetrack.diagnosis.per_trial_estimates import lay
 from vinetrack.dynamics.simulate import simulate_many
-from vinetrack.effects._own import own_effects
+from vinetrack.effects import own_effects
 from vinetrack.inference.fit_result import Fit
 
 FORCES = {

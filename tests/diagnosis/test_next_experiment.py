@@ -19,9 +19,8 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.next_experiment import Limits, NextExperiment, next_experiment
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.campaign import Vine, campaign
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import Vine, campaign
 from vinetrack.planning.scaling_priors import damping_prior
 
 Pairs = list[tuple[Trial, Track]]

@@ -10,9 +10,8 @@ from hidden_truth import Pairs, sheet
 import vinetrack as vt
 from vinetrack.diagnosis.slack_hypothesis import pushes, slack_fit
 from vinetrack.inference.fit import fit
-from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import damping_values
 
 
 def grown(payload_g: float, tail_slack: str, angle_rad: float = 0.0) -> Pairs:

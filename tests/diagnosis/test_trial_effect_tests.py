@@ -11,9 +11,8 @@ from hidden_truth import Pairs, grown, sheet
 import vinetrack as vt
 from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_motion
 from vinetrack.inference.fit_result import Fit
-from vinetrack.laboratory.campaign import damping_values
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import damping_values
 
 WANDER_M = 2e-4
 

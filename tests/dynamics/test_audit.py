@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 
 from vinetrack.core.records import Bend, Kinematics, Trial
-from vinetrack.dynamics.audit import COLUMNS, Audit, AuditedMotion, audit, measured_motion, simulated_motion
+from vinetrack.dynamics.audit import COLUMNS, Audit, AuditedMotion, audit, measured_motion
 from vinetrack.dynamics.model import Model, base_model
+from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import catalogue
 
 A = math.pi * 24e-3**2 / 4
@@ -159,7 +160,10 @@ def test_bends_of_thirty_degrees_are_warned_of(degrees: float, broken: bool) -> 
 @pytest.mark.parametrize(("P", "onset_s", "within_s"), [(7e3, 0.0, 4e-3), (14e3, 24e-3, 1e-3), (28e3, 145e-3, 2e-3)])
 def test_the_tail_that_would_have_to_push_is_found(P: float, onset_s: float, within_s: float) -> None:
     of = trial(pressure_Pa=P)
-    found = audit(BASE, [simulated_motion(BASE, of, 30.0)])
+    spread = np.linspace(0.0, 1.0, 200) ** 2
+    times = simulate(BASE, of, 30.0 * spread).end_time_s * spread[:-1]
+    grown = simulate(BASE, of, times)
+    found = audit(BASE, [AuditedMotion(of, times, grown.lead_position_m, grown.lead_velocity_m_s)])
     tension = row(found, "tail_tension")
     assert abs(tension["slack_from_s"] - onset_s) < within_s
     assert tension["force_N"] < 0

@@ -9,15 +9,15 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Bend
+from vinetrack.core.yaml_document import read_yaml
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.settings import (
-    BASE_EFFECTS,
     ExperimentSettings,
     RunSettings,
     read_experiment_settings,
-    read_run_settings,
     run_settings,
 )
 
@@ -206,7 +206,7 @@ def test_settings_cannot_be_changed() -> None:
 
 
 def test_the_shipped_config_holds_the_defaults() -> None:
-    assert read_run_settings(CONFIG) == RunSettings()
+    assert run_settings(read_yaml(CONFIG).content) == RunSettings()
 
 
 def _keys(model: type[BaseModel]) -> dict[str, Any]:

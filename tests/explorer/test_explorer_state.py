@@ -22,8 +22,7 @@ from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.curves import errors_m, follow, overall_m
 from vinetrack.explorer.export import CURVE_COLUMNS, commands, curve_table, exported, model_words
 from vinetrack.explorer.series import bands, error_bars, measured, modelled, residuals, symmetric, thinned, vine_colours
-from vinetrack.laboratory.ground_truth import read_nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import grow, read_nature
 from vinetrack.results.folder_layout import ResultsError
 
 GAMMA, EXPONENT = "reservoir_depletion.gamma", "eversion_damping.n"

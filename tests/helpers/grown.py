@@ -8,12 +8,10 @@ from pathlib import Path
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.dynamics.model import Model, make_model
-from vinetrack.effects import Effect
-from vinetrack.effects._own import own_effects
+from vinetrack.effects import Effect, own_effects
 from vinetrack.experiment.naming import with_names
-from vinetrack.laboratory.campaign import CAPTURE_FPS, campaign, damping_values, isometric_vine
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import VirtualTrial, grow
+from vinetrack.laboratory.tracks import BASE, Nature, VirtualTrial, grow
+from vinetrack.laboratory.vine_campaigns import CAPTURE_FPS, campaign, damping_values, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
 PRESSURES = {1: (16.0, 22.0, 30.0), 2: (30.0, 40.0, 50.0, 60.0), 4: (24.0, 30.0, 38.0, 48.0)}

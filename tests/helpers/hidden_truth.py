@@ -7,9 +7,8 @@ from dataclasses import replace
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.naming import with_names
-from vinetrack.laboratory.campaign import campaign, damping_values, isometric_vine
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
 

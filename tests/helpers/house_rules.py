@@ -58,17 +58,24 @@ def _arguments(function: ast.FunctionDef) -> list[str]:
 
 
 def undocumented(package: Path) -> list[Place]:
-    """Public functions with arguments whose docstring lacks Parameters, or Returns where something is returned."""
+    """Public functions whose docstring lacks an argument under Parameters, or Returns where something is returned."""
     places = []
     for path, function, name in public_functions(package):
         if _is_hook(path, package):
             continue
         text = ast.get_docstring(function) or ""
         returns = function.returns is not None and ast.unparse(function.returns) not in ("None", "NoReturn")
-        sections = "Parameters\n-" in text and (not returns or "Returns\n-" in text or "Yields\n-" in text)
-        if not sections:
+        complete = not returns or "Returns\n-" in text or "Yields\n-" in text
+        if not complete or not set(_arguments(function)) <= _documented_arguments(text):
             places.append(Place(path.relative_to(package).as_posix(), function.lineno, name))
     return places
+
+
+def _documented_arguments(docstring: str) -> set[str]:
+    """Names at the beginning of the lines of a Parameters section."""
+    section = re.search(r"Parameters\n-+\n(.*?)(?=\n\n\w+\n-{3,}|\Z)", docstring, re.DOTALL)
+    lines = [line for line in section[1].split("\n") if line and not line.startswith(" ")] if section else []
+    return {name.strip().lstrip("*") for line in lines for name in line.split(" : ")[0].split(",")}
 
 
 def _is_hook(path: Path, package: Path) -> bool:

@@ -21,10 +21,9 @@ from vinetrack.kinematics.summary import (
     redo_damping,
     summarise_trial,
 )
-from vinetrack.laboratory.campaign import PAPER_B, PAPER_N, damping_pressures_kPa, damping_values, isometric_vine
-from vinetrack.laboratory.campaign import campaign as of_vine
-from vinetrack.laboratory.ground_truth import BASE, Nature
-from vinetrack.laboratory.tracks import grow
+from vinetrack.laboratory.tracks import BASE, Nature, grow
+from vinetrack.laboratory.vine_campaigns import PAPER_B, PAPER_N, damping_pressures_kPa, damping_values, isometric_vine
+from vinetrack.laboratory.vine_campaigns import campaign as of_vine
 
 SETTINGS = RunSettings.model_validate({"damping": {"resamples": 300}})
 

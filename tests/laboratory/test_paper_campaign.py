@@ -8,10 +8,9 @@ import pytest
 
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.laboratory import __main__ as command
-from vinetrack.laboratory.campaign import paper_campaign, paper_values
-from vinetrack.laboratory.filming import make_filming
-from vinetrack.laboratory.ground_truth import read_nature
-from vinetrack.laboratory.refilm import before_the_camera
+from vinetrack.laboratory.filming import before_the_camera, make_filming
+from vinetrack.laboratory.tracks import read_nature
+from vinetrack.laboratory.vine_campaigns import paper_campaign, paper_values
 
 ROOT = Path(__file__).parents[2]
 PAPER = ROOT / "data" / "paper"

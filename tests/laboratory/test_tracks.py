@@ -17,7 +17,16 @@ from vinetrack.dynamics.simulate import simulate
 from vinetrack.experiment.folder import check_experiment, read_experiment
 from vinetrack.experiment.naming import with_names
 from vinetrack.laboratory import __main__ as command
-from vinetrack.laboratory.campaign import (
+from vinetrack.laboratory.tracks import (
+    Nature,
+    VirtualTrial,
+    grow,
+    read_nature,
+    write_experiment,
+    write_tracks,
+    write_truth,
+)
+from vinetrack.laboratory.vine_campaigns import (
     PAPER_B,
     campaign,
     damping_pressures_kPa,
@@ -26,8 +35,6 @@ from vinetrack.laboratory.campaign import (
     paper_damping,
     paper_payload,
 )
-from vinetrack.laboratory.ground_truth import Nature, read_nature
-from vinetrack.laboratory.tracks import VirtualTrial, grow, write_experiment, write_tracks, write_truth
 from vinetrack.tracks.importers import load_track
 
 ROOT = Path(__file__).parents[2]
@@ -345,7 +352,7 @@ def told():
     return {"seen": list(seen), "modules": [name for name in sys.modules if "laboratory" in name]}
 
 blind = told()
-import vinetrack.laboratory.ground_truth
+import vinetrack.laboratory.tracks
 open(truth).close()
 print(json.dumps([blind, told()]))
 """
@@ -386,4 +393,4 @@ def test_the_analysis_never_opens_the_truth_nor_loads_the_laboratory(watched: tu
 def test_the_watch_would_see_a_peek(watched: tuple[Path, list[dict]]) -> None:
     root, (_, peeked) = watched
     assert root / "truth.json" in truths(peeked["seen"])
-    assert "vinetrack.laboratory.ground_truth" in peeked["modules"]
+    assert "vinetrack.laboratory.tracks" in peeked["modules"]

@@ -23,9 +23,14 @@ from vinetrack.paper.departures import (
     position_trials,
     pressure_table,
 )
-from vinetrack.paper.expected import drag_shares, fast_vine_speeds, rule_on_noise_free
-from vinetrack.paper.foretold import departures_in_words, foretold_rows
 from vinetrack.paper.rows import as_table
+from vinetrack.paper.theory_rows import (
+    departures_in_words,
+    drag_shares,
+    fast_vine_speeds,
+    rule_on_noise_free,
+    theory_rows,
+)
 
 A, L, PAY, B, N, P_Y, G, AMBIENT, V0 = math.pi * 0.012**2, 0.28, 35.6e-3, 6.44, 0.37, 3e3, 9.81, 101_325.0, 3.7e-3
 FILM = 1200 * math.pi * 0.024 * 200e-6
@@ -152,8 +157,8 @@ def test_a_chamber_that_sags_lowers_the_exponent_of_the_published_rule() -> None
 
 
 def test_lines_without_an_experiment() -> None:
-    table = as_table(foretold_rows([])).set_index("row")
+    table = as_table(theory_rows([])).set_index("row")
     assert set(table["mark"]) == {"not checkable"}
     assert table.loc["fast_vine_predicted_95", "ours"] == pytest.approx(47, abs=0.5)
     assert "rule_bias_n" not in table.index
-    assert "rule_bias_n" in set(as_table(foretold_rows(horizontal(4)))["row"])
+    assert "rule_bias_n" in set(as_table(theory_rows(horizontal(4)))["row"])

@@ -16,8 +16,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.figures.registry import PAPER_FIGURES
-from vinetrack.laboratory.ground_truth import read_nature
-from vinetrack.laboratory.tracks import grow, write_experiment
+from vinetrack.laboratory.tracks import grow, read_nature, write_experiment
 from vinetrack.pipeline.workflow import PAPER_TABLES
 
 ROOT = Path(__file__).parents[2]

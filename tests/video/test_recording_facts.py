@@ -12,11 +12,11 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment.folder import check_experiment
 from vinetrack.laboratory.render import render_recording
 from vinetrack.laboratory.scene import Tube, preset
-from vinetrack.video.frames import RecordingError, inspect_recording
+from vinetrack.video.frames import RecordingError, capture_rate, inspect_recording
 from vinetrack.video.quick_look import look_at
 from vinetrack.video.recording_facts import RecordingFacts, exposure_problems, size_problems
 from vinetrack.video.survey import Surveyor
-from vinetrack.video.track import capture_rate, track_recording
+from vinetrack.video.track import track_recording
 
 FPS, SCALE_MM = 1069.0, 0.24
 VINE = Trial(name="a", diameter_m=0.012, length_m=0.14)

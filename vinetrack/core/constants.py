@@ -1,4 +1,8 @@
-"""Physical constants, SI: the values that the analysis and the published numbers of the paper share."""
+"""What the whole program shares: physical constants, SI, and the names of the effects of the base model."""
+
+BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
+"""The four effects that make the equation of motion of the paper, Eq. (2): the model in use unless settings say
+otherwise, whatever columns the sheet has."""
 
 GRAVITY_M_S2 = 9.81
 """Chosen: the rounded value of the paper; standard gravity is 9.80665, a third of a per mille less."""

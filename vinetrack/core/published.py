@@ -97,10 +97,6 @@ DRAG_EXAMPLE = {"thickness_um": 50.0, "diameter_mm": 24.0, "length_mm": 150.0, "
 DRAG_COEFFICIENT, DRAG_SHARE = 0.82, 0.05
 """The vine whose drag is said to stay below this share of the drive up to its pressure. Published: below Eq. (2)."""
 
-PSI_KPA = 6.894757293168361
-"""Pressures look like rounded pounds per square inch: 14 kPa is 13.79. Derived: kPa in a psi, the unit as
-`vinetrack.core.units` defines it."""
-
 
 def scale_of(diameter_mm: float, thickness_um: float) -> int | None:
     """Scale R of the vine of Table I of this size, to one per cent; None for any other.

@@ -19,7 +19,7 @@ import pandas as pd
 from vinetrack.core.records import Floats, Kinematics, Trial
 from vinetrack.dynamics.force_terms import Terms, evaluate
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import Trace, simulate
+from vinetrack.dynamics.simulate import Trace
 from vinetrack.dynamics.trial_inputs import trial_inputs
 from vinetrack.effects import Effect, EffectError, catalogue
 
@@ -64,8 +64,7 @@ class AuditedMotion:
 
         Parameters
         ----------
-        most
-            Number of points that is not exceeded.
+        most : number of points that is not exceeded.
 
         Returns
         -------
@@ -92,33 +91,6 @@ class Audit:
     warnings: tuple[str, ...]
 
 
-def simulated_motion(model: Model, trial: Trial, until_s: float, trace: Trace | None = None) -> AuditedMotion:
-    """Motion of a trial as a model simulates it.
-
-    Parameters
-    ----------
-    model, trial
-        The sum of effects; the vine and its settings.
-    until_s
-        End of the motion, s since release, where growth does not end before.
-    trace
-        Times since release, s, and gauge pressures measured there, Pa.
-
-    Returns
-    -------
-    AuditedMotion
-        At 200 times, denser at first.
-    """
-    spread = np.linspace(0.0, 1.0, 200) ** 2
-    times = until_s * spread
-    motion = simulate(model, trial, times, trace=trace)
-    if motion.status == "ended":
-        times = motion.end_time_s * spread[:-1]
-        motion = simulate(model, trial, times, trace=trace)
-    pressure = None if trace is None else np.interp(times, *trace)
-    return AuditedMotion(trial, times, motion.lead_position_m, motion.lead_velocity_m_s, pressure)
-
-
 def measured_motion(
     trial: Trial, kinematics: Kinematics, release_s: float, trace: Trace | None = None
 ) -> AuditedMotion:
@@ -126,12 +98,9 @@ def measured_motion(
 
     Parameters
     ----------
-    trial, kinematics
-        The trial and its measured motion.
-    release_s
-        Time of release on the clock of `kinematics`, s.
-    trace
-        Times since release, s, and gauge pressures measured there, Pa.
+    trial, kinematics : the trial and its measured motion.
+    release_s : time of release on the clock of `kinematics`, s.
+    trace : times since release, s, and gauge pressures measured there, Pa.
 
     Returns
     -------

@@ -124,10 +124,8 @@ def trace_at(time, trial):
 
     Parameters
     ----------
-    time
-        Since release, s.
-    trial
-        The `TrialArrays` of a trial with a measured pressure.
+    time : since release, s.
+    trial : the `TrialArrays` of a trial with a measured pressure.
 
     Returns
     -------
@@ -152,12 +150,9 @@ def next_slope_change(k, time, trial):
 
     Parameters
     ----------
-    k
-        Index from which to search.
-    time
-        Since release, s.
-    trial
-        The `TrialArrays` of the trial.
+    k : index from which to search.
+    time : since release, s.
+    trial : the `TrialArrays` of the trial.
 
     Returns
     -------
@@ -185,10 +180,8 @@ def angle_passed(y, trial):
 
     Parameters
     ----------
-    y
-        Position of the leading edge, m.
-    trial
-        The `TrialArrays` of the trial.
+    y : position of the leading edge, m.
+    trial : the `TrialArrays` of the trial.
 
     Returns
     -------

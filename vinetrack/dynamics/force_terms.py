@@ -52,8 +52,10 @@ def evaluate(
 
     Parameters
     ----------
-    time_s, lead_position_m, lead_velocity_m_s : arrays of one shape (n,), since release and from rest
-    measured_Pa : array (n,), gauge pressure measured along with it, in place of the set pressure
+    model : the effects and their values.
+    trial : its inputs.
+    time_s, lead_position_m, lead_velocity_m_s : since release and from rest, shape (n,).
+    measured_Pa : gauge pressure measured along with it, in place of the set pressure, shape (n,).
 
     Returns
     -------
@@ -222,8 +224,7 @@ def pressure_along(
 
     Parameters
     ----------
-    model, trial, time_s, lead_position_m, lead_velocity_m_s
-        As those of `evaluate`.
+    model, trial, time_s, lead_position_m, lead_velocity_m_s : as those of `evaluate`.
 
     Returns
     -------

@@ -59,21 +59,15 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
 
     Parameters
     ----------
-    times
-        Array (n_times,), s since release, increasing. Before 0 the vine is at rest; after the end of growth it stays at
-        `stop`, speed and acceleration 0.
-    breakpoints
-        Array, rising, padded with infinity: where along x the forces have corners, such as where the film's mass
-        reaches its floor, m. A step ends at each, for none is accurate across it.
-    stop
-        Tail travel at the end of growth, m; infinite for a body that moves as a whole.
-    rtol
-        Local tolerance on the speed, relative.
-    out
-        Array (n_times, 4) to be filled: x, v, a of the tail and the position of the leading edge that the camera
+    times : array (n_times,), s since release, increasing. Before 0 the vine is at rest; after the end of growth it
+        stays at `stop`, speed and acceleration 0.
+    breakpoints : array, rising, padded with infinity: where along x the forces have corners, such as where the film's
+        mass reaches its floor, m. A step ends at each, for none is accurate across it.
+    stop : tail travel at the end of growth, m; infinite for a body that moves as a whole.
+    rtol : local tolerance on the speed, relative.
+    out : array (n_times, 4) to be filled: x, v, a of the tail and the position of the leading edge that the camera
         reports; while a tail is slack, r times those of the leading edge.
-    work
-        Array (7, 4) for `follow_slack`.
+    work : array (7, 4) for `follow_slack`.
 
     Returns
     -------
@@ -191,25 +185,17 @@ def integrate_trials(
 
     Parameters
     ----------
-    equations
-        The compiled functions of the model.
-    starts, times
-        Trial i has times[starts[i]:starts[i + 1]], s since release; shapes (n_trials + 1,) and (n_times,).
-    on, inputs, thetas
-        Which effects act, fields of `TrialInputs` and parameters: a row for each trial.
-    trace_starts, trace_time, trace_pressure
-        Measured pressures, s and Pa, laid end to end like the times.
-    bend_starts, bends
-        Bends laid end to end: rows of start, arc and radius, m.
-    breakpoints, stops
-        As those of `_integrate`, m: shapes (n_trials, n_breakpoints), padded with infinity, and (n_trials,).
-    rtol
-        Local tolerance on the speed, relative.
-    out, ends
-        Filled, shapes (n_times, 4) and (n_trials, 5): the latter status, end time, end speed, number of steps, time of
-        slack.
-    work
-        Array (7, 4), overwritten.
+    equations : the compiled functions of the model.
+    starts, times : trial i has times[starts[i]:starts[i + 1]], s since release; shapes (n_trials + 1,) and (n_times,).
+    on, inputs, thetas : which effects act, fields of `TrialInputs` and parameters: a row for each trial.
+    trace_starts, trace_time, trace_pressure : measured pressures, s and Pa, laid end to end like the times.
+    bend_starts, bends : bends laid end to end: rows of start, arc and radius, m.
+    breakpoints, stops : as those of `_integrate`, m: shapes (n_trials, n_breakpoints), padded with infinity, and
+        (n_trials,).
+    rtol : local tolerance on the speed, relative.
+    out, ends : filled, shapes (n_times, 4) and (n_trials, 5): the latter status, end time, end speed, number of steps,
+        time of slack.
+    work : array (7, 4), overwritten.
     """
     for i in range(starts.size - 1):
         trace = slice(trace_starts[i], trace_starts[i + 1])

@@ -167,10 +167,8 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
 
     Parameters
     ----------
-    effects
-        Effects of the model, in its order.
-    tail_free
-        Whether tails may go slack.
+    effects : effects of the model, in its order.
+    tail_free : whether tails may go slack.
 
     Returns
     -------
@@ -244,10 +242,8 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
 
     Parameters
     ----------
-    effects
-        Effects of the model, in its order.
-    tail_free
-        Whether tails may go slack; only then `vinetrack.dynamics.slack_tail` is compiled, which takes longer.
+    effects : effects of the model, in its order.
+    tail_free : whether tails may go slack; only then `vinetrack.dynamics.slack_tail` is compiled, which takes longer.
 
     Returns
     -------

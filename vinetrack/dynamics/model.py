@@ -78,7 +78,7 @@ class Model:
         if name not in self.names:
             raise EffectError(f"The model has no effect {name!r}; it has {', '.join(self.names)}.")
         values = {key: value for key, value in self.values.items() if key.split(".")[0] != name}
-        return replace(self, effects=tuple(one for one in self.effects if one.name != name), values=values)
+        return replace(self, effects=tuple(effect for effect in self.effects if effect.name != name), values=values)
 
     def __contains__(self, name: object) -> bool:
         return name in self.names
@@ -91,8 +91,7 @@ class Model:
 
         Parameters
         ----------
-        values
-            By `effect.parameter`, SI; parameters that are not named keep their values.
+        values : by `effect.parameter`, SI; parameters that are not named keep their values.
 
         Returns
         -------
@@ -106,8 +105,7 @@ class Model:
 
         Parameters
         ----------
-        vine
-            Name of the vine, for values that are given per vine.
+        vine : name of the vine, for values that are given per vine.
 
         Returns
         -------
@@ -159,10 +157,8 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
 
     Parameters
     ----------
-    model
-        The sum of effects.
-    parameters
-        Shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`.
+    model : the sum of effects.
+    parameters : shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`.
 
     Returns
     -------
@@ -187,12 +183,9 @@ def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
 
     Parameters
     ----------
-    host
-        The larger model.
-    model
-        The smaller one.
-    parameters
-        Shape (n_trials, n_parameters of the model), SI.
+    host : the larger model.
+    model : the smaller one.
+    parameters : shape (n_trials, n_parameters of the model), SI.
 
     Returns
     -------
@@ -219,10 +212,8 @@ def asked(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]
 
     Parameters
     ----------
-    model
-        The sum of effects.
-    hook
-        One of `vinetrack.effects.HOOKS`.
+    model : the sum of effects.
+    hook : one of `vinetrack.effects.HOOKS`.
 
     Returns
     -------
@@ -260,8 +251,8 @@ def make_model(names: Iterable[str] = BASE_EFFECTS, user_effects: Mapping[str, E
     EffectError
         If a name is unknown or stands twice.
     """
-    found = tuple(find_effect(name, user_effects) for name in names)
-    return Model(found, user_effects=dict(user_effects or {}))
+    effects = tuple(find_effect(name, user_effects) for name in names)
+    return Model(effects, user_effects=dict(user_effects or {}))
 
 
 def base_model() -> Model:

@@ -86,12 +86,9 @@ def first_stages(point, h, before):
 
     Parameters
     ----------
-    point
-        The `Point` from which the step starts.
-    h
-        Size of the step, s.
-    before
-        The `Stages` of the last accepted step, or `NO_STAGES`.
+    point : the `Point` from which the step starts.
+    h : size of the step, s.
+    before : the `Stages` of the last accepted step, or `NO_STAGES`.
 
     Returns
     -------
@@ -149,7 +146,11 @@ def radau_step(equations, trial, point, stages, scale, rtol):
 
     Parameters
     ----------
-    scale : speed that the motion reaches, m/s; with `rtol` it sets the tolerance
+    equations, trial : the model, and the `TrialArrays` of the trial.
+    point : where the step begins.
+    stages : size of the step, s, and the three starting values of the speeds gained, m/s.
+    scale : speed that the motion reaches, m/s; with `rtol` it sets the tolerance.
+    rtol : tolerance relative to that speed.
 
     Returns
     -------
@@ -241,12 +242,9 @@ def quintic(s, h, start, end):
 
     Parameters
     ----------
-    s
-        Fraction of the step.
-    h
-        Size of the step, s.
-    start, end
-        The `Point` at either end.
+    s : fraction of the step.
+    h : size of the step, s.
+    start, end : the `Point` at either end.
 
     Returns
     -------

@@ -116,9 +116,8 @@ def simulate_many(
     Parameters
     ----------
     model, trials, times_s, traces, relative_tolerance : as those of `simulate`, lists with an entry for each trial
-    parameters
-        Shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`: values by trial in place of those
-        of the model.
+    parameters : shape (n_trials, n_parameters), SI, in the order of `model.parameter_names`: values by trial in place
+        of those of the model.
     host : a larger model whose compiled form serves this one; its other effects do not act
 
     Returns
@@ -188,9 +187,9 @@ class Batch:
 
         Parameters
         ----------
-        threads
-            Threads to share the trials among, by default one for every 64 trials and no more than there are cores:
-            the kernel runs outside the interpreter's lock.
+        relative_tolerance : of the integrator, relative to the speed that a motion reaches.
+        threads : to share the trials among, by default one for every 64 trials and no more than there are cores: the
+            kernel runs outside the interpreter's lock.
 
         Returns
         -------

@@ -56,10 +56,8 @@ def slack_at_rest(equations, trial, time, x, chamber):
 
     Parameters
     ----------
-    equations, trial
-        The compiled functions of the model, and the arrays of the trial.
-    time, x, chamber
-        Time since release, s; position of the tail, m; gauge pressure of the chamber, Pa.
+    equations, trial : the compiled functions of the model, and the arrays of the trial.
+    time, x, chamber : time since release, s; position of the tail, m; gauge pressure of the chamber, Pa.
 
     Returns
     -------
@@ -78,12 +76,9 @@ def slack_fraction(equations, trial, h, start, end):
 
     Parameters
     ----------
-    equations, trial
-        The compiled functions of the model, and the arrays of the trial.
-    h
-        Size of the step, s.
-    start, end
-        The `Point` at either end.
+    equations, trial : the compiled functions of the model, and the arrays of the trial.
+    h : size of the step, s.
+    start, end : the `Point` at either end.
 
     Returns
     -------
@@ -247,18 +242,13 @@ def follow_slack(equations, trial, times, row, start, stop, rtol, out, k):
 
     Parameters
     ----------
-    equations, trial
-        The compiled functions of the model, and the arrays of the trial.
-    times, row, out
-        As those of the integrator; rows of `out` are filled from `row` on with r·y, r·ẏ and r·ÿ of the tip.
-    start
-        The `Point` at which the tail goes slack.
-    stop
-        Tail travel r·L at the end of growth, m.
-    rtol
-        Local tolerance, relative.
-    k
-        Array (7, 4) for the rates at the stages of a step.
+    equations, trial : the compiled functions of the model, and the arrays of the trial.
+    times, row, out : as those of the integrator; rows of `out` are filled from `row` on with r·y, r·ẏ and r·ÿ of the
+        tip.
+    start : the `Point` at which the tail goes slack.
+    stop : tail travel r·L at the end of growth, m.
+    rtol : local tolerance, relative.
+    k : array (7, 4) for the rates at the stages of a step.
 
     Returns
     -------

@@ -18,8 +18,7 @@ def trial_inputs(trial: Trial) -> TrialInputs:
 
     Parameters
     ----------
-    trial
-        The vine and its settings; of a body that moves as a whole what is blank counts as zero.
+    trial : the vine and its settings; of a body that moves as a whole what is blank counts as zero.
 
     Returns
     -------
@@ -64,10 +63,8 @@ def with_pressures(rigs: Floats, set_pressure_Pa: Floats, yield_pressure_Pa: Flo
 
     Parameters
     ----------
-    rigs
-        Rows of `TrialInputs`, shape (n_trials, n_fields), SI.
-    set_pressure_Pa, yield_pressure_Pa
-        Shape (n_trials,); a yield pressure that is NaN leaves that of the row.
+    rigs : rows of `TrialInputs`, shape (n_trials, n_fields), SI.
+    set_pressure_Pa, yield_pressure_Pa : shape (n_trials,); a yield pressure that is NaN leaves that of the row.
 
     Returns
     -------
@@ -95,10 +92,8 @@ def stated(column: str, trial: Trial) -> bool:
 
     Parameters
     ----------
-    column
-        Name of a column of the sheet.
-    trial
-        The trial as read from it.
+    column : name of a column of the sheet.
+    trial : the trial as read from it.
 
     Returns
     -------
@@ -114,10 +109,8 @@ def check_needs(model: Model, *trials: Trial) -> None:
 
     Parameters
     ----------
-    model
-        The sum of effects.
-    *trials
-        Trials it is to be used on.
+    model : the sum of effects.
+    *trials : trials it is to be used on.
 
     Raises
     ------

@@ -6,10 +6,19 @@ a user's own, `own_effects(paths)` all of them, tried out.
 
 from __future__ import annotations
 
+from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.effects._base import HOOKS, Effect, Parameter, State, TrialInputs, Worked
-from vinetrack.effects._catalogue import BASE_EFFECTS, EffectError, catalogue, find_effect, load_effect
+from vinetrack.effects._catalogue import (
+    EffectError,
+    catalogue,
+    explanation,
+    find_effect,
+    listing,
+    load_effect,
+    remedy,
+    told_apart,
+)
 from vinetrack.effects._own import own_effects
-from vinetrack.effects._words import explanation, listing, remedy, told_apart
 
 __all__ = [
     "BASE_EFFECTS",

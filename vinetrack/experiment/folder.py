@@ -93,10 +93,8 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
 
     Parameters
     ----------
-    folder
-        The experiment's folder.
-    strict
-        Whether a fault of one row is a fault of the whole; None leaves it to `strict` in the settings.
+    folder : the experiment's folder.
+    strict : whether a fault of one row is a fault of the whole; None leaves it to `strict` in the settings.
 
     Returns
     -------

@@ -63,29 +63,17 @@ def _yield_pressure(trial: Trial) -> str:
     return f"yield{_digits(trial.yield_pressure_Pa / 1000)}kPa"
 
 
-def _growth_angle(trial: Trial) -> str:
-    return f"{_digits(math.degrees(trial.growth_angle_rad))}deg"
-
-
-def _chamber(trial: Trial) -> str:
-    return f"chamber{_digits(trial.chamber_m3 * 1000)}l" if math.isfinite(trial.chamber_m3) else ""
-
-
-def _inlet(trial: Trial) -> str:
-    return f"inlet{_digits(trial.inlet_m * 1000)}mm" if math.isfinite(trial.inlet_m) else ""
-
-
-def _film(trial: Trial) -> str:
-    return f"film{_digits(trial.film_density_kg_m3)}"
-
-
-def _travel_ratio(trial: Trial) -> str:
-    return f"ratio{_digits(trial.travel_ratio)}"
-
-
 def _bends(trial: Trial) -> str:
     bends = ("x".join(_digits(1000 * m) for m in (bend.start_m, bend.arc_m, bend.radius_m)) for bend in trial.bends)
     return f"bends{'-'.join(bends)}" if trial.bends else ""
 
 
-_FURTHER: tuple[Callable[[Trial], str], ...] = (_growth_angle, _chamber, _inlet, _film, _travel_ratio, _bends)
+_FURTHER: tuple[Callable[[Trial], str], ...] = (
+    lambda trial: f"{_digits(math.degrees(trial.growth_angle_rad))}deg",
+    lambda trial: f"chamber{_digits(trial.chamber_m3 * 1000)}l" if math.isfinite(trial.chamber_m3) else "",
+    lambda trial: f"inlet{_digits(trial.inlet_m * 1000)}mm" if math.isfinite(trial.inlet_m) else "",
+    lambda trial: f"film{_digits(trial.film_density_kg_m3)}",
+    lambda trial: f"ratio{_digits(trial.travel_ratio)}",
+    _bends,
+)
+"""Parts of a condition's name that are shown where they differ within the experiment."""

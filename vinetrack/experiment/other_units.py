@@ -90,8 +90,8 @@ def in_key_units(document: YamlDocument, file: str) -> tuple[YamlDocument, list[
             content[key] = value
             continue
         column, unit = other
-        own = split_unit(column.name)[1]
-        content[column.name] = float(f"{convert(float(value), unit, own):.15g}")
+        unit_of_column = split_unit(column.name)[1]
+        content[column.name] = float(f"{convert(float(value), unit, unit_of_column):.15g}")
         line = lines.get((key,), 0)
         lines[column.name,] = line
         message = _conversion(column, unit)
@@ -105,6 +105,10 @@ def keys_in_other_units(path: Path) -> list[Problem]:
     Parameters
     ----------
     path : of the settings; they can be read.
+
+    Returns
+    -------
+    warnings; none where there is no such file.
     """
     return in_key_units(read_yaml(path), path.name)[1] if path.exists() else []
 

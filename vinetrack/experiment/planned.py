@@ -38,7 +38,7 @@ Shown = Callable[[Problem], Problem]
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedTrials:
     """Trials that are planned, one a condition, with the settings they share; `problems` are warnings."""
 
     trials: tuple[Trial, ...]
@@ -49,7 +49,7 @@ class Planned:
 
 def planned_trial(
     values: Mapping[str, str], settings: ExperimentSettings | None = None, needed: Sequence[str] = NEEDED
-) -> Planned:
+) -> PlannedTrials:
     """A trial from texts by name of column, as they come from the command line.
 
     A yield pressure that is not given is NaN. What is wrong is said of the option.
@@ -79,7 +79,7 @@ def planned_trial(
     return _assembled(table, settings, None, needed, shown)
 
 
-def planned_sheet(path: Path) -> Planned:
+def planned_sheet(path: Path) -> PlannedTrials:
     """The conditions of an experiment folder, or of a sheet by itself, whether filmed or not.
 
     Rows of the same nominal settings are one condition, named after the first; rows with `use: no` are passed over.
@@ -152,7 +152,7 @@ def _assembled(
     needed: Sequence[str],
     shown: Shown,
     header: Sequence[Problem] = (),
-) -> Planned:
+) -> PlannedTrials:
     """Read, judge and name the rows; refuse them all if one has a fault."""
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
     for row in rows:
@@ -163,7 +163,7 @@ def _assembled(
         nothing = [] if rows else [shown(Problem(message="has no trial in use", remedy="take `use: no` off one"))]
         raise ExperimentError([*problems, *nothing])
     trials = [_trial(row, settings) for row in rows]
-    return Planned(_one_a_condition(with_names(trials)), settings, folder, tuple(_once(problems)))
+    return PlannedTrials(_one_a_condition(with_names(trials)), settings, folder, tuple(_once(problems)))
 
 
 def _judge(row: Row, needed: Sequence[str]) -> None:

@@ -22,15 +22,13 @@ from pydantic import (
     model_validator,
 )
 
+from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.records import Bend
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
 from vinetrack.experiment.cells import read_limit, read_range, read_value, steps_between
 from vinetrack.experiment.other_units import in_key_units
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
-
-BASE_EFFECTS = ("pressure_drive", "gravity", "eversion_damping", "yield_pressure")
-"""Eq. (2): the effects in use unless `model` says otherwise, whatever columns the sheet has."""
 
 
 def _no_yes_or_no(value: Any) -> Any:
@@ -59,7 +57,7 @@ def _optional_fields(types: dict[str, Any]) -> Any:
     return create_model("Columns", __base__=_Strict, **fields)
 
 
-class Axis(_Strict):
+class AxisSettings(_Strict):
     """The growth axis in the picture, and how wide a strip along it is looked at."""
 
     from_px: Pixel
@@ -67,7 +65,7 @@ class Axis(_Strict):
     width_mm: Positive | None = None
 
     @model_validator(mode="after")
-    def _has_a_direction(self) -> Axis:
+    def _has_a_direction(self) -> AxisSettings:
         if self.from_px == self.to_px:
             raise ValueError("from_px and to_px are the same point: name two")
         return self
@@ -206,7 +204,7 @@ class ExperimentSettings(_SharedColumns):
     """Paths of Python files with effects of one's own."""
     strict: bool = False
     """Whether a fault of one trial stops all."""
-    axis: Axis | None = None
+    axis: AxisSettings | None = None
     """The growth axis in the picture, from_px, to_px and width_mm; found from the motion where blank."""
     calibration: Calibration | None = None
     """kind: charuco, checkerboard, two_points or mm_per_px, with the keys of that kind."""
@@ -350,25 +348,6 @@ def read_experiment_settings(path: Path) -> ExperimentSettings:
     return _validate(ExperimentSettings, in_key_units(read_yaml(path), path.name)[0], path.name)
 
 
-def read_run_settings(path: Path) -> RunSettings:
-    """Read `config/config.yaml`, or a file like it.
-
-    Parameters
-    ----------
-    path : the file.
-
-    Returns
-    -------
-    the settings.
-
-    Raises
-    ------
-    ExperimentError
-        With every problem of the file.
-    """
-    return _validate(RunSettings, read_yaml(path), path.name)
-
-
 def run_settings(values: dict[str, Any]) -> RunSettings:
     """Check settings of a run given as a mapping, such as Snakemake's `config` after `--config`.
 
@@ -440,5 +419,5 @@ def _keys_beside(model: type[BaseModel], content: Any, location: tuple[Any, ...]
             "mm_per_px": MmPerPx,
         }
         return list(kinds[_kind(content)].model_fields)
-    inner = type(model.model_fields[location[0]].default) if location[0] != "axis" else Axis
+    inner = type(model.model_fields[location[0]].default) if location[0] != "axis" else AxisSettings
     return list(getattr(inner, "model_fields", {}))

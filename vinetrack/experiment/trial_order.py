@@ -30,8 +30,7 @@ def trial_order(trials: Sequence[Trial]) -> tuple[Floats, bool]:
 
     Parameters
     ----------
-    trials
-        In the order of the sheet.
+    trials : in the order of the sheet.
 
     Returns
     -------
@@ -49,8 +48,7 @@ def order_follows_pressure(trials: Sequence[Trial]) -> float:
 
     Parameters
     ----------
-    trials
-        In the order of the sheet.
+    trials : in the order of the sheet.
 
     Returns
     -------
@@ -105,10 +103,8 @@ def _one_a_condition(trials: Sequence[Trial], column: str) -> bool:
 
     Parameters
     ----------
-    trials
-        Trials with their conditions named.
-    column
-        `specimen` or `day`.
+    trials : trials with their conditions named.
+    column : `specimen` or `day`.
     """
     values = {(trial.vine, trial.condition, getattr(trial, column)) for trial in trials}
     if not values or any(not value for _, _, value in values):

@@ -60,12 +60,9 @@ def condition_table(
 
     Parameters
     ----------
-    trials
-        As in `trials.csv`; those that failed or were left out do not count.
-    known
-        The trials of the experiment, for their sizes.
-    final_at_fraction, efficiency_at_mm
-        Where the final speed and the efficiency of `trials` were taken.
+    trials : as in `trials.csv`; those that failed or were left out do not count.
+    known : the trials of the experiment, for their sizes.
+    final_at_fraction, efficiency_at_mm : where the final speed and the efficiency of `trials` were taken.
 
     Returns
     -------

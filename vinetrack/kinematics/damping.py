@@ -120,13 +120,11 @@ def fit_damping(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -
 
     Parameters
     ----------
-    points
-        A row a trial: `trial, vine, diameter_mm, thickness_um, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N,
+    points : A row a trial: `trial, vine, diameter_mm, thickness_um, x_ss_m_s, x_ss_sigma_m_s, force_N, force_sigma_N,
         yield_force_sigma_N` and, optional, `pressure_source` (`trace` where the force was measured, else `set`) and
-        `scale_rel_sigma` (relative error of the scale, which all trials share).
-        Vines with fewer than three trials, or a span of forces below 1.2, are left out and named.
-    resamples, seed
-        Number of resamples, and the seed that makes them repeatable.
+        `scale_rel_sigma` (relative error of the scale, which all trials share). Vines with fewer than three trials, or
+        a span of forces below 1.2, are left out and named.
+    resamples, seed : number of resamples, and the seed that makes them repeatable.
 
     Returns
     -------
@@ -217,10 +215,11 @@ def slope(
 
     Parameters
     ----------
-    log_force : array, shape (n_resamples, n_points) or (1, n_points)
-    counts : array, shape (n_resamples, n_points), how often each point is drawn
-    speed_variance, force_variance : arrays, shape (n_points,), of the logarithms; where the first is 0 this is least
-    squares in F
+    log_force : shape (n_resamples, n_points) or (1, n_points).
+    counts : how often each point is drawn, shape (n_resamples, n_points).
+    data : the points.
+    speed_variance, force_variance : of the logarithms, shape (n_points,); where the first is 0 this is least squares in
+        F.
 
     Returns
     -------

@@ -59,10 +59,9 @@ def quasi_steady_window(
 
     Parameters
     ----------
-    pressure_Pa
-        Known gauge pressure at the points of `kinematics`, shape (n,).
-    start_fraction
-        Slower than this part of the highest speed the window ends.
+    trial, track, kinematics, release : of one trial.
+    pressure_Pa : known gauge pressure at the points of `kinematics`, shape (n,).
+    start_fraction : slower than this part of the highest speed the window ends.
 
     Returns
     -------

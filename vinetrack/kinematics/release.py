@@ -46,10 +46,8 @@ def find_release(track: Track, kinematics: Kinematics) -> Release:
 
     Parameters
     ----------
-    track
-        The track from which `kinematics` was made.
-    kinematics
-        Its motion; the noise is taken from here.
+    track : the track from which `kinematics` was made.
+    kinematics : its motion; the noise is taken from here.
 
     Returns
     -------

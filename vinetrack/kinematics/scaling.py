@@ -39,10 +39,8 @@ def fit_scaling(damping: Mapping[str, Mapping[str, Any]], method: str = "both_ax
 
     Parameters
     ----------
-    damping
-        Both fits as `vinetrack.kinematics.damping.fit_damping` returns them.
-    method
-        Which of them the coefficients are taken from.
+    damping : both fits as `vinetrack.kinematics.damping.fit_damping` returns them.
+    method : which of them the coefficients are taken from.
 
     Returns
     -------
@@ -145,8 +143,7 @@ def fit_trends(conditions: pd.DataFrame) -> dict[str, Any]:
 
     Parameters
     ----------
-    conditions
-        As `vinetrack.kinematics.conditions.condition_table` returns them.
+    conditions : as `vinetrack.kinematics.conditions.condition_table` returns them.
 
     Returns
     -------
@@ -234,12 +231,9 @@ def _efficiency_families(conditions: pd.DataFrame) -> list[dict[str, Any]]:
         "growth_angle_deg": SAME_SETTING_WITHIN,
     }
     groups = [group.sort_values(["diameter_mm", "thickness_um"]) for group in alike(known, settings)]
-    families = [_efficiency_family(group) for group in groups if _sizes(group) > 1]
+    several = [group for group in groups if len(group[["diameter_mm", "thickness_um"]].drop_duplicates()) > 1]
+    families = [_efficiency_family(group) for group in several]
     return sorted(families, key=lambda family: -len(family["conditions"]))
-
-
-def _sizes(group: pd.DataFrame) -> int:
-    return len(group[["diameter_mm", "thickness_um"]].drop_duplicates())
 
 
 def _efficiency_family(group: pd.DataFrame) -> dict[str, Any]:

@@ -57,12 +57,11 @@ def gated_window(
 
     Parameters
     ----------
-    track, kinematics
-        The track and the motion made from it.
-    drift_limit
-        Largest change of speed across the window, and of any velocity in it from the mean, as a fraction of the mean.
-    start_fraction, start_sigmas
-        The search begins where the velocity exceeds this fraction of its maximum and this many of its standard errors.
+    track, kinematics : the track and the motion made from it.
+    drift_limit : largest change of speed across the window, and of any velocity in it from the mean, as a fraction of
+        the mean.
+    start_fraction, start_sigmas : the search begins where the velocity exceeds this fraction of its maximum and this
+        many of its standard errors.
 
     Returns
     -------

@@ -43,14 +43,10 @@ def estimate_kinematics(track: Track, *, travel_ratio: float, order: int = 3, ka
 
     Parameters
     ----------
-    track
-        At least two usable points, in order of time.
-    travel_ratio
-        How many times faster the tail moves than the lead.
-    order
-        Order of the polynomial.
-    kappa
-        How many standard errors two windows may differ by and still agree.
+    track : at least two usable points, in order of time.
+    travel_ratio : how many times faster the tail moves than the lead.
+    order : order of the polynomial.
+    kappa : how many standard errors two windows may differ by and still agree.
 
     Returns
     -------

@@ -22,16 +22,19 @@ from pathlib import Path
 import yaml
 
 from vinetrack.experiment.folder import Experiment, read_experiment
-from vinetrack.laboratory.filming import Filming, film, make_filming, picture_target
-from vinetrack.laboratory.ground_truth import read_nature
-from vinetrack.laboratory.refilm import before_the_camera
-from vinetrack.laboratory.tracks import VirtualTrial, grow, write_tracks, write_truth
+from vinetrack.laboratory.filming import Filming, before_the_camera, film, make_filming, picture_target
+from vinetrack.laboratory.tracks import VirtualTrial, grow, read_nature, write_tracks, write_truth
 
 DEMO = Path(__file__).with_name("demo.yaml")
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command described above."""
+    """Run the command described above.
+
+    Parameters
+    ----------
+    arguments : of the command line; `sys.argv` if None.
+    """
     parser = argparse.ArgumentParser(prog="python -m vinetrack.laboratory", description="Grow the trials of a sheet.")
     parser.add_argument("experiment", type=Path)
     parser.add_argument("--nature", type=Path)
@@ -75,8 +78,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _nature_of(experiment: Experiment) -> Path:
     """What is true in an experiment of this name, or else in the demonstration."""
-    own = Path(__file__).with_name(f"{experiment.name}.yaml")
-    return own if own.exists() else DEMO
+    beside_this_file = Path(__file__).with_name(f"{experiment.name}.yaml")
+    return beside_this_file if beside_this_file.exists() else DEMO
 
 
 def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, seed: int, processes: int) -> None:
@@ -84,9 +87,9 @@ def _film(experiment: Experiment, grown: list[VirtualTrial], filming: Filming, s
     image = getattr(experiment.settings.calibration, "image", None)
     if image is not None:
         picture_target(filming, experiment.folder / image, seed)
-    one = partial(_film_one, filming=filming, seed=seed)
+    film_trial = partial(_film_one, filming=filming, seed=seed)
     with ProcessPoolExecutor(processes) as pool:
-        for i, name in enumerate(pool.map(one, grown, range(len(grown)))):
+        for i, name in enumerate(pool.map(film_trial, grown, range(len(grown)))):
             print(f"filmed {i + 1} of {len(grown)}: {name}", flush=True)
 
 

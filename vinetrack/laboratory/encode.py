@@ -25,7 +25,18 @@ class Renderer(Protocol):
     exposure_s: float
 
     def frame(self, frame: int, *, low: float = ..., span: float | None = ...) -> Frame:
-        """Grey levels of frame `frame`, black at `low`, full scale `span` above it."""
+        """Render the grey levels of one frame.
+
+        Parameters
+        ----------
+        frame : its number.
+        low : level of black.
+        span : levels from black to full scale; all of the bit depth if None.
+
+        Returns
+        -------
+        shape (height, width).
+        """
         ...
 
 
@@ -35,11 +46,13 @@ PICTURE_FORMATS = ("png", "tiff", "jpg", "dng")
 CODECS = {"h264": "libx264", "ffv1": "ffv1", "mjpeg": "mjpeg", "raw": "rawvideo"}
 GREY_FORMATS = {8: "gray", 10: "gray10le", 12: "gray12le", 16: "gray16le"}
 LIMITED_RANGE, FULL_RANGE = 1, 2
-"""Codes of the H.264 stream for 16…235 and 0…255."""
+"""Codes of the H.264 stream for 16…235 and 0…255. Defined by FFmpeg (AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG)."""
 HEADER_SHARE = 0.15
-"""Share of a file left alone when bytes are damaged: the index at its front is well inside."""
+"""Share of a file left alone when bytes are damaged: the index at its front is well inside. Chosen: 85 % of the file
+may then be damaged."""
 TINT = (12, -8)
-"""How far (U, V) of a colour recording lie from grey: a warm wall and bluish film under LED lamps."""
+"""How far (U, V) of a colour recording lie from grey: a warm wall and bluish film under LED lamps. Chosen by eye;
+brightness, which is what trackers read, does not depend on it."""
 
 
 def write_recording(renderer: Renderer, order: NDArray[np.int_], path: Path) -> None:
@@ -47,6 +60,12 @@ def write_recording(renderer: Renderer, order: NDArray[np.int_], path: Path) -> 
 
     A path without ending becomes a folder of `frame_000000.png` and so on; `NAME.dng`, `NAME.jpg`, `NAME.tiff` and
     `NAME.png` as *folder* names choose another format and lose that ending.
+
+    Parameters
+    ----------
+    renderer : of the scene.
+    order : frame of the renderer that each frame of the file shows, shape (n_frames,); −1 for rubbish.
+    path : its ending chooses the form.
 
     Raises
     ------

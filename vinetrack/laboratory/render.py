@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 TONE_STEPS = 4096
-"""Entries of the table of a sensor's gamma: a sixteenth of an 8-bit level."""
+"""Entries of the table of a sensor's gamma: a sixteenth of an 8-bit level. Derived: 4096/256 = 16 entries a level."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,12 @@ class Truth:
     exposure_s: float
 
     def write_csv(self, path: Path) -> None:
-        """Write one row a frame."""
+        """Write one row a frame.
+
+        Parameters
+        ----------
+        path : of the table; its folder is made where it is missing.
+        """
         names = ("source_frame", "time_s", "lead_position_m", "lead_px", "tip_x_px", "tip_y_px", "in_frame")
         table = np.column_stack([np.asarray(getattr(self, name), dtype=float) for name in names])
         formats = ["%d", "%.9f", "%.9f", "%.6f", "%.6f", "%.6f", "%d"]
@@ -149,7 +154,16 @@ class FrameRenderer:
         self._tone = (np.linspace(0, 1, steps + 1) ** (1 / sensor.gamma)).astype(np.float32)
 
     def radiance(self, frame: int) -> Image:
-        """Light that reaches the sensor in frame `frame`, before lamps, gain and noise, shape (height, width)."""
+        """Return the light that reaches the sensor, before lamps, gain and noise.
+
+        Parameters
+        ----------
+        frame : its number.
+
+        Returns
+        -------
+        fraction of full scale, shape (height, width).
+        """
         shake = self.staging.shake_px(float(self.staging.mid_exposure_s(frame)))
         light = self._still.copy()
         if shake != (0.0, 0.0):
@@ -165,13 +179,35 @@ class FrameRenderer:
         return self._still.copy()
 
     def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
-        """Grey levels of frame `frame`, shape (height, width): black at `low`, full scale `span` above it."""
+        """Render the grey levels of one frame.
+
+        Parameters
+        ----------
+        frame : its number.
+        low : level of black.
+        span : levels from black to full scale; all of the bit depth if None.
+
+        Returns
+        -------
+        shape (height, width).
+        """
         return self.expose(self.radiance(frame), frame, low=low, span=span)
 
     def expose(
         self, light: Image, frame: int, *, low: float = 0.0, span: float | None = None
     ) -> NDArray[np.uint8 | np.uint16]:
-        """Grey levels of `light` with the lamps, gain and noise of frame `frame`; see `frame`."""
+        """Turn light into grey levels with the lamps, gain and noise of one frame.
+
+        Parameters
+        ----------
+        light : fraction of full scale, shape (height, width).
+        frame : its number.
+        low, span : as of `frame`.
+
+        Returns
+        -------
+        shape (height, width).
+        """
         sensor = self.scene.sensor
         out = np.empty(light.shape, dtype=np.uint8 if sensor.bit_depth <= 8 else np.uint16)
         well_e = sensor.full_well_e if sensor.noise else 0.0
@@ -183,7 +219,16 @@ class FrameRenderer:
         return out
 
     def truth(self, source_frame: NDArray[np.int_]) -> Truth:
-        """Return what each of `source_frame` shows (−1: nothing), see `Truth`."""
+        """Return what frames show.
+
+        Parameters
+        ----------
+        source_frame : frame of the renderer for each frame of a file, shape (n,); −1: nothing.
+
+        Returns
+        -------
+        the truth, an entry each; NaN where nothing is shown.
+        """
         shown = source_frame >= 0
         blank = np.where(shown, 0.0, np.nan)
         time_s = self.staging.mid_exposure_s(np.maximum(source_frame, 0))
@@ -207,7 +252,17 @@ class FrameRenderer:
 
 
 def frame_order(scene: Scene, n_frames: int) -> NDArray[np.int_]:
-    """Which frame of the undisturbed recording each frame of the file shows; −1 for rubbish."""
+    """Which frame of the undisturbed recording each frame of the file shows; −1 for rubbish.
+
+    Parameters
+    ----------
+    scene : its `faults` drop, repeat and spoil frames.
+    n_frames : of the undisturbed recording.
+
+    Returns
+    -------
+    shape (n_frames of the file,).
+    """
     faults = scene.faults
     order: list[int] = []
     for index in range(n_frames):
@@ -236,6 +291,21 @@ def render_recording(
     The ending chooses the form: .mp4, .mov, .mkv, .avi with the scene's codec; .tif, .tiff one stack; no ending a
     folder of numbered pictures (see `encode.write_recording`). `truth_path`, a CSV, should lie outside the folder
     that an experiment's analysis is given. Returns the truth, one entry for each frame of the file.
+
+    Parameters
+    ----------
+    scene : what stands before the camera.
+    motion : position of the leading edge, m: a function of time, s, or samples (time, position).
+    n_frames : of the undisturbed recording.
+    capture_fps : frames a second.
+    out_path : of the recording.
+    exposure_s : of a frame; the scene's fraction of a frame if None.
+    seed : of noise and textures.
+    truth_path : a CSV of the truth; none is written if None.
+
+    Returns
+    -------
+    the truth, an entry for each frame of the file.
 
     Raises
     ------

@@ -260,6 +260,14 @@ PRESETS = tuple(_presets())
 def preset(name: str) -> Scene:
     """Return a scene by name (see `PRESETS`).
 
+    Parameters
+    ----------
+    name : a key of `PRESETS`.
+
+    Returns
+    -------
+    the scene.
+
     Raises
     ------
     ValueError

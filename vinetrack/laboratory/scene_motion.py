@@ -18,13 +18,28 @@ Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]
 """Lead position in metres against time in seconds: a function of an array, or samples (time_s, lead_position_m)."""
 
 FASTEST_PAYLOAD_M_S = 150.0
+"""Largest speed with which a payload flies off. Chosen above any vine; it keeps the picture finite where a motion
+jumps."""
+
 RELEASE_TRAVEL_M = 1e-5
+"""Travel from which a vine counts as released. Chosen: a thirtieth of a pixel."""
+
 EVENT_STEPS = 10
-"""Steps a frame in which release and exit of the tail are looked for."""
+"""Steps a frame in which release and exit of the tail are looked for. Chosen: doors and payloads then start within a
+tenth of a frame."""
 
 
 def motion_function(motion: Motion) -> Callable[[Floats], Floats]:
-    """Return `motion` as a function; samples are joined by monotone cubics and held before and after."""
+    """Return a motion as a function; samples are joined by monotone cubics and held before and after.
+
+    Parameters
+    ----------
+    motion : a function, or samples (time, s; position, m), shape (n,) each.
+
+    Returns
+    -------
+    function from times, s, to positions, m.
+    """
     if callable(motion):
         return motion
     from scipy.interpolate import PchipInterpolator
@@ -76,16 +91,43 @@ class Staging:
         return float(grid_s[k]), min(2 * lead_speed_m_s, FASTEST_PAYLOAD_M_S) / self.scene.camera.m_per_px
 
     def mid_exposure_s(self, frame: int | NDArray[np.int_]) -> Floats:
-        """Middle of the exposure of a frame, s."""
+        """Return the middle of the exposure of frames.
+
+        Parameters
+        ----------
+        frame : numbers of frames, any shape.
+
+        Returns
+        -------
+        s, of that shape.
+        """
         return np.asarray(np.asarray(frame) / self.capture_fps + self.exposure_s / 2)
 
     def lead_px(self, time_s: Floats | float) -> Floats:
-        """Distance of the foremost point from the path's start."""
+        """Return the distance of the foremost point from the path's start.
+
+        Parameters
+        ----------
+        time_s : any shape, s.
+
+        Returns
+        -------
+        plane pixels, of that shape.
+        """
         lead_m = np.asarray(self._position_m(np.asarray(time_s, dtype=float)), dtype=float)
         return np.asarray((self.scene.start_m + lead_m) / self.scene.camera.m_per_px)
 
     def tail_end_px(self, time_s: Floats | float) -> Floats:
-        """Where the tail ends, and the payload is: 2y − L along the path, then on at the speed of the exit."""
+        """Where the tail ends, and the payload is: 2y − L along the path, then on at the speed of the exit.
+
+        Parameters
+        ----------
+        time_s : any shape, s.
+
+        Returns
+        -------
+        plane pixels along the path, of that shape.
+        """
         assert isinstance(self.scene.subject, Tube)
         scale = self.scene.camera.m_per_px
         end = (self.scene.subject.length_m + self.scene.start_m) / scale
@@ -102,7 +144,16 @@ class Staging:
         return subject.length_m / self.scene.camera.m_per_px if isinstance(subject, Tube) else 1.0
 
     def sway_px(self, time_s: float) -> float:
-        """Sideways displacement of the tube at `sway_length_px`; starts softly at the release."""
+        """Sideways displacement of the tube at `sway_length_px`; starts softly at the release.
+
+        Parameters
+        ----------
+        time_s : s.
+
+        Returns
+        -------
+        plane pixels.
+        """
         subject = self.scene.subject
         if not isinstance(subject, Tube) or not subject.wobble_px:
             return 0.0
@@ -110,7 +161,16 @@ class Staging:
         return subject.wobble_px * min(since / 0.01, 1.0) * math.sin(2 * math.pi * subject.wobble_Hz * since)
 
     def shake_px(self, time_s: float) -> tuple[float, float]:
-        """Displacement of the whole picture (x, y): six sinusoids of rms 1 together, a kick that rings on release."""
+        """Displacement of the whole picture (x, y): six sinusoids of rms 1 together, a kick that rings on release.
+
+        Parameters
+        ----------
+        time_s : s.
+
+        Returns
+        -------
+        plane pixels along x and y.
+        """
         if not self.scene.shake_px:
             return 0.0, 0.0
         sway = (self._amplitude * np.sin(2 * np.pi * self._hertz * time_s + self._phase)).sum(axis=1)
@@ -120,13 +180,31 @@ class Staging:
         return float(self.scene.shake_px * sway[0]), float(self.scene.shake_px * sway[1])
 
     def lamp(self, frame: int) -> float:
-        """Brightness of the lamps averaged over the exposure: sin averaged over T is sin at its middle · sinc(fT)."""
+        """Brightness of the lamps averaged over the exposure: sin averaged over T is sin at its middle · sinc(fT).
+
+        Parameters
+        ----------
+        frame : its number.
+
+        Returns
+        -------
+        relative to the mean.
+        """
         light = self.scene.light
         phase = 2 * math.pi * light.flicker_Hz * float(self.mid_exposure_s(frame)) + self._lamp_phase
         return 1 + light.flicker * float(np.sinc(light.flicker_Hz * self.exposure_s)) * math.sin(phase)
 
     def door_angle_rad(self, time_s: float) -> float:
-        """Angle of the door: 0 closed, evenly accelerated, then rebounding a little from its stop."""
+        """Angle of the door: 0 closed, evenly accelerated, then rebounding a little from its stop.
+
+        Parameters
+        ----------
+        time_s : s.
+
+        Returns
+        -------
+        rad.
+        """
         door = self.scene.door
         if door is None or not math.isfinite(self.release_s):
             return 0.0
@@ -139,7 +217,16 @@ class Staging:
         return math.radians(door.open_deg - 12 * math.exp(-after / 1.5) * abs(math.sin(2.2 * after)))
 
     def tip_plane_px(self, time_s: Floats) -> Floats:
-        """Tip of the tube or body in plane pixels, with sway and shake, shape (n, 2)."""
+        """Tip of the tube or body in plane pixels, with sway and shake, shape (n, 2).
+
+        Parameters
+        ----------
+        time_s : shape (n,), s.
+
+        Returns
+        -------
+        plane pixels (x, y), shape (n, 2).
+        """
         along = self.lead_px(time_s)
         across = np.array([self.sway_px(float(t)) for t in time_s]) * np.clip(along / self.sway_length_px, 0, 1.5) ** 2
         shake = np.array([self.shake_px(float(t)) for t in time_s]).reshape(-1, 2)

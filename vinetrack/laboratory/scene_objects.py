@@ -16,14 +16,22 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 EXPOSURE_PIECES = 4
-"""Straight pieces the tip's path over an exposure is cut into; at 3000 m/s² over 0.5 ms each is off by
-a·(T/4)²/8 = 6 µm at most, a sixtieth of a pixel of 0.36 mm."""
+"""Straight pieces the tip's path over an exposure is cut into; at 3000 m/s² over 0.5 ms each is off by a·(T/4)²/8 = 6
+µm at most, a sixtieth of a pixel of 0.36 mm. Derived."""
 TABLE_STEP_PX = 1 / 16
+"""Steps of the table of covers along the path. Chosen: linear interpolation of an edge blurred by 0.8 px then errs by
+2e-4."""
+
 PROFILE_PER_PX = 16
+"""Entries a pixel of the profiles across. Chosen as TABLE_STEP_PX."""
+
 SLOPES = np.linspace(1.0, 4.0, 7)
 """How much wider the edge's blur is along the path where the tip's outline is slanted (1/cos of the slant)."""
 TAIL_PERIOD_PX = 4096
+"""Length after which the tail's texture repeats. Chosen: longer than any picture, so that the period does not show."""
+
 BALL_STEP_PX = 0.7
+"""Distance of the centres over which a moving ball is averaged. Chosen: less than a pixel."""
 
 
 class PathMaps:
@@ -37,7 +45,16 @@ class PathMaps:
         self.across: Image = (dy * ux - dx * uy).astype(np.float32)
 
     def rows_within(self, touched: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First and one-past-last column of each row that `touched` marks; equal where it marks none."""
+        """First and one-past-last column of each row that `touched` marks; equal where it marks none.
+
+        Parameters
+        ----------
+        touched : pixels, shape (height, width).
+
+        Returns
+        -------
+        two arrays, shape (height,).
+        """
         any_in_row = touched.any(axis=1)
         last = touched.shape[1] - touched[:, ::-1].argmax(axis=1)
         return np.where(any_in_row, touched.argmax(axis=1), 0), np.where(any_in_row, last, 0)
@@ -74,7 +91,14 @@ class TubeLayer:
             self._payload = BallLayer(staging, maps, rng, metal, staging.tail_end_px, emerges_at_px=0.0)
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
-        """Lay the tube as exposed in `frame` over `light`, in place; `shift` is the shake along and across."""
+        """Lay the tube as exposed in one frame over a picture, in place.
+
+        Parameters
+        ----------
+        light : fraction of full scale, shape (height, width).
+        frame : its number.
+        shift : shake along and across the path, px.
+        """
         if self._payload is not None:
             self._payload.lay(light, frame, shift)
         staging, tube = self._staging, self._tube
@@ -116,6 +140,16 @@ def tip_profiles(tube: Tube, radius_px: float, psf_px: float) -> tuple[Floats, N
     The tip is flat for |v| < R − ρ and a quarter circle of radius ρ (`tip_roundness` of R) beyond: there its outline
     lies `setback` = ρ − √(ρ² − (|v| − R + ρ)²) behind the foremost point, at a slant 1/cos = ρ/√(…), which picks the
     row of the edge table. `side` is the coverage of the tube's blurred sides, `core` that of the tail.
+
+    Parameters
+    ----------
+    tube : what is drawn.
+    radius_px : of the tube.
+    psf_px : standard deviation of the optical blur.
+
+    Returns
+    -------
+    setback, slope row, side, core, each of shape (n_entries,).
     """
     from scipy.special import ndtr
 
@@ -149,7 +183,14 @@ class BallLayer:
         self._surface = textures.ball_surface(ball, rng, max(self._radius_px, 2.0))
 
     def lay(self, light: Image, frame: int, shift: tuple[float, float]) -> None:
-        """Lay the ball over `light`, in place, averaged over centres at most BALL_STEP_PX apart."""
+        """Lay the ball over a picture, in place, averaged over centres at most BALL_STEP_PX apart.
+
+        Parameters
+        ----------
+        light : fraction of full scale, shape (height, width).
+        frame : its number.
+        shift : shake along and across the path, px.
+        """
         staging = self._staging
         begin_s, span_s = frame / staging.capture_fps, staging.exposure_s
         ends = self._centre_px(begin_s + np.array([0, span_s]))
@@ -186,7 +227,14 @@ class DoorLayer:
         self._hinge = np.array([float(staging.lead_px(0.0)) + 2 + self._half, -1.25 * radius])
 
     def lay(self, light: Image, frame: int, shake: tuple[float, float]) -> None:
-        """Lay the door over `light`, in place, averaged over the beginning, middle and end of the exposure."""
+        """Lay the door over a picture, in place, averaged over the beginning, middle and end of the exposure.
+
+        Parameters
+        ----------
+        light : fraction of full scale, shape (height, width).
+        frame : its number.
+        shake : displacement of the picture along x and y, px.
+        """
         times_s = frame / self._staging.capture_fps + self._staging.exposure_s * np.array([0.1, 0.5, 0.9])
         angles = [self._staging.door_angle_rad(float(t)) for t in times_s]
         arm = np.array([[-1, -4], [1, -4], [1, self._length], [-1, self._length]]) * [self._half, 1]

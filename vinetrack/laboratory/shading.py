@@ -13,9 +13,10 @@ Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
 NORMAL_BITS = 12
-"""Bits of a random number per normal deviate: 4096 quantiles, in steps too fine to be seen in one grey level."""
+"""Bits of a random number per normal deviate: 4096 quantiles, in steps too fine to be seen in one grey level. Chosen;
+each bit more doubles the table."""
 TAIL_TAPER_PX = 30.0
-"""Over this length the tail's end, a crumpled bunch of film, comes to nothing."""
+"""Over this length the tail's end, a crumpled bunch of film, comes to nothing. Chosen by eye."""
 
 
 @njit(cache=True)
@@ -35,6 +36,18 @@ def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px:
     Column i is a point `first_px + i·step_px` ahead of the edge's reference; `path_px` are positions of the edge
     against that reference at equal times, moving evenly between them, so each piece is integrated exactly:
     the mean of Φ((p − e)/σ) over p from a to b is σ [ramp((b−e)/σ) − ramp((a−e)/σ)] / (b − a).
+
+    Parameters
+    ----------
+    path_px : positions of the edge at equal times, shape (n_pieces + 1,).
+    sigmas_px : standard deviations of the blur, a row each.
+    first_px : place of column 0.
+    step_px : from column to column.
+    n : columns.
+
+    Returns
+    -------
+    shape (n_sigmas, n).
     """
     table = np.empty((sigmas_px.size, n), dtype=np.float32)
     pieces = path_px.size - 1
@@ -59,7 +72,15 @@ def coverage_table(path_px: Floats, sigmas_px: Floats, first_px: float, step_px:
 
 @njit(cache=True, fastmath=True, nogil=True)
 def sample_backdrop(canvas: Image, map_x: Image, map_y: Image, shift_x: float, shift_y: float, out: Image) -> None:
-    """Backdrop as the camera sees it when everything is moved by (shift_x, shift_y) px; bilinear, into `out`."""
+    """Backdrop as the camera sees it when everything is moved by (shift_x, shift_y) px; bilinear, into `out`.
+
+    Parameters
+    ----------
+    canvas : the backdrop, shape (canvas_height, canvas_width).
+    map_x, map_y : place on the canvas that each pixel sees at rest, shape (height, width), px.
+    shift_x, shift_y : shake of the picture, px.
+    out : written to, shape (height, width).
+    """
     rows, columns = canvas.shape
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
@@ -86,6 +107,22 @@ def shade_tube(
     tube can touch; `tip_px` the reference of `table` (see `coverage_table`), whose row `fold_row` is the fold's glow;
     `setback`, `slope_row`, `side`, `core` are profiles over the distance from the axis, `per_px` entries a pixel.
     The tail's texture is averaged from `tail_from` to `tail_to`, its displacements at both ends of the exposure.
+
+    Parameters
+    ----------
+    out : the light so far, fraction of full scale.
+    along, across : coordinates of each pixel at rest, shape (height, width), px.
+    first_x, last_x : columns of each row that the tube can touch, shape (height,).
+    shift_along, shift_across : shake, px.
+    tip_px : place of the tip, the reference of `table`.
+    sway, sway_length : sideways displacement, and where along the path, px.
+    table, table_first, table_step, fold_row : covers of the edge, see `coverage_table`, and the row of the fold's glow.
+    setback, slope_row, side, core, per_px : profiles across, see `scene_objects.tip_profiles`, and entries a pixel.
+    transmission, glow, girth, tail : textures, see `textures`.
+    tail_from, tail_to : displacements of the tail's texture at both ends of the exposure, px.
+    tail_end : where the tail ends along the path, px.
+    tail_opacity, tail_level, tail_contrast : of the tail.
+    fold_glow, ghost, ghost_across : brightness of the fold and of a mirror image, and where that lies across, px.
     """
     half_profile = (setback.size - 1) // 2
     reach = (half_profile - 1) / per_px
@@ -155,7 +192,19 @@ def shade_ball(
     out: Image, along: Image, across: Image, shift_along: float, shift_across: float, path_px: Floats,
     radius_px: float, sigma_px: float, surface: Image, box: Whole, min_along: float,
 ) -> None:  # fmt: skip
-    """Lay a ball over `out` within `box` (x0, y0, x1, y1), averaged over its centres `path_px` along the path."""
+    """Lay a ball over `out` within `box` (x0, y0, x1, y1), averaged over its centres `path_px` along the path.
+
+    Parameters
+    ----------
+    out : the light so far, fraction of full scale, shape (height, width).
+    along, across : coordinates of each pixel at rest, shape (height, width), px.
+    shift_along, shift_across : shake, px.
+    path_px : centres along the path, shape (n_pieces,).
+    radius_px, sigma_px : of the ball, and of the optical blur.
+    surface : from `textures.ball_surface`.
+    box : x0, y0, x1, y1, pixels that it can touch.
+    min_along : place along the path before which it is hidden, px.
+    """
     half = (surface.shape[0] - 1) // 2
     for y in range(box[1], box[3]):
         for x in range(box[0], box[2]):
@@ -199,6 +248,18 @@ def expose(
     Level = low + span · tone(signal); the noise of a signal s has standard deviation √(s·well + read²)/well. Normal
     deviates are looked up in `normals` (2^NORMAL_BITS quantiles), four for each step of a 64-bit xorshift generator
     seeded by (seed, frame, row). A `full_well_e` of 0 means no noise.
+
+    Parameters
+    ----------
+    light : fraction of full scale, shape (height, width).
+    gain : of each pixel, shape (height, width).
+    lamp : brightness of the lamps in this frame.
+    full_well_e, read_noise_e : of the sensor, electrons.
+    seed, frame : of the noise.
+    normals : quantiles of the normal distribution, shape (2^NORMAL_BITS,).
+    tone : table of the sensor's gamma; of fewer than three entries for a linear one.
+    low, span : level of black, and levels from black to full scale.
+    out : written to, shape (height, width).
     """
     rows, columns = out.shape
     mask = np.uint64((1 << NORMAL_BITS) - 1)

@@ -25,9 +25,10 @@ Image = NDArray[np.float32]
 
 POINTS, LATTICE = 89, 55
 """Points in a pixel, on a Fibonacci lattice: no two share a column or a row, so that edges along either, too, are met
-to 1/89 px; a square grid of as many would round them to 1/9."""
+to 1/89 px; a square grid of as many would round them to 1/9. Derived from neighbours in the Fibonacci sequence."""
 PATTERN_PX = 120
-"""Side of a square in the stored pattern of a ChArUco board; squares are met exactly, marker bits to 1/240 square."""
+"""Side of a square in the stored pattern of a ChArUco board; squares are met exactly, marker bits to 1/240 square.
+Chosen: well below what a pixel shows; twice takes four times the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,16 @@ class Target:
         return np.asarray(board * self.square_m @ self._turn().T + np.array(self.centre_m))
 
     def board_squares(self, plane_m: Floats) -> Floats:
-        """Points of the plane, shape (..., 2), counted in squares from the board's top left."""
+        """Express points of the plane in squares of the board.
+
+        Parameters
+        ----------
+        plane_m : shape (..., 2), m.
+
+        Returns
+        -------
+        squares from the board's top left, shape (..., 2).
+        """
         along_board = (plane_m - np.array(self.centre_m)) @ self._turn()
         return np.asarray(along_board / self.square_m + np.array(self.squares) / 2)
 
@@ -111,13 +121,34 @@ def _paint_board(
 
 
 def plane_seen(camera: Camera) -> Floats:
-    """Point of the plane that each pixel's middle sees, from where the optical axis meets it; (height, width, 2), m."""
+    """Point of the plane that each pixel's middle sees, from where the optical axis meets it; (height, width, 2), m.
+
+    Parameters
+    ----------
+    camera : that looks at the plane.
+
+    Returns
+    -------
+    shape (height, width, 2), m.
+    """
     grid = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1).astype(float)
     return np.asarray((camera.plane_from_picture(grid) - np.array(camera.centre_px)) * camera.m_per_px)
 
 
 def lay_target(light: Image, target: Target, plane_m: Floats, psf_px: float) -> Image:
-    """Return `light`, shape (height, width), with `target` laid over it where pixels see it, blurred by the optics."""
+    """Lay a target over a picture where pixels see it, blurred by the optics.
+
+    Parameters
+    ----------
+    light : fraction of full scale, shape (height, width).
+    target : what is printed, and where it lies.
+    plane_m : from `plane_seen`, shape (height, width, 2).
+    psf_px : standard deviation of the optical blur.
+
+    Returns
+    -------
+    a new picture, shape (height, width).
+    """
     import cv2
 
     painted, share = np.zeros(light.shape, np.float32), np.zeros(light.shape, np.float32)
@@ -166,7 +197,17 @@ class TargetRenderer:
         return light
 
     def frame(self, frame: int, *, low: float = 0.0, span: float | None = None) -> NDArray[np.uint8 | np.uint16]:
-        """Grey levels of frame `frame`, as `FrameRenderer.frame` gives them."""
+        """Render the grey levels of one frame.
+
+        Parameters
+        ----------
+        frame : its number.
+        low, span : as of `FrameRenderer.frame`.
+
+        Returns
+        -------
+        shape (height, width).
+        """
         return self._empty.expose(self._radiance(frame), frame, low=low, span=span)
 
 
@@ -177,9 +218,20 @@ def _target_scene(scene: Scene) -> Scene:
 
 
 def render_target(target: Target, scene: Scene, *, seed: int = 0, **settings: Any) -> NDArray[np.uint8 | np.uint16]:
-    """One picture of `target` through the camera of `scene`, with its noise; shape (height, width).
+    """Render one picture of a target through the camera of a scene, with its noise.
 
     The truth is `scene.camera`: `plane_from_picture`, times `m_per_px`, says where in the plane each pixel looks.
+
+    Parameters
+    ----------
+    target : what is printed, and where it lies.
+    scene : its camera, light and sensor.
+    seed : of the noise.
+    **settings : further arguments of `TargetRenderer`.
+
+    Returns
+    -------
+    grey levels, shape (height, width).
     """
     return TargetRenderer(target, _target_scene(scene), seed=seed, **settings).frame(0)
 
@@ -193,7 +245,17 @@ def render_calibration_clip(
     seed: int = 0,
     moves: tuple[dict[str, Any], ...] = (),
 ) -> None:
-    """Write a clip (or, by the path's ending, a folder of pictures) of `target`; see `TargetRenderer` for `moves`."""
+    """Write a clip (or, by the path's ending, a folder of pictures) of `target`; see `TargetRenderer` for `moves`.
+
+    Parameters
+    ----------
+    target : what is printed, and where it lies.
+    scene : its camera, light and sensor.
+    n_frames : of the clip.
+    out_path : its ending chooses the form.
+    seed : of the noise.
+    moves : see `TargetRenderer`.
+    """
     from vinetrack.laboratory.encode import write_recording
 
     renderer = TargetRenderer(target, _target_scene(scene), seed=seed, moves=moves)

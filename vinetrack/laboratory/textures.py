@@ -16,7 +16,8 @@ from vinetrack.laboratory.scene import Ball, Scene, Tube
 Image = NDArray[np.float32]
 
 OVERSAMPLING = 4
-"""Sub-pixels per pixel when lines are drawn, so that their edges lie within 1/8 px of where they belong."""
+"""Sub-pixels per pixel when lines are drawn, so that their edges lie within 1/8 px of where they belong. Derived: half
+a sub-pixel."""
 
 
 def _smooth_noise(rng: np.random.Generator, shape: tuple[int, int], sigma_y: float, sigma_x: float) -> Image:
@@ -148,7 +149,19 @@ def _clutter(canvas: Image, scene: Scene, rng: np.random.Generator) -> Image:
 
 
 def backdrop_canvas(scene: Scene, rng: np.random.Generator, shape: tuple[int, int], corner: tuple[int, int]) -> Image:
-    """Everything that does not move, on plane pixels from `corner` (x, y) on; shape `shape`, blurred by the optics."""
+    """Paint everything that does not move, blurred by the optics.
+
+    Parameters
+    ----------
+    scene : backdrop, ruler, launcher.
+    rng : of the textures.
+    shape : height and width, plane pixels.
+    corner : (x, y) of the first pixel, plane pixels.
+
+    Returns
+    -------
+    fraction of full scale, of that shape.
+    """
     import cv2
 
     along, _ = _along_and_across(scene, shape, corner)
@@ -197,6 +210,16 @@ def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px:
 
     Row `i` lies `i − (rows − 1)/2` px off the axis. Towards its limb a look through the wall crosses more film:
     transmission (1 − opacity) to the power of 1/√(1 − (v/R)²), kept finite.
+
+    Parameters
+    ----------
+    tube : what is drawn.
+    rng : of the wrinkles.
+    radius_px, length_px : of the tube.
+
+    Returns
+    -------
+    transmission, glow.
     """
     half = math.ceil(radius_px) + 7
     shape = (2 * half + 1, length_px)
@@ -215,7 +238,18 @@ def film_wall(tube: Tube, rng: np.random.Generator, radius_px: float, length_px:
 
 
 def film_girth(tube: Tube, rng: np.random.Generator, length_px: int) -> Image:
-    """Relative stretch of distances from the axis along the everted wall, shape (length_px,): its sides ripple."""
+    """Relative stretch of distances from the axis along the everted wall, shape (length_px,): its sides ripple.
+
+    Parameters
+    ----------
+    tube : what is drawn.
+    rng : of the ripples.
+    length_px : of the tube.
+
+    Returns
+    -------
+    shape (length_px,), about 1.
+    """
     ripple = 0.7 * _smooth_noise(rng, (4, length_px), 1, 9)[0] + 0.7 * _smooth_noise(rng, (4, length_px), 1, 40)[0]
     return (1 + 0.08 * tube.texture * ripple).astype(np.float32)
 
@@ -224,6 +258,17 @@ def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px:
     """Running sums along the tail's texture, shape (rows, period_px + 1); the texture is periodic, of mean 0.
 
     The mean over any stretch, as motion blur takes it, is a difference of two entries.
+
+    Parameters
+    ----------
+    tube : what is drawn.
+    rng : of the texture.
+    radius_px : of the tube.
+    period_px : length after which the texture repeats.
+
+    Returns
+    -------
+    shape (rows, period_px + 1).
     """
     rows = 2 * math.ceil(radius_px * tube.tail_width) + 5
     shape = (rows, period_px)
@@ -235,7 +280,18 @@ def tail_sums(tube: Tube, rng: np.random.Generator, radius_px: float, period_px:
 
 
 def ball_surface(ball: Ball, rng: np.random.Generator, radius_px: float) -> Image:
-    """A sphere lit from the upper left, with texture and two glints; square of side 2·(ceil(radius)+4)+1."""
+    """A sphere lit from the upper left, with texture and two glints; square of side 2·(ceil(radius)+4)+1.
+
+    Parameters
+    ----------
+    ball : what is drawn.
+    rng : of the texture.
+    radius_px : of the ball.
+
+    Returns
+    -------
+    fraction of full scale, square.
+    """
     half = math.ceil(radius_px) + 4
     grid = np.arange(-half, half + 1) / radius_px
     r2 = np.clip(grid[:, None] ** 2 + grid[None, :] ** 2, 0, 1)

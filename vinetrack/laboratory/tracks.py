@@ -1,25 +1,29 @@
 """A campaign grown in the virtual laboratory and measured as tracks.
 
 Every trial draws from its own stream of random numbers, so that leaving one out changes no other.
+
+A `Nature` is what is true and hidden from the analysis: physics, scatter, noise, faults.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import yaml
 
+from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import write_csv, write_json, write_text
 from vinetrack.dynamics.force_terms import pressure_along
-from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.model import Model, Value, make_model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
-from vinetrack.laboratory.ground_truth import Nature
 from vinetrack.tracks.position_noise import ar1_noise
 
 
@@ -47,7 +51,17 @@ class VirtualTrial:
 
 
 def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
-    """Grow and measure these trials; the same seed gives the same numbers."""
+    """Grow and measure these trials; the same seed gives the same numbers.
+
+    Parameters
+    ----------
+    trials : as the sheet states them.
+    nature : what is true and hidden.
+
+    Returns
+    -------
+    grown and measured trials, in their order.
+    """
     model = nature.model()
     draws = [_draw(nature.seed, 0, trial.name) for trial in trials]
     errors = _yield_errors(trials, nature)
@@ -152,18 +166,24 @@ def _faults(
     its predecessor once more in place of itself.
     """
     moving = velocity_m_s > 0
-    lost = moving & (draw.uniform(size=velocity_m_s.size) < nature.dropped)
-    shown = np.flatnonzero(~lost)
+    dropped = moving & (draw.uniform(size=velocity_m_s.size) < nature.dropped)
+    shown = np.flatnonzero(~dropped)
     stale = moving[shown] & (draw.uniform(size=shown.size) < nature.repeated)
     stale[0] = False
     # Where several follow each other, all show the last frame that was fresh.
     shown = shown[np.maximum.accumulate(np.where(stale, 0, np.arange(shown.size)))]
     rows = np.flatnonzero(stale)
-    return shown, np.arange(shown.size), tuple(np.flatnonzero(lost).tolist()), tuple(rows.tolist())
+    return shown, np.arange(shown.size), tuple(np.flatnonzero(dropped).tolist()), tuple(rows.tolist())
 
 
 def write_tracks(grown: Sequence[VirtualTrial], folder: Path) -> None:
-    """Write the track of each trial to `folder/<trial>.csv`."""
+    """Write the track of each trial to `folder/<trial>.csv`.
+
+    Parameters
+    ----------
+    grown : from `grow`.
+    folder : where the tracks go.
+    """
     for trial in grown:
         columns = {"time_s": trial.track.time_s.round(9), "position_m": trial.track.lead_position_m.round(8)}
         if np.isfinite(trial.track.lead_position_sigma_m).any():
@@ -187,7 +207,16 @@ SHEET_COLUMNS = (
 
 
 def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
-    """The trial sheet of a campaign whose tracks lie in `tracks/`."""
+    """The trial sheet of a campaign whose tracks lie in `tracks/`.
+
+    Parameters
+    ----------
+    trials : as the sheet states them.
+
+    Returns
+    -------
+    a row a trial.
+    """
     rows = [
         (
             trial.name,
@@ -206,7 +235,14 @@ def sheet(trials: Sequence[Trial]) -> pd.DataFrame:
 
 
 def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str = "") -> None:
-    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`; no truth."""
+    """Write an experiment folder: sheet, tracks and, where given, the text of `experiment.yaml`; no truth.
+
+    Parameters
+    ----------
+    grown : from `grow`.
+    folder : of the experiment.
+    settings : text of `experiment.yaml`; none is written where blank.
+    """
     write_tracks(grown, folder / "tracks")
     write_csv(folder / "trials.csv", sheet([trial.stated for trial in grown]))
     if settings:
@@ -215,6 +251,12 @@ def write_experiment(grown: Sequence[VirtualTrial], folder: Path, settings: str 
 
 def write_truth(grown: Sequence[VirtualTrial], nature: Nature, path: Path) -> None:
     """Write what is hidden to a JSON file.
+
+    Parameters
+    ----------
+    grown : from `grow`.
+    nature : what was true.
+    path : of the JSON file.
 
     Raises
     ------
@@ -238,3 +280,58 @@ def write_truth(grown: Sequence[VirtualTrial], nature: Nature, path: Path) -> No
         for trial in grown
     }
     write_json(path, {"nature": asdict(nature), "trials": trials})
+
+
+BASE = BASE_EFFECTS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nature:
+    """The truth behind a campaign.
+
+    `effects` and `values` are the physics. Scatter is a standard deviation from trial to trial, relative to B and to P;
+    `yield_error_kPa` that of the yield pressure stated for each vine. `release_frames` bounds the rest frames before
+    release, whose instant is uniform between two frames; `origin_m` bounds the unknown zero of position. Noise is
+    AR(1) with standard deviation `noise_m` and lag-one correlation `noise_correlation`. `dropped` and `repeated` are
+    probabilities per moving frame. `trace_sigma_kPa` is the noise of a recorded pressure (None: none is recorded).
+    """
+
+    effects: tuple[str, ...] = BASE
+    values: Mapping[str, Value] = field(default_factory=dict)
+    damping_scatter: float = 0.03
+    pressure_scatter: float = 0.01
+    yield_error_kPa: float = 0.0
+    noise_m: float = 1e-4
+    noise_correlation: float = 0.0
+    release_frames: tuple[int, int] = (15, 40)
+    frames_after_end: int = 4
+    longest_frames: int = 12_000
+    origin_m: tuple[float, float] = (-0.05, 0.05)
+    dropped: float = 0.0
+    repeated: float = 0.0
+    trace_sigma_kPa: float | None = None
+    stated_sigma: bool = False
+    seed: int = 0
+
+    def model(self) -> Model:
+        """The true model with its true values."""
+        return make_model(self.effects).with_values(self.values)
+
+
+def read_nature(path: Path) -> Nature:
+    """Read a nature from YAML; its keys are the fields of `Nature`, and `filming`, which is not read here.
+
+    Parameters
+    ----------
+    path : the YAML file.
+
+    Returns
+    -------
+    the nature.
+    """
+    content: dict[str, Any] = yaml.safe_load(path.read_text(encoding="utf-8"))
+    content.pop("filming", None)
+    for key in ("effects", "release_frames", "origin_m"):
+        if key in content:
+            content[key] = tuple(content[key])
+    return Nature(**content)

@@ -15,6 +15,7 @@ from scipy.stats import t as student
 
 from vinetrack.core import published
 from vinetrack.core.constants import AMBIENT_PRESSURE_PA, GRAVITY_M_S2
+from vinetrack.core.units import convert
 from vinetrack.kinematics.scaling import regress
 from vinetrack.paper.rows import COMPUTED, PaperRow
 from vinetrack.planning.scaling_priors import BURST_STRESS_PA, damping_prior, hoop_stress_Pa
@@ -24,12 +25,31 @@ GAMMAS = {"slow": 1.0, "fast": 1.4}
 
 
 def area_m2(diameter_mm: float) -> float:
-    """Cross-section πD²/4."""
+    """Cross-section πD²/4.
+
+    Parameters
+    ----------
+    diameter_mm : D.
+
+    Returns
+    -------
+    m².
+    """
     return math.pi * (diameter_mm / 1e3) ** 2 / 4
 
 
 def volume_change(chamber_m3: float, diameter_mm: float, length_mm: float) -> float:
-    """Volume of a whole vine over that of its chamber."""
+    """Volume of a whole vine over that of its chamber.
+
+    Parameters
+    ----------
+    chamber_m3 : volume of the chamber.
+    diameter_mm, length_mm : of the vine.
+
+    Returns
+    -------
+    a fraction.
+    """
     return area_m2(diameter_mm) * length_mm / 1e3 / chamber_m3
 
 
@@ -37,6 +57,16 @@ def gauge_left(gauge_Pa: float, change: float, gamma: float = 1.0) -> float:
     """Part of the gauge pressure left when the volume has grown by the fraction `change` and nothing refills it.
 
     P_abs V^γ is kept, in absolute pressure.
+
+    Parameters
+    ----------
+    gauge_Pa : gauge pressure at first.
+    change : of the volume, a fraction.
+    gamma : γ, 1 isothermal, 1.4 adiabatic.
+
+    Returns
+    -------
+    a fraction.
 
     >>> round(1 - gauge_left(28e3, 0.0342), 3)
     0.153
@@ -48,6 +78,15 @@ def gauge_left(gauge_Pa: float, change: float, gamma: float = 1.0) -> float:
 def p_value(R2: float, n: int) -> float:
     """Two-sided p of a straight line's slope from its R² and the number of points.
 
+    Parameters
+    ----------
+    R2 : coefficient of determination.
+    n : points.
+
+    Returns
+    -------
+    probability.
+
     >>> round(p_value(0.935, 4), 3)
     0.033
     """
@@ -56,13 +95,32 @@ def p_value(R2: float, n: int) -> float:
 
 
 def printed_steady_speed_m_s(scale: int, gauge_Pa: float, yield_Pa: float) -> float:
-    """Steady tail speed by Eq. (3) with the printed B and n."""
+    """Steady tail speed by Eq. (3) with the printed B and n.
+
+    Parameters
+    ----------
+    scale : R.
+    gauge_Pa, yield_Pa : P and P_y.
+
+    Returns
+    -------
+    m/s.
+    """
     force_N = (gauge_Pa - yield_Pa) * area_m2(published.DIAMETER_MM[scale])
     return (force_N / published.DAMPING_B[scale]) ** (1 / published.EXPONENT)
 
 
 def weight_over_gas(diameter_mm: float) -> float:
-    """Work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y."""
+    """Work of the payload's weight m g x over that of the gas P₀Ay, as in the paper's Fig. 9, x = 2y.
+
+    Parameters
+    ----------
+    diameter_mm : D.
+
+    Returns
+    -------
+    a fraction.
+    """
     gas_Pa_m2 = 1e3 * published.EFFICIENCY_KPA * area_m2(diameter_mm)
     return published.PAYLOAD_G / 1e3 * GRAVITY_M_S2 * 2 / gas_Pa_m2
 
@@ -144,15 +202,17 @@ def _statistics_rows() -> Iterator[PaperRow]:
 def _coefficient_rows() -> Iterator[PaperRow]:
     scales, B = (np.array(list(values), dtype=float) for values in (published.DAMPING_B, published.DAMPING_B.values()))
     power, line = regress(np.log(scales), np.log(B)), regress(scales, B)
-    one = partial(
+    row_of = partial(
         PaperRow, where="Fig. 7A", setting="the four printed B against R", mark=COMPUTED, as_printed="near-linear"
     )
     low, high = power["slope_95"]
     how = "least squares, N = 4 vines"
-    yield one(row="B_power_of_scale", quantity="exponent on log axes", ours=power["slope"], low=low, high=high, how=how)
-    yield one(row="B_line_R2", quantity="R² of a straight line", ours=line["R2"], how=how)
+    yield row_of(
+        row="B_power_of_scale", quantity="exponent on log axes", ours=power["slope"], low=low, high=high, how=how
+    )
+    yield row_of(row="B_line_R2", quantity="R² of a straight line", ours=line["R2"], how=how)
     low, high = line["intercept_95"]
-    yield one(
+    yield row_of(
         row="B_line_intercept",
         quantity="intercept of a straight line",
         unit="N·(s/m)ⁿ",
@@ -207,15 +267,15 @@ def _injector_rows() -> Iterator[PaperRow]:
     )
     setting = f"{size}, {vine['pressure_kPa']:g} kPa"
     printed = 100 * published.INJECTOR_CHANGE
-    one = partial(PaperRow, where="Section V-B", setting=setting, unit="%", mark=COMPUTED, published=printed)
-    yield one(
+    row_of = partial(PaperRow, where="Section V-B", setting=setting, unit="%", mark=COMPUTED, published=printed)
+    yield row_of(
         row="injector_volume_change",
         quantity="volume change of the injector's chamber",
         ours=100 * change,
         how="πD²L/4 of the vine over that of the chamber",
     )
     drop = {name: 100 * (1 - gauge_left(1e3 * vine["pressure_kPa"], change, gamma)) for name, gamma in GAMMAS.items()}
-    yield one(
+    yield row_of(
         row="injector_gauge_drop",
         quantity="fall of gauge pressure in the injector, isothermal",
         as_printed=f"{printed:g} (as a decrease in pressure)",
@@ -254,8 +314,9 @@ def _guess_rows() -> Iterator[PaperRow]:
 
 
 def _rounding_row() -> PaperRow:
-    pressures_kPa = (7, 14, 28, 34, 41, 48, 62)
-    exact = [round(kPa / published.PSI_KPA) * published.PSI_KPA for kPa in pressures_kPa]
+    # They look like rounded pounds per square inch: 14 kPa is 13.79, 2 psi.
+    pressures_kPa, psi_kPa = (7, 14, 28, 34, 41, 48, 62), convert(1.0, "psi", "kPa")
+    exact = [round(kPa / psi_kPa) * psi_kPa for kPa in pressures_kPa]
     off = [abs(kPa / true - 1) for kPa, true in zip(pressures_kPa, exact, strict=True)]
     worst = int(np.argmax(off))
     return PaperRow(

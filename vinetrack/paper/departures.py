@@ -23,10 +23,13 @@ from vinetrack.dynamics.simulate import Trajectory, simulate
 from vinetrack.kinematics.conditions import lead_velocity_at
 
 WITHIN = 0.95
-"""Of the length, up to which positions are compared: a motion that stalls would else be averaged for ever."""
+"""Of the length, up to which positions are compared: a motion that stalls would else be averaged for ever. Chosen: the
+last 5 % is where a motion that runs out of pressure creeps. At 0.9 differences are a little smaller, at 1 they may not
+end."""
 
 LASTS_S = 60.0
-"""For as long motions are followed; the slowest, at 7 kPa, would take 7 s by Eq. (2)."""
+"""For as long motions are followed; the slowest, at 7 kPa, would take 7 s by Eq. (2). Chosen: eight times that; twice
+changes nothing, half nothing either."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +42,32 @@ class Departure:
     slack: bool = False
 
     def model(self, B: float) -> Model:
-        """Eq. (2) with the printed n, and this beside it."""
+        """Make Eq. (2) with the printed n, and this departure beside it.
+
+        Parameters
+        ----------
+        B : damping coefficient, N·(s/m)ⁿ.
+
+        Returns
+        -------
+        the model.
+        """
         model = base_model()
         if self.gamma is not None:
             model = (model + effects.reservoir_depletion).with_values({"reservoir_depletion.gamma": self.gamma})
         return model.with_values({"eversion_damping.B": B, "eversion_damping.n": published.EXPONENT})
 
     def trial(self, trial: Trial) -> Trial:
-        """The trial, with a tail that may go slack where it may."""
+        """Return the trial, with a tail that may go slack where the departure lets it.
+
+        Parameters
+        ----------
+        trial : of the paper's rig.
+
+        Returns
+        -------
+        the trial.
+        """
         return replace(trial, tail_slack="free" if self.slack else "taut")
 
 
@@ -73,7 +94,18 @@ MOTION_COLUMNS = ("pressure_kPa", "departure", "time_s", "lead_position_m")
 def paper_trial(
     diameter_mm: float, thickness_um: float, length_mm: float, pressure_kPa: float, payload_g: float = 0.0
 ) -> Trial:
-    """A trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa."""
+    """A trial of the paper's rig: downwards, 3.7 L, P_y 3 kPa.
+
+    Parameters
+    ----------
+    diameter_mm, thickness_um, length_mm : of the vine.
+    pressure_kPa : gauge pressure.
+    payload_g : mass that rides on the tail.
+
+    Returns
+    -------
+    the trial.
+    """
     return Trial(
         name=f"{diameter_mm:g} mm × {thickness_um:g} µm at {pressure_kPa:g} kPa",
         capture_fps=published.CAPTURE_FPS,
@@ -98,8 +130,11 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
 
     Parameters
     ----------
-    payloads_g
-        Payloads of Fig. 5, over which speeds are put together.
+    payloads_g : payloads of Fig. 5, over which speeds are put together.
+
+    Returns
+    -------
+    a row a figure, pressure and departure.
     """
     rows: list[tuple[object, ...]] = []
     for trial in position_trials():
@@ -117,13 +152,34 @@ def departure_table(payloads_g: Sequence[float]) -> pd.DataFrame:
 
 
 def follow(trial: Trial, departure: Departure, B: float) -> Trajectory:
-    """The motion at the camera's frames, until it ends or for `LASTS_S`."""
+    """The motion at the camera's frames, until it ends or for `LASTS_S`.
+
+    Parameters
+    ----------
+    trial : of the paper's rig.
+    departure : what is added to Eq. (2).
+    B : damping coefficient, N·(s/m)ⁿ.
+
+    Returns
+    -------
+    the motion.
+    """
     time_s = np.arange(0, LASTS_S, 1 / published.CAPTURE_FPS)
     return simulate(departure.model(B), departure.trial(trial), time_s)
 
 
 def position_rms_m(plain: Trajectory, moved: Trajectory, trial: Trial) -> float:
-    """Root mean square of the two positions' difference until Eq. (2) has grown to 95 %; both start at release."""
+    """Root mean square of the two positions' difference until Eq. (2) has grown to 95 %; both start at release.
+
+    Parameters
+    ----------
+    plain, moved : motions without and with a departure, at the same times.
+    trial : its length.
+
+    Returns
+    -------
+    m.
+    """
     stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trial.length_m))
     return math.sqrt(float(np.mean((moved.lead_position_m[:stop] - plain.lead_position_m[:stop]) ** 2)))
 
@@ -140,14 +196,23 @@ def _speed_change_m_s(pressure_kPa: float, payload_g: float, departure: Departur
     trial, B = _speed_trial(pressure_kPa, payload_g)
     at_m = published.FINAL_SPEED_AT_MM / 1e3
     speeds = []
-    for one in (departure, NONE):
-        moved = follow(trial, one, B)
+    for assumed in (departure, NONE):
+        moved = follow(trial, assumed, B)
         speeds.append(lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, at_m))
     return speeds[0] - speeds[1] if math.isfinite(speeds[0]) else -speeds[1]
 
 
 def motion_table(instants: int = 200) -> pd.DataFrame:
-    """Motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`, thinned to so many instants."""
+    """Motions of Fig. 4 by Eq. (2) and with each departure, columns `MOTION_COLUMNS`, thinned to so many instants.
+
+    Parameters
+    ----------
+    instants : rows of each motion.
+
+    Returns
+    -------
+    the table.
+    """
     parts = []
     for trial in position_trials():
         for departure in (NONE, *DEPARTURES):
@@ -161,7 +226,16 @@ def motion_table(instants: int = 200) -> pd.DataFrame:
 
 
 def pressure_table(instants: int = 60) -> pd.DataFrame:
-    """Gauge pressure left along the growth of Fig. 4's vine: `pressure_kPa, departure, lead_position_m, gauge_left`."""
+    """Gauge pressure left along the growth of Fig. 4's vine: `pressure_kPa, departure, lead_position_m, gauge_left`.
+
+    Parameters
+    ----------
+    instants : rows of each curve.
+
+    Returns
+    -------
+    the table; `gauge_left` is a fraction.
+    """
     from vinetrack.paper.arithmetic import area_m2, gauge_left
 
     rows = []

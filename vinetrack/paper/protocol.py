@@ -22,6 +22,10 @@ def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> I
     trials : of the experiment.
     steady : as in `steady.csv`.
     mark : `SIMULATED` or `MEASURED`.
+
+    Yields
+    ------
+    rows of the table.
     """
     source = "an input: the virtual trials were grown with it" if mark == SIMULATED else "as the trial sheet says"
     bare = [trial for trial in trials if trial.payload_kg == 0 and trial.travel_ratio == 2]
@@ -29,18 +33,18 @@ def protocol_rows(trials: Sequence[Trial], steady: pd.DataFrame, mark: str) -> I
         scale: [t for t in bare if published.scale_of(1e3 * t.diameter_m, 1e6 * t.thickness_m) == scale]
         for scale in published.DAMPING_B
     }
-    for scale, own in by_scale.items():
-        yield from _size_rows(scale, own, mark, source)
-    for scale, own in by_scale.items():
-        yield from _campaign_rows(scale, own, mark, source)
+    for scale, of_scale in by_scale.items():
+        yield from _size_rows(scale, of_scale, mark, source)
+    for scale, of_scale in by_scale.items():
+        yield from _campaign_rows(scale, of_scale, mark, source)
     yield _capture_row(trials, mark, source)
-    yield from _window_rows({trial.name for own in by_scale.values() for trial in own}, steady, mark)
+    yield from _window_rows({trial.name for of_scale in by_scale.values() for trial in of_scale}, steady, mark)
 
 
-def _size_rows(scale: int, own: Sequence[Trial], mark: str, source: str) -> Iterator[PaperRow]:
+def _size_rows(scale: int, of_scale: Sequence[Trial], mark: str, source: str) -> Iterator[PaperRow]:
     sizes = (
-        ("thickness", "wall thickness", "µm", published.THICKNESS_UM, [1e6 * trial.thickness_m for trial in own]),
-        ("diameter", "diameter", "mm", published.DIAMETER_MM, [1e3 * trial.diameter_m for trial in own]),
+        ("thickness", "wall thickness", "µm", published.THICKNESS_UM, [1e6 * trial.thickness_m for trial in of_scale]),
+        ("diameter", "diameter", "mm", published.DIAMETER_MM, [1e3 * trial.diameter_m for trial in of_scale]),
     )
     for name, quantity, unit, printed, ours in sizes:
         yield PaperRow(
@@ -71,9 +75,9 @@ def _size_rows(scale: int, own: Sequence[Trial], mark: str, source: str) -> Iter
         )
 
 
-def _campaign_rows(scale: int, own: Sequence[Trial], mark: str, source: str) -> Iterator[PaperRow]:
+def _campaign_rows(scale: int, of_scale: Sequence[Trial], mark: str, source: str) -> Iterator[PaperRow]:
     pressures: dict[float, int] = {}
-    for trial in own:
+    for trial in of_scale:
         pressures[round(trial.pressure_Pa, 3)] = pressures.get(round(trial.pressure_Pa, 3), 0) + 1
     low, high = published.CONDITIONS
     yield PaperRow(
@@ -82,7 +86,7 @@ def _campaign_rows(scale: int, own: Sequence[Trial], mark: str, source: str) -> 
         quantity="pressures without payload",
         setting=f"R = {scale}",
         as_printed=f"{low} to {high}",
-        ours=float(len(pressures)) if own else math.nan,
+        ours=float(len(pressures)) if of_scale else math.nan,
         mark=mark,
         how=f"{source}; which pressures is not printed",
     )
@@ -93,7 +97,7 @@ def _campaign_rows(scale: int, own: Sequence[Trial], mark: str, source: str) -> 
         quantity="trials of each pressure",
         setting=f"R = {scale}",
         as_printed=f"{low} to {high}",
-        ours=float(np.median(list(pressures.values()))) if own else math.nan,
+        ours=float(np.median(list(pressures.values()))) if of_scale else math.nan,
         mark=mark,
         how=source,
     )
@@ -115,8 +119,8 @@ def _capture_row(trials: Sequence[Trial], mark: str, source: str) -> PaperRow:
 
 def _window_rows(names: set[str], steady: pd.DataFrame, mark: str) -> Iterator[PaperRow]:
     """What the published rule for a steady window accepts, beside the gated one, in trials without payload."""
-    own = steady[steady["trial"].isin(names)]
-    literal, gated = own[own["rule"] == "paper"], own[own["rule"] == "gated"]
+    of_scale = steady[steady["trial"].isin(names)]
+    literal, gated = of_scale[of_scale["rule"] == "paper"], of_scale[of_scale["rule"] == "gated"]
     accepted = literal[literal["accepted"]]
     drift = accepted["drift"].abs()
     line = partial(PaperRow, where="Section III-E", setting="trials of R = 1…4 without payload", mark=mark)

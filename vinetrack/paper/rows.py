@@ -42,7 +42,6 @@ PAPER_COLUMNS = (
     "how",
     "beside",
 )
-TEXTS = frozenset(PAPER_COLUMNS) - {"published", "ours", "ours_low_95", "ours_high_95"}
 
 PREFERRED = "both_axes"
 """The fit of the damping law whose numbers stand for ours."""
@@ -77,6 +76,14 @@ class PaperRow:
 def as_table(rows: Iterable[PaperRow]) -> pd.DataFrame:
     """Rows as `paper.csv` holds them, columns `PAPER_COLUMNS`.
 
+    Parameters
+    ----------
+    rows : of the table, each name once.
+
+    Returns
+    -------
+    a row each.
+
     Raises
     ------
     ValueError
@@ -105,11 +112,29 @@ def _as_answered(row: PaperRow) -> PaperRow:
 
 
 def number(value: Any) -> float:
-    """A number as JSON gives it back: NaN where it is null."""
+    """Return a number as JSON gives it back: NaN where it is null.
+
+    Parameters
+    ----------
+    value : a number, or None.
+
+    Returns
+    -------
+    float.
+    """
     return nan if value is None else float(value)
 
 
 def bounds(pair: Sequence[float | None] | None) -> tuple[float, float]:
-    """An interval as JSON gives it back."""
+    """Return an interval as JSON gives it back: NaN where it is null.
+
+    Parameters
+    ----------
+    pair : low and high, or None.
+
+    Returns
+    -------
+    low, high.
+    """
     low, high = pair or (None, None)
     return number(low), number(high)

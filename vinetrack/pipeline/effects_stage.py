@@ -99,11 +99,11 @@ def model_problems(experiment: Path) -> list[Problem]:
     -------
     list of Problem
     """
+    from vinetrack.core.constants import BASE_EFFECTS
     from vinetrack.dynamics.model import make_model
     from vinetrack.dynamics.trial_inputs import check_needs
     from vinetrack.effects import EffectError, find_effect
     from vinetrack.experiment.folder import read_experiment
-    from vinetrack.experiment.settings import BASE_EFFECTS
 
     try:
         read = read_experiment(experiment, strict=False)

@@ -56,10 +56,10 @@ def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
         If the experiment does not ask for it, or a stage before this one has not run.
     """
     from vinetrack.paper.arithmetic import computed_rows
-    from vinetrack.paper.foretold import foretold_rows
-    from vinetrack.paper.found import found_rows
     from vinetrack.paper.protocol import protocol_rows
+    from vinetrack.paper.result_rows import result_rows
     from vinetrack.paper.rows import MARKS, MEASURED, SIMULATED, as_table
+    from vinetrack.paper.theory_rows import theory_rows
 
     kind = experiment.settings.published
     if kind is None:
@@ -70,9 +70,9 @@ def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
     results_given = _found(mark, results, tables)
     rows = [
         *protocol_rows(experiment.trials, read_result(results.steady), mark),
-        *found_rows(results_given),
+        *result_rows(results_given),
         *computed_rows(),
-        *foretold_rows(experiment.trials),
+        *theory_rows(experiment.trials),
     ]
     table = as_table(rows)
     for name, table_of_figure in tables.items():
@@ -85,13 +85,13 @@ def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
 
 def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]:
     """Every table behind a figure, by the name of its file."""
-    from vinetrack.paper import beside
+    from vinetrack.paper import comparison
     from vinetrack.paper.departures import departure_table, motion_table, pressure_table
 
     trials = experiment.trials
-    positions, speeds = beside.position_conditions(trials), beside.speed_conditions(trials)
+    positions, speeds = comparison.position_conditions(trials), comparison.speed_conditions(trials)
     starts = {
-        name: beside.Rest(fitted_trial.release_s, fitted_trial.origin_m)
+        name: comparison.Rest(fitted_trial.release_s, fitted_trial.origin_m)
         for name, fitted_trial in read_fit(results).trials.items()
     }
     rests = {name: start for name, start in starts.items() if math.isfinite(start.release_s + start.origin_m)}
@@ -105,11 +105,11 @@ def _tables(experiment: Experiment, results: Results) -> dict[str, pd.DataFrame]
     return {
         "paper_departures": departure_table(payloads_g),
         "paper_motions": motion_table(),
-        "paper_means": beside.mean_motions(positions, kinematics, rests),
-        "paper_positions": beside.position_errors(positions, kinematics, rests),
+        "paper_means": comparison.mean_motions(positions, kinematics, rests),
+        "paper_positions": comparison.position_errors(positions, kinematics, rests),
         "paper_pressures": pressure_table(),
-        "paper_speeds": beside.final_speeds(speeds, kinematics, rests),
-        "paper_speed_curves": beside.speed_curves(speeds),
+        "paper_speeds": comparison.final_speeds(speeds, kinematics, rests),
+        "paper_speed_curves": comparison.speed_curves(speeds),
     }
 
 
@@ -179,9 +179,9 @@ def _printed_B(damping: dict[str, Any]) -> dict[str, float]:
 
 
 def _found(mark: str, results: Results, tables: Mapping[str, pd.DataFrame]) -> Any:
-    from vinetrack.paper.found import Found
+    from vinetrack.paper.result_rows import ExperimentResults
 
-    return Found(
+    return ExperimentResults(
         mark=mark,
         damping=read_json(results.damping),
         scaling=read_json(results.scaling),

@@ -13,7 +13,7 @@ from vinetrack.core.numbers import number
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_bytes
 from vinetrack.core.units import PREDICTION_UNITS, display_unit
-from vinetrack.experiment.planned import Planned, planned_sheet, planned_trial
+from vinetrack.experiment.planned import PlannedTrials, planned_sheet, planned_trial
 from vinetrack.experiment.schema import option
 from vinetrack.results.folder_layout import Results, ResultsError, read_json
 
@@ -54,7 +54,7 @@ class Asked:
 class Ground:
     """What predictive inputs are made from: planned trials, stated values, and a fit where there is one."""
 
-    planned: Planned
+    planned: PlannedTrials
     stated: StatedValues
     fit: FitNumbers | None
 
@@ -121,7 +121,7 @@ def _refuse_beside_sheet(asked: Asked) -> None:
         raise ExperimentError(problems)
 
 
-def _own(planned: Planned) -> Mapping[str, Effect]:
+def _own(planned: PlannedTrials) -> Mapping[str, Effect]:
     """The user's own effects of the sheet's experiment."""
     from vinetrack.pipeline.effects_stage import effects_of
 

@@ -29,8 +29,8 @@ CLEAR_STEP_SIGMAS = 8.0
 
 DROP_RATIO = 1.6
 """A step above this many times its neighbours is a dropped frame. Chosen between 1, a steady step, and 2, a step over
-one dropped frame, nearer to 2 since speeds rise by up to 60 % in a frame at release. By reasoning: at half every step
-is a suspect, at twice (3.2) only two dropped frames in a row are found."""
+one dropped frame, nearer to 2 since speed rises from frame to frame at release. By reasoning: at half every step is a
+suspect, at twice (3.2) only two dropped frames in a row are found."""
 
 JUMP_SIGMAS = 5.5
 """Least significance of a jump: 4e-8 by chance, 1e-4 over a long campaign's frames. Derived from the normal
@@ -103,8 +103,7 @@ def correct_frames(track: Track) -> Track:
 
     Parameters
     ----------
-    track
-        A row for every frame; positions may be NaN.
+    track : A row for every frame; positions may be NaN.
 
     Returns
     -------

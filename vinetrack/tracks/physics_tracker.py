@@ -281,8 +281,7 @@ def _project_on_axis(points: Floats) -> tuple[Floats, str]:
 
     Parameters
     ----------
-    points
-        Shape (n, 1) or (n, 2). A single coordinate keeps its zero; points in a plane start from the first.
+    points : shape (n, 1) or (n, 2). A single coordinate keeps its zero; points in a plane start from the first.
 
     Returns
     -------

@@ -55,8 +55,7 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
 
     Parameters
     ----------
-    time_s, position_m
-        Arrays, shape (n,), s and m, finite, in order of time.
+    time_s, position_m : arrays, shape (n,), s and m, finite, in order of time.
 
     Returns
     -------
@@ -260,8 +259,7 @@ def track_noise(track: Track) -> tuple[float, float]:
 
     Parameters
     ----------
-    track
-        A track; only its usable points are read.
+    track : A track; only its usable points are read.
 
     Returns
     -------

@@ -164,8 +164,7 @@ def wild_points(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
 
     Parameters
     ----------
-    time_s, position_m
-        Arrays, shape (n_points,), s and m, finite, in order of time.
+    time_s, position_m : arrays, shape (n_points,), s and m, finite, in order of time.
 
     Returns
     -------

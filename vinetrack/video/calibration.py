@@ -24,15 +24,27 @@ from vinetrack.video.target_corners import CornersError, charuco_corners, checke
 Floats = NDArray[np.float64]
 
 CLICK_SIGMA_PX = 0.5
-"""A point picked by hand in a picture is off by about half a pixel."""
+"""A point picked by hand in a picture is off by about half a pixel. Chosen: a hand points to about a pixel. At half or
+twice the stated error of such a scale halves or doubles."""
 CORNER_BIAS_PX = 0.02
-"""Corners at one end of a target may all be off this much the same way (uneven light, blur), however many there are."""
+"""Corners at one end of a target may all be off this much the same way (uneven light, blur), however many there are.
+Chosen: a fiftieth of a pixel, the size of what light from one side leaves. At half or twice the least error of a scale
+halves or doubles."""
 STILL_PX = 0.5
-"""Corners that wander by more than this over a clip belong to a target that was moved."""
+"""Corners that wander by more than this over a clip belong to a target that was moved. Chosen: ten times the noise of
+a corner, far below a motion meant as one. By reasoning: at half a shaken tripod counts as a moved target; at twice
+slowly moved targets are averaged."""
 LARGEST_REPROJECTION_PX = 2.0
+"""Mean distance of the corners from the model beyond which the board is another one. Chosen: a wrong count of squares
+puts corners whole squares away, noise a fraction of a pixel. Half or twice changes only what bent boards pass."""
+
 MOST_PICTURES = 10
+"""Pictures of a clip that are read. Chosen: the error of averaged corners falls with the root of their number, and
+CORNER_BIAS_PX remains; time grows in proportion."""
+
 SEARCHED_FRAMES = 300
-"""A target in a recording is looked for in its first frames, while nothing hides it yet."""
+"""A target in a recording is looked for in its first frames, while nothing hides it yet. Chosen: 0.3 s at 1000 frames
+a second; at twice a vine may already stand before the target."""
 
 
 class CalibrationError(ValueError):
@@ -83,11 +95,30 @@ class PlaneCalibration:
         return self.along(*self._middle_line()).scale_rel_sigma
 
     def plane_m(self, picture_px: Floats) -> Floats:
-        """Points of the picture (x, y), shape (..., 2), to points of the plane of growth, shape (..., 2), m."""
+        """Map points of the picture to the plane of growth.
+
+        Parameters
+        ----------
+        picture_px : (x, y), shape (..., 2), px.
+
+        Returns
+        -------
+        shape (..., 2), m.
+        """
         return self.plane.plane_m(picture_px)
 
     def along(self, from_px: Sequence[float], to_px: Sequence[float]) -> AxisScale:
-        """Scale and position along the axis from `from_px` to `to_px` (x, y)."""
+        """Return scale and position along an axis of the picture.
+
+        Parameters
+        ----------
+        from_px, to_px : ends of the axis, (x, y), px.
+
+        Returns
+        -------
+        m/px on average, its relative standard error, and a function from (x, y) in px, shape (n, 2), to m along the
+            axis.
+        """
         start_px, end_px = np.asarray(from_px, dtype=float), np.asarray(to_px, dtype=float)
         start_m, end_m = self.plane.plane_m(np.stack([start_px, end_px]))
         length_m = float(np.linalg.norm(end_m - start_m))
@@ -112,12 +143,13 @@ def calibrate(settings: Calibration, folder: Path, width_px: int, height_px: int
 
     Parameters
     ----------
-    settings
-        The `calibration` of `experiment.yaml`.
-    folder
-        The experiment's folder, from which `image` counts.
-    width_px, height_px
-        Size of the recordings; pictures of a target must have it too.
+    settings : the `calibration` of `experiment.yaml`.
+    folder : the experiment's folder, from which `image` counts.
+    width_px, height_px : size of the recordings; pictures of a target must have it too.
+
+    Returns
+    -------
+    the calibration.
 
     Raises
     ------
@@ -146,6 +178,15 @@ def calibrate_pictures(pictures: Sequence[NDArray[Any]], board: Charuco | Checke
 
     Of a target that stands still the corners are averaged; of one that is moved every picture gets its own plane but
     all share the lens, and the first readable one shows the plane of growth.
+
+    Parameters
+    ----------
+    pictures : grey levels, shape (height, width) each, all of one size.
+    board : what the target is.
+
+    Returns
+    -------
+    the calibration.
 
     Raises
     ------

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
-from vinetrack.video.edge_repair import ASTRAY_PX, FAINTEST, disagreement, mend_jumps
+from vinetrack.video.edge_repair import ASTRAY_PX, FAINTEST, disagreement, growth_end, mend_jumps
 from vinetrack.video.edge_state import (
     ASSUMED_EXPOSURE,
     CLEAR_PX,
@@ -31,30 +31,38 @@ from vinetrack.video.edge_state import (
     residuals,
     seen_exposure,
 )
-from vinetrack.video.growth_end import growth_end
 from vinetrack.video.strip import Strip
 
 Floats = NDArray[np.float64]
 
 START_PX = 0.08
-"""Error near the start, where background is seen briefly or never."""
+"""Error near the start, where background is seen briefly or never. Chosen: twice FLOOR_PX of `point_quality`. At half
+or twice the stated errors of the first 25 px halve or double."""
 START_REACH_PX = 25.0
-"""Growth over which that error falls to 1/e."""
+"""Growth over which that error falls to 1/e. Chosen: about the length of the tip, which hides the background there. At
+half or twice the reach changes so."""
 DOOR_PX = 0.5
-"""What is added to that where a door crosses everything before the start and the picture departs from the model."""
+"""What is added to that where a door crosses everything before the start and the picture departs from the model.
+Chosen: half a pixel. At half or twice stated errors behind doors halve or double."""
 SETTLED_PX = 0.2
-"""Largest change of any moving edge from one round to the next at which they are done."""
+"""Largest change of any moving edge from one round to the next at which they are done. Chosen below the error of
+blurred frames at the fastest; at half more rounds are made, at twice fewer."""
 UNFIT = 3.0
-"""Factor of the bands' disagreement where no blur within reason fits: all rows err together then."""
+"""Factor of the bands' disagreement where no blur within reason fits: all rows err together then. Chosen: pictures out
+of focus then state errors of a pixel. At half or twice they state half or twice as much."""
 HIDDEN = 3.2
-"""Misfit, in units of the noise and in usual ones, above which something else stands there and the edge is a guess."""
+"""Misfit, in units of the noise and in usual ones, above which something else stands there and the edge is a guess.
+Chosen: sqrt(3.2) is 1.8 standard deviations in every pixel, which noise never has. By reasoning: at half textured
+backgrounds count as hidden; at twice payloads before the edge do not."""
 SIDES_PX = 1.0
-"""Error of a width between two sides that are each known to a blur of about 0.7 px."""
+"""Error of a width between two sides that are each known to a blur of about 0.7 px. Derived: √2 · 0.7 px."""
 FAINT, FAINT_PART = 25.0, 0.15
 """Grey levels of contrast below which the sides of a tube fade away, and the error of its width then, a part of it.
 Measured (benchmarks/seen_sizes.py, seeds 20900 and up): 0.76 of the width is seen at 16 levels, 0.96 and more at 70."""
 EVIDENCE_CLIP = 2.5
-"""Widths beyond which a pixel is as unlike film (or background) as can be."""
+"""Widths beyond which a pixel is as unlike film (or background) as can be. Chosen as the usual bend of robust
+estimates, 2 to 3 standard deviations. By reasoning: at half contrast hardly counts, at twice a bright door outvotes
+the film."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +97,13 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
 
     Parameters
     ----------
-    exposure_frames
-        Exposure over frame period; NaN to estimate it from the blur.
-    rounds
-        At least so many, at most three times as many until the edges settle.
+    strip : along the axis, growth towards higher columns.
+    exposure_frames : exposure over frame period; NaN to estimate it from the blur.
+    rounds : at least so many, at most three times as many until the edges settle.
+
+    Returns
+    -------
+    edge, errors and flags of every frame, px.
 
     Raises
     ------
@@ -146,6 +157,15 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     From the contrast by row in `parts` stretches along the way: a given axis two degrees off would otherwise cut the
     tube obliquely.
 
+    Parameters
+    ----------
+    strip : along a roughly known axis.
+    parts : stretches along the way.
+
+    Returns
+    -------
+    centreline, width and the standard error of that, px.
+
     Raises
     ------
     ValueError
@@ -174,7 +194,15 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
 
 
 def rough_growth(strip: Strip) -> tuple[float, float]:
-    """Columns that the front passes, px, and its mean speed over the middle of them, px a frame, without a fit.
+    """Estimate growth and speed from the first path of the front, without a fit.
+
+    Parameters
+    ----------
+    strip : along the axis, growth towards higher columns.
+
+    Returns
+    -------
+    columns that the front passes, px, and its mean speed over the middle of them, px a frame.
 
     Raises
     ------
@@ -190,14 +218,14 @@ def rough_growth(strip: Strip) -> tuple[float, float]:
 
 def _bright_run(excess: Floats) -> tuple[float, float]:
     """Where the run of greatest sum begins and ends, to a fraction of a row: short gaps and glints do not end it."""
-    best, total, start, found = -np.inf, 0.0, 0, (0, len(excess) - 1)
+    best, total, start, limits = -np.inf, 0.0, 0, (0, len(excess) - 1)
     for i, value in enumerate(excess):
         if total <= 0:
             total, start = 0.0, i
         total += value
         if total > best:
-            best, found = total, (start, i)
-    return _crossing(excess, found[0], -1), _crossing(excess, found[1], 1)
+            best, limits = total, (start, i)
+    return _crossing(excess, limits[0], -1), _crossing(excess, limits[1], 1)
 
 
 def _crossing(excess: Floats, row: int, outwards: int) -> float:
@@ -255,6 +283,14 @@ def after_jump(path: Floats) -> int:
 
     At release the tail jerks inside the film that already stands, and its columns change without any front. No front
     is three times as fast in its first frames as in those that follow.
+
+    Parameters
+    ----------
+    path : column of the front by frame, shape (n_frames,), px.
+
+    Returns
+    -------
+    column; 0 where the path does not leap at its start.
     """
     steps = np.diff(path)
     if not np.any(steps > 0):

@@ -13,19 +13,24 @@ import numpy as np
 from numba import njit
 
 STEP = 0.05
-"""Spacing of the table of covers, px: linear interpolation then errs by under 4e-4."""
+"""Spacing of the table of covers, px. Derived: linear interpolation errs by at most |p''|·STEP²/8, with |p''| ≤
+0.242/blur² and the least blur of 0.4 px 5e-4."""
 BEHIND = 25
-"""Columns behind the first passed one whose film is looked at: neighbours that stand in where it is never seen."""
+"""Columns behind the first passed one whose film is looked at: neighbours that stand in where it is never seen.
+Chosen: nearly two lengths of MEMORY in `edge_state`. Half or twice changes only film that is never seen."""
 FORGOTTEN = 4.0
-"""Frames further off than this many memories, e⁻⁴ = 2 %, are not read."""
+"""Frames further off than this many memories, e⁻⁴ = 2 %, are not read. Chosen for time; at half 14 % of the weight is
+left out, at twice time grows."""
 PARTIAL = 0.05
-"""Weight of a half-covered pixel: what it says of film and background depends on where the edge was thought to be."""
+"""Weight of a half-covered pixel: what it says of film and background depends on where the edge was thought to be.
+Chosen: a pixel seen half covered in 20 frames weighs as one seen bare once. By reasoning: at half or twice the few
+pixels never seen bare change."""
 FOREIGN = 1.7
-"""How much farther than background film is from what resembles neither."""
+"""How much farther than background film is from what resembles neither. Chosen above 1, so that what resembles neither
+hides background. By reasoning: nearer 1 a payload counts as film, farther a stain on the film does as background."""
 DOUBT = 0.1
-"""By how much a pixel that could be either is called film: one that never changed was film from the start."""
-BLOCK = 1
-"""Columns in a block whose sum tells how far noise adds up: about one grain of film."""
+"""By how much a pixel that could be either is called film: one that never changed was film from the start. Chosen
+small beside the clip of 6: only pixels without contrast are decided by it."""
 
 
 @njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
@@ -33,6 +38,16 @@ def cover_table(length: float, blur: float, reach: float) -> np.ndarray:
     """Cover p and slope dp/dx at x = −reach, −reach + STEP, … ; shape (n, 2).
 
     p is the mean of the normal distribution function over a box of `length`: ∫Φ = zΦ(z) + φ(z).
+
+    Parameters
+    ----------
+    length : of the motion blur, px.
+    blur : standard deviation of the optical blur, px.
+    reach : farthest distance from the edge, px.
+
+    Returns
+    -------
+    p and dp/dx, shape (n, 2), n = 2 reach/STEP + 2.
     """
     n = int(2 * reach / STEP) + 2
     table = np.empty((n, 2))
@@ -84,6 +99,22 @@ def gather(
     pixels count in between, hardly. The answer's columns: Σwq², Σwqp, Σwp², ΣwqV, ΣwpV (q = 1 − p) of those, then
     weight, sum and sum of squares of V where only background, and where only film, is seen.
     With `clip` > 0 a value that strays from the last solution is weighed down by 1/(1 + (r/clip)²).
+
+    Parameters
+    ----------
+    strip : values as the camera wrote them, shape (n_frames, n_across, n_along).
+    scale, offset : brightness = scale · value + offset, shape (n_frames,).
+    edge, lengths : place of the edge and length of its motion blur, shape (n_frames,), px; NaN where unknown.
+    lag : by how much each row of the tip lags behind its foremost point, shape (n_across,), px.
+    blur : standard deviation of the optical blur, px.
+    early, late : first and last frame with the edge over a column, shape (n_along,).
+    memory_frames : frames after which weights fall to 1/e.
+    pictures : the last solution of `solve`; unused where `clip` is 0.
+    clip : grey levels.
+
+    Returns
+    -------
+    the sums.
     """
     n, rows, columns = strip.shape
     sums = np.zeros((rows, columns, 11), np.float32)
@@ -141,6 +172,18 @@ def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise:
     A pixel that never shows one of the two, or whose background changes (a door swings there), takes it from its row:
     film from the columns behind it, background from those ahead, with weights falling as `memory`^distance; its
     variance is then `texture`², a tenth more where it changes.
+
+    Parameters
+    ----------
+    sums : from `gather`, shape (n_across, n_along, 11).
+    ridge : weight of the row's guess where a pixel was seen itself, frames.
+    memory : factor by which weights of neighbours fall from column to column.
+    fallback : brightness where nothing is known.
+    noise, texture : standard deviation of a value, and of a pixel about its neighbours, grey levels.
+
+    Returns
+    -------
+    after, before, variance after, variance before.
     """
     rows, columns, _ = sums.shape
     out = np.empty((4, rows, columns), np.float32)
@@ -168,8 +211,8 @@ def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise:
             total = total * memory + sums[u, s, 9]
             count = count * memory + sums[u, s, 8]
             # Never seen bare: what a half-covered pixel seems to show would follow any error of the edge.
-            own = _variance(sums[u, s, 5], sums[u, s, 6], sums[u, s, 7], noise)
-            bare, film = sums[u, s, 5] > 0.1 and own < unsteady, sums[u, s, 8] > 0.1
+            bare_variance = _variance(sums[u, s, 5], sums[u, s, 6], sums[u, s, 7], noise)
+            bare, film = sums[u, s, 5] > 0.1 and bare_variance < unsteady, sums[u, s, 8] > 0.1
             qq, qp, pp = sums[u, s, 0] + sums[u, s, 5], sums[u, s, 1], sums[u, s, 2] + sums[u, s, 8]
             vq, vp = sums[u, s, 3] + sums[u, s, 6], sums[u, s, 4] + sums[u, s, 9]
             rq = ridge if bare else 1e4 * (1 + qq)
@@ -179,7 +222,7 @@ def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise:
             out[0, u, s] = (vp * qq - vq * qp) / det
             out[1, u, s] = (vq * pp - vp * qp) / det
             out[2, u, s] = _variance(sums[u, s, 8], sums[u, s, 9], sums[u, s, 10], noise) if film else texture**2
-            out[3, u, s] = own if bare else (1.1 if own >= unsteady else 1.0) * texture**2
+            out[3, u, s] = bare_variance if bare else (1.1 if bare_variance >= unsteady else 1.0) * texture**2
     return out
 
 
@@ -188,8 +231,8 @@ def _variance(weight: float, total: float, squares: float, noise: float) -> floa
     """Variance of what a pixel showed, never below that of the noise, drawn towards it where few frames speak."""
     if weight <= 0:
         return noise**2
-    own = max(squares / weight - (total / weight) ** 2, 0.0)
-    return max((weight * own + 2 * noise**2) / (weight + 2), noise**2)
+    seen = max(squares / weight - (total / weight) ** 2, 0.0)
+    return max((weight * seen + 2 * noise**2) / (weight + 2), noise**2)
 
 
 @njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
@@ -201,6 +244,17 @@ def film_evidence(
     The sum over rows of min(a², FOREIGN clip²) − min(b², clip²), a and b the distances from film and background in
     units of `width` and their own variances. A pixel like neither (door, payload) rather hides background: what film
     looks like is known from the frames after, what may come before the background is not.
+
+    Parameters
+    ----------
+    strip, scale, offset : as in `gather`.
+    pictures : from `solve`, shape (4, n_across, n_along).
+    width : further standard deviation of a pixel, grey levels.
+    clip : widths beyond which a difference counts no more.
+
+    Returns
+    -------
+    negative where a column looks like film.
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
@@ -235,6 +289,20 @@ def fit_edges(
     Columns: edge, its Fisher sigma, mean squared weighted residual, amplitude − 1, level, pixels used. Amplitude and
     level of the contrast are free within `prior_sd`. `inflation[i]` multiplies the variance of pixels i − len/2 px
     ahead of the edge: how far their noise adds up.
+
+    Parameters
+    ----------
+    strip, scale, offset, lengths, lag, blur : as in `gather`.
+    start : where each search begins, shape (n_frames,), px; NaN to leave a frame out.
+    pictures : from `solve`, shape (4, n_across, n_along).
+    inflation : shape (n_bins,), about its middle.
+    prior_sd : standard deviation of relative amplitude and level.
+    margin : pixels beyond the blurred edge that take part.
+    rounds : steps at most.
+
+    Returns
+    -------
+    a row a frame, NaN where there is no start.
     """
     n, rows, columns = strip.shape
     out = np.full((n, 6), np.nan)
@@ -318,10 +386,20 @@ def residual_sums(
     """What the fit leaves: by distance ahead of the edge, by row, and in all.
 
     First answer: shape (n, 2), bins of 1 px about the middle: the sum over frames of z² / var z, z = Σ C r / v over
-    blocks of BLOCK columns and all rows, and the count: 1 on average for white noise, more where noise adds up across
+    all rows of a column, and the count: 1 on average for white noise, more where noise adds up across
     neighbours (grain of the film, its tail moving inside). Second: shape (n_across, 2), Σ g r and Σ g² with g the
     slope of the model in the row's own lag. Third: the mean of log(1 + r²/9v̄), v̄ the mean
     of the two variances: a robust misfit for comparing blurs.
+
+    Parameters
+    ----------
+    strip, scale, offset, lengths, lag, blur, pictures, margin : as in `fit_edges`.
+    fit : from `fit_edges`, shape (n_frames, 6).
+    use : mask of frames, shape (n_frames,).
+
+    Returns
+    -------
+    three sums, as above.
     """
     n, rows, columns = strip.shape
     widest = 0.0
@@ -364,12 +442,8 @@ def residual_sums(
                 # A variance that knows nothing of the blur: else the widest blur would be its own excuse.
                 misfit += math.log(1 + r * r / (4.5 * (pictures[2, u, s] + pictures[3, u, s])))
                 count += 1
-        for i in range(BLOCK // 2, bins - BLOCK // 2):
-            a, b = 0.0, 0.0
-            for k in range(i - BLOCK // 2, i + BLOCK // 2 + 1):
-                a += column[k, 0]
-                b += column[k, 1]
-            if b > 0:
-                by_distance[i, 0] += a * a / b
+        for i in range(bins):
+            if column[i, 1] > 0:
+                by_distance[i, 0] += column[i, 0] * column[i, 0] / column[i, 1]
                 by_distance[i, 1] += 1
     return by_distance, by_row, misfit / max(count, 1)

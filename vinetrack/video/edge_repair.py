@@ -2,6 +2,8 @@
 
 The disagreement of bands is an error that needs no model of noise: film, tail, glints and a swinging door touch one
 band and not another, and whatever misleads them differently shows.
+
+Where growth ends, when something flies on: a payload in free flight leaves background behind it, film stays.
 """
 
 from __future__ import annotations
@@ -18,13 +20,18 @@ from vinetrack.video.strip import Strip
 Floats = NDArray[np.float64]
 
 ASTRAY_PX = 3.0
-"""Error stated where nothing like the edge is found where the motion leads."""
+"""Error stated where nothing like the edge is found where the motion leads. Chosen just below LOST_SIGMA_PX: the point
+stays, and hardly weighs. At twice such points are lost; at half they weigh four times as much."""
 ASTRAY_MISFIT = 1.4
-"""How much worse a fit may be that agrees with its neighbours than one that does not."""
+"""How much worse a fit may be that agrees with its neighbours than one that does not. Chosen between 1 and the 1.5
+from which a fit counts as bad. By reasoning: near 1 noise keeps fits that break the motion; beyond 1.5 good fits at
+gaps are replaced."""
 FAINTEST = 0.5
-"""An edge of less than this much of its contrast is another thing's."""
+"""An edge of less than this much of its contrast is another thing's. Chosen: half. By reasoning: at half of it
+reflections pass for the edge; near 1 real edges of changing light do not."""
 LONG_REST = 8
-"""Frames of rest, counted from the motion, in which a bad fit is still sought again from many starts."""
+"""Frames of rest, counted from the motion, in which a bad fit is still sought again from many starts. Chosen for time:
+at rest a search from one start is enough."""
 
 
 def mend_jumps(strip: Strip, state: EdgeState, fit: Floats) -> Floats:
@@ -34,6 +41,16 @@ def mend_jumps(strip: Strip, state: EdgeState, fit: Floats) -> Floats:
     1.5 px more than) its neighbour. A fit that breaks that (it caught the far side of a door, a payload) gives way to
     the best one that does not; only a good fit at two to four whole steps stands, for frames may be missing. A fit
     half again as bad as most gives way to a better one.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : what lies before and after the edge.
+    fit : from `edge_state.fit_edges`, shape (n_frames, 6).
+
+    Returns
+    -------
+    fits, shape (n_frames, 6).
     """
     moving = np.flatnonzero(moving_frames(state.edge) & np.isfinite(fit[:, 0]))
     if len(moving) < 5:
@@ -87,9 +104,9 @@ def _smoothed_out(strip: Strip, state: EdgeState, fit: Floats, moving: NDArray[n
     return out
 
 
-def _is_better(found: Floats, other: Floats | None, bad: float) -> bool:
+def _is_better(fit: Floats, other: Floats | None, bad: float) -> bool:
     """Whether a fit is good, and better than another."""
-    return bool(found[2] <= bad) and (other is None or bool(other[2] > found[2]))
+    return bool(fit[2] <= bad) and (other is None or bool(other[2] > fit[2]))
 
 
 def _may_be_gap(stride: float, step: float) -> bool:
@@ -112,25 +129,35 @@ def _best_between(strip: Strip, state: EdgeState, t: int, low: float, high: floa
     for start in np.linspace(low, high, int(np.clip((high - low) / 2, 3, 9)))[:: 9 // starts]:
         edge = np.full(len(state.edge), np.nan)
         edge[t] = start
-        found = fit_edges(strip, replace(state, edge=edge))[t]
-        inside = low - 0.5 <= found[0] <= high + 0.5 and found[3] > FAINTEST - 1
-        if inside and np.isfinite(found[2]) and (best is None or found[2] < best[2]):
-            best = found
+        fit = fit_edges(strip, replace(state, edge=edge))[t]
+        inside = low - 0.5 <= fit[0] <= high + 0.5 and fit[3] > FAINTEST - 1
+        if inside and np.isfinite(fit[2]) and (best is None or fit[2] < best[2]):
+            best = fit
     return best
 
 
 BANDS = 4
-"""Bands across: enough to tell who errs, few enough that each still finds the edge."""
+"""Bands across: enough to tell who errs, few enough that each still finds the edge. Chosen: three degrees of freedom;
+at half one, at twice bands of thin vines hold two rows."""
 FEWEST_ROWS = 4
+"""Rows of a band at least. Chosen: fewer show no edge in noise."""
+
 OUTLYING = 2.0
-"""A band further off than this many median distances counts as that far: its pixels hardly counted in the fit."""
+"""A band further off than this many median distances counts as that far: its pixels hardly counted in the fit. Chosen:
+two median distances are 1.35 standard deviations of four bands. At half errors of all frames shrink; at twice one
+glint makes a frame doubtful."""
 HABIT_PX = 50.0
-"""Growth over which a lead or lag of one band is its habit: longer than film's grain, shorter than a sway."""
+"""Growth over which a lead or lag of one band is its habit: longer than film's grain, shorter than a sway. Chosen: a
+few diameters of the smallest vine. By reasoning: at half noise is taken for a habit, at twice a sway for an error."""
 HABIT_FRAMES = 7
+"""Frames over which the habit is taken at least. Chosen: the median of seven knows it to half of a frame's error."""
+
 NEIGHBOURS = 2
-"""Frames on each side of which the median disagreement is taken: four bands alone say little, one glint nothing."""
+"""Frames on each side of which the median disagreement is taken: four bands alone say little, one glint nothing.
+Chosen: five frames of three degrees of freedom know a standard deviation to 18 % (1/√30). At half to 24 %, at twice an
+error of few frames is averaged away."""
 MEDIAN_TO_MEAN = 1.27
-"""Mean over median of χ² with three degrees of freedom."""
+"""Mean over median of χ² with three degrees of freedom. Derived: 3/2.366."""
 
 
 def disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> Floats:
@@ -138,6 +165,17 @@ def disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.
 
     The weighted mean of K independent bands errs by Σ w (y − ȳ)² / ((K − 1) Σ w). What a band is ahead or behind
     for long in the `core` frames is the shape of the tip, not an error.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : what lies before and after the edge.
+    edge : fitted to all rows, shape (n_frames,), px.
+    core : moving frames clear of the start, mask, shape (n_frames,).
+
+    Returns
+    -------
+    standard error, shape (n_frames,), px.
     """
     edges, sigmas = band_fits(strip, state, edge)
     if edges.shape[1] < 2:
@@ -160,22 +198,32 @@ def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Flo
     """Edge by band and its Fisher sigma, shapes (n_frames, n_bands), px; NaN where a band shows none.
 
     The bands share the rows that say anything about the edge evenly.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : what lies before and after the edge.
+    edge : where each search begins, shape (n_frames,), px.
+
+    Returns
+    -------
+    edge and its standard error, each of shape (n_frames, n_bands), px.
     """
     rows = strip.values.shape[1]
-    said = np.sum((state.pictures[0] - state.pictures[1]) ** 2, axis=1).astype(float)
-    said = np.minimum(said, 4 * np.median(said) + 1e-9)
-    cuts = np.searchsorted(np.cumsum(said) / said.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
+    contrast = np.sum((state.pictures[0] - state.pictures[1]) ** 2, axis=1).astype(float)
+    contrast = np.minimum(contrast, 4 * np.median(contrast) + 1e-9)
+    cuts = np.searchsorted(np.cumsum(contrast) / contrast.sum(), np.linspace(0, 1, BANDS + 1)[1:-1])
     limits = np.concatenate([[0], cuts, [rows]])
     edges, sigmas = [], []
     for low, high in pairwise(limits):
         if high - low < FEWEST_ROWS:
             continue
         part = replace(strip, values=np.ascontiguousarray(strip.values[:, low:high]))
-        own = replace(
+        state_of_rows = replace(
             state, edge=edge, lag=np.ascontiguousarray(state.lag[low:high]),
             pictures=np.ascontiguousarray(state.pictures[:, low:high]),
         )  # fmt: skip
-        fit = fit_edges(part, own)
+        fit = fit_edges(part, state_of_rows)
         edges.append(fit[:, 0])
         sigmas.append(fit[:, 1])
     return np.stack(edges, axis=1), np.stack(sigmas, axis=1)
@@ -190,3 +238,78 @@ def _habit(off: Floats, edge: Floats, core: NDArray[np.int_]) -> Floats:
         near = far <= max(HABIT_PX, float(np.partition(far, fewest - 1)[fewest - 1]))
         out[t] = np.median(off[core[near]], axis=0)
     return out
+
+
+RETURNED = 0.2
+"""Share of the film's usual difference from the background (in power) below which a column shows background again.
+Chosen: 0.45 of the film's contrast. By reasoning: at half noise keeps bare columns from counting as bare; at twice
+faint film counts as bare."""
+SHORTEST_PX = 10
+"""Columns that must show background again: more than any blur or ringing of the coder. Chosen. By reasoning: at half
+ringing of the coder counts as bare; at twice payloads that leave late are followed."""
+RUNS_AWAY = 1.35
+"""A payload leaves at the speed of the tail, twice the edge's; less than this is growth. Chosen between 1 and 2. By
+reasoning: nearer 1 growth that speeds up counts as flight; nearer 2 a payload slowed by drag does not."""
+
+
+def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
+    """Column where the film ends although what moves goes on, or the end of `passed` where nothing does.
+
+    From the last column passed backwards: what flies (no longer than the tube is wide), then columns that look as
+    they did before anything came, then film. What flies must be faster than the edge was.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    path : column of the front by frame, shape (n_frames,), px.
+    passed : first column passed, and the one behind the last.
+
+    Returns
+    -------
+    column.
+    """
+    columns, frames = np.arange(passed[0], passed[1]), len(path)
+    if len(columns) < 5 * SHORTEST_PX or frames < 8:
+        return passed[1]
+    arrival = np.clip(np.searchsorted(path, columns + 0.5), 0, frames - 1)
+    stays = _difference(strip, columns, arrival)
+    usual = float(np.median(stays[: int(0.7 * len(stays))]))
+    back = stays < RETURNED * usual
+    i = _first_bare(back, strip.values.shape[1])
+    if i < 3 * SHORTEST_PX or back[i - 2 * SHORTEST_PX : i].mean() > 0.3:
+        return passed[1]
+    flight = _speed(arrival, i + 2, len(columns))
+    return int(columns[i]) + 1 if flight > RUNS_AWAY * _speed(arrival, i - 6 * SHORTEST_PX, i - 5) else passed[1]
+
+
+def _first_bare(back: NDArray[np.bool_], longest: int) -> int:
+    """First column of SHORTEST_PX or more in a row that are `back`, with at most `longest` after it that are not."""
+    others = np.cumsum(~back[::-1])[::-1]
+    runs = np.convolve(back, np.ones(SHORTEST_PX), mode="full")[SHORTEST_PX - 1 :] > SHORTEST_PX - 0.5
+    starts = np.flatnonzero(runs & (others <= longest))
+    return int(starts[0]) if len(starts) else 0
+
+
+def _speed(arrival: NDArray[np.int_], first: int, last: int) -> float:
+    """Columns a frame between two of them."""
+    first, last = max(first, 0), min(last, len(arrival)) - 1
+    return (last - first) / max(float(arrival[last] - arrival[first]), 0.5)
+
+
+def _difference(strip: Strip, columns: NDArray[np.int_], arrival: NDArray[np.int_]) -> Floats:
+    """Mean square over the rows of last minus first looks at each column, shape (n_columns,), smoothed over 5."""
+    last = _mean(strip, slice(len(strip.values) - 2, len(strip.values)), columns)
+    out = np.zeros(len(columns))
+    for when in np.unique(arrival):
+        those = arrival == when
+        before = _mean(strip, slice(max(int(when) - 8, 0), max(int(when) - 2, 1)), columns[those])
+        out[those] = np.mean((last[:, those] - before) ** 2, axis=0)
+    noise = strip.noise**2 * (0.5 + 0.2)
+    return np.convolve(np.clip(out - noise, 0, None), np.ones(5) / 5, mode="same")
+
+
+def _mean(strip: Strip, frames: slice, columns: NDArray[np.int_]) -> NDArray[np.float32]:
+    """Mean brightness of some columns over some frames, shape (n_across, n_columns)."""
+    values = strip.values[frames][:, :, columns].astype(np.float32)
+    level = values * strip.scale[frames, None, None] + strip.offset[frames, None, None]
+    return np.asarray(level.mean(axis=0), dtype=np.float32)

@@ -18,21 +18,29 @@ Floats = NDArray[np.float64]
 
 MEMORY_FRAMES = 6.0
 """What a pixel showed this long before and after its passing counts 1/e: enough frames to average noise, few enough
-that a door that has swung away, or a tube that sways, is forgotten."""
+that a door that has swung away, or a tube that sways, is forgotten. Chosen. By reasoning: at half noise of the
+pictures grows by 1.4; at twice things that moved stay in them."""
 RIDGE = 0.05
-"""Weight, in frames, of a pixel's neighbours where it was seen itself: (noise / texture)² of 2 / 9 grey levels."""
+"""Weight, in frames, of a pixel's neighbours where it was seen itself: (noise / texture)² of 2 / 9 grey levels.
+Derived from TEXTURE and usual noise: (2/9)² = 0.05."""
 MEMORY = 0.93
-"""Neighbours' weights fall to 1/e over 14 px, a few times the grain of film and background."""
+"""Neighbours' weights fall to 1/e over 14 px, a few times the grain of film and background. Derived: −1/ln 0.93 =
+13.8."""
 TEXTURE = 12.0
 """Standard deviation, grey levels, of a pixel about its neighbours, where it was never seen itself."""
 PRIOR_SD = 0.15
-"""Relative scatter allowed to amplitude and level of the contrast from frame to frame."""
+"""Relative scatter allowed to amplitude and level of the contrast from frame to frame. Chosen: flicker and shading of
+a tip. By reasoning: at half changes of light displace the edge, at twice a payload before it passes for one."""
 MARGIN_PX = 6.0
-"""Pixels beyond the blurred edge that take part: they hold amplitude and level."""
+"""Pixels beyond the blurred edge that take part: they hold amplitude and level. Chosen: six pixels on either side know
+level and amplitude better than their prior. At half worse, at twice other things come in."""
 SELFSAME = 0.4
-"""Share of the usual contrast under which film and background near the start are the same thing seen twice."""
+"""Share of the usual contrast under which film and background near the start are the same thing seen twice. Chosen
+below half. By reasoning: at half film over itself is tracked as an edge; near 1 every start is taken for it."""
 CLEAR_PX = 60.0
-"""Growth after which the surroundings of the start are free of what held the tip there (20 mm at 3 px/mm)."""
+"""Growth after which the surroundings of the start are free of what held the tip there (20 mm at 3 px/mm). Chosen: the
+length of a latch. At half doors still count as shape of the tip; at twice short growth leaves no frames, hence a fifth
+of the way at most."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,17 @@ class EdgeState:
 
 
 def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
-    """Length of the motion blur in every frame, shape (n_frames,): speed times exposure, px."""
+    """Length of the motion blur in every frame, shape (n_frames,): speed times exposure, px.
+
+    Parameters
+    ----------
+    edge : shape (n_frames,), px.
+    exposure_frames : exposure over frame period.
+
+    Returns
+    -------
+    shape (n_frames,), px.
+    """
     if len(edge) < 3:
         return np.zeros(len(edge))
     speed = np.gradient(edge)
@@ -62,14 +80,34 @@ def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
 
 
 def moving_frames(edge: Floats) -> NDArray[np.bool_]:
-    """Frames in which the edge is on its way, shape (n_frames,); all of them where hardly any is."""
+    """Frames in which the edge is on its way, shape (n_frames,); all of them where hardly any is.
+
+    Parameters
+    ----------
+    edge : shape (n_frames,), px.
+
+    Returns
+    -------
+    mask, shape (n_frames,).
+    """
     speed = np.abs(np.gradient(edge)) if len(edge) > 1 else np.zeros(len(edge))
     moving = speed > max(0.2, 0.1 * float(np.quantile(speed, 0.95)))
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
 
 
 def repicture(strip: Strip, state: EdgeState, clip: float) -> EdgeState:
-    """Solve every pixel's brightness before and after, given the edge; `clip` > 0 weighs strays down."""
+    """Solve every pixel's brightness before and after, given the edge; `clip` > 0 weighs strays down.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : where the edge is and how it is blurred.
+    clip : grey levels beyond which a stray value counts less; 0 to count all alike.
+
+    Returns
+    -------
+    the state with new `pictures`.
+    """
     early, late = _passing(state, strip.values.shape[2])
     sums = kernels.gather(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
@@ -117,12 +155,31 @@ def _passing(state: EdgeState, columns: int) -> tuple[Floats, Floats]:
 
 
 def clear_of_start(edge: Floats) -> float:
-    """Place beyond which nothing that held the tip at its start is near: CLEAR_PX on, or a fifth of the way."""
+    """Place beyond which nothing that held the tip at its start is near: CLEAR_PX on, or a fifth of the way.
+
+    Parameters
+    ----------
+    edge : shape (n_frames,), px.
+
+    Returns
+    -------
+    column, px.
+    """
     return float(edge[0] + min(CLEAR_PX, 0.2 * (edge.max() - edge[0])))
 
 
 def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
-    """Moving frames clear of the start that fit no worse than most, shape (n_frames,): those that tell of the tip."""
+    """Moving frames clear of the start that fit no worse than most, shape (n_frames,): those that tell of the tip.
+
+    Parameters
+    ----------
+    state : where the edge is.
+    fit : from `fit_edges`, shape (n_frames, 6).
+
+    Returns
+    -------
+    mask, shape (n_frames,).
+    """
     moving = moving_frames(state.edge)
     clear = moving & (state.edge > clear_of_start(state.edge))
     if clear.sum() < 5:
@@ -132,7 +189,17 @@ def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
 
 
 def fit_edges(strip: Strip, state: EdgeState) -> Floats:
-    """Most likely edge of every frame, shape (n_frames, 6); see `edge_kernels.fit_edges`."""
+    """Most likely edge of every frame, shape (n_frames, 6); see `edge_kernels.fit_edges`.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : where the search begins, and what lies before and after the edge.
+
+    Returns
+    -------
+    a row a frame: edge, its sigma, misfit, amplitude − 1, level, pixels used.
+    """
     return kernels.fit_edges(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, state.pictures,
         state.inflation, PRIOR_SD, MARGIN_PX, 12,
@@ -140,7 +207,19 @@ def fit_edges(strip: Strip, state: EdgeState) -> Floats:
 
 
 def residuals(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
-    """What the fit leaves in the frames of `use`; see `edge_kernels.residual_sums`."""
+    """What the fit leaves in the frames of `use`; see `edge_kernels.residual_sums`.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : where the edge is, and what lies before and after it.
+    fit : from `fit_edges`, shape (n_frames, 6).
+    use : mask, shape (n_frames,).
+
+    Returns
+    -------
+    sums by distance, by row, and the misfit.
+    """
     filled = np.nan_to_num(fit)
     filled[:, 0] = state.edge
     return kernels.residual_sums(
@@ -152,21 +231,40 @@ def residuals(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_
 BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
 EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
 ASSUMED_EXPOSURE = 0.25
-"""Exposure over frame period until it is estimated."""
+"""Exposure over frame period until it is estimated. Chosen as usual for high-speed cameras; it is replaced after the
+second round."""
 CONTRADICTED = 1.01
 """Measured (seeds 20900 and up): the true exposure leaves a misfit within 1.003 of the least of any exposure but in
 one recording of eight (1.012); twice the true one or more leaves 1.02 to 1.35 where the edge moves 7 px a frame."""
 FASTEST_LAG_STEP_PX = 4.0
+"""Largest change of a row's lag in one round. Chosen as trust region; only the number of rounds depends on it."""
+
 DEEPEST_LAG_PX = 60.0
+"""Largest lag of a row behind the foremost point. Chosen: above the radius of the widest tip, 36 px at 3 px/mm."""
+
 FEW_FRAMES = 16
+"""Frames from which the blur is told. Chosen for time; at half the blur scatters by 1.4 more."""
+
 OPTICAL_BLUR_PX = (0.4, 3.0)
-"""From a sharp pixel to a picture out of focus; more is taken for blur only where noise drowns the edge."""
+"""From a sharp pixel to a picture out of focus; more is taken for blur only where noise drowns the edge. Chosen;
+sharper is not sampled, and wider is noise."""
 
 
 def find_shape(strip: Strip, state: EdgeState, fit: Floats, anew: bool) -> EdgeState:
     """Estimate how far each row of the tip lags behind its foremost point, then the optical blur.
 
     From the core frames with less blur by motion: not those in which a door may still stand before the tip.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : the last estimate.
+    fit : from `fit_edges`, shape (n_frames, 6).
+    anew : whether the blur is looked for everywhere, not only near the last one.
+
+    Returns
+    -------
+    the state with new `lag` and `blur`, and the edge moved to the foremost point.
     """
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
@@ -193,7 +291,18 @@ def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_]) -
 
 
 def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
-    """Exposure in frame periods that explains the blur of the faster frames best; a guess where none moves 2 px."""
+    """Exposure in frame periods that explains the blur of the faster frames best; a guess where none moves 2 px.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : the last estimate.
+    fit : from `fit_edges`, shape (n_frames, 6).
+
+    Returns
+    -------
+    exposure over frame period.
+    """
     core = core_frames(state, fit)
     speed = blur_lengths(state.edge, 1.0)
     fast = core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
@@ -204,9 +313,21 @@ def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
 
 
 def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: float) -> tuple[float, float]:
-    """Exposure in frame periods that the blur shows in place of a stated one, and the speed there, px a frame.
+    """Find the exposure that the blur shows in place of a stated one.
 
     The exposure is NaN where the stated one explains the blur as well (misfit within CONTRADICTED).
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : the last estimate.
+    fit : from `fit_edges`, shape (n_frames, 6).
+    stated_frames : stated exposure over frame period.
+
+    Returns
+    -------
+    exposure over frame period, NaN where the stated one explains the blur as well (misfit within CONTRADICTED); and the
+        median speed of the frames used, px a frame.
     """
     core = core_frames(state, fit)
     speed = blur_lengths(state.edge, 1.0)

@@ -8,12 +8,14 @@ carry the true rate (tag 51044) and the exposure (33434), other image files carr
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from vinetrack.core.records import Trial
 
 if TYPE_CHECKING:
     import av
@@ -21,6 +23,12 @@ if TYPE_CHECKING:
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
 DECODER_THREADS = 2
+"""Chosen: as many recordings are tracked at once as there are cores; more threads gain nothing then."""
+
+
+SAME_RATE = 0.005
+"""Derived: 29.97 and 30 frames a second differ by 0.1 %, 23.976 and 24 likewise; a rate of capture that is no rate of
+playback but within 0.5 % of one is 30.1 for 30, which no camera offers."""
 
 
 class RecordingError(ValueError):
@@ -108,6 +116,14 @@ class _Decoded:
 def inspect_recording(path: Path | str) -> Recording:
     """Open a recording and read its header, without decoding more than one frame.
 
+    Parameters
+    ----------
+    path : a film, a picture stack, or a folder of pictures.
+
+    Returns
+    -------
+    its size, rate and kind.
+
     Raises
     ------
     RecordingError
@@ -128,6 +144,16 @@ def inspect_recording(path: Path | str) -> Recording:
 def read_frames(path: Path | str | Recording, region: Region | None = None, threads: int = DECODER_THREADS) -> Frames:
     """Decode every frame of a recording, or the `region` of it.
 
+    Parameters
+    ----------
+    path : of the recording, or what `inspect_recording` returned.
+    region : part of the picture; the whole where None.
+    threads : of the decoder.
+
+    Returns
+    -------
+    every frame with its capture period; partly damaged recordings say so in `notes`.
+
     Raises
     ------
     RecordingError
@@ -145,7 +171,17 @@ def read_frames(path: Path | str | Recording, region: Region | None = None, thre
 
 
 def iterate_frames(recording: Recording, region: Region | None = None) -> Iterator[NDArray[Any]]:
-    """Yield the region of one frame after another; each is a copy of its own. Stops where decoding does."""
+    """Yield the region of one frame after another; each is a copy of its own. Stops where decoding does.
+
+    Parameters
+    ----------
+    recording : from `inspect_recording`.
+    region : part of the picture; the whole where None.
+
+    Yields
+    ------
+    grey levels, shape (height, width).
+    """
     region = region or recording.whole
     if recording.kind != "container":
         from vinetrack.video.images import iterate_images
@@ -260,10 +296,10 @@ def _assemble(recording: Recording, region: Region, decoded: _Decoded) -> Frames
         )
     damaged = np.array(decoded.corrupt, dtype=bool)
     if decoded.complaints or damaged.any():
-        said = f"; the decoder says: {decoded.complaints[0].strip()}" if decoded.complaints else ""
+        complaint = f"; the decoder says: {decoded.complaints[0].strip()}" if decoded.complaints else ""
         notes.append(
             f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt"
-            f" ({len(decoded.complaints)} complaints of the decoder{said})"
+            f" ({len(decoded.complaints)} complaints of the decoder{complaint})"
         )
     slot, irregular = slots_from_times(np.array(decoded.pts))
     if irregular:
@@ -276,6 +312,14 @@ def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]
 
     Timestamps are rounded to whole periods of their median spacing: a missing frame leaves a gap of one. Timestamps
     that repeat, run backwards, or fit no common period say nothing, and the plain index is used.
+
+    Parameters
+    ----------
+    times : timestamps, shape (n_frames,), any unit.
+
+    Returns
+    -------
+    capture periods since the first frame, shape (n_frames,), and a sentence.
     """
     plain = np.arange(len(times))
     if len(times) < 3 or not np.all(np.isfinite(times)):
@@ -295,9 +339,40 @@ def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]
     return slot, f"{missing} frames are missing by the timestamps; the others keep their own time"
 
 
-def _with_notes(recording: Recording, *notes: str) -> Recording:
-    """The same recording with more to say."""
-    return replace(recording, notes=(*recording.notes, *notes))
+def capture_rate(trial: Trial, recording: Recording) -> float:
+    """Return the capture rate: the user's; that of DNG frames where the sheet is blank.
+
+    Parameters
+    ----------
+    trial : its `capture_fps` is that of the sheet, NaN where blank.
+    recording : from `inspect_recording`.
+
+    Returns
+    -------
+    frames a second.
+
+    Raises
+    ------
+    RecordingError
+        Where there is none, where sheet and DNG frames differ, and where it is the file's rate of playback.
+    """
+    true_fps, stated = recording.capture_fps, trial.capture_fps
+    if true_fps is not None:
+        if np.isfinite(stated) and abs(stated / true_fps - 1) > 1e-3:
+            raise RecordingError(
+                f"{trial.name}: capture_fps is {stated:g} in the sheet but {true_fps:g} in the frames; "
+                "correct the sheet"
+            )
+        return true_fps
+    if not np.isfinite(stated):
+        raise RecordingError(f"{trial.name}: capture_fps is missing; the file knows its playback rate only")
+    playback = recording.playback_fps
+    if playback and abs(stated / playback - 1) < SAME_RATE and not trial.capture_fps_is_playback:
+        raise RecordingError(
+            f"{trial.name}: capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g}); "
+            "write the rate of capture, or capture_fps_is_playback: yes where the film plays as fast as it was captured"
+        )
+    return stated
 
 
 class _quiet_log:  # noqa: N801 - used as a context, like a function

@@ -13,12 +13,24 @@ from numpy.typing import NDArray
 from vinetrack.video.frames import IMAGES, Frames, Recording, RecordingError, Region
 
 TAG_EXPOSURE = 33434
+"""Defined by TIFF/EP (ISO 12234-2): exposure time."""
+
 TAG_FRAME_RATE = 51044
+"""Defined by CinemaDNG: frame rate."""
+
 JPEG_END, PNG_END = b"\xff\xd9", b"IEND\xaeB`\x82"
 
 
 def inspect_images(path: Path) -> Recording:
     """Facts about a folder of images or a TIFF stack, from its first picture.
+
+    Parameters
+    ----------
+    path : a folder of pictures, or a TIFF stack.
+
+    Returns
+    -------
+    its size, kind and files.
 
     Raises
     ------
@@ -45,6 +57,15 @@ def inspect_images(path: Path) -> Recording:
 
 def read_images(recording: Recording, region: Region) -> Frames:
     """Read every picture; one that is missing its end or cannot be read is black or partial and marked damaged.
+
+    Parameters
+    ----------
+    recording : from `inspect_images`.
+    region : part of the picture.
+
+    Returns
+    -------
+    every picture with its capture period, by its number.
 
     Raises
     ------
@@ -78,7 +99,17 @@ def read_images(recording: Recording, region: Region) -> Frames:
 
 
 def iterate_images(recording: Recording, region: Region) -> Iterator[NDArray[Any]]:
-    """Yield the region of each picture that can be read."""
+    """Yield the region of each picture that can be read.
+
+    Parameters
+    ----------
+    recording : from `inspect_images`.
+    region : part of the picture.
+
+    Yields
+    ------
+    grey levels, shape (height, width).
+    """
     if recording.kind == "stack":
         for page in _stack_pages(recording):
             yield page[region.slices]
@@ -200,16 +231,16 @@ def _dng_clock(file: Path) -> tuple[float | None, float | None]:
     """Capture rate and exposure that a CinemaDNG frame carries (tags 51044 and 33434); None where absent."""
     import tifffile
 
-    found: dict[int, float] = {}
+    values: dict[int, float] = {}
     with tifffile.TiffFile(file) as tiff:
         for page in _dng_pages(tiff):
             for code in (TAG_FRAME_RATE, TAG_EXPOSURE):
-                if code in page.tags and code not in found:
+                if code in page.tags and code not in values:
                     value = page.tags[code].value
                     top, bottom = (value[0], value[1]) if isinstance(value, tuple) else (value, 1)
                     if bottom:
-                        found[code] = float(top) / float(bottom)
-    return found.get(TAG_FRAME_RATE), found.get(TAG_EXPOSURE)
+                        values[code] = float(top) / float(bottom)
+    return values.get(TAG_FRAME_RATE), values.get(TAG_EXPOSURE)
 
 
 def _read_dng(file: Path) -> NDArray[np.uint16]:

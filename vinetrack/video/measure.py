@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
-from vinetrack.video.frames import Recording, RecordingError, inspect_recording, read_frames
-from vinetrack.video.track import Tracking, capture_rate, track_frames
+from vinetrack.video.frames import Recording, RecordingError, capture_rate, inspect_recording, read_frames
+from vinetrack.video.track import Tracking, track_frames
 
 if TYPE_CHECKING:
     from vinetrack.experiment.settings import ExperimentSettings
@@ -48,12 +48,13 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
 
     Parameters
     ----------
-    trial
-        Its `video`, frame rate, exposure and diameter; its `m_per_px` overrides the calibration.
-    settings
-        `calibration` and, where the trial has none of its own, `axis` are used.
-    folder
-        The experiment's folder, from which the calibration's picture counts.
+    trial : its `video`, frame rate, exposure and diameter; its `m_per_px` overrides the calibration.
+    settings : `calibration` and, where the trial has none of its own, `axis` are used.
+    folder : the experiment's folder, from which the calibration's picture counts.
+
+    Returns
+    -------
+    track, scale, its relative standard error, and the calibration.
 
     Raises
     ------
@@ -93,6 +94,10 @@ def calibration_of(
     trial, settings, folder : see `measure_recording`.
     recording : opened, for the size of its picture.
 
+    Returns
+    -------
+    the calibration, or None.
+
     Raises
     ------
     RecordingError
@@ -107,7 +112,18 @@ def calibration_of(
 
 
 def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> Axis | None:
-    """The growth axis of the sheet or the settings, None where neither has one; `m_per_px` is for its width."""
+    """Return the growth axis of the sheet or the settings.
+
+    Parameters
+    ----------
+    trial : its axis comes first.
+    settings : their axis stands for all trials.
+    m_per_px : scale, for the width of the axis.
+
+    Returns
+    -------
+    in the picture, px; None where neither has one.
+    """
     if trial.axis is not None:
         return Axis(trial.axis.from_px, trial.axis.to_px, trial.axis.width_m / m_per_px)
     if settings.axis is None:

@@ -16,11 +16,14 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 LOST_SIGMA_PX = 4.0
-"""A point known no better than this is no point."""
+"""A point known no better than this is no point. Chosen: about a millimetre at the usual 3 px/mm. At half blurred
+frames are lost; at twice they stay and hardly weigh."""
 FLOOR_PX = 0.04
-"""Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands: 0.03-0.06 px."""
+"""Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands. Chosen between 0.03
+and 0.06 px, which they came to. At half good frames state errors that are too small, at twice too large."""
 STEP_RATIO = 1.6
-"""A step this many times its neighbours is no acceleration: a frame is missing."""
+"""A step this many times its neighbours is no acceleration: a frame is missing. Chosen as `DROP_RATIO` of
+`vinetrack.tracks.frame_timing`, with the same consequences."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,16 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: fl
 
     Fourth differences cancel any cubic motion and have variance Σ c² σ², c = (1, −4, 6, −4, 1). Their median size in
     units of the stated errors is the factor, left at 1 where fewer than 8 of them exist; FLOOR_PX is added in square.
+
+    Parameters
+    ----------
+    edge_px, sigma_px : positions and stated errors, shape (n_frames,), px; NaN where the edge was not found.
+    use : mask of the frames that count, shape (n_frames,).
+    smallest : factor at least; 6 at most.
+
+    Returns
+    -------
+    standard errors, shape (n_frames,), px.
     """
     weights = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
     if len(edge_px) < 5:
@@ -62,6 +75,14 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
 
     At rest means: within three sigma, at least 0.4 px (0.25 px at the end, where a creeping stop still tells), of
     the level that it keeps up to, or from, there.
+
+    Parameters
+    ----------
+    edge_px, sigma_px : positions and their errors, shape (n_frames,), px; NaN where the edge was not found.
+
+    Returns
+    -------
+    first and last frame.
     """
     good = np.flatnonzero(np.isfinite(edge_px))
     n = len(edge_px)
@@ -79,15 +100,15 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
 def _leaves_level(y: Floats, tolerance: float) -> int:
     """Index of the first point from which on `y` stays above the level of those before it; 0 where none rest."""
     level = float(y[0])
-    rest = 0
+    last_at_rest = 0
     for i in range(1, len(y)):
         if y[i] - level <= tolerance:
-            rest = i
-            level = float(np.median(y[: rest + 1]))
+            last_at_rest = i
+            level = float(np.median(y[: last_at_rest + 1]))
         elif i + 1 >= len(y) or y[i + 1] - level > tolerance:
             break
     # Two frames alike may be a slow start; a rest has three.
-    return rest + 1 if rest >= 2 else 0
+    return last_at_rest + 1 if last_at_rest >= 2 else 0
 
 
 def judge(
@@ -105,27 +126,27 @@ def judge(
 
     Parameters
     ----------
-    edge_px, sigma_px
-        Shape (n_frames,), px; NaN where the edge was not found.
-    slot
-        Capture periods from the first frame, shape (n_frames,).
-    unsure, damaged, repeated
-        Masks (n_frames,): a poor fit, a frame the decoder calls corrupt, a picture like the one before it.
-    end_px
-        Where the strip ends: an edge beyond it has left the picture.
-    retime
-        Whether a frame missing by the motion alone shifts the times of those after it.
+    edge_px, sigma_px : shape (n_frames,), px; NaN where the edge was not found.
+    slot : capture periods from the first frame, shape (n_frames,).
+    unsure, damaged, repeated : masks (n_frames,): a poor fit, a frame the decoder calls corrupt, a picture like the one
+        before it.
+    end_px : where the strip ends: an edge beyond it has left the picture.
+    retime : whether a frame missing by the motion alone shifts the times of those after it.
+
+    Returns
+    -------
+    flags, capture periods, notes, and first and last moving frame.
     """
     n = len(edge_px)
     flags = [""] * n
     notes: list[str] = []
-    lost = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
+    no_edge = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
     gone = np.flatnonzero(np.isfinite(edge_px) & (edge_px >= end_px))
     left = int(gone[0]) if len(gone) else n
-    y = np.where(lost | (np.arange(n) >= left), np.nan, edge_px)
+    y = np.where(no_edge | (np.arange(n) >= left), np.nan, edge_px)
     first, last = moving_range(y, sigma_px)
-    slot, gaps, found = _mend_times(y, sigma_px, slot, repeated, first, last, retime)
-    notes.extend(found)
+    slot, gaps, gap_notes = _mend_times(y, sigma_px, slot, repeated, first, last, retime)
+    notes.extend(gap_notes)
     if left < n:
         notes.append(f"the leading edge leaves the picture at frame {left}; later frames are not used")
     copies = repeated & (np.arange(n) > first) & (np.arange(n) <= last)
@@ -138,13 +159,13 @@ def judge(
         parts = (
             "before_release" if i < first else "",
             "after_end" if i > last >= 0 or i >= left else "",
-            "lost" if lost[i] and i < left else "",
+            "lost" if no_edge[i] and i < left else "",
             "duplicate" if copies[i] else "",
             "gap" if gaps[i] else "",
-            "doubtful" if (unsure[i] or damaged[i] or outlying[i]) and not lost[i] else "",
+            "doubtful" if (unsure[i] or damaged[i] or outlying[i]) and not no_edge[i] else "",
         )
         flags[i] = join_flags(*parts)
-    missing = lost & (np.arange(n) >= first) & (np.arange(n) <= last)
+    missing = no_edge & (np.arange(n) >= first) & (np.arange(n) <= last)
     if missing.any():
         notes.append(
             f"the leading edge is lost in {int(missing.sum())} moving frames, first frame {np.flatnonzero(missing)[0]}"

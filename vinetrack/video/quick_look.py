@@ -62,10 +62,10 @@ def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | 
     every = max(1, -(-min(count or MOST_DECODED, MOST_DECODED) // most))
     luma = np.stack(list(islice(iterate_frames(recording), 0, MOST_DECODED, every)))
     try:
-        found, orderly = whereabouts(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
+        axis_found, orderly = whereabouts(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
         if trial.travel_ratio == 1 or not orderly:
-            return Look(found)
-        strip = cut_strip(luma, squared(found), 0.65 * found.width_px + 3)
+            return Look(axis_found)
+        strip = cut_strip(luma, squared(axis_found), 0.65 * axis_found.width_px + 3)
         for _ in range(2 * CENTRINGS):
             before, sides = strip, outline(strip)
             strip = centred(luma, strip, sides)

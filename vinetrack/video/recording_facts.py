@@ -33,11 +33,15 @@ BLUR_PX = 3.0
 20900 and up): true exposures miss it by up to 0.8 px, one of a whole frame for a tenth by 3.4 to 34 px at 7 to 45 px a
 frame."""
 ERROR_FACTOR = 1.5
-"""Factor between picture and sheet that no lens or ruler makes: an error."""
+"""Factor between picture and sheet that no lens or ruler makes: an error. Chosen: the smallest usual slip, of an inch
+for a centimetre or a radius for a diameter, is 2 and more. At half (of its logarithm) wide lenses are refused, at
+twice (2.25) a diameter doubled by mistake passes."""
 SIGMAS = 3.0
 """Standard errors of the width that are allowed for."""
 SAME_FACTOR = 0.1
-"""Width and growth that are off by factors within a tenth of each other are off by one factor: the scale."""
+"""Width and growth that are off by factors within a tenth of each other are off by one factor: the scale. Chosen:
+widths and growths are seen to some per cent. At half true errors of scale are told as two faults, at twice two faults
+as one of scale."""
 LEAVE_OUT = "or write compare_sizes: no where only part of the tube is seen"
 
 
@@ -76,6 +80,10 @@ def tracked_facts(trial: Trial, measurement: Measurement) -> RecordingFacts:
     ----------
     trial : as the sheet has it.
     measurement : its recording, tracked.
+
+    Returns
+    -------
+    the facts.
     """
     tracking = measurement.tracking
     mm_per_px = 1e3 * measurement.m_per_px
@@ -173,6 +181,10 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
     Parameters
     ----------
     facts, trials : of the same recordings, in the same order.
+
+    Returns
+    -------
+    lines for the terminal.
     """
     rows = [_cells(fact, trial) for fact, trial in zip(facts, trials, strict=True)]
     head = (
@@ -194,7 +206,16 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
 
 
 def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
-    """The numbers of a recording as JSON holds them."""
+    """Return the numbers of a recording as JSON holds them.
+
+    Parameters
+    ----------
+    facts : of one recording.
+
+    Returns
+    -------
+    units stand in the keys.
+    """
     entry = {key: value for key, value in vars(facts).items() if key != "axis"}
     axis = None if facts.axis is None else {"from_px": facts.axis.from_px, "to_px": facts.axis.to_px}
     return entry | {"duration_s": facts.duration_s, "axis": axis}

@@ -17,14 +17,20 @@ from vinetrack.video.axis import Axis
 Floats = NDArray[np.float64]
 
 GAP_PX = 5
-"""Rows left out between tube and band, for sway and blur."""
+"""Rows left out between tube and band, for sway and blur. Chosen; at half a swaying tube enters the bands, at twice
+small pictures have none."""
 BAND_PX = (14, 44)
-"""Least and greatest height of a band."""
+"""Least and greatest height of a band. Chosen: at the least, two bands hold PIXELS along 320 px of axis. Half or twice
+changes how well flicker is known."""
 REFERENCE_FRAMES = 15
+"""Frames whose mean is what all are compared with. Chosen: its noise is then a quarter of a frame's."""
+
 PIXELS = 9000
-"""Pixels of the bands that are used, evenly spread: enough for a shift of 0.01 px."""
+"""Pixels of the bands that are used, evenly spread: enough for a shift of 0.01 px. Derived for slopes of 5 grey levels
+a pixel and noise of 5: 1/√9000 = 0.01 px."""
 SHAKE_FLOOR_PX = 0.04
-"""Shake below this is left alone: moving a picture by it costs more than it mends."""
+"""Shake below this is left alone: moving a picture by it costs more than it mends. Chosen as FLOOR_PX of
+`point_quality`."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,18 @@ class Strip:
 
 
 def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
-    """Cut, level and steady the strip of `half_px` on both sides of the axis; `luma` has shape (n, height, width)."""
+    """Cut, level and steady the strip on both sides of an axis.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+    axis : in the picture, px.
+    half_px : half the height of the strip, px.
+
+    Returns
+    -------
+    the strip.
+    """
     half = int(np.ceil(half_px))
     bands = _band_rows(luma.shape[1:], axis, half)
     unit = _unit(luma)
@@ -61,7 +78,19 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
 
 
 def recut(strip: Strip, luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
-    """The same frames cut along a slightly different axis; gain and shift are those of `strip`."""
+    """Cut the same frames along a slightly different axis; gain and shift are those of `strip`.
+
+    Parameters
+    ----------
+    strip : the first cut.
+    luma : grey levels, shape (n_frames, height, width).
+    axis : in the picture, px.
+    half_px : half the height of the strip, px.
+
+    Returns
+    -------
+    the strip.
+    """
     half = int(np.ceil(half_px))
     values = sample(luma, axis, np.arange(-half, half + 1), strip.shift_px if strip.steadied else None)
     return replace(strip, values=values, axis=axis)
@@ -72,6 +101,17 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: 
 
     An axis along the picture's own rows or columns is cut out without interpolation, moved by less than half a
     pixel for it; `shift_px` (n, 2) moves every frame back by its own shift.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+    axis : in the picture, px.
+    rows_px : consecutive distances beside the axis, shape (n_rows,), px.
+    shift_px : shake of every frame along and across, shape (n_frames, 2), px.
+
+    Returns
+    -------
+    grey levels, shape (n_frames, n_rows, n_along).
     """
     import cv2
 
@@ -116,6 +156,14 @@ def squared(axis: Axis) -> Axis:
     """The axis turned and moved onto whole rows or columns where it is that already but for 0.2 px of slope.
 
     Cutting is then exact. The slope is forgiven over the whole length, not per pixel.
+
+    Parameters
+    ----------
+    axis : in the picture, px.
+
+    Returns
+    -------
+    the axis, or the same where it slopes by more.
     """
     (x0, y0), (x1, y1) = axis.from_px, axis.to_px
     if abs(y1 - y0) <= 0.4 and abs(x1 - x0) > 10:
@@ -188,8 +236,8 @@ def _halves_agree(views: list[NDArray[Any]], basis: list[NDArray[np.float32]]) -
     columns = views[0].shape[2]
     parts = []
     for low, high in ((0, columns // 2), (columns // 2, columns)):
-        own = [part.reshape(4, -1, columns - 2)[:, :, low : high - 2].reshape(4, -1) for part in basis]
-        parts.append(_register([view[:, :, low:high] for view in views], own))
+        basis_here = [part.reshape(4, -1, columns - 2)[:, :, low : high - 2].reshape(4, -1) for part in basis]
+        parts.append(_register([view[:, :, low:high] for view in views], basis_here))
     (first, first_sd), (second, second_sd) = parts
     apart, both = np.abs(first[:, 2] - second[:, 2]), np.abs(first[:, 2] + second[:, 2])
     most = apart + both >= np.quantile(apart + both, 0.75)

@@ -19,14 +19,18 @@ Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 FEWEST_CORNERS = 8
-"""A plane and a lens are ten numbers, two of them nearly fixed beforehand: four corners would fit anything."""
+"""A plane and a lens are ten numbers, two of them nearly fixed beforehand: four corners would fit anything. Chosen:
+sixteen coordinates for the ten numbers."""
 MARKER_OUTLIER = 0.3
-"""A marker further than this (squares) from where the board has it belongs to another board."""
+"""A marker further than this (squares) from where the board has it belongs to another board. Chosen: below half a
+square, where the next marker begins. At half bent boards are refused, at twice markers of another board pass."""
 MARKER_TOLERANCE = 0.10
 """Markers that differ from `marker_mm` by more than this, as a share of it, were printed at another size. Blur alone
-makes small ones (25 px) look 4 % smaller."""
+makes small ones (25 px) look 4 % smaller. Chosen above that 4 %, below the steps of usual prints. At half small
+markers are refused, at twice a print scaled to fit the page passes."""
 DICTIONARY_SIZES = (50, 100, 250, 1000)
-"""Words in OpenCV's dictionaries of each marker size; a smaller one is the beginning of a larger."""
+"""Words in OpenCV's dictionaries of each marker size; a smaller one is the beginning of a larger. Defined by
+OpenCV."""
 OTHER_DICTIONARIES = (*(f"DICT_{n}X{n}" for n in (4, 5, 6, 7)), "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11")
 
 
@@ -35,7 +39,16 @@ class CornersError(ValueError):
 
 
 def eight_bits(picture: NDArray[Any]) -> Grey:
-    """Grey levels, shape (height, width), stretched so that 0.5 % of the pixels are black and 0.5 % white."""
+    """Grey levels, shape (height, width), stretched so that 0.5 % of the pixels are black and 0.5 % white.
+
+    Parameters
+    ----------
+    picture : grey levels of any depth, shape (height, width).
+
+    Returns
+    -------
+    shape (height, width), 0 to 255.
+    """
     low, high = np.percentile(picture, [0.5, 99.5])
     stretched = (picture.astype(np.float32) - low) * (255 / max(float(high - low), 1.0))
     return stretched.clip(0, 255).astype(np.uint8)
@@ -45,6 +58,15 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     """Corners of a ChArUco board in the picture (px) and on the board (m), both of shape (n, 2).
 
     Boards printed by OpenCV before 4.6 (markers in the other squares where the rows are even) are recognised too.
+
+    Parameters
+    ----------
+    picture : grey levels of any depth, shape (height, width).
+    board : what the target is.
+
+    Returns
+    -------
+    corners in the picture (px) and on the board (m), both of shape (n, 2).
 
     Raises
     ------
@@ -57,13 +79,13 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
     words = _words(board.dictionary)
     corners, ids = _markers(grey, words)
     if len(ids) < 0.9 * (board.squares[0] * board.squares[1] // 2):
-        corners, ids = max((corners, ids), _markers(grey, words, enlarge=2), key=lambda one: len(one[1]))
+        corners, ids = max((corners, ids), _markers(grey, words, enlarge=2), key=lambda pair: len(pair[1]))
     if not len(ids):
         raise CornersError(_no_markers(grey, board.dictionary))
     layouts = [_charuco_board(board, words, legacy) for legacy in (False, True)]
     agreement = [_agreeing_markers(layout, corners, ids, board) for layout in layouts]
     layout = layouts[int(np.argmax([share for share, _ in agreement]))]
-    share, marker_mm = max(agreement, key=lambda one: one[0])
+    share, marker_mm = max(agreement, key=lambda pair: pair[0])
     if share < 0.8:
         raise CornersError(
             f"the markers do not lie as on a board of {board.squares[0]} × {board.squares[1]} squares "
@@ -87,6 +109,15 @@ def charuco_corners(picture: NDArray[Any], board: Charuco) -> tuple[Floats, Floa
 
 def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Floats, Floats]:
     """Inner corners of a checkerboard, all of which must be in the picture (px), and on the board (m); shape (n, 2).
+
+    Parameters
+    ----------
+    picture : grey levels of any depth, shape (height, width).
+    board : what the target is.
+
+    Returns
+    -------
+    corners in the picture (px) and on the board (m), both of shape (n, 2).
 
     Raises
     ------
@@ -234,8 +265,8 @@ def _no_markers(grey: Grey, dictionary: str) -> str:
             best, numbers = name, ids
     if len(numbers) >= 3:
         enough = next((size for size in DICTIONARY_SIZES if size > numbers.max()), DICTIONARY_SIZES[-1])
-        found = f"{best}_{enough}" if best[-2] == "X" else best
-        return f"no marker of {dictionary} is seen, but {len(numbers)} of {found}; correct `dictionary`"
+        likely = f"{best}_{enough}" if best[-2] == "X" else best
+        return f"no marker of {dictionary} is seen, but {len(numbers)} of {likely}; correct `dictionary`"
     return (
         f"no marker of {dictionary} is seen; check `dictionary`, and that the board is in the picture, in focus, "
         "not mirrored and larger than 5 pixels a marker bit"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
-from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording, read_frames
+from vinetrack.video.frames import Frames, RecordingError, capture_rate, inspect_recording, read_frames
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
@@ -22,22 +22,27 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 5
+"""Derived: fourth differences take five."""
+
 GROWN_TOLERANCE = 0.03
-"""Part of a vine's length by which travel and length may differ, for the vine to have grown whole."""
+"""Part of a vine's length by which travel and length may differ, for the vine to have grown whole. Chosen: lengths are
+cut to a few millimetres in 20 cm, and scales err by a per cent. At half whole growths go unrecognised, at twice a stop
+just before the end passes for it."""
 CENTRINGS = 3
-"""Times the strip may be cut anew: what lay outside the first shows only in the second."""
-SAME_RATE = 0.005
-"""Derived: 29.97 and 30 frames a second differ by 0.1 %, 23.976 and 24 likewise; a rate of capture that is no rate of
-playback but within 0.5 % of one is 30.1 for 30, which no camera offers."""
+"""Times the strip may be cut anew: what lay outside the first shows only in the second. Chosen; it is cut anew only
+while the axis moves by more than OFF_CENTRE_PX, so that more cost little."""
 APART_PX = 1.0
-"""Bands of the edge that disagree by more cannot all be its own."""
+"""Bands of the edge that disagree by more cannot all be its own. Chosen: 25 times FLOOR_PX. By reasoning: at half tips
+of crumpled film count as doubtful, at twice an edge half behind a door does not."""
 MOSTLY_LOST = 0.5
-"""Part of the frames without an edge from which a recording is not one where nothing moves."""
+"""Part of the frames without an edge from which a recording is not one where nothing moves. Chosen: the majority; it
+decides which of two messages is given."""
 
 STEADIED_PX = 0.1
 """Error of a camera's shake taken off by what stands still: measured 0.1-0.15 px, mostly of its slow part."""
 OFF_CENTRE_PX = 0.8
-"""Tilt of the axis, over its length, or shift that is left alone: the tip's rows then lag by under a tenth of it."""
+"""Tilt of the axis, over its length, or shift that is left alone: the tip's rows then lag by under a tenth of it.
+Chosen; at half the strip is cut once more, at twice rows lag by up to 0.16 px."""
 
 
 @dataclass(frozen=True)
@@ -92,14 +97,15 @@ def track_recording(
 
     Parameters
     ----------
-    trial
-        Its `video`, `capture_fps`, `exposure_s`, `travel_ratio` and, unless given here, `m_per_px` are used.
-    axis
-        Growth axis in the picture; found from the motion where None. It is centred on what moves along it.
-    m_per_px
-        Scale; that of the trial where None. Without any, positions in metres are NaN and pixels remain.
-    position_m
-        Metres along the axis of picture points (x, y), shape (n, 2): a calibration that knows distortion and tilt.
+    trial : its `video`, `capture_fps`, `exposure_s`, `travel_ratio` and, unless given here, `m_per_px` are used.
+    axis : growth axis in the picture; found from the motion where None. It is centred on what moves along it.
+    m_per_px : scale; that of the trial where None. Without any, positions in metres are NaN and pixels remain.
+    position_m : metres along the axis of picture points (x, y), shape (n, 2): a calibration that knows distortion and
+        tilt.
+
+    Returns
+    -------
+    the track, and what the report shows of it.
 
     Raises
     ------
@@ -123,7 +129,23 @@ def track_frames(
     m_per_px: float | None = None,
     position_m: Callable[[Floats], Floats] | None = None,
 ) -> Tracking:
-    """Track frames that are in memory already; see `track_recording`."""
+    """Track frames that are in memory already; see `track_recording`.
+
+    Parameters
+    ----------
+    frames : decoded, with their capture periods.
+    trial, axis, m_per_px, position_m : as in `track_recording`.
+    capture_fps : frames a second.
+
+    Returns
+    -------
+    the track, and what the report shows of it.
+
+    Raises
+    ------
+    RecordingError
+        In one sentence, where the frames hold no track.
+    """
     name = frames.recording.path.name
     exposure_s = trial.exposure_s if np.isfinite(trial.exposure_s) else (frames.recording.exposure_s or np.nan)
     if len(frames) < FEWEST_FRAMES:
@@ -139,18 +161,18 @@ def track_frames(
     luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
     try:
         axis, orderly = whereabouts(luma, axis, trial, m_per_px)
-        strip, found = _follow(luma, trial, axis, exposure_s * capture_fps, orderly)
+        strip, edge_fit = _follow(luma, trial, axis, exposure_s * capture_fps, orderly)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
-    repeated = _repeated(strip, found.edge_px)
-    moving = np.gradient(found.edge_px) > 0.3 if len(kept) > 1 else np.ones(len(kept), bool)
-    sigma = calibrated_sigma(found.edge_px, found.sigma_px, moving & np.isfinite(found.edge_px))
+    repeated = _repeated(strip, edge_fit.edge_px)
+    moving = np.gradient(edge_fit.edge_px) > 0.3 if len(kept) > 1 else np.ones(len(kept), bool)
+    sigma = calibrated_sigma(edge_fit.edge_px, edge_fit.sigma_px, moving & np.isfinite(edge_fit.edge_px))
     # Roughness and the bands' disagreement tell of the same noise; the larger one also of what the other is blind to.
-    sigma = np.maximum(sigma, np.hypot(found.apart_sigma_px, FLOOR_PX))
+    sigma = np.maximum(sigma, np.hypot(edge_fit.apart_sigma_px, FLOOR_PX))
     sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
-    end_px = strip.axis.length_px - found.reach_px
+    end_px = strip.axis.length_px - edge_fit.reach_px
     verdict = judge(
-        found.edge_px, sigma, frames.slot[kept], unsure=found.unsure, damaged=frames.damaged[kept],
+        edge_fit.edge_px, sigma, frames.slot[kept], unsure=edge_fit.unsure, damaged=frames.damaged[kept],
         repeated=repeated, end_px=end_px,
     )  # fmt: skip
     sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
@@ -162,9 +184,9 @@ def track_frames(
             )
         raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
     scale = trial.m_per_px if m_per_px is None else m_per_px
-    notes = [*frames.notes, *verdict.notes, *(f"{name}: {note}" for note in found.notes)]
-    if not found.notes and not _is_grown(found.edge_px, verdict, trial.length_m / scale):
-        notes += _ending(luma, verdict, found.edge_px, name)
+    notes = [*frames.notes, *verdict.notes, *(f"{name}: {note}" for note in edge_fit.notes)]
+    if not edge_fit.notes and not _is_grown(edge_fit.edge_px, verdict, trial.length_m / scale):
+        notes += _ending(luma, verdict, edge_fit.edge_px, name)
     if not orderly:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
@@ -173,46 +195,32 @@ def track_frames(
     if rejected.any():
         first = int(np.flatnonzero(rejected)[0])
         notes.append(f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {first}")
-    track = _assemble(frames, kept, found, sigma, verdict, capture_fps, exposure_s, notes)
+    track = _assemble(frames, kept, edge_fit, sigma, verdict, capture_fps, exposure_s, notes)
     track = _in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
     pictures = tuple((int(kept[i]), luma[i]) for i in chosen)
     shake_px = np.zeros(len(frames))
     shake_px[kept] = strip.shift_px[:, 0] if strip.steadied else 0.0
     return Tracking(
-        track, strip.axis, _kymograph(strip), pictures, found.blur_px, found.exposure_frames, shake_px,
-        *found.width_px, *found.seen_exposure,
+        track, strip.axis, _kymograph(strip), pictures, edge_fit.blur_px, edge_fit.exposure_frames, shake_px,
+        *edge_fit.width_px, *edge_fit.seen_exposure,
     )  # fmt: skip
 
 
-def capture_rate(trial: Trial, recording: Recording) -> float:
-    """The capture rate: the user's; that of DNG frames where the sheet is blank.
-
-    Raises
-    ------
-    RecordingError
-        Where there is none, where sheet and DNG frames differ, and where it is the file's rate of playback.
-    """
-    own, stated = recording.capture_fps, trial.capture_fps
-    if own is not None:
-        if np.isfinite(stated) and abs(stated / own - 1) > 1e-3:
-            raise RecordingError(
-                f"{trial.name}: capture_fps is {stated:g} in the sheet but {own:g} in the frames; correct the sheet"
-            )
-        return own
-    if not np.isfinite(stated):
-        raise RecordingError(f"{trial.name}: capture_fps is missing; the file knows its playback rate only")
-    playback = recording.playback_fps
-    if playback and abs(stated / playback - 1) < SAME_RATE and not trial.capture_fps_is_playback:
-        raise RecordingError(
-            f"{trial.name}: capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g}); "
-            "write the rate of capture, or capture_fps_is_playback: yes where the film plays as fast as it was captured"
-        )
-    return stated
-
-
 def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, bool]:
-    """The axis, with a width, and whether what changes along it is one front that passes once and stays."""
+    """The axis, with a width, and whether what changes along it is one front that passes once and stays.
+
+    Parameters
+    ----------
+    luma : brightness, shape (n_frames, height, width).
+    axis : in the picture, px; found from the motion where None.
+    trial : its diameter or the axis gives the width; its travel ratio decides what is looked for.
+    m_per_px : scale; None where unknown.
+
+    Returns
+    -------
+    axis, px; and False where the vine bends or sweeps away.
+    """
     given = axis is not None
     axis = axis if axis is not None else find_axis(luma)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
@@ -232,7 +240,7 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
 
         strip = cut_strip(luma, axis, 1.5 * half + 12)
         fit = track_body(strip)
-        place = np.where(fit.lost, np.nan, fit.position_px)
+        place = np.where(fit.unseen, np.nan, fit.position_px)
         return strip, _Edge(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, notes=fit.notes)
     from vinetrack.video.edge import outline, track_edge
 
@@ -277,9 +285,13 @@ def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
 
     Parameters
     ----------
-    luma : array, shape (n_frames, height, width), brightness.
+    luma : brightness, shape (n_frames, height, width).
     strip : cut from it.
     sides : of the tube in that strip.
+
+    Returns
+    -------
+    the strip.
     """
     shift, slope, half = sides.shift_px, sides.slope, sides.half_px
     tilt = slope * strip.axis.length_px
@@ -346,10 +358,10 @@ def _is_grown(edge_px: Floats, verdict: Judgement, length_px: float) -> bool:
     """Whether the edge stops where the whole vine has grown, as it should; no where its length or rest is unknown."""
     if verdict.last_moving < 0 or not np.isfinite(length_px):
         return False
-    rest, end = edge_px[: verdict.first_moving], edge_px[verdict.last_moving + 1 :]
-    if not (np.isfinite(rest).any() and np.isfinite(end).any()):
+    start, end = edge_px[: verdict.first_moving], edge_px[verdict.last_moving + 1 :]
+    if not (np.isfinite(start).any() and np.isfinite(end).any()):
         return False
-    return bool(abs((np.nanmedian(end) - np.nanmedian(rest)) / length_px - 1) < GROWN_TOLERANCE)
+    return bool(abs((np.nanmedian(end) - np.nanmedian(start)) / length_px - 1) < GROWN_TOLERANCE)
 
 
 def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str) -> list[str]:
@@ -360,16 +372,16 @@ def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str) 
     small = luma[:, ::3, ::3].astype(np.float32)
     change = np.abs(np.diff(small, axis=0)).mean(axis=(1, 2))
     before = float(np.median(change[verdict.first_moving : last])) if last > verdict.first_moving else 0.0
-    rest = float(np.min(change)) if len(change) else 0.0
+    least = float(np.min(change)) if len(change) else 0.0
     later = float(np.median(change[last + 1 :]))
     where = f"{name}: the leading edge stops at {np.nanmedian(edge_px[last + 1 :]):.0f} px after frame {last}"
-    if later - rest > 0.3 * (before - rest):
+    if later - least > 0.3 * (before - least):
         return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
     return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
 
 
 def _assemble(
-    frames: Frames, kept: NDArray[np.int_], found: _Edge, sigma: Floats, verdict: Judgement, capture_fps: float,
+    frames: Frames, kept: NDArray[np.int_], edge_fit: _Edge, sigma: Floats, verdict: Judgement, capture_fps: float,
     exposure_s: float, notes: list[str],
 ) -> Track:  # fmt: skip
     """A row for every decoded frame; those rejected, or after the end of what follows the axis, have no position."""
@@ -378,9 +390,9 @@ def _assemble(
     flag = np.full(n, "rejected", dtype="<U64")
     flag[int(kept[-1]) + 1 :] = "after_end"
     slot = frames.slot.astype(float)
-    lost = np.array(["lost" in f.split(";") for f in verdict.flag], dtype=bool)
-    edge[kept] = np.where(lost, np.nan, found.edge_px)
-    error[kept] = np.where(lost, np.nan, sigma)
+    no_edge = np.array(["lost" in f.split(";") for f in verdict.flag], dtype=bool)
+    edge[kept] = np.where(no_edge, np.nan, edge_fit.edge_px)
+    error[kept] = np.where(no_edge, np.nan, sigma)
     flag[kept] = verdict.flag
     slot[kept] = verdict.slot
     time = slot / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)

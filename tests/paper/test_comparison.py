@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
 from vinetrack.experiment.naming import with_names
-from vinetrack.paper.beside import (
+from vinetrack.paper.comparison import (
     Rest,
     eq2_speed_m_s,
     final_speeds,

@@ -12,11 +12,10 @@ from vinetrack.inference.fit_result import Number
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.kinematics.conditions import CONDITION_COLUMNS
 from vinetrack.paper.arithmetic import computed_rows
-from vinetrack.paper.beside import POSITION_COLUMNS, SPEED_COLUMNS
+from vinetrack.paper.comparison import POSITION_COLUMNS, SPEED_COLUMNS
 from vinetrack.paper.departures import DEPARTURE_COLUMNS, DEPARTURES
-from vinetrack.paper.foretold import foretold_rows
-from vinetrack.paper.found import Found, found_rows
 from vinetrack.paper.protocol import protocol_rows
+from vinetrack.paper.result_rows import ExperimentResults, result_rows
 from vinetrack.paper.rows import (
     COMPUTED,
     MEASURED,
@@ -28,6 +27,7 @@ from vinetrack.paper.rows import (
     bounds,
     number,
 )
+from vinetrack.paper.theory_rows import theory_rows
 
 nan = math.nan
 
@@ -89,7 +89,7 @@ FIT = FitSummary(
 )
 
 
-def found(mark: str = SIMULATED, **changes: object) -> Found:
+def found(mark: str = SIMULATED, **changes: object) -> ExperimentResults:
     positions = pd.DataFrame([("c", 7.0, 4, 0.0031, 0.0042)], columns=list(POSITION_COLUMNS))
     speeds = pd.DataFrame(
         [("a", "v", 14.0, 10.0, 4, 120.0, 1.1, 0.1, 1.0), ("b", "v", 14.0, 20.0, 4, 120.0, 1.3, 0.1, 1.6)],
@@ -103,12 +103,12 @@ def found(mark: str = SIMULATED, **changes: object) -> Found:
     fast |= {"final_at_mm": 380.0, "final_lead_velocity_m_s": 46.0, "n_final": 1}
     conditions = pd.DataFrame([fast]).reindex(columns=list(CONDITION_COLUMNS))
     given: dict = {"damping": DAMPING, "scaling": SCALING, "conditions": conditions, "fit": FIT}
-    return Found(
+    return ExperimentResults(
         **({"mark": mark, "positions": positions, "speeds": speeds, "departures": departures} | given | changes)
     )
 
 
-def nothing() -> Found:
+def nothing() -> ExperimentResults:
     empty = {name: pd.DataFrame(columns=list(columns), dtype=float) for name, columns in EMPTY.items()}
     return found(damping={}, scaling={}, fit=FitSummary(()), **empty)
 
@@ -121,8 +121,8 @@ EMPTY = {
 }
 
 
-def table(of: Found) -> pd.DataFrame:
-    return as_table(found_rows(of)).set_index("row")
+def table(of: ExperimentResults) -> pd.DataFrame:
+    return as_table(result_rows(of)).set_index("row")
 
 
 def test_the_law_stands_beside_the_printed_one() -> None:
@@ -246,7 +246,7 @@ EVERY_STATEMENT = {
 
 def test_no_published_number_is_without_its_line() -> None:
     steady = pd.DataFrame(columns=["trial", "rule", "accepted", "points", "cv", "drift"]).astype({"accepted": bool})
-    rows = [*protocol_rows([], steady, SIMULATED), *found_rows(nothing()), *computed_rows(), *foretold_rows([])]
+    rows = [*protocol_rows([], steady, SIMULATED), *result_rows(nothing()), *computed_rows(), *theory_rows([])]
     whole = as_table(rows)
     assert list(whole.columns) == list(PAPER_COLUMNS)
     by_row = whole.set_index("row")

@@ -24,7 +24,8 @@ PAPER_N = published.EXPONENT
 WALLS_UM = tuple(published.THICKNESS_UM.values())
 PAYLOADS_G = (10.0, 20.0, published.PAYLOAD_G, 50.0)
 EFFICIENCY_LENGTH_MM = 200.0
-"""Beyond the 150 mm at which the paper takes the efficiency."""
+"""Beyond the 150 mm at which the paper takes the efficiency. Length of the vines whose efficiency is taken. Chosen: 50
+mm beyond, so that the end of growth stays away."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,19 @@ class Vine:
     yield_pressure_kPa: float = 3.0
 
     def trial(self, name: str, pressure_kPa: float, payload_g: float = 0.0, capture_fps: float = CAPTURE_FPS) -> Trial:
-        """One trial with this vine."""
+        """Make one trial with this vine.
+
+        Parameters
+        ----------
+        name : of the trial.
+        pressure_kPa : gauge pressure.
+        payload_g : mass that rides on the tail.
+        capture_fps : frames a second.
+
+        Returns
+        -------
+        the trial, with errors of 1 % of the pressure and 0.2 kPa of the yield pressure.
+        """
         return Trial(
             name=name,
             capture_fps=capture_fps,
@@ -53,14 +66,36 @@ class Vine:
 
 
 def isometric_vine(scale: int) -> Vine:
-    """The paper's vine of scale R = 1…4: 50R µm, 6R mm and, isometric with the 280 mm of R = 4, 70R mm."""
+    """The paper's vine of scale R = 1…4: 50R µm, 6R mm and, isometric with the 280 mm of R = 4, 70R mm.
+
+    Parameters
+    ----------
+    scale : R.
+
+    Returns
+    -------
+    the vine.
+    """
     return Vine(6.0 * scale, 50.0 * scale, 70.0 * scale)
 
 
 def campaign(
     vine: Vine, pressures_kPa: Iterable[float], replicates: int, payload_g: float = 0.0, prefix: str = ""
 ) -> list[Trial]:
-    """Every pressure `replicates` times with one vine and payload."""
+    """Make trials of every pressure, `replicates` times, with one vine and payload.
+
+    Parameters
+    ----------
+    vine : the vine.
+    pressures_kPa : gauge pressures.
+    replicates : trials of each.
+    payload_g : mass that rides on the tail.
+    prefix : of the trials' names.
+
+    Returns
+    -------
+    trials, replicates together.
+    """
     return [
         vine.trial(f"{prefix}{pressure_kPa:g}kPa_{k + 1}".replace(".", "p"), pressure_kPa, payload_g)
         for pressure_kPa in pressures_kPa
@@ -81,7 +116,17 @@ def _paper_B(diameter_m: float, thickness_m: float) -> float:
 
 
 def damping_pressures_kPa(scale: int, count: int = 10) -> np.ndarray:
-    """Pressures of the damping protocol for one scale; see `_steady_pressures_kPa`."""
+    """Return pressures of the damping protocol for one scale; see `_steady_pressures_kPa`.
+
+    Parameters
+    ----------
+    scale : R.
+    count : of pressures.
+
+    Returns
+    -------
+    shape (count,), kPa, rising.
+    """
     return _steady_pressures_kPa(isometric_vine(scale), count)
 
 
@@ -104,7 +149,17 @@ def _steady_pressures_kPa(of: Vine, count: int = 10) -> np.ndarray:
 
 
 def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
-    """The protocol of the damping fit: R = 1…4, `count` pressures, `replicates` trials, no payload."""
+    """The protocol of the damping fit: R = 1…4, `count` pressures, `replicates` trials, no payload.
+
+    Parameters
+    ----------
+    replicates : trials of each pressure.
+    count : pressures of each scale.
+
+    Returns
+    -------
+    trials, with vine and condition named.
+    """
     trials = [
         trial
         for scale in PAPER_B
@@ -116,7 +171,16 @@ def paper_damping(replicates: int = 4, count: int = 10) -> list[Trial]:
 
 
 def paper_payload(replicates: int = 4) -> list[Trial]:
-    """The paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads."""
+    """The paper's Figs. 4 and 5: 24 mm × 200 µm at 7, 14, 28 kPa with 35.6 g; 150 µm with four payloads.
+
+    Parameters
+    ----------
+    replicates : trials of each pressure and payload.
+
+    Returns
+    -------
+    trials, with vine and condition named.
+    """
     payload = published.PAYLOAD_G
     trials = campaign(isometric_vine(4), published.POSITION_RMS_CM, replicates, payload_g=payload, prefix="fig4_")
     thinner = replace(isometric_vine(4), thickness_um=published.FINAL_SPEED_THICKNESS_UM)
@@ -190,12 +254,30 @@ def paper_campaign() -> list[Trial]:
 
 
 def paper_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
-    """True parameters for the vines of the paper's campaign: B by vine, to four digits, and the printed n."""
+    """True parameters for the vines of the paper's campaign: B by vine, to four digits, and the printed n.
+
+    Parameters
+    ----------
+    trials : of the paper's campaign, with vines named.
+
+    Returns
+    -------
+    values as `Nature.values` takes them; B in N·(s/m)ⁿ.
+    """
     by_vine = {trial.vine: float(f"{_paper_B(trial.diameter_m, trial.thickness_m):.4g}") for trial in trials}
     return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}
 
 
 def damping_values(trials: Iterable[Trial]) -> dict[str, dict[str, float] | float]:
-    """True parameters for the isometric vines among these trials: the printed B by vine, the printed n."""
+    """True parameters for the isometric vines among these trials: the printed B by vine, the printed n.
+
+    Parameters
+    ----------
+    trials : of isometric vines, with vines named.
+
+    Returns
+    -------
+    values as `Nature.values` takes them; B in N·(s/m)ⁿ.
+    """
     by_vine = {trial.vine: PAPER_B[round(trial.diameter_m / 6e-3)] for trial in trials}
     return {"eversion_damping.B": by_vine, "eversion_damping.n": PAPER_N}

@@ -38,23 +38,41 @@ class Rest(NamedTuple):
 
 
 def position_conditions(trials: Sequence[Trial]) -> dict[float, list[Trial]]:
-    """Trials of Fig. 4, by pressure in kPa: the 24 mm × 200 µm vine with the paper's payload."""
-    found: dict[float, list[Trial]] = {}
+    """Trials of Fig. 4, by pressure in kPa: the 24 mm × 200 µm vine with the paper's payload.
+
+    Parameters
+    ----------
+    trials : of the experiment.
+
+    Returns
+    -------
+    trials of one condition each, by pressure in kPa.
+    """
+    conditions: dict[float, list[Trial]] = {}
     for pressure_kPa in published.POSITION_RMS_CM:
-        own = [trial for trial in trials if _is(trial, published.THICKNESS_UM[4], pressure_kPa, published.PAYLOAD_G)]
-        if own:
-            found[float(pressure_kPa)] = [trial for trial in own if trial.condition == own[0].condition]
-    return found
+        alike = [trial for trial in trials if _is(trial, published.THICKNESS_UM[4], pressure_kPa, published.PAYLOAD_G)]
+        if alike:
+            conditions[float(pressure_kPa)] = [trial for trial in alike if trial.condition == alike[0].condition]
+    return conditions
 
 
 def speed_conditions(trials: Sequence[Trial]) -> dict[str, list[Trial]]:
-    """Trials of Fig. 5, by condition: 24 mm × 150 µm vines at the paper's pressures with any payload."""
-    found: dict[str, list[Trial]] = {}
+    """Trials of Fig. 5, by condition: 24 mm × 150 µm vines at the paper's pressures with any payload.
+
+    Parameters
+    ----------
+    trials : of the experiment.
+
+    Returns
+    -------
+    trials by condition.
+    """
+    conditions: dict[str, list[Trial]] = {}
     for pressure_kPa in published.FINAL_SPEED_RMS_M_S:
         for trial in trials:
             if _is(trial, published.FINAL_SPEED_THICKNESS_UM, pressure_kPa) and trial.payload_kg > 0:
-                found.setdefault(trial.condition, []).append(trial)
-    return found
+                conditions.setdefault(trial.condition, []).append(trial)
+    return conditions
 
 
 def _is(trial: Trial, thickness_um: float, pressure_kPa: float, payload_g: float | None = None) -> bool:
@@ -81,6 +99,10 @@ def mean_motions(
     conditions : as `position_conditions` finds them.
     kinematics : by trial, as `kinematics/TRIAL.csv` holds them.
     rests : by trial.
+
+    Returns
+    -------
+    the table; empty where no trial can be laid over the others.
     """
     parts = []
     for pressure_kPa, trials in conditions.items():
@@ -100,9 +122,9 @@ def _since_release(
     motions = []
     for trial in trials:
         if trial.name in kinematics and trial.name in rests:
-            rest, own = rests[trial.name], kinematics[trial.name]
-            grown_m = own["lead_position_m"].to_numpy(float) - rest.origin_m
-            time_s, known = own["time_s"].to_numpy(float) - rest.release_s, np.isfinite(grown_m)
+            start, table = rests[trial.name], kinematics[trial.name]
+            grown_m = table["lead_position_m"].to_numpy(float) - start.origin_m
+            time_s, known = table["time_s"].to_numpy(float) - start.release_s, np.isfinite(grown_m)
             beyond = np.flatnonzero(known & (grown_m >= WITHIN * trial.length_m))
             stop = int(beyond[0]) + 1 if beyond.size else grown_m.size
             motions.append((time_s[:stop][known[:stop]], grown_m[:stop][known[:stop]]))
@@ -119,6 +141,14 @@ def position_errors(
     """How far trials lie from Eq. (2) with the printed B and n, their mean and each alone, columns `POSITION_COLUMNS`.
 
     Since release, until Eq. (2) or the first trial has grown to 95 %; parameters as those of `mean_motions`.
+
+    Parameters
+    ----------
+    conditions, kinematics, rests : as of `mean_motions`.
+
+    Returns
+    -------
+    a row a pressure.
     """
     rows = []
     for pressure_kPa, trials in conditions.items():
@@ -129,7 +159,7 @@ def position_errors(
         stop = int(np.searchsorted(plain.lead_position_m, WITHIN * trials[0].length_m))
         counts = time_s <= plain.time_s[min(stop, plain.time_s.size - 1)]
         off_m = (laid_m - np.interp(time_s, plain.time_s, plain.lead_position_m))[:, counts]
-        mean_m, single_m = (math.sqrt(float(np.mean(np.square(one)))) for one in (off_m.mean(axis=0), off_m))
+        mean_m, single_m = (math.sqrt(float(np.mean(np.square(part_m)))) for part_m in (off_m.mean(axis=0), off_m))
         rows.append((trials[0].condition, pressure_kPa, len(laid_m), mean_m, single_m))
     return pd.DataFrame(rows, columns=list(POSITION_COLUMNS))
 
@@ -144,6 +174,10 @@ def final_speeds(
     conditions : as `speed_conditions` finds them.
     kinematics : by trial, as `kinematics/TRIAL.csv` holds them.
     rests : by trial.
+
+    Returns
+    -------
+    a row a condition.
     """
     rows = []
     at_m = published.FINAL_SPEED_AT_MM / 1e3
@@ -159,14 +193,23 @@ def final_speeds(
         ]
         mean, sigma, count = mean_with_error(np.array(speeds, dtype=float))
         if count:
-            one = trials[0]
-            sizes = (condition, one.vine, one.pressure_Pa / 1e3, 1e3 * one.payload_kg)
-            rows.append((*sizes, count, 1e3 * at_m, mean, sigma, eq2_speed_m_s(one)))
+            first = trials[0]
+            sizes = (condition, first.vine, first.pressure_Pa / 1e3, 1e3 * first.payload_kg)
+            rows.append((*sizes, count, 1e3 * at_m, mean, sigma, eq2_speed_m_s(first)))
     return pd.DataFrame(rows, columns=list(SPEED_COLUMNS))
 
 
 def eq2_speed_m_s(trial: Trial) -> float:
-    """Speed of the leading edge at 12 cm by Eq. (2), B in proportion to the wall; 0 where it does not get there."""
+    """Speed of the leading edge at 12 cm by Eq. (2), B in proportion to the wall; 0 where it does not get there.
+
+    Parameters
+    ----------
+    trial : its size, pressure and payload.
+
+    Returns
+    -------
+    m/s.
+    """
     B = published.DAMPING_B[4] * 1e6 * trial.thickness_m / published.THICKNESS_UM[4]
     moved = follow(trial, NONE, B)
     speed = lead_velocity_at(moved.lead_position_m, moved.lead_velocity_m_s, published.FINAL_SPEED_AT_MM / 1e3)
@@ -174,7 +217,17 @@ def eq2_speed_m_s(trial: Trial) -> float:
 
 
 def speed_curves(conditions: Mapping[str, list[Trial]], instants: int = 15) -> pd.DataFrame:
-    """Eq. (2) along payloads, from the least of each pressure to the largest, in the columns of `final_speeds`."""
+    """Eq. (2) along payloads, from the least of each pressure to the largest, in the columns of `final_speeds`.
+
+    Parameters
+    ----------
+    conditions : as `speed_conditions` finds them.
+    instants : payloads along each curve.
+
+    Returns
+    -------
+    a row a payload and pressure.
+    """
     rows = []
     by_pressure: dict[float, list[Trial]] = {}
     for trials in conditions.values():
