@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from vinetrack.core.constants import AMBIENT_PRESSURE_PA, FILM_DENSITY_KG_M3
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int_]
+Bools = NDArray[np.bool_]
 
 FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "gap", "corrected", "after_end")
 """Every flag a point of a track can carry; several are joined by `;`."""

@@ -7,12 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Kinematics, Window
+from vinetrack.core.records import Floats, Indices, Kinematics, Window
 from vinetrack.kinematics.windows import correlated
 
-Indices = NDArray[np.int_]
 Bounds = Callable[[Indices, Indices], tuple[Floats, Floats]]
 
 

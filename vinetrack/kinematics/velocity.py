@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Kinematics, Track
-from vinetrack.kinematics.windows import Indices, Mask, WindowFits, fit_all_windows
+from vinetrack.core.records import Bools, Floats, Indices, Kinematics, Track
+from vinetrack.kinematics.windows import WindowFits, fit_all_windows
 from vinetrack.tracks.position_noise import track_noise
 
 WINDOWS = (5, 7, 9, 13, 19, 27, 39, 57, 83, 119, 171, 247)
@@ -129,7 +129,7 @@ def smooth(
     return values, np.maximum(sigma, TRUSTED_GAIN * centred_error), np.array(widths)[fit_used]
 
 
-def _narrowest(fit: WindowFits, centred: Centred, follows: Mask, noise_m: float) -> tuple[Floats, Indices, Floats]:
+def _narrowest(fit: WindowFits, centred: Centred, follows: Bools, noise_m: float) -> tuple[Floats, Indices, Floats]:
     """Where nothing wider serves: the narrowest window, its error that of the noise or of its misfit if larger."""
     window, _, gain = centred
     good = follows[window]
@@ -138,7 +138,7 @@ def _narrowest(fit: WindowFits, centred: Centred, follows: Mask, noise_m: float)
 
 
 def _agreement(
-    centred: list[Centred], follows: list[Mask], noise_m: float, kappa: float
+    centred: list[Centred], follows: list[Bools], noise_m: float, kappa: float
 ) -> tuple[Floats, Floats, Floats]:
     """Velocities on which the centred windows agree, from the narrowest up: lowest, highest, least error; (n,) each.
 

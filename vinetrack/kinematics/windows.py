@@ -10,12 +10,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
-
-Indices = NDArray[np.int_]
-Mask = NDArray[np.bool_]
+from vinetrack.core.records import Bools, Floats, Indices
 
 EVEN_TOLERANCE = 0.01
 """Spacings within this fraction of their median count as even. Chosen: printed times are rounded."""
@@ -40,7 +36,7 @@ class WindowFits:
     middle_s: Floats
     half_s: Floats
     even_covariance: Floats
-    odd: Mask
+    odd: Bools
     odd_covariance: Floats | None
     misfit: Floats
     misfit_terms: int
@@ -148,7 +144,7 @@ def _rows(u: Floats, terms: int) -> tuple[Floats, Floats, Floats]:
     return value, slope, curve
 
 
-def _uneven_windows(time_s: Floats, width: int) -> Mask:
+def _uneven_windows(time_s: Floats, width: int) -> Bools:
     """Windows that hold a spacing off the usual one, shape (n − width + 1,)."""
     spacing = np.diff(time_s)
     off = np.abs(spacing / np.median(spacing) - 1) > EVEN_TOLERANCE

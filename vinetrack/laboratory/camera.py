@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from vinetrack.core.records import Floats
 
 UNDISTORT_STEPS = 10
 """Newton steps of the inverse of the distortion; exact to rounding after about six for lenses such as cameras have.

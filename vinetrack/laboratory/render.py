@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.laboratory import shading, textures
 from vinetrack.laboratory.scene import Scene, Tube
 from vinetrack.laboratory.scene_motion import Motion, Staging
 from vinetrack.laboratory.scene_objects import BallLayer, DoorLayer, PathMaps, TubeLayer
 from vinetrack.laboratory.targets import lay_target, plane_seen
 
-Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 TONE_STEPS = 4096

@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.laboratory.scene import Scene, Tube
 
-Floats = NDArray[np.float64]
 Motion = Callable[[Floats], Floats] | tuple[Floats, Floats]
 """Lead position in metres against time in seconds: a function of an array, or samples (time_s, lead_position_m)."""
 

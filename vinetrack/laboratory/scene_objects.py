@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.laboratory import shading, textures
 from vinetrack.laboratory.scene import Ball, Door, Scene, Tube
 from vinetrack.laboratory.scene_motion import Staging
 
-Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 EXPOSURE_PIECES = 4

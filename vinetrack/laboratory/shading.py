@@ -8,8 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
+
 Image = NDArray[np.float32]
-Floats = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
 NORMAL_BITS = 12

@@ -15,12 +15,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.laboratory.camera import Camera
 
 if TYPE_CHECKING:
     from vinetrack.laboratory.scene import Scene
 
-Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 POINTS, LATTICE = 89, 55

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import fan_gains, passing_times
-
-Floats = NDArray[np.float64]
 
 SMALL_PX = 240
 """Longest side of the pictures in which the axis is sought. Chosen: a vine of 3 % of it is then 7 px wide;

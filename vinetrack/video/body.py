@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.video.strip import Strip
-
-Floats = NDArray[np.float64]
 
 SEARCH_ROWS = 8
 """Rows across by which the body may stray from the axis, from frame to frame of the search. Chosen: a body that strays

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.experiment.settings import Calibration, Charuco, Checkerboard, MmPerPx, TwoPoints
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames
 from vinetrack.video.plane_map import PlaneMap, fit_planes
 from vinetrack.video.target_corners import CornersError, charuco_corners, checkerboard_corners
-
-Floats = NDArray[np.float64]
 
 CLICK_SIGMA_PX = 0.5
 """A point picked by hand in a picture is off by about half a pixel. Chosen: a hand points to about a pixel. At half or

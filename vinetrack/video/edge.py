@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
 from vinetrack.video.edge_repair import ASTRAY_PX, FAINTEST, disagreement, growth_end, mend_jumps
@@ -32,8 +33,6 @@ from vinetrack.video.edge_state import (
     seen_exposure,
 )
 from vinetrack.video.strip import Strip
-
-Floats = NDArray[np.float64]
 
 START_PX = 0.08
 """Error near the start, where background is seen briefly or never. Chosen: twice FLOOR_PX of `point_quality`. At half

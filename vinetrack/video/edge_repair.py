@@ -14,10 +14,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.video.edge_state import EdgeState, core_frames, fit_edges, moving_frames
 from vinetrack.video.strip import Strip
-
-Floats = NDArray[np.float64]
 
 ASTRAY_PX = 3.0
 """Error stated where nothing like the edge is found where the motion leads. Chosen just below LOST_SIGMA_PX: the point

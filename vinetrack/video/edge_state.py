@@ -11,10 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.strip import Strip
-
-Floats = NDArray[np.float64]
 
 MEMORY_FRAMES = 6.0
 """What a pixel showed this long before and after its passing counts 1/e: enough frames to average noise, few enough

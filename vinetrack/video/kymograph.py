@@ -18,6 +18,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
+
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
 
@@ -153,8 +155,6 @@ def first_path(
     score = np.where(worth[None, :] > 0, score - 0.15 * score.max(axis=0, keepdims=True), -0.2).astype(np.float32)
     return _collect_path(score), score
 
-
-Floats = NDArray[np.float64]
 
 FIRST_FRAMES = 5
 """Frames whose median is what stands before the vine comes. Chosen: the median of five drops two odd ones."""

@@ -15,9 +15,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from vinetrack.core.records import Floats
 
 PRIOR_SIGMA = (0.15, 0.15, 0.10, 0.02)
 """Standard deviations, before any corner is seen, of the two perspective terms (0.15: 25° of tilt at a focal length of

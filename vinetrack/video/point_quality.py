@@ -10,10 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import join_flags
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from vinetrack.core.records import Bools, Floats, join_flags
 
 LOST_SIGMA_PX = 4.0
 """A point known no better than this is no point. Chosen: about a millimetre at the usual 3 px/mm. At half blurred
@@ -120,7 +117,6 @@ def judge(
     damaged: Bools,
     repeated: Bools,
     end_px: float,
-    retime: bool = True,
 ) -> Judgement:
     """Flag every frame and mend the times.
 
@@ -131,7 +127,6 @@ def judge(
     unsure, damaged, repeated : masks (n_frames,): a poor fit, a frame the decoder calls corrupt, a picture like the one
         before it.
     end_px : where the strip ends: an edge beyond it has left the picture.
-    retime : whether a frame missing by the motion alone shifts the times of those after it.
 
     Returns
     -------
@@ -145,7 +140,7 @@ def judge(
     left = int(gone[0]) if len(gone) else n
     y = np.where(no_edge | (np.arange(n) >= left), np.nan, edge_px)
     first, last = moving_range(y, sigma_px)
-    slot, gaps, gap_notes = _mend_times(y, sigma_px, slot, repeated, first, last, retime)
+    slot, gaps, gap_notes = _mend_times(y, sigma_px, slot, repeated, first, last)
     notes.extend(gap_notes)
     if left < n:
         notes.append(f"the leading edge leaves the picture at frame {left}; later frames are not used")
@@ -204,7 +199,7 @@ def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
 
 
 def _mend_times(
-    y: Floats, sigma_px: Floats, slot: NDArray[np.int_], repeated: Bools, first: int, last: int, retime: bool
+    y: Floats, sigma_px: Floats, slot: NDArray[np.int_], repeated: Bools, first: int, last: int
 ) -> tuple[NDArray[np.int_], Bools, list[str]]:
     """Slots with the missing frames counted in, the frames that follow a gap, and what to say of it."""
     n = len(y)
@@ -225,7 +220,7 @@ def _mend_times(
         if ratio > STEP_RATIO:
             gaps[i] = True
             whole = round(ratio)
-            if retime and abs(ratio - whole) < 0.2 and whole <= 4:
+            if abs(ratio - whole) < 0.2 and whole <= 4:
                 mended[i:] += whole - 1
                 notes.append(
                     f"{whole - 1} frame(s) missing before frame {i} by the step of the motion; "

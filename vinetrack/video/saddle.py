@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from vinetrack.core.records import Floats
 
 HALF_WINDOW_PX = 12
 """Beyond it a strong lens bends edges by more than the fit gains: 6 k₁ r / f² · 12²/2 ≈ 0.015 px. Derived with k₁ of a

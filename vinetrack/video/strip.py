@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
-
-Floats = NDArray[np.float64]
 
 GAP_PX = 5
 """Rows left out between tube and band, for sway and blur. Chosen; at half a swaying tube enters the bands, at twice

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
 from vinetrack.video.saddle import refine_saddles
 
 if TYPE_CHECKING:
     from vinetrack.experiment.settings import Charuco, Checkerboard
 
-Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 FEWEST_CORNERS = 8

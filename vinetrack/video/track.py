@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
 from vinetrack.video.frames import Frames, RecordingError, capture_rate, inspect_recording, read_frames
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
@@ -19,7 +19,6 @@ from vinetrack.video.strip import Strip, cut_strip, recut, squared
 if TYPE_CHECKING:
     from vinetrack.video.edge import EdgeFit, Outline
 
-Floats = NDArray[np.float64]
 
 FEWEST_FRAMES = 5
 """Derived: fourth differences take five."""
