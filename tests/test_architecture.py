@@ -33,7 +33,7 @@ FLOORS = (
     {"figures"},
     {"report"},
     {"pipeline"},
-    {"explorer", "setup_page"},
+    {"explorer", "interface", "setup_page"},
     {"cli"},
 )
 """From the ground up; a room may use its own floor and those below. `experiment` looks into tracks (video)."""
@@ -41,7 +41,7 @@ FLOORS = (
 HEAVY = {"matplotlib", "cv2", "skimage", "numba", "scipy", "pandas", "jinja2", "bokeh", "odrpack"}
 HEAVY_AT_IMPORT = {
     *("dynamics", "inference", "effects", "kinematics", "laboratory", "video", "tracks", "diagnosis", "explorer"),
-    *("planning", "paper", "setup_page"),
+    *("planning", "paper", "interface", "setup_page"),
 }
 """Rooms that compute: whoever imports them wants what they stand on. All others must start at once."""
 

@@ -2,11 +2,11 @@
 
     import vinetrack as vt
 
-    experiment = vt.read_experiment("my_experiment")
-    fit = vt.fit(vt.base_model(), experiment)
-    print(fit)
-    print(vt.compare(fit, experiment).table)
-    print(vt.refit(fit, fit.model + vt.effects.reservoir_depletion))
+    results = vt.load("results/demo")
+    print(results.diagnosis)
+    fit = vt.fit(vt.base_model(), "results/demo")
+    print(vt.compare(fit).table)
+    print(vt.refit(fit, fit.model + "reservoir_depletion"))
 
 Whatever is named here is loaded when it is first used.
 """
@@ -24,9 +24,11 @@ _HOMES = {
     "Model": "vinetrack.dynamics.model",
     "StatedValues": "vinetrack.planning.input_sources",
     "base_model": "vinetrack.dynamics.model",
-    "compare": "vinetrack.diagnosis.compare",
-    "diagnose": "vinetrack.diagnosis.diagnose",
-    "fit": "vinetrack.inference.fit",
+    "compare": "vinetrack.interface.calls",
+    "diagnose": "vinetrack.interface.calls",
+    "example_tracks": "vinetrack.interface.calls",
+    "fit": "vinetrack.interface.calls",
+    "load": "vinetrack.interface.loaded",
     "make_model": "vinetrack.dynamics.model",
     "planned_trial": "vinetrack.experiment.planned",
     "predict": "vinetrack.inference.fit",
@@ -35,6 +37,7 @@ _HOMES = {
     "read_experiment": "vinetrack.experiment.folder",
     "refit": "vinetrack.inference.fit",
     "simulate": "vinetrack.dynamics.simulate",
+    "tracks_from_frame": "vinetrack.interface.frames",
 }
 
 _RENAMED = {"Said": "StatedValues", "believe": "predictive_inputs", "foresee": "predict_vine"}

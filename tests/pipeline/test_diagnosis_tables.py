@@ -12,6 +12,7 @@ import pytest
 from hand_diagnosis import BASE, VERDICTS, diagnosis, ladder, moved, one_round, refused
 
 from vinetrack.diagnosis.result import Round
+from vinetrack.figures.registry import draw
 from vinetrack.figures.style import render
 from vinetrack.pipeline.diagnosis_tables import (
     figure_tables,
@@ -22,7 +23,7 @@ from vinetrack.pipeline.diagnosis_tables import (
     read_diagnosed,
     worst_condition,
 )
-from vinetrack.pipeline.figures_stage import draw_diagnosed, with_after
+from vinetrack.pipeline.figures_stage import figure_inputs, with_after
 from vinetrack.results.folder_layout import Results
 
 RELEASE_S, ORIGIN_M = 0.05, 0.2
@@ -108,23 +109,23 @@ def test_misfits_that_the_diagnosis_found_are_taken_with_their_errors(tmp_path: 
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
-def test_every_verdict_has_all_its_pictures(tmp_path: Path, verdict: str) -> None:
+def test_every_verdict_has_a_picture_of_what_it_has_a_table_of(tmp_path: Path, verdict: str) -> None:
     found = read_diagnosed(folder(tmp_path / "r", diagnosis(verdict), after=verdict == "missing"), conditions())
-    pictures = draw_diagnosed(found)
-    assert set(pictures) == PICTURES
-    for figure in pictures.values():
-        assert render(figure, ["svg"])["svg"]
+    assert found is not None
+    inputs = figure_inputs(found)
+    assert set(inputs) == set(figure_tables(found)) <= PICTURES
+    for name, values in inputs.items():
+        assert render(draw(name, *values), ["svg"])["svg"]
     tables = figure_tables(found)
     assert {"ladder", "before_after", "where", "candidates", "cosines"} <= set(tables)
     assert "drift" not in tables
 
 
 @pytest.mark.parametrize("content", [None, refused()], ids=["none", "refused"])
-def test_without_a_verdict_every_picture_says_so(tmp_path: Path, content: dict | None) -> None:
+def test_without_a_verdict_there_is_nothing_to_draw(tmp_path: Path, content: dict | None) -> None:
     found = read_diagnosed(folder(tmp_path / "r", content), conditions())
     assert found is None
     assert figure_tables(found) == {}
-    assert all(figure.texts for figure in draw_diagnosed(found).values())
 
 
 def test_a_diagnosis_without_predictions_has_the_rest(tmp_path: Path) -> None:
@@ -133,7 +134,7 @@ def test_a_diagnosis_without_predictions_has_the_rest(tmp_path: Path) -> None:
     found = read_diagnosed(results, conditions())
     assert found is not None
     assert set(figure_tables(found)) == {"candidates", "cosines"}
-    assert set(draw_diagnosed(found)) == PICTURES
+    assert set(figure_inputs(found)) == {"candidates", "cosines"}
 
 
 def test_what_the_last_model_says_joins_the_comparison_where_something_was_added(tmp_path: Path) -> None:

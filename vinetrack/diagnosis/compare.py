@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vinetrack.core.notebook import plot
 from vinetrack.core.records import Floats, Kinematics, Track
 from vinetrack.diagnosis.replicates import Replicates, first_that_counts, replicates_of
 from vinetrack.dynamics.simulate import simulate_many
@@ -32,6 +33,7 @@ from vinetrack.kinematics.velocity import estimate_kinematics
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
     from vinetrack.experiment.folder import Experiment
 
@@ -68,7 +70,7 @@ SMOOTHED_SHARE = 0.05
 Chosen: a twentieth averages 5 to 50 frames."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """`table` has a row a condition, columns `COMPARISON_COLUMNS`.
 
@@ -79,6 +81,16 @@ class Comparison:
     table: pd.DataFrame
     trajectories: Mapping[str, pd.DataFrame]
     trials: tuple[TrialFit, ...]
+
+    def plot(self, name: str = "model_comparison") -> Figure:
+        """Return a figure of the report: `model_comparison` or `model_residuals`."""
+        return plot(self, name)
+
+    def __repr__(self) -> str:
+        return f"Comparison({len(self.trials)} trials, {len(self.table)} conditions)"
+
+    def _repr_html_(self) -> str:
+        return str(self.table._repr_html_())  # type: ignore[operator]
 
 
 def compare(

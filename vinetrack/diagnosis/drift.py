@@ -13,6 +13,7 @@ that would have to change along the growth; and it shows in a yield pressure tha
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -37,6 +38,8 @@ from vinetrack.inference.subset import fit_subset
 
 if TYPE_CHECKING:
     import pandas as pd
+
+log = logging.getLogger(__name__)
 
 DRIFT_COLUMNS = (
     "parameter",
@@ -129,6 +132,31 @@ def drift(found: Fit, scatter: Scatter | None = None) -> Drift:
         pd.DataFrame(groups, columns=list(GROUP_COLUMNS)),
         tuple(notes),
     )
+
+
+def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
+    """Return what suits every group of trials best under the first model and, where something was added, the last.
+
+    Parameters
+    ----------
+    before : of the first model.
+    after : the last fit; None where nothing was added.
+
+    Returns
+    -------
+    DataFrame
+        Columns `GROUP_COLUMNS` and `model` (`before` or `after`); the last model is left out where its drift cannot be
+        worked out.
+    """
+    import pandas as pd
+
+    parts = [before.groups.assign(model="before")]
+    if after is not None:
+        try:
+            parts.append(drift(after).groups.assign(model="after"))
+        except (FitError, SimulationError, np.linalg.LinAlgError) as error:
+            log.info("the drift under the last model is not known: %s", error)
+    return pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
 
 
 def _tests(found: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTest]:

@@ -250,11 +250,22 @@ def make_model(names: Iterable[str] = BASE_EFFECTS, user_effects: Mapping[str, E
     ------
     EffectError
         If a name is unknown or stands twice.
+
+    Examples
+    --------
+    >>> make_model(["pressure_drive", "gravity", "air_drag"])
+    Model(pressure_drive + gravity + air_drag)
     """
     effects = tuple(find_effect(name, user_effects) for name in names)
     return Model(effects, user_effects=dict(user_effects or {}))
 
 
 def base_model() -> Model:
-    """The four base effects: the equation of motion of the paper, Eq. (2)."""
+    """The four base effects: the equation of motion of the paper, Eq. (2).
+
+    Examples
+    --------
+    >>> base_model() - "gravity"
+    Model(pressure_drive + eversion_damping + yield_pressure)
+    """
     return make_model()

@@ -97,6 +97,15 @@ def simulate(
         If the trial lacks what an effect needs.
     SimulationError
         If the integration does not get through.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import vinetrack as vt
+    >>> trial, _ = vt.tracks_from_frame(vt.example_tracks())[0]
+    >>> moved = vt.simulate(vt.base_model(), trial, np.array([0.0, 0.02, 0.04]))
+    >>> bool(np.all(np.diff(moved.lead_position_m) > 0))
+    True
     """
     return simulate_many(model, [trial], [times_s], traces=[trace], relative_tolerance=relative_tolerance)[0]
 

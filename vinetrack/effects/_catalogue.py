@@ -70,6 +70,12 @@ def load_effect(path: Path | str) -> Effect:
     ------
     EffectError
         If the file does not follow the contract of `Effect`; the message names what is missing.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.load_effect(vt.effects.air_drag.path).name
+    'air_drag'
     """
     path = Path(path)
     module = _load_module(path)
@@ -125,7 +131,14 @@ def _faults(effect: Effect) -> Iterable[str]:
 
 @lru_cache(maxsize=1)
 def catalogue() -> Mapping[str, Effect]:
-    """Every effect that comes with vinetrack, by name: base effects first, then alphabetical."""
+    """Every effect that comes with vinetrack, by name: base effects first, then alphabetical.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.catalogue()["air_drag"].kind
+    'physical'
+    """
     paths = {path.stem: path for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")}
     names = [*BASE_EFFECTS, *sorted(set(paths) - set(BASE_EFFECTS))]
     return MappingProxyType({name: load_effect(paths[name]) for name in names})
@@ -147,6 +160,13 @@ def find_effect(name: str, user_effects: Mapping[str, Effect] | None = None) -> 
     ------
     EffectError
         If there is none; the message suggests the nearest name.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.effects.find_effect("air_drg")
+    Traceback (most recent call last):
+    vinetrack.effects._catalogue.EffectError: ...
     """
     known = {**catalogue(), **(user_effects or {})}
     if name in known:

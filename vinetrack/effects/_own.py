@@ -85,6 +85,12 @@ def own_effects(paths: Iterable[Path | str]) -> Mapping[str, Effect]:
     ------
     EffectError
         If a file is no effect, two have one name, or one does not do what it says; one sentence.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> dict(vt.effects.own_effects([]))
+    {}
     """
     effects: dict[str, Effect] = {}
     for path in map(Path, paths):

@@ -104,6 +104,13 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     ------
     ExperimentError
         With all problems, if the sheet or the settings cannot be read, or if any row has a fault and it is strict.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.read_experiment("nowhere")
+    Traceback (most recent call last):
+    vinetrack.core.problems.ExperimentError: ...
     """
     folder = Path(folder)
     problems: list[Problem] = []

@@ -68,6 +68,12 @@ def planned_trial(
     ------
     ExperimentError
         With everything that is missing or not allowed.
+
+    Examples
+    --------
+    >>> texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30"}
+    >>> planned_trial(texts).trials[0].vine
+    '24mm-200um-280mm'
     """
 
     def shown(problem: Problem) -> Problem:

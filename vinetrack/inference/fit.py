@@ -145,7 +145,8 @@ def fit(
     held = _held(spreads, noise, data)
     solution = _solve_from_scratch(predictor, held, watch, thorough=thorough)
     _refuse_a_standstill(predictor, solution)
-    return assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
+    found = assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
+    return replace(found, pairs=tuple(pairs))
 
 
 def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
@@ -358,6 +359,14 @@ def refit(
         Whether releases, deviations and noise begin as the tracks show them, and not as the fit left them.
     watch
         Told of every step of the iterations; what it raises ends the fit.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> later = vt.refit(fit, fit.model + "reservoir_depletion")
+    >>> later.log_likelihood > fit.log_likelihood
+    True
     """
     model = model or before.model
     known = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
@@ -391,7 +400,8 @@ def refit(
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
     solution = _found_again(predictor, solution, held, watch, thorough=thorough)
-    return assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
+    found = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
+    return replace(found, pairs=before.pairs)
 
 
 def _led_back(predictor: Predictor, frame: MixedProblem, state: FitState, held: FixedTerms) -> FitState:
@@ -423,5 +433,13 @@ def predict(found: Fit, pairs: Pairs) -> list[TrialFit]:
     ------
     FitError
         If a trial cannot be used, or its vine was not in the fit and B is one per vine.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> pairs = vt.tracks_from_frame(vt.example_tracks())
+    >>> fit = vt.fit(vt.base_model(), pairs[:6], profile=False)
+    >>> [trial.name for trial in vt.predict(fit, pairs[6:])]
+    ['P48_1', 'P48_2']
     """
     return predict_trials(found, pairs)

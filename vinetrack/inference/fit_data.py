@@ -58,7 +58,15 @@ points go, at twice blurred ones stay."""
 
 
 class FitError(UserError, ValueError):
-    """A fit cannot be made; the message is one sentence with a remedy."""
+    """A fit cannot be made; the message is one sentence with a remedy.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.fit(vt.base_model(), [])
+    Traceback (most recent call last):
+    vinetrack.inference.fit_data.FitError: No trial can be fitted: there is none.
+    """
 
 
 @dataclass(frozen=True)

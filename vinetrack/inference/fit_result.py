@@ -11,7 +11,7 @@ import numpy as np
 
 from vinetrack.core.notebook import html_table, plot
 from vinetrack.core.numbers import decimals, or_nan
-from vinetrack.core.records import Floats, Trial
+from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.units import display_unit
 from vinetrack.dynamics.model import Model
 from vinetrack.inference.fit_data import FitError
@@ -186,7 +186,8 @@ class Fit(NumberTable):
     deviation of a position and `noise_correlation` its lag-one correlation, found with the model;
     `chi2_per_dof` holds what the model leaves against the noise of the tracks alone: 1 where nothing is missed.
     `log_likelihood` is the marginal one, every trial's own numbers integrated out, spreads and noise at their best:
-    what hypotheses are compared by. `left_out` gives trials that could not be used, and why. `between`, of the shape
+    what hypotheses are compared by. `left_out` gives trials that could not be used, and why; `pairs`
+    are the trials with their tracks, empty for a fit to part of another fit's trials. `between`, of the shape
     of `covariance`, is by how much the numbers of a trial differ from the shared ones, beyond its deviations of
     pressure and B (`vinetrack.inference.pooling`): all zeros where the trials agree, or are many.
     """
@@ -207,6 +208,7 @@ class Fit(NumberTable):
     predictor: Predictor
     solution: Solution
     options: Mapping[str, Any]
+    pairs: tuple[tuple[Trial, Track], ...] = ()
     between: Floats | None = None
 
     def trial(self, name: str) -> TrialFit:

@@ -60,7 +60,7 @@ class FitSummary(NumberTable):
     refused: str = ""
 
     @property
-    def values(self) -> dict[str, float | dict[str, float]]:
+    def fitted_values(self) -> dict[str, float | dict[str, float]]:
         """Fitted values by `effect.parameter`, SI, as `Model.with_values` takes them."""
         found: dict[str, Any] = {}
         for number in self.numbers:

@@ -178,6 +178,8 @@ def _write_laws(
 
 def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
     """Tables of where the first model fails, and the force that is missing, by name of file."""
+    from vinetrack.diagnosis.drift import drift_groups
+
     tables: dict[str, pd.DataFrame] = {}
     failure: Failure | None = diagnosis.failure
     if failure is not None:
@@ -186,26 +188,11 @@ def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
             "along_time.csv": failure.along_time,
             "along_position.csv": failure.along_position,
             "along_speed.csv": failure.along_speed,
-            "drift_groups.csv": _drift_groups(failure, diagnosis.fits[-1] if len(diagnosis.fits) > 1 else None),
+            "drift_groups.csv": drift_groups(failure.drift, diagnosis.fits[-1] if len(diagnosis.fits) > 1 else None),
         }
     if diagnosis.force_table is not None:
         tables["missing_force.csv"] = diagnosis.force_table
     return tables
-
-
-def _drift_groups(failure: Failure, after: Fit | None) -> pd.DataFrame:
-    """What suits every group of trials best under the first model and, where something was added, under the last."""
-    import pandas as pd
-
-    from vinetrack.diagnosis.drift import drift
-
-    parts = [failure.drift.groups.assign(model="before")]
-    if after is not None:
-        try:
-            parts.append(drift(after).groups.assign(model="after"))
-        except Exception as error:
-            log.info("the drift under the last model is not known: %s", _reason(error))
-    return pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
 
 
 def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:

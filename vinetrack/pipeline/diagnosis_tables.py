@@ -22,7 +22,7 @@ from vinetrack.results.folder_layout import Results, read_result
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.diagnosis.result import Round
+    from vinetrack.diagnosis.result import Diagnosis, Round
     from vinetrack.effects import Effect
     from vinetrack.experiment.folder import Experiment
     from vinetrack.report.diagnosis_section import DiagnosisResult
@@ -73,18 +73,50 @@ def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTable
     diagnosis = stored.read_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return None
+    located, drifting, force = (
+        _table(results.diagnosed(name)) for name in ("along_position.csv", "drift_groups.csv", "missing_force.csv")
+    )
+    return assemble_tables(diagnosis, conditions, predicted_trials(results, conditions), located, drifting, force)
+
+
+def assemble_tables(
+    diagnosis: Diagnosis,
+    conditions: pd.DataFrame,
+    trials: pd.DataFrame,
+    located: pd.DataFrame,
+    drifting: pd.DataFrame,
+    force: pd.DataFrame,
+) -> DiagnosisTables:
+    """Put the tables behind the pictures together.
+
+    Parameters
+    ----------
+    diagnosis
+        With a verdict.
+    conditions : DataFrame
+        As of `read_diagnosed`.
+    trials : DataFrame
+        Columns `CURVE_COLUMNS`.
+    located, drifting, force : DataFrame
+        Misfit along the growth, values of groups of trials, and the missing force; empty where there is none.
+
+    Returns
+    -------
+    DiagnosisTables
+    """
+    import pandas as pd
+
     labels = {str(row.condition): str(row.condition_label) for row in conditions.itertuples()}
-    trials = predicted_trials(results, conditions)
     worst = worst_condition(trials)
     names, matrix = in_order_of_rank(diagnosis.rounds[0])
     return DiagnosisTables(
-        ladder=_table(results.ladder),
+        ladder=pd.DataFrame() if diagnosis.ladder is None else diagnosis.ladder,
         trials=trials,
         before_after=trials[trials["condition"] == worst] if worst else trials.iloc[:0],
-        where=_where_table(trials, labels, _table(results.diagnosed("along_position.csv"))),
+        where=_where_table(trials, labels, located),
         cells=_cosine_cells(names, matrix),
-        drift=_table(results.diagnosed("drift_groups.csv")),
-        force=_table(results.diagnosed("missing_force.csv")),
+        drift=drifting,
+        force=force,
         rounds=[(question(i, diagnosis.rounds), ranking_table(ranked)) for i, ranked in enumerate(diagnosis.rounds)],
         cosines=(names, matrix),
         worst=worst,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.tables import write_bytes
+from vinetrack.core.tables import write_bytes, write_json
 from vinetrack.pipeline.pool import map_trials
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
@@ -74,15 +74,37 @@ def draw_trials(experiment: Experiment, folder: Path, settings: FigureSettings, 
 
 
 def _draw_trial(picture: _TrialPicture, results: Results, settings: FigureSettings) -> None:
+    _write(_trial_figure(picture, results), partial(results.trial_figure, picture.name), settings)
+
+
+def _trial_figure(picture: _TrialPicture, results: Results) -> Figure:
     from vinetrack.figures.registry import draw
 
     track, kinematics = read_result(results.track(picture.name)), read_result(results.kinematics(picture.name))
-    figure = draw("trial_motion", picture.title, track, kinematics, picture.windows, picture.travel_ratio)
-    _write(figure, partial(results.trial_figure, picture.name), settings)
+    return draw("trial_motion", picture.title, track, kinematics, picture.windows, picture.travel_ratio)
 
 
-def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> None:
-    """Draw the figures of the whole experiment.
+def draw_trial(folder: Path, trial: Trial | None, name: str) -> Figure:
+    """Draw position, speed and steady stretches of one trial of a results folder.
+
+    Parameters
+    ----------
+    folder : of the results.
+    trial : from the sheet; None where it is not known.
+    name : of the trial.
+
+    Returns
+    -------
+    Figure
+    """
+    results = Results(folder)
+    windows = read_result(results.steady)
+    title, ratio = (_describe_trial(trial), trial.travel_ratio) if trial is not None else (name, 2.0)
+    return _trial_figure(_TrialPicture(name, title, ratio, windows[windows["trial"] == name]), results)
+
+
+def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings) -> list[str]:
+    """Draw the figures of the whole experiment that have content; those of an earlier run go.
 
     Parameters
     ----------
@@ -92,38 +114,67 @@ def draw_campaign(experiment: Experiment, folder: Path, settings: FigureSettings
         Results folder.
     settings
         Formats and resolution.
+
+    Returns
+    -------
+    list of str
+        Names of the figures drawn, as `figures/campaign.json` holds them: Snakemake cannot know them beforehand.
     """
-    from vinetrack.figures.registry import draw
+    from vinetrack.figures.registry import CAMPAIGN_FIGURES, draw
+
+    results = Results(folder)
+    for name in CAMPAIGN_FIGURES:
+        for form in ("png", "svg", "pdf"):
+            results.figure(name, f".{form}").unlink(missing_ok=True)
+    inputs = campaign_inputs(folder, experiment.trials)
+    for name, values in inputs.items():
+        _write(draw(name, *values), partial(results.figure, name), settings)
+        log.info("drew %s", name)
+    write_json(results.figure_list, {"figures": list(inputs)})
+    return list(inputs)
+
+
+def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[Any, ...]]:
+    """Read what every figure of a whole experiment is drawn from.
+
+    Parameters
+    ----------
+    folder : of the results.
+    known : trials of the sheet, for labels.
+
+    Returns
+    -------
+    dict
+        Arguments of the drawing function by name of figure; figures without content are left out.
+    """
+    from vinetrack.figures.registry import CAMPAIGN_FIGURES
     from vinetrack.narrative.law_text import METHOD_NAMES
     from vinetrack.pipeline.diagnosis_tables import read_diagnosed
 
     results = Results(folder)
     damping, points, trials = read_json(results.damping), read_result(results.points), read_result(results.trials)
-    described = describe_conditions(trials, experiment.trials)
-    moved = {
-        name: read_result(results.kinematics(name))
-        for name in described.loc[described["status"] != "left_out", "trial"]
-    }
+    described = describe_conditions(trials, known)
+    names = described.loc[described["status"] != "left_out", "trial"]
+    moved = {name: read_result(results.kinematics(name)) for name in names}
     in_fit = [vine for method in METHOD_NAMES for vine in damping[method]["vines"]]
     points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
-    compared = _label_conditions(read_result(results.comparison), described)
+    compared = label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
     scaling, diagnosed = read_json(results.scaling), read_diagnosed(results, described)
+    payload = read_result(results.payload_model)
     inputs: dict[str, tuple[Any, ...]] = {
-        "damping_law": (points, damping),
-        "exponents": (damping,),
-        "scaling": (scaling,),
-        "speed_scaling": (scaling,),
-        "efficiency": (scaling,),
-        "payload_speed": (read_result(results.conditions), read_result(results.payload_model)),
-        "overview": (described, moved),
-        "model_comparison": (compared, with_after(trajectories, diagnosed)),
-        "model_residuals": (compared, trajectories),
+        "damping_law": (points, damping) if len(points) else (),
+        "exponents": (damping,) if in_fit else (),
+        "scaling": (scaling,) if scaling["isometric"] or scaling["thickness"] else (),
+        "speed_scaling": (scaling,) if scaling["steady_speed"] else (),
+        "efficiency": (scaling,) if scaling["efficiency"] else (),
+        "payload_speed": (read_result(results.conditions), payload) if len(payload) else (),
+        "overview": (described, moved) if moved else (),
+        "model_comparison": (compared, with_after(trajectories, diagnosed)) if len(compared) else (),
+        "model_residuals": (compared, trajectories) if len(compared) else (),
     }
-    drawings = {name: draw(name, *values) for name, values in inputs.items()} | draw_diagnosed(diagnosed)
-    for name, figure in drawings.items():
-        _write(figure, partial(results.figure, name), settings)
-        log.info("drew %s", name)
+    inputs |= {} if diagnosed is None else figure_inputs(diagnosed)
+    return {name: inputs[name] for name in CAMPAIGN_FIGURES if inputs.get(name)}
 
 
 def _write(figure: Figure, path: Callable[[str], Path], settings: FigureSettings) -> None:
@@ -179,8 +230,20 @@ def describe_conditions(trials: pd.DataFrame, known: tuple[Trial, ...]) -> pd.Da
     return trials.assign(condition_label=labels, pressure_kPa=pressures)
 
 
-def _label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
-    """`comparison.csv` with the vine and the short label of each condition, vines together, pressure rising."""
+def label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.DataFrame:
+    """`comparison.csv` with the vine and the short label of each condition, vines together, pressure rising.
+
+    Parameters
+    ----------
+    comparison : DataFrame
+        `comparison.csv`.
+    described : DataFrame
+        From `describe_conditions`.
+
+    Returns
+    -------
+    DataFrame
+    """
     first = described.drop_duplicates("condition").set_index("condition")
     vines = {vine: i for i, vine in enumerate(dict.fromkeys(described["vine"]))}
     known = comparison[comparison["condition"].isin(first.index)]
@@ -190,8 +253,8 @@ def _label_conditions(comparison: pd.DataFrame, described: pd.DataFrame) -> pd.D
     return table.iloc[order].reset_index(drop=True)
 
 
-def draw_diagnosed(tables: DiagnosisTables | None) -> dict[str, Figure]:
-    """Draw all figures of a diagnosis, by name; those without data state so.
+def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
+    """Return what each figure of a diagnosis is drawn from, by name; those without content are left out.
 
     Parameters
     ----------
@@ -200,13 +263,12 @@ def draw_diagnosed(tables: DiagnosisTables | None) -> dict[str, Figure]:
 
     Returns
     -------
-    dict of Figure
+    dict of tuple
+        Arguments of the drawing function.
     """
-    from vinetrack.figures.registry import DIAGNOSIS_FIGURES, draw
-    from vinetrack.figures.style import blank
+    from vinetrack.figures.registry import DIAGNOSIS_FIGURES
+    from vinetrack.pipeline.diagnosis_tables import figure_tables
 
-    if tables is None:
-        return {name: blank("There is no diagnosis of this model.") for name in DIAGNOSIS_FIGURES}
     inputs: dict[str, tuple[Any, ...]] = {
         "ladder": (tables.ladder,),
         "before_after": (tables.labels.get(tables.worst, tables.worst), tables.before_after, tables.added),
@@ -216,7 +278,8 @@ def draw_diagnosed(tables: DiagnosisTables | None) -> dict[str, Figure]:
         "cosines": tables.cosines,
         "drift": (tables.drift, tables.added),
     }
-    return {name: draw(name, *inputs[name]) for name in DIAGNOSIS_FIGURES}
+    there = figure_tables(tables)
+    return {name: inputs[name] for name in DIAGNOSIS_FIGURES if name in there}
 
 
 def with_after(trajectories: Mapping[str, pd.DataFrame], diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.tables import write_json, write_text
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.figures.registry import CAMPAIGN_FIGURES, PAPER_FIGURES, RegisteredFigure
-from vinetrack.narrative.law_text import METHOD_NAMES
 from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
 from vinetrack.pipeline.figures_stage import describe_conditions
 from vinetrack.results.folder_layout import Results, read_json, read_result
@@ -96,7 +95,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         damping=read_json(results.damping),
         provenance=_provenance(experiment, settings),
         kinematics={name: read_result(results.kinematics(name)) for name in drawn},
-        figures=[_figure(results, figure, own_data.get(figure.name, "")) for figure in _drawn(results, own_data)],
+        figures=[_figure(results, figure, own_data.get(figure.name, "")) for figure in _drawn(results)],
         trial_figures=_trial_figures(results, drawn),
         recordings={name: _recording(results, name) for name in filmed},
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
@@ -124,16 +123,10 @@ def _paper_section(results: Results) -> ReportSection:
     return paper_section(table, departures, figures)
 
 
-def _drawn(results: Results, own_data: Mapping[str, str]) -> list[RegisteredFigure]:
-    """Figures with something in them; the others would only repeat why there is no law."""
-    damping, scaling = read_json(results.damping), read_json(results.scaling)
-    empty = set() if any(damping[method]["vines"] for method in METHOD_NAMES) else {"exponents"}
-    empty |= set() if scaling["isometric"] or scaling["thickness"] else {"scaling"}
-    empty |= {key for key, of in (("speed_scaling", "steady_speed"), ("efficiency", "efficiency")) if not scaling[of]}
-    empty |= set() if len(read_result(results.payload_model)) else {"payload_speed"}
-    empty |= {"model_comparison", "model_residuals"} if read_fit(results).refused else set()
-    empty |= {name for name, figure in CAMPAIGN_FIGURES.items() if not figure.data and name not in own_data}
-    return [figure for name, figure in CAMPAIGN_FIGURES.items() if name not in empty and _svg(results, figure).exists()]
+def _drawn(results: Results) -> list[RegisteredFigure]:
+    """Figures of the whole experiment that had content."""
+    names = set(read_json(results.figure_list)["figures"])
+    return [figure for name, figure in CAMPAIGN_FIGURES.items() if name in names and _svg(results, figure).exists()]
 
 
 def _svg(results: Results, figure: RegisteredFigure) -> Path:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
-from vinetrack.figures.registry import CAMPAIGN_FIGURES, PAPER_FIGURES
+from vinetrack.figures.registry import PAPER_FIGURES
 
 if TYPE_CHECKING:
     from vinetrack.experiment.settings import RunSettings
@@ -130,9 +130,10 @@ class Plan:
         """
         return "|".join(sorted(names)) or "there-is-none"
 
-    def campaign_figures(self) -> list[tuple[str, str, str]]:
-        """Figures of the whole experiment: name, format and path."""
-        return self._figures(CAMPAIGN_FIGURES, "")
+    @property
+    def figure_list(self) -> str:
+        """Which figures of the whole experiment had content: those without are not written."""
+        return self.result("figures", "campaign.json")
 
     @property
     def paper_tables(self) -> list[str]:
@@ -149,8 +150,8 @@ class Plan:
 
     def figure_files(self) -> list[str]:
         """Paths of all figures."""
-        figures = (*self.campaign_figures(), *self.trial_figures(), *self._figures(self.filmed, "strip_"))
-        return [path for _, _, path in (*figures, *self.paper_figures())]
+        figures = (*self.trial_figures(), *self._figures(self.filmed, "strip_"), *self.paper_figures())
+        return [self.figure_list, *(path for _, _, path in figures)]
 
     def _figures(self, names: Iterable[str], prefix: str) -> list[tuple[str, str, str]]:
         formats = self.settings.figures.formats

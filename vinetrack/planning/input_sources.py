@@ -44,6 +44,11 @@ class StatedValues:
     `B_error` is relative, `n_error` absolute, both standard deviations. `effects` are further effects of the model
     beside `model`, `sizes` their parameters where they are given; `spreads` those of pressure and B from trial to
     trial, relative.
+
+    Examples
+    --------
+    >>> StatedValues(n=0.37, n_error=0.01).n
+    0.37
     """
 
     B: float = math.nan
@@ -101,6 +106,15 @@ def predictive_inputs(
         If an effect of the model is unknown.
     FitError
         If the fit is not one of everting vines.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30"}
+    >>> trial = vt.planned_trial(texts).trials[0]
+    >>> inputs = vt.predictive_inputs(trial, vt.StatedValues(B=6.4, B_error=0.05, n=0.37, n_error=0.01))
+    >>> inputs.model.values["eversion_damping.n"]
+    0.37
     """
     stated = stated or StatedValues()
     if fit is not None and not isinstance(fit, FitNumbers):

@@ -351,6 +351,15 @@ def predict_vine(
         If the trial lacks what an effect of the model needs.
     SimulationError
         If a draw cannot be integrated.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30"}
+    >>> inputs = vt.predictive_inputs(vt.planned_trial(texts).trials[0], vt.StatedValues(B=6.4, n=0.37))
+    >>> prediction = vt.predict_vine(inputs, samples=40)
+    >>> prediction.samples, prediction.arrives
+    (40, 1.0)
     """
     length_m = inputs.trial.length_m
     along = np.union1d(ALONG, [at_fraction])

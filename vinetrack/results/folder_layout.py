@@ -331,6 +331,11 @@ class Results:
         """
         return result_file(self.folder / "figures", name, suffix)
 
+    @property
+    def figure_list(self) -> Path:
+        """Which figures of the whole experiment had content and were drawn."""
+        return self.folder / "figures" / "campaign.json"
+
     def trial_figure(self, trial: str, suffix: str) -> Path:
         """Return the figure of one trial.
 

@@ -1,0 +1,128 @@
+"""A results folder in memory, and the story of the README told on it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+import vinetrack as vt
+from vinetrack.core.problems import ExperimentError
+from vinetrack.inference.fit_result import Fit
+from vinetrack.interface.loaded import LoadedResults
+from vinetrack.results.folder_layout import ResultsError
+
+README = Path(__file__).parents[2] / "README.md"
+
+
+@pytest.fixture(scope="module")
+def loaded(small_run: Path) -> LoadedResults:
+    return vt.load(small_run)
+
+
+def test_it_is_said_in_a_line(loaded: LoadedResults) -> None:
+    assert repr(loaded) == "Results(demo: 6 of 6 trials; missing: reservoir_depletion)"
+    assert "Missing from the model: reservoir depletion." in loaded._repr_html_()
+
+
+def test_tracks_and_speeds_of_all_trials_stand_in_one_frame(loaded: LoadedResults) -> None:
+    assert list(loaded.tracks.columns[:3]) == ["trial", "frame", "time_s"]
+    assert loaded.tracks["trial"].nunique() == loaded.kinematics["trial"].nunique() == 6
+    assert loaded.tracks["lead_position_m"].max() < 1
+
+
+def test_every_table_of_the_folder_is_there_with_units_in_its_columns(loaded: LoadedResults) -> None:
+    assert {"trials", "conditions", "steady", "ladder", "comparison", "diagnosis/moved"} <= set(loaded.tables)
+    assert loaded.tables["ladder"].equals(loaded.ladder)
+    assert [name for name in loaded.ladder.columns if "rms" in name and not name.endswith("_m")] == []
+
+
+def test_models_carry_fitted_values_and_what_was_added(loaded: LoadedResults) -> None:
+    assert "reservoir_depletion" in loaded.final_model
+    assert "reservoir_depletion" not in loaded.initial_model
+    assert loaded.diagnosis is not None
+    (n,) = [one.value for one in loaded.diagnosis.parameters if one.key == "eversion_damping.n"]
+    assert loaded.final_model.parameters_for("24mm-200um-200mm")[2] == n
+
+
+@pytest.mark.parametrize("name", ["", "damping_law", "model_comparison", "before_after", "candidates"])
+def test_a_figure_of_the_report_is_a_figure(loaded: LoadedResults, name: str) -> None:
+    assert isinstance(loaded.plot(name), Figure)
+
+
+def test_a_figure_of_one_trial_takes_its_name(loaded: LoadedResults) -> None:
+    assert isinstance(loaded.plot("trial_motion", trial="d24_24kPa_1"), Figure)
+    with pytest.raises(ResultsError, match="d24_24kPa_1"):
+        loaded.plot("trial_motion", trial="nobody")
+
+
+def test_a_figure_without_content_is_neither_drawn_nor_written(loaded: LoadedResults, small_run: Path) -> None:
+    with pytest.raises(ResultsError, match="the figures with content are damping_law"):
+        loaded.plot("missing_force")
+    assert not (small_run / "figures" / "missing_force.svg").exists()
+    assert (small_run / "figures" / "ladder.svg").exists()
+
+
+def test_what_is_no_results_folder_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ResultsError, match=r"it has no provenance\.json"):
+        vt.load(tmp_path)
+
+
+def test_the_story_of_the_readme_runs(small_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pattern = r"\n((?:    [^\n]*\n|\n)*    import vinetrack as vt\n(?:    [^\n]*\n|\n)*)"
+    story = re.search(pattern, README.read_text("utf-8"))
+    assert story is not None
+    lines = [line.removeprefix("    ") for line in story[1].splitlines() if line.strip()]
+    assert len(lines) <= 10
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "demo").symlink_to(small_run)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec("\n".join(lines), names)
+    assert (tmp_path / "ladder.png").exists()
+
+
+@pytest.fixture(scope="module")
+def fit() -> Fit:
+    return vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+
+
+def test_a_frame_of_tracks_in_other_units_is_the_same_experiment() -> None:
+    frame = vt.example_tracks()
+    inches = frame.assign(diameter_in=frame["diameter_mm"] / 25.4).drop(columns="diameter_mm")
+    trials = [[trial for trial, _ in vt.tracks_from_frame(one)] for one in (frame, inches)]
+    assert [round(1e3 * trial.diameter_m, 9) for trial in trials[1]] == [24.0] * 8
+    assert [trial.condition for trial in trials[0]] == [trial.condition for trial in trials[1]]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"drop": "time_s"}, "time_s"),
+        ({"drop": "thickness_um"}, "thickness_um"),
+        ({"set": ("diameter_mm", 3000.0)}, "diameter_mm"),
+    ],
+)
+def test_a_frame_that_says_too_little_is_refused_in_a_sentence(change: dict, words: str) -> None:
+    frame = vt.example_tracks()
+    frame = frame.drop(columns=change["drop"]) if "drop" in change else frame.assign(**dict([change["set"]]))
+    with pytest.raises(ExperimentError, match=words):
+        vt.tracks_from_frame(frame)
+
+
+def test_a_setting_that_changes_along_a_trial_is_refused_and_a_pressure_is_a_trace() -> None:
+    frame = vt.example_tracks()
+    with pytest.raises(ExperimentError, match="changes along the trial P24_1"):
+        vt.tracks_from_frame(frame.assign(length_mm=280.0 + frame["time_s"]))
+    _, track = vt.tracks_from_frame(frame.assign(pressure_kPa=frame["pressure_kPa"] - frame["time_s"]))[0]
+    assert track.pressure_Pa is not None
+    assert track.pressure_Pa[0] == pytest.approx(24e3)
+
+
+def test_a_fit_of_a_frame_is_that_of_its_pairs(fit: Fit) -> None:
+    again = vt.fit(vt.base_model(), vt.tracks_from_frame(vt.example_tracks()), profile=False)
+    pd.testing.assert_frame_equal(again.table(), fit.table())
+    assert list(again.positions().columns)[-1] == "residual_m"

@@ -1,0 +1,48 @@
+"""The notebook of the documentation runs, and shows what is stored in it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from notebook import run
+
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "python.ipynb"
+
+
+@pytest.fixture(scope="module")
+def shown() -> list[dict[str, Any]]:
+    return [one for outputs in run(NOTEBOOK) for one in outputs]
+
+
+@pytest.fixture(scope="module")
+def stored() -> list[dict[str, Any]]:
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    return [one for cell in cells for one in cell.get("outputs", [])]
+
+
+def kinds(outputs: list[dict[str, Any]]) -> list[list[str]]:
+    return [sorted(one.get("data", one)) for one in outputs]
+
+
+def test_every_cell_runs_and_shows_what_kind_of_thing_is_stored(
+    shown: list[dict[str, Any]], stored: list[dict[str, Any]]
+) -> None:
+    assert kinds(shown) == kinds(stored)
+    assert sum("image/png" in kind for kind in kinds(shown)) == 3
+
+
+def test_objects_and_words_are_those_stored(shown: list[dict[str, Any]], stored: list[dict[str, Any]]) -> None:
+    texts = [["".join(one["data"]["text/plain"]) for one in each if "data" in one] for each in (shown, stored)]
+    objects = [[text for text in each if text.startswith(("Fit(", "Diagnosis("))] for each in texts]
+    assert objects[0] == objects[1]
+    assert objects[0][1] == "Diagnosis(missing: reservoir_depletion)"
+    printed = [["".join(one["text"]) for one in each if "text" in one] for each in (shown, stored)]
+    assert printed[0] == printed[1]
+    assert "n = 0.370 instead of" in printed[0][0]
+
+
+def test_the_notebook_is_small() -> None:
+    assert NOTEBOOK.stat().st_size < 400_000

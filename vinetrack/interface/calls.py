@@ -1,0 +1,178 @@
+"""`vt.fit`, `vt.diagnose` and `vt.compare`: the functions of the rooms below, from any source of trials."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import Any
+
+import pandas as pd
+
+from vinetrack.diagnosis.compare import Comparison
+from vinetrack.diagnosis.compare import compare as compare_pairs
+from vinetrack.diagnosis.diagnose import diagnose as diagnose_pairs
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.dynamics.model import Model, make_model
+from vinetrack.inference.fit import fit as fit_pairs
+from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_result import Fit
+from vinetrack.interface.sources import Source, TrialSource, read_source
+
+
+def fit(model: Model, source: Source, **options: Any) -> Fit:
+    """Fit a model to the trajectories of all trials.
+
+    Parameters
+    ----------
+    model : a sum of effects.
+    source : loaded results, a results folder, an experiment or its folder, a frame of tracks (see
+        `tracks_from_frame`), or pairs of trial and track.
+    options : of `vinetrack.inference.fit.fit`, such as `fixed`, `free`, `start` and `tracks`.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit, or the model cannot be followed.
+    ExperimentError, ResultsError
+        If the source cannot be read.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> fit
+    Fit(pressure_drive + gravity + eversion_damping + yield_pressure; 8 trials)
+    >>> fit.table()["unit"].tolist()
+    ['N·(s/m)ⁿ', '1', 'Pa']
+    """
+    if "tracks" in options:
+        return fit_pairs(model, source, **options)  # type: ignore[arg-type]
+    given = read_source(source)
+    found = fit_pairs(model, given.pairs, **options)
+    return found if not given.left_out else _with_left_out(found, given)
+
+
+def _with_left_out(found: Fit, given: TrialSource) -> Fit:
+    from dataclasses import replace
+
+    return replace(found, left_out={**given.left_out, **found.left_out})
+
+
+def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
+    """Ask what a model lacks: verdict, candidates with sizes, errors before and after, what to do next.
+
+    Parameters
+    ----------
+    source : a fit, whose model is questioned, or any source of trials as in `fit`; then the model is the one that the
+        experiment names, else the base model.
+    options : of `vinetrack.diagnosis.diagnose.diagnose`, such as `model`, `candidates`, `ladder` and `advice`.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit.
+    ExperimentError, ResultsError
+        If the source cannot be read.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> diagnosis = vt.diagnose(vt.example_tracks(), ladder=False, advice=False)
+    >>> diagnosis
+    Diagnosis(missing: reservoir_depletion)
+    >>> diagnosis.candidates().loc[0, ["effect", "status"]].tolist()
+    ['reservoir_depletion', 'refitted']
+    """
+    if isinstance(source, Fit) or "tracks" in options:
+        return diagnose_pairs(source, **options)  # type: ignore[arg-type]
+    given = read_source(source)
+    if given.experiment is None:
+        return diagnose_pairs(given.pairs, **options)
+    return diagnose_pairs(given.experiment, tracks=given.tracks, **options)
+
+
+def compare(found: Fit | Source, source: Source | None = None, **options: Any) -> Comparison:
+    """Hold a fitted model against the trials, condition by condition, beside what replicates differ by.
+
+    Parameters
+    ----------
+    found : a fit; or any source of trials, to which the model that the experiment names (else the base model) is
+        fitted first.
+    source : the trials to compare with, as in `fit`; None for those that the model was fitted to.
+    options : of `vinetrack.diagnosis.compare.compare`, such as `final_at_fraction` and `tracks`.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    FitError
+        If the model cannot be followed.
+    ExperimentError, ResultsError
+        If the source cannot be read.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> comparison = vt.compare(vt.fit(vt.base_model(), vt.example_tracks(), profile=False))
+    >>> list(comparison.table.columns)[:3]
+    ['model', 'condition', 'rms_position_m']
+    """
+    if not isinstance(found, Fit):
+        given = read_source(found)
+        model = make_model() if given.experiment is None else named_model(given)
+        return compare_pairs(fit_pairs(model, given.pairs), given.pairs, kinematics=given.kinematics, **options)
+    if "tracks" in options:
+        return compare_pairs(found, source, **options)  # type: ignore[arg-type]
+    if source is None:
+        if not found.pairs:
+            raise FitError("The fit does not carry its tracks: name the trials to compare with.")
+        return compare_pairs(found, found.pairs, **options)
+    given = read_source(source)
+    return compare_pairs(found, given.pairs, **{"kinematics": given.kinematics, **options})
+
+
+def named_model(given: TrialSource) -> Model:
+    """Return the model that the experiment of a source names, with the user's own effects at hand.
+
+    Parameters
+    ----------
+    given : with an experiment.
+
+    Returns
+    -------
+    Model
+    """
+    from vinetrack.effects import own_effects
+
+    if given.experiment is None:
+        return make_model()
+    settings = given.experiment.settings
+    return make_model(settings.model, own_effects([given.experiment.folder / path for path in settings.effects]))
+
+
+def example_tracks() -> pd.DataFrame:
+    """Return eight trials of one vine from the virtual laboratory, fed from a chamber of 2 L that empties.
+
+    Returns
+    -------
+    DataFrame
+        A frame of tracks as `fit`, `diagnose` and `compare` take it: `trial, time_s, lead_position_m` and columns of
+        the trial sheet.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> vt.example_tracks()["trial"].nunique()
+    8
+    """
+    with (files("vinetrack.interface") / "example_tracks.csv").open(encoding="utf-8") as file:
+        return pd.read_csv(file)

@@ -1,0 +1,128 @@
+"""Trials and tracks from one frame of pandas, a row a point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.records import Track, Trial
+from vinetrack.core.tables import Table
+from vinetrack.experiment.naming import with_names
+from vinetrack.experiment.other_units import in_sheet_units
+from vinetrack.experiment.schema import COLUMNS
+from vinetrack.experiment.settings import ExperimentSettings
+from vinetrack.experiment.sheet import judge_pressures, judge_wall, make_trial, read_row
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+POSITION_COLUMNS = ("lead_position_m", "position_m")
+NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
+"""Columns of the sheet that a vine in a frame of tracks needs; a body (`travel_ratio` 1) needs the diameter alone."""
+
+
+def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
+    """Return trials and tracks from one frame, a row a point.
+
+    Parameters
+    ----------
+    frame : columns `trial, time_s` and `lead_position_m` (or `position_m`); where known `lead_position_sigma_m` and
+        `flag`; and the columns of a trial sheet, the same in every row of a trial: `diameter_mm, thickness_um,
+        length_mm, pressure_kPa, yield_pressure_kPa, …`, or in other units. A `pressure_kPa` that changes along a trial
+        is a measured trace; its first value is then the set pressure.
+
+    Returns
+    -------
+    list of (Trial, Track), in the order of the frame
+
+    Raises
+    ------
+    ExperimentError
+        If a column is missing, or a value is refused as in a trial sheet.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> trial, track = vt.tracks_from_frame(vt.example_tracks())[0]
+    >>> f"{trial.name}: {1e3 * trial.diameter_m:g} mm, {track.time_s.size} points"
+    'P24_1: 24 mm, 224 points'
+    """
+    position = next((name for name in POSITION_COLUMNS if name in frame), "")
+    absent = [name for name in ("trial", "time_s") if name not in frame] + ([] if position else ["lead_position_m"])
+    if absent:
+        remedy = "a frame of tracks has trial, time_s, lead_position_m and the columns of a trial sheet"
+        raise ExperimentError([Problem(message=f"has no column {', '.join(absent)}", file="the frame", remedy=remedy)])
+    parts = [(str(name), part) for name, part in frame.groupby("trial", sort=False)]
+    trials = _trials([_cells(name, part) for name, part in parts])
+    return [(trial, _track(part, position)) for trial, (_, part) in zip(trials, parts, strict=True)]
+
+
+def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
+    """What the sheet would say of a trial: its columns other than those of the track, as text."""
+    cells = {"trial": name}
+    of_track = {"trial", "time_s", *POSITION_COLUMNS, "lead_position_sigma_m", "flag", "edge_px", "frame"}
+    for column in part.columns:
+        first = part[column].iloc[0]
+        if column in of_track or _is_blank(first):
+            continue
+        if column != "pressure_kPa" and not _is_constant(part[column]):
+            message = f"changes along the trial {name}"
+            raise ExperimentError([Problem(message=message, file="the frame", column=str(column))])
+        cells[str(column)] = f"{first:.15g}" if isinstance(first, float | np.floating) else str(first)
+    return cells
+
+
+def _is_blank(value: Any) -> bool:
+    return value is None or value == "" or (isinstance(value, float | np.floating) and math.isnan(value))
+
+
+def _is_constant(column: pd.Series) -> bool:
+    first = column.iloc[0]
+    return bool(column.isna().all() if _is_blank(first) else (column == first).all())
+
+
+def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
+    columns = tuple(dict.fromkeys(name for row in rows for name in row))
+    table = Table(columns, tuple(rows), tuple(range(1, len(rows) + 1)), ((),) * len(rows), ",", ".")
+    table, _ = in_sheet_units(table, "the frame")
+    settings = ExperimentSettings()
+    problems: list[Problem] = []
+    trials = []
+    for i in range(len(rows)):
+        row = read_row(table, i, settings)
+        needed = NEEDED if row.travel_ratio == 2 else NEEDED[:1]
+        for name in needed:
+            if name not in row.values and all(problem.column != name for problem in row.problems):  # noqa: PD011
+                row.add("is missing", name, allowed=COLUMNS[name].allowed, remedy="give it as a column of the frame")
+        judge_wall(row)
+        judge_pressures(row)
+        problems += [replace(problem, file="the frame", line=0) for problem in row.problems]
+        if not row.failed:
+            # A track that somebody measured elsewhere: what is assumed of its smooth errors follows from that.
+            row.values["track"] = row.name  # noqa: PD011
+            trials.append(replace(make_trial(row, Path(), settings), track=None))
+    if any(problem.severity == "error" for problem in problems):
+        raise ExperimentError(problems)
+    return list(with_names(trials))
+
+
+def _track(part: pd.DataFrame, position: str) -> Track:
+    count = len(part)
+    unknown = np.full(count, math.nan)
+    sigma_m = part["lead_position_sigma_m"].to_numpy(dtype=float) if "lead_position_sigma_m" in part else unknown
+    flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(count, "", dtype=str)
+    traced = "pressure_kPa" in part and not _is_constant(part["pressure_kPa"])
+    return Track(
+        time_s=part["time_s"].to_numpy(dtype=float),
+        lead_position_m=part[position].to_numpy(dtype=float),
+        lead_position_sigma_m=sigma_m,
+        flag=flag,
+        edge_px=unknown,
+        pressure_Pa=1e3 * part["pressure_kPa"].to_numpy(dtype=float) if traced else None,
+    )

@@ -1,0 +1,143 @@
+"""Figures of the report for objects in memory and for results folders, by their names in the registry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.diagnosis.compare import Comparison
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.figures.registry import draw
+from vinetrack.inference.fit_result import Fit
+from vinetrack.interface.loaded import LoadedResults
+from vinetrack.results.folder_layout import ResultsError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from vinetrack.core.records import Trial
+    from vinetrack.pipeline.diagnosis_tables import DiagnosisTables
+
+MODEL_FIGURES = ("model_comparison", "model_residuals")
+
+
+def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
+    """Draw an object of the Python interface as the report draws it.
+
+    Parameters
+    ----------
+    shown : loaded results, a fit, a comparison or a diagnosis.
+    name : of the figure; blank for the one that says most about the object.
+    trial : for figures of one trial.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ResultsError
+        If the object has no such figure.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> fit = vt.fit(vt.base_model(), vt.example_tracks(), profile=False)
+    >>> type(fit.plot("model_residuals")).__name__
+    'Figure'
+    """
+    if isinstance(shown, LoadedResults):
+        return _of_results(shown, name, trial)
+    if isinstance(shown, Fit):
+        from vinetrack.interface.calls import compare
+
+        shown = compare(shown)
+    inputs = _of_comparison(shown) if isinstance(shown, Comparison) else _of_diagnosis(shown)
+    return _drawn(inputs, name or next(iter(inputs), "none"))
+
+
+def _drawn(inputs: Mapping[str, tuple[Any, ...]], name: str) -> Figure:
+    if name not in inputs:
+        known = ", ".join(inputs) or "none"
+        raise ResultsError(f"There is nothing to draw as {name!r}; the figures with content are {known}.")
+    return draw(name, *inputs[name])
+
+
+def _of_comparison(shown: Comparison) -> dict[str, tuple[Any, ...]]:
+    from vinetrack.pipeline.figures_stage import label_conditions
+
+    table = label_conditions(shown.table, _described([one.trial for one in shown.trials]))
+    return {name: (table, dict(shown.trajectories)) for name in MODEL_FIGURES}
+
+
+def _described(trials: list[Trial]) -> Any:
+    import pandas as pd
+
+    from vinetrack.pipeline.figures_stage import describe_conditions
+
+    rows = pd.DataFrame(
+        {
+            "trial": [trial.name for trial in trials],
+            "vine": [trial.vine for trial in trials],
+            "condition": [trial.condition for trial in trials],
+            "status": "ok",
+        }
+    )
+    return describe_conditions(rows, tuple(trials))
+
+
+def _of_diagnosis(shown: Diagnosis) -> dict[str, tuple[Any, ...]]:
+    """Inputs of the figures that the diagnosis has something for; one that was read back knows no trajectories."""
+    from vinetrack.pipeline.figures_stage import figure_inputs
+
+    return figure_inputs(_tables_in_memory(shown)) if shown.rounds else {}
+
+
+def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
+    import pandas as pd
+
+    from vinetrack.diagnosis.drift import drift_groups
+    from vinetrack.diagnosis.ladder import in_sample
+    from vinetrack.pipeline.diagnosis_tables import CURVE_COLUMNS, assemble_tables
+
+    nothing = pd.DataFrame()
+    if not shown.fits:
+        curves = pd.DataFrame(columns=list(CURVE_COLUMNS))
+        return assemble_tables(shown, _described([]), curves, nothing, nothing, nothing)
+    before, after = shown.fits[0], shown.fits[-1]
+    later = {one.name: one for one in in_sample(after).trials} if after is not before else {}
+    parts = []
+    for one in in_sample(before).trials:
+        last = later[one.name].predicted_position_m if later else np.full(one.time_s.size, math.nan)
+        positions = (one.lead_position_m, one.predicted_position_m, last)
+        columns = (one.name, one.trial.condition, one.time_s - one.release_s, *(y - one.origin_m for y in positions))
+        parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True))))
+    located, drifting = nothing, nothing
+    if shown.failure is not None:
+        located = shown.failure.along_position
+        drifting = drift_groups(shown.failure.drift, after if later else None)
+    force = nothing if shown.force_table is None else shown.force_table
+    conditions = _described([one.trial for one in before.trials])
+    return assemble_tables(shown, conditions, pd.concat(parts, ignore_index=True), located, drifting, force)
+
+
+def _of_results(shown: LoadedResults, name: str, trial: str) -> Figure:
+    from vinetrack.pipeline.figures_stage import campaign_inputs, draw_trial
+
+    known: tuple[Trial, ...] = ()
+    try:
+        known = shown.experiment.trials
+    except Exception as error:  # the figures do without the sheet, with plainer labels
+        if name == "trial_motion":
+            raise ResultsError(f"{error}") from None
+    if name == "trial_motion":
+        names = list(shown.trials["trial"])
+        if trial not in names:
+            raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
+        return draw_trial(shown.folder, next((one for one in known if one.name == trial), None), trial)
+    inputs = campaign_inputs(shown.folder, known)
+    chosen = name or ("ladder" if "ladder" in inputs else "damping_law")
+    return _drawn(inputs, chosen)

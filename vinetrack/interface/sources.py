@@ -1,0 +1,74 @@
+"""Trials with their tracks from whatever a user has: a results folder, an experiment, a frame of tracks, or pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pandas as pd
+
+from vinetrack.core.records import Kinematics, Track, Trial
+from vinetrack.experiment.folder import Experiment, read_experiment
+from vinetrack.experiment.provenance import PROVENANCE
+from vinetrack.inference.fit_data import Pairs
+from vinetrack.interface.frames import tracks_from_frame
+from vinetrack.interface.loaded import LoadedResults
+
+Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs
+"""Loaded results, a results folder, an experiment or its folder, a frame of tracks, or pairs of trial and track."""
+
+
+@dataclass(frozen=True)
+class TrialSource:
+    """Trials with their tracks, the experiment that they belong to, and why others are missing.
+
+    `experiment` is None for a frame and for pairs; `kinematics` are those of a results folder, by name of trial.
+    """
+
+    pairs: list[tuple[Trial, Track]]
+    experiment: Experiment | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    kinematics: Mapping[str, Kinematics] = field(default_factory=dict)
+
+    @property
+    def tracks(self) -> dict[str, Track]:
+        """Tracks by name of trial."""
+        return {trial.name: track for trial, track in self.pairs}
+
+
+def read_source(source: Source) -> TrialSource:
+    """Read trials and tracks from any source.
+
+    Parameters
+    ----------
+    source : see `Source`; the columns of a frame are those of `tracks_from_frame`.
+
+    Returns
+    -------
+    TrialSource
+
+    Raises
+    ------
+    ExperimentError
+        If an experiment or a frame cannot be read.
+    ResultsError
+        If a stage of a results folder has not run, or its experiment has moved.
+    """
+    from vinetrack.inference.fit_data import pairs_of
+    from vinetrack.pipeline.model_stage import measured
+    from vinetrack.pipeline.source_experiment import experiment_behind
+    from vinetrack.results.folder_layout import Results
+
+    if isinstance(source, LoadedResults):
+        source = source.folder
+    if isinstance(source, pd.DataFrame):
+        return TrialSource(tracks_from_frame(source))
+    if isinstance(source, (str, Path)) and (Path(source) / PROVENANCE).exists():
+        experiment = experiment_behind(Path(source))
+        pairs, kinematics = measured(experiment, Results(Path(source)))
+        return TrialSource(pairs, experiment, {**experiment.failed, **experiment.left_out}, kinematics)
+    if isinstance(source, (str, Path)):
+        source = read_experiment(source)
+    pairs, left_out = pairs_of(source)
+    return TrialSource(pairs, source if isinstance(source, Experiment) else None, left_out)
