@@ -29,8 +29,7 @@ STATUS = ("running", "ended", "stalled", "too hard")
 _NOTHING = State(*(math.nan,) * len(State._fields))
 
 SMALLEST_SHARE = 64
-"""Trials below which another thread costs more than it saves. Chosen: about a millisecond of work; at half and at
-twice only the time of small batches changes, no result."""
+"""Trials below which another thread costs more than it saves. Chosen: a millisecond of work; no result changes."""
 
 Trace = tuple[Floats, Floats]
 """Times since release, s, and gauge pressures, Pa, measured there."""
@@ -41,9 +40,9 @@ class Trajectory:
     """Motion of one trial since release; arrays have shape (n_times,), SI.
 
     `observed_position_m` is the lead position as the camera reports it: another where the model has measurement
-    effects. `status` is `ended` where all film was everted before the last time asked for, `stalled` where it stopped
-    for good before, else `running`. `end_time_s` is when growth ended (or last stalled), NaN if it did not;
-    `slack_from_s` when the tail of a trial that lets it (`tail_slack: free`) first went slack.
+    effects. `status`: `ended` (all film everted before the last time asked for), `stalled` for good before, `running`.
+    `end_time_s` is when growth ended (or last stalled), NaN if it did not; `slack_from_s` when the tail of a trial that
+    lets it (`tail_slack: free`) first went slack.
     """
 
     time_s: Floats
@@ -98,14 +97,10 @@ def simulate(
     SimulationError
         If the integration does not get through.
 
-    Examples
-    --------
-    >>> import numpy as np
     >>> import vinetrack as vt
     >>> trial, _ = vt.tracks_from_frame(vt.example_tracks())[0]
-    >>> moved = vt.simulate(vt.base_model(), trial, np.array([0.0, 0.02, 0.04]))
-    >>> bool(np.all(np.diff(moved.lead_position_m) > 0))
-    True
+    >>> vt.simulate(vt.base_model(), trial, np.array([0.0, 0.02])).status
+    'running'
     """
     return simulate_many(model, [trial], [times_s], traces=[trace], relative_tolerance=relative_tolerance)[0]
 
@@ -446,12 +441,9 @@ __all__ = [
     "Batch",
     "SimulationError",
     "Trajectory",
-    "bends_of",
-    "check_needs",
     "lay_out",
     "prepare",
     "simulate",
     "simulate_many",
     "trajectories",
-    "trial_inputs",
 ]

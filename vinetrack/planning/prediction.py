@@ -1,8 +1,5 @@
 """What a vine will do: position, speed and tension along its growth, with the uncertainty of its inputs.
 
-    inputs = predictive_inputs(planned_trial({"diameter_mm": "25", "thickness_um": "100", …}).trials[0])
-    print(predict_vine(inputs).table)
-
 Every uncertainty of the inputs is drawn, every draw simulated from release to the end of growth. Stated are medians and
 the band of nine draws in ten. As growth never turns back, the quantiles of the time at which a place is passed are
 those of the position at a time.
@@ -355,11 +352,9 @@ def predict_vine(
     Examples
     --------
     >>> import vinetrack as vt
-    >>> texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "280", "pressure_kPa": "30"}
-    >>> inputs = vt.predictive_inputs(vt.planned_trial(texts).trials[0], vt.StatedValues(B=6.4, n=0.37))
-    >>> prediction = vt.predict_vine(inputs, samples=40)
-    >>> prediction.samples, prediction.arrives
-    (40, 1.0)
+    >>> trial, _ = vt.tracks_from_frame(vt.example_tracks())[0]
+    >>> vt.predict_vine(vt.predictive_inputs(trial), samples=40).arrives
+    1.0
     """
     length_m = inputs.trial.length_m
     along = np.union1d(ALONG, [at_fraction])
