@@ -151,7 +151,7 @@ def test_a_shift_of_every_trial_is_that_of_B(questioned: Fit) -> None:
     moved[place] += 0.1 / layout.free[place].scale
     up = state.theta.copy()
     up[[k for k, number in enumerate(layout.free) if number.key == DAMPING]] += 0.1
-    one, other = (fitted.predictor.jobs(theta, state.own) for theta in (moved, up))
+    one, other = (fitted.predictor.jobs(theta, state.trial_effects) for theta in (moved, up))
     for a, b in zip(one, other, strict=True):
         np.testing.assert_allclose(a.row, b.row, rtol=1e-12)
 

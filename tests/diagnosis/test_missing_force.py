@@ -115,7 +115,7 @@ def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(path: Path) 
     model = vt.base_model() + vt.effects.reservoir_depletion
     virtual = grown(sheet(payloads_g=(0.0, 20.0), replicates=1), 98, ["reservoir_depletion"])
     found = vt.fit(model, pairs_of(virtual), profile=False)
-    own = lay(found).own
+    own = lay(found).trial_effects
     motions = motions_of(found, own)
     shapes = {
         "bump": lambda m: np.exp(-0.5 * ((m.lead_position_m - 0.08) / 0.01) ** 2),

@@ -132,7 +132,7 @@ def one_way(n_trials: int, count: int, spread: float, seed: int) -> tuple[Soluti
     frame = frame_of(n_trials, count, 1)
     state = state_of(n_trials, 1, 0.3, rho=0.0, sigma=0.01)
     found = estimate_spreads(marginal(grams, frame, state), frame, state, (False, True), search=True)
-    state = FitState(state.theta, state.own, found, 0.0, state.variance)
+    state = FitState(state.theta, state.trial_effects, found, 0.0, state.variance)
     return Solution(state, frame, grams, (), (False, True), True, 1), means
 
 

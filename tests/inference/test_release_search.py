@@ -36,9 +36,9 @@ def test_what_makes_the_vine_is_found_without_a_frame_at_rest(only_in_motion: Fi
 @pytest.mark.parametrize("early_frames", [5, 20, 45])
 def test_the_same_likelihood_is_reached_wherever_the_releases_begin(only_in_motion: Fit, early_frames: int) -> None:
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
-    own = solution.state.own.copy()
+    own = solution.state.trial_effects.copy()
     own[:, 0] = [item.time_s[0] - early_frames * item.frame_s for item in predictor.data]
-    elsewhere = solve(predictor, solution.frame, replace(solution.state, own=own), FixedTerms(), warm=True)
+    elsewhere = solve(predictor, solution.problem, replace(solution.state, trial_effects=own), FixedTerms(), warm=True)
     found = vt.refit(replace(only_in_motion, solution=elsewhere))
     assert log_likelihood(found.solution) == pytest.approx(log_likelihood(solution), abs=0.5)
     assert np.isfinite(found["n"].sigma)

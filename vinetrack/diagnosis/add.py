@@ -37,9 +37,9 @@ def add(
     from vinetrack.diagnosis.ladder import ladder
     from vinetrack.effects import own_effects
 
-    own = own_effects([experiment.folder / path for path in experiment.settings.effects])
-    model = make_model(experiment.settings.model, own)
-    effect = find_effect(name, own)
+    user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
+    model = make_model(experiment.settings.model, user_effects)
+    effect = find_effect(name, user_effects)
     if effect.name in model:
         raise EffectError(f"{effect.name} is in the model already: {' + '.join(model.names)}.")
     check_needs(model + effect, *(trial for trial in experiment.trials if trial.name in tracks))

@@ -101,39 +101,39 @@ def linear_gain(found: Fit, base: Solution, one: Difference, spread: tuple[float
     float
         Fall of −2 ln L.
     """
-    grams, frame, state = _widened(found, base, one)
-    before = marginal(base.grams, base.frame, base.state)
-    part = marginal(grams, frame, state)
+    grams, problem, state = _widened(found, base, one)
+    before = marginal(base.grams, base.problem, base.state)
+    part = marginal(grams, problem, state)
     if spread is None:
-        old = estimate_spreads(before, base.frame, base.state, base.estimable, restricted=False)
-        new = estimate_spreads(part, frame, state, base.estimable, restricted=False)
+        old = estimate_spreads(before, base.problem, base.state, base.estimable, restricted=False)
+        new = estimate_spreads(part, problem, state, base.estimable, restricted=False)
     else:
         old = new = spread
-    plain = deviance(before, base.frame, base.state, old, restricted=False)
-    return plain - deviance(part, frame, state, new, restricted=False)
+    plain = deviance(before, base.problem, base.state, old, restricted=False)
+    return plain - deviance(part, problem, state, new, restricted=False)
 
 
-def _widened(found: Fit, base: Solution, one: Difference) -> tuple[Floats, MixedProblem, FitState]:
+def _widened(fit: Fit, base: Solution, one: Difference) -> tuple[Floats, MixedProblem, FitState]:
     """Cross products, problem and state of a solution with the coefficients of a difference added, all zero."""
-    old, state = found.predictor.layout, base.state
-    data, options = found.predictor.data, found.options
+    old, state = fit.predictor.layout, base.state
+    data, options = fit.predictor.data, fit.options
     layout = make_layout(
         old.model, data, fixed=options["fixed"], free=options["free"],
         shared={**options["shared"], **one.shared}, between=(*old.between, *one.terms),
     )  # fmt: skip
-    frame = make_problem(Predictor(layout, data, found.predictor.host), state.own)
-    frame = replace(frame, own_centre=base.frame.own_centre)
+    problem = make_problem(Predictor(layout, data, fit.predictor.host), state.trial_effects)
+    problem = replace(problem, own_centre=base.problem.own_centre)
     theta = layout.start
     known = {number.name: number.outside(float(at)) for number, at in zip(old.free, state.theta, strict=False)}
     for k, number in enumerate(layout.free):
         value = known.get(number.name, known.get(number.key))
         theta[k] = theta[k] if value is None else number.inside(value)
-    shapes = base.frame.index.shape[1] - len(old.keys)
+    shapes = base.problem.index.shape[1] - len(old.keys)
     if shapes:
-        frame, theta = with_shapes(frame, shapes), np.append(theta, state.theta[len(old.free) :])
+        problem, theta = with_shapes(problem, shapes), np.append(theta, state.theta[len(old.free) :])
     turn = _turn(old, layout, shapes)
     grams = np.einsum("nka,nckl,nlb->ncab", turn, base.grams, turn, optimize=True)
-    return grams, frame, replace(state, theta=theta)
+    return grams, problem, replace(state, theta=theta)
 
 
 def _turn(old: ParameterMap, layout: ParameterMap, shapes: int) -> Floats:

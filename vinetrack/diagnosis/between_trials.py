@@ -174,9 +174,9 @@ def effect_of(one: Difference) -> Effect:
     )
 
 
-def _law(found: Fit, trials: Sequence[Trial]) -> list[Difference]:
+def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
     """N of every vine, where there are several with one n."""
-    free = [number for number in found.predictor.layout.free if number.key == EXPONENT]
+    free = [number for number in fit.predictor.layout.free if number.key == EXPONENT]
     if len(free) != 1 or len({trial.vine for trial in trials}) < 2:
         return []
     return [Difference(N_BY_VINE, shared={EXPONENT: "vine"})]
@@ -241,7 +241,7 @@ def _forms(
     ]
 
 
-def _changes(found: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
+def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
     """Where specimens are not stated: another tube of each vine from some trial on, or for each condition.
 
     A tube for each condition can only be where replicates were made one after the other.
@@ -257,7 +257,7 @@ def _changes(found: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differ
             later = set(members[begin:])
             way = [f"{vine}, later tube" if i in later else group for i, group in enumerate(groups)]
             form = _forms(SPECIMEN, way, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
-            gain = linear_gain(found, base, form, spread=base.state.spread)
+            gain = linear_gain(fit, base, form, spread=base.state.spread)
             ways.append((gain, way))
         if ways:
             groups = max(ways, key=lambda one: one[0])[1]
@@ -297,10 +297,10 @@ def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
     return total, len(groups) - len(names)
 
 
-def _estimated(found: Fit, base: Solution, one: Difference) -> Difference | None:
+def _estimated(fit: Fit, base: Solution, one: Difference) -> Difference | None:
     """The difference with its linear estimate; None where it cannot be laid out."""
-    gain = linear_gain(found, base, one)
-    return replace(one, gain=gain, p=chance_of_gain(found, one, gain)) if math.isfinite(gain) else None
+    gain = linear_gain(fit, base, one)
+    return replace(one, gain=gain, p=chance_of_gain(fit, one, gain)) if math.isfinite(gain) else None
 
 
 def _fitted(found: Fit, one: Difference) -> Fit | None:
@@ -319,20 +319,20 @@ def between_candidates(
     """Rows of the ranking of candidates for the differences that were fitted."""
     return [
         Candidate(
-            one.names[0],
+            hypothesis.names[0],
             BETWEEN_TRIALS,
             REFITTED,
-            one.delta_chi2,
-            one.sigma,
-            one.numbers,
-            one.plausible,
-            one.names[0] in answer,
-            aside.get(one.names[0], one.reason),
+            hypothesis.delta_chi2,
+            hypothesis.sigma,
+            hypothesis.numbers,
+            hypothesis.plausible,
+            hypothesis.names[0] in answer,
+            aside.get(hypothesis.names[0], hypothesis.reason),
             {},
-            one.others if one.names[0] in answer else (),
+            hypothesis.others if hypothesis.names[0] in answer else (),
         )
-        for one in tried
-        if one.effects[-1].kind == BETWEEN_TRIALS
+        for hypothesis in tried
+        if hypothesis.effects[-1].kind == BETWEEN_TRIALS
     ]
 
 

@@ -121,7 +121,9 @@ class CandidateFits:
         reach = max(REACH_OF_CLIMBS, SHARE_OF_REACH * gain)
         alike = [c for c in leaders if self.questions.cosine(c.names[0], best.names[0]) > ALIKE]
         near = [
-            one for one in leaders if one.deviance - best.deviance < (ALIKE_REACH * reach if one in alike else reach)
+            leader
+            for leader in leaders
+            if leader.deviance - best.deviance < (ALIKE_REACH * reach if leader in alike else reach)
         ]
         chosen = [one for one in near if not one.hopeless] or near
         for climb in chosen if all_of_them else chosen[: self.most_fitted]:
@@ -132,14 +134,14 @@ class CandidateFits:
     def _fit_what_is_contained(self) -> None:
         """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
         found = self.questions.found
-        best = max((one.fit.log_likelihood for one in self.fitted.values()), default=0.0)
-        for one in list(self.fitted.values()):
+        best = max((fitted_one.fit.log_likelihood for fitted_one in self.fitted.values()), default=0.0)
+        for fitted_one in list(self.fitted.values()):
             # The simpler is in the larger one, and can be no better.
-            behind = 2 * (best - one.fit.log_likelihood) > ANSWER_SET * MOST_INFLATION
-            if behind or any(known is one.fit for known in self.simplified):
+            behind = 2 * (best - fitted_one.fit.log_likelihood) > ANSWER_SET * MOST_INFLATION
+            if behind or any(known is fitted_one.fit for known in self.simplified):
                 continue
-            self.simplified.append(one.fit)
-            for both, fit in simpler_forms(found, one, self.questions.effects):
+            self.simplified.append(fitted_one.fit)
+            for both, fit in simpler_forms(found, fitted_one, self.questions.effects):
                 simpler = likelihood_ratio(found, both, fit)
                 known = self.fitted.get(simpler.label)
                 if known is None or simpler.delta_chi2 > max(known.delta_chi2, WORSE):
@@ -213,7 +215,7 @@ class CandidateFits:
         if name in self.fitted and not math.isnan(climb.deviance):
             return
         self.report(f"fitting {name}")
-        best = max((one.fit.log_likelihood for one in self.fitted.values()), default=-math.inf)
+        best = max((fitted_one.fit.log_likelihood for fitted_one in self.fitted.values()), default=-math.inf)
         found = self._from_climb(climb, best)
         promised = self.base - climb.deviance if math.isfinite(climb.deviance) else 0.0
         if found is not None and found.delta_chi2 < max(WORSE, PART_KEPT * promised):
@@ -231,8 +233,8 @@ class CandidateFits:
         return None if fit is None else likelihood_ratio(self.questions.found, climb.effects, fit)
 
 
-def _gain(one: LikelihoodRatio) -> float:
-    return one.delta_chi2
+def _gain(hypothesis: LikelihoodRatio) -> float:
+    return hypothesis.delta_chi2
 
 
 def pairs(
@@ -240,8 +242,8 @@ def pairs(
 ) -> list[LikelihoodRatio]:
     """Fits of two effects together: to each of the best single ones, those that promise to mend what it leaves."""
     found: dict[frozenset[str], LikelihoodRatio] = {}
-    top = max((one.delta_chi2 for one in firsts), default=0.0)
-    for first in [one for one in firsts if one.delta_chi2 >= SHARE_OF_BEST * top][:FIRSTS]:
+    top = max((first.delta_chi2 for first in firsts), default=0.0)
+    for first in [first for first in firsts if first.delta_chi2 >= SHARE_OF_BEST * top][:FIRSTS]:
         later = misfit_tests(first.fit, effects, LATER_LEVEL)
         search = CandidateFits(later, report, most_fitted=PARTNERS)
         search.singles()

@@ -69,7 +69,7 @@ class CandidateShape:
 
 
 def candidates_of(
-    model: Model, wanted: Iterable[str] | None, own: Mapping[str, Effect] | None = None
+    model: Model, wanted: Iterable[str] | None, user_effects: Mapping[str, Effect] | None = None
 ) -> tuple[Effect, ...]:
     """Effects to question: those `wanted` (default the catalogue) and the user's own, less what is in the model.
 
@@ -78,32 +78,34 @@ def candidates_of(
     EffectError
         If a name is unknown; the message suggests the nearest.
     """
-    own = own or {}
+    user_effects = user_effects or {}
     names = [name for name, effect in catalogue().items() if effect.kind != "base"] if wanted is None else list(wanted)
-    names += [name for name in own if name not in names]
+    names += [name for name in user_effects if name not in names]
     replaced = {name for effect in model for name in effect.replaces}
-    return tuple(find_effect(name, own) for name in names if name not in model and name not in replaced)
+    return tuple(find_effect(name, user_effects) for name in names if name not in model and name not in replaced)
 
 
 def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
     """Candidates that the sheet lets act, and for the others the reason why not, by name."""
     found, reasons = [], {}
-    no_tube = all(item.trial.travel_ratio == 1 for item in data)
+    no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
     for effect in candidates:
         if no_tube and (absent := [column for column in effect.needs if column in OF_A_TUBE]):
             reasons[effect.name] = f"it acts on {OF_A_TUBE[absent[0]]}, and a body that moves as a whole has none"
             continue
-        if effect.in_trace and all(item.trace is not None for item in data):
+        if effect.in_trace and all(trial_data.trace is not None for trial_data in data):
             reasons[effect.name] = "the measured pressure already holds it"
             continue
-        if "trace_time" in effect.functions and all(item.trace is None for item in data):
+        if "trace_time" in effect.functions and all(trial_data.trace is None for trial_data in data):
             reasons[effect.name] = "it needs a pressure measured during growth, and no trial has one"
             continue
-        if absent := [column for column in effect.needs if not any(stated(column, item.trial) for item in data)]:
+        if absent := [
+            column for column in effect.needs if not any(stated(column, trial_data.trial) for trial_data in data)
+        ]:
             reasons[effect.name] = f"it needs `{absent[0]}`, which is blank or zero for every trial"
             continue
         try:
-            check_needs(Model((effect,)), *(item.trial for item in data))
+            check_needs(Model((effect,)), *(trial_data.trial for trial_data in data))
         except EffectError:
             blank = " and ".join(f"`{column}`" for column in effect.needs)
             reasons[effect.name] = f"it needs {blank}, which the sheet leaves blank for some trials"

@@ -175,7 +175,7 @@ def _worst(together: Replicates) -> tuple[float, float]:
 
 
 def final_speed_errors(
-    found: Fit,
+    fit: Fit,
     predicted: Sequence[TrialFit],
     tracks: Mapping[str, Track],
     kinematics: Mapping[str, Kinematics],
@@ -187,7 +187,7 @@ def final_speed_errors(
     """
     times = [LASTS * max(t.time_s[-1] - t.release_s, 1e-9) * np.linspace(0, 1, 601) for t in predicted]
     traces = [_trace_since_release(tracks[t.name], t.release_s) for t in predicted]
-    moved = simulate_many(found.model, [t.trial for t in predicted], times, traces=traces)
+    moved = simulate_many(fit.model, [t.trial for t in predicted], times, traces=traces)
     errors = {}
     for trial, time_s, run in zip(predicted, times, moved, strict=True):
         known = kinematics.get(trial.name) or estimate_kinematics(

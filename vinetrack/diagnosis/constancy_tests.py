@@ -66,18 +66,22 @@ class Sums:
     groups: int
 
 
-def sums_of(own: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDArray[np.bool_]) -> Sums | None:
+def sums_of(estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDArray[np.bool_]) -> Sums | None:
     """Deviations about the mean of each vine (or of all), and the scatter of replicates; None without any to tell."""
-    conditions = np.array([trial.condition for trial in own.trials])
-    blocks = np.array([trial.vine for trial in own.trials]) if own.per_vine else np.full(len(own.trials), "")
-    weight = 1 / own.variance
-    spread = np.zeros(len(own.trials))
-    for condition in dict.fromkeys(conditions[np.isfinite(own.deviation)]):
-        k = np.flatnonzero((conditions == condition) & np.isfinite(own.deviation))
-        spread[k] = own.deviation[k] - np.average(own.deviation[k], weights=weight[k])
-    known = np.isfinite(own.deviation)
+    conditions = np.array([trial.condition for trial in estimates.trials])
+    blocks = (
+        np.array([trial.vine for trial in estimates.trials])
+        if estimates.per_vine
+        else np.full(len(estimates.trials), "")
+    )
+    weight = 1 / estimates.variance
+    spread = np.zeros(len(estimates.trials))
+    for condition in dict.fromkeys(conditions[np.isfinite(estimates.deviation)]):
+        k = np.flatnonzero((conditions == condition) & np.isfinite(estimates.deviation))
+        spread[k] = estimates.deviation[k] - np.average(estimates.deviation[k], weights=weight[k])
+    known = np.isfinite(estimates.deviation)
     dof = int(known.sum()) - len(set(conditions[known]))
-    xs, ds = x[chosen].copy(), own.deviation[chosen].copy()
+    xs, ds = x[chosen].copy(), estimates.deviation[chosen].copy()
     w, block = weight[chosen], blocks[chosen]
     for name in dict.fromkeys(block):
         k = block == name

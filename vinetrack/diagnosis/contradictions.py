@@ -63,7 +63,7 @@ def is_within_position_errors(before: Fit, after: Fit) -> bool:
     -------
     bool
     """
-    systematic_m = float(np.median([item.position_systematic_m for item in before.predictor.data]))
+    systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in before.predictor.data]))
     if not displacement_m(before, after) < systematic_m:
         return False
     try:

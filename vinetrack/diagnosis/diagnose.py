@@ -70,7 +70,7 @@ def diagnose(
     model: Model | None = None,
     tracks: Mapping[str, Track] | None = None,
     candidates: Iterable[str] | None = None,
-    own: Mapping[str, Effect] | None = None,
+    user_effects: Mapping[str, Effect] | None = None,
     limits: Limits | None = None,
     ladder: bool = True,
     advice: bool = True,
@@ -108,17 +108,17 @@ def diagnose(
     """
     wild = ""
     if isinstance(source, Fit):
-        questioned = candidates_of(source.model, candidates, own)
+        questioned = candidates_of(source.model, candidates, user_effects)
         found, dropped = _with_host(source, questioned), _dropped_in_fit(source)
     else:
         settings = _settings(source)
         if settings is not None:
             source, named, listed_candidates, brought, stated = settings
-            model, own = model or named, {**brought, **(own or {})}
+            model, user_effects = model or named, {**brought, **(user_effects or {})}
             candidates = listed_candidates if candidates is None else candidates
             limits = limits or stated
         model = model or base_model()
-        questioned = candidates_of(model, candidates, own)
+        questioned = candidates_of(model, candidates, user_effects)
         pairs, left_out = pairs_of(source, tracks)
         pairs, dropped = _frames_put_right(pairs)
         wild = listed_wild_points({trial.name: track for trial, track in pairs if trial.video is None})
@@ -137,7 +137,7 @@ def diagnose(
     if ladder and result.final_verdict == ADEQUATE:
         report("what speaks against it")
         doubts = contradictions(result.fits, result.effects, result.ladder)
-        result = replace(result, notes=(*result.notes, *(f"Against this verdict: {one}" for one in doubts)))
+        result = replace(result, notes=(*result.notes, *(f"Against this verdict: {doubt}" for doubt in doubts)))
     if advice:
         result = _with_advice(result, limits, report)
     return result
@@ -155,8 +155,8 @@ def _settings(
     if not isinstance(source, Experiment):
         return None
     settings = source.settings
-    own = own_effects([source.folder / path for path in settings.effects])
-    return source, make_model(settings.model, own), settings.candidates, dict(own), settings.limits
+    user_effects = own_effects([source.folder / path for path in settings.effects])
+    return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
 
 
 def _with_host(found: Fit, questioned: Sequence[Effect]) -> Fit:
@@ -188,25 +188,25 @@ def _dropped_in_fit(found: Fit) -> list[str]:
     from vinetrack.tracks.frame_timing import correct_frames
 
     dropped = []
-    for item in found.predictor.data:
-        blank = np.full(item.time_s.size, "", dtype=object)
+    for trial_data in found.predictor.data:
+        blank = np.full(trial_data.time_s.size, "", dtype=object)
         track = Track(
-            time_s=item.time_s,
-            lead_position_m=item.lead_position_m,
-            lead_position_sigma_m=np.full(item.time_s.size, math.nan),
+            time_s=trial_data.time_s,
+            lead_position_m=trial_data.lead_position_m,
+            lead_position_sigma_m=np.full(trial_data.time_s.size, math.nan),
             flag=blank,
-            edge_px=np.full(item.time_s.size, math.nan),
+            edge_px=np.full(trial_data.time_s.size, math.nan),
         )
         if any("corrected" in str(flag) for flag in correct_frames(track).flag):
-            dropped.append(item.trial.name)
+            dropped.append(trial_data.trial.name)
     return dropped
 
 
-def _conclude(found: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, str]) -> Diagnosis:
+def _conclude(fit: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, str]) -> Diagnosis:
     """Findings in words and tables."""
     rounds = tuple(_round(finding, blind) for finding in findings)
     added: list[str] = []
-    fits = [found]
+    fits = [fit]
     for finding in findings[:-1]:
         effect = finding.answer[0]
         added.append(effect)
@@ -231,7 +231,11 @@ def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
         cosine_names=names,
         cosines=cosines,
         fit=questions.found,
-        fits={one.names[-1]: one.fit for one in finding.kept if one.effects[-1].kind != BETWEEN_TRIALS},
+        fits={
+            hypothesis.names[-1]: hypothesis.fit
+            for hypothesis in finding.kept
+            if hypothesis.effects[-1].kind != BETWEEN_TRIALS
+        },
     )
 
 
@@ -246,9 +250,9 @@ def _cosines(questions: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]
 def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate]:
     questions = finding.questions
     aside = dict(finding.aside)
-    singles = {one.names[0]: one for one in finding.tried if len(one.names) == 1}
+    singles = {hypothesis.names[0]: hypothesis for hypothesis in finding.tried if len(hypothesis.names) == 1}
     weights = weights_of(list(singles.values()))
-    rows = [_rule(one, finding) for one in finding.kept if one.effects[-1] is TAIL_SLACK]
+    rows = [_rule(hypothesis, finding) for hypothesis in finding.kept if hypothesis.effects[-1] is TAIL_SLACK]
     for effect in questions.effects:
         largest, shows = questions.largest(effect)
         if effect.name in questions.answers.silent:
@@ -300,10 +304,12 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
     return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_known(row.delta_chi2)))
 
 
-def _rule(one: LikelihoodRatio, finding: SelectionStep) -> Candidate:
+def _rule(hypothesis: LikelihoodRatio, finding: SelectionStep) -> Candidate:
     """The rule that a tail cannot push, as a candidate without a size."""
-    name = one.names[-1]
-    return Candidate(name, "physical", REFITTED, one.delta_chi2, one.sigma, (), True, name in finding.answer)
+    name = hypothesis.names[-1]
+    return Candidate(
+        name, "physical", REFITTED, hypothesis.delta_chi2, hypothesis.sigma, (), True, name in finding.answer
+    )
 
 
 def _promised(finding: SelectionStep, name: str, z: float) -> float:
@@ -324,7 +330,7 @@ def _behind(finding: SelectionStep, name: str) -> str:
     climbs = finding.search.climbs if finding.search else {}
     if name not in climbs:
         return ""
-    behind = climbs[name].deviance - min(one.deviance for one in climbs.values())
+    behind = climbs[name].deviance - min(climb.deviance for climb in climbs.values())
     return f"fitted to one trial of every condition, worse by Δχ² = {behind:.0f}" if behind > 0 else ""
 
 

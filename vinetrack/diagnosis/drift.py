@@ -105,7 +105,7 @@ class Drift:
         return tuple(significant["sentence"])
 
 
-def drift(found: Fit, scatter: Scatter | None = None) -> Drift:
+def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
     """Ask every parameter whether it drifts with pressure, payload, angle, chamber, inlet, vine or along the growth.
 
     Parameters
@@ -121,12 +121,12 @@ def drift(found: Fit, scatter: Scatter | None = None) -> Drift:
     import pandas as pd
 
     notes: list[str] = []
-    scatter = scatter or replicate_scatter(found, courses_of(found)[0])
-    tests = list(_tests(found, scatter, notes))
+    scatter = scatter or replicate_scatter(fit, courses_of(fit)[0])
+    tests = list(_tests(fit, scatter, notes))
     level = 1 - (1 - FALSE_ALARMS) ** (1 / max(len(tests), 1))
     tests.sort(key=lambda one: one.p)
-    rows = [{**one.row, "significant": bool(one.p < level)} for one in tests]
-    groups = [group for one in tests for group in one.groups]
+    rows = [{**test.row, "significant": bool(test.p < level)} for test in tests]
+    groups = [group for test in tests for group in test.groups]
     return Drift(
         pd.DataFrame(rows, columns=list(DRIFT_COLUMNS)).astype({"significant": bool, "relative": bool}),
         pd.DataFrame(groups, columns=list(GROUP_COLUMNS)),
@@ -159,52 +159,57 @@ def drift_groups(before: Drift, after: Fit | None) -> pd.DataFrame:
     return pd.concat([part for part in parts if len(part)] or parts, ignore_index=True)
 
 
-def _tests(found: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTest]:
-    keys = [key for key in found.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
-    laid, damping = lay(found), None
+def _tests(fit: Fit, scatter: Scatter, notes: list[str]) -> Iterator[ConstancyTest]:
+    keys = [key for key in fit.predictor.layout.keys if key not in (YIELD_PRESSURE, EXPONENT)]
+    laid, damping = lay(fit), None
     for key in keys:
         try:
-            own = per_trial_estimates(found, key, laid)
+            estimates = per_trial_estimates(fit, key, laid)
         except SimulationError:
             notes.append(f"{key} could not be found for single trials: the model cannot be followed there.")
             continue
-        damping = own if key == DAMPING else damping
+        damping = estimates if key == DAMPING else damping
         for against in CONDITIONS:
-            yield from _against(own, against)
-    yield from _between_vines(found, scatter)
-    yield from against_the_sheet(found)
+            yield from _against(estimates, against)
+    yield from _between_vines(fit, scatter)
+    yield from against_the_sheet(fit)
     if damping is not None:
         try:
-            yield from along_growth(found, laid, damping)
+            yield from along_growth(fit, laid, damping)
         except SimulationError:
             notes.append("B could not be followed along the growth: the model cannot be followed there.")
 
 
-def _against(own: PerTrialEstimates, against: Against) -> Iterator[ConstancyTest]:
+def _against(estimates: PerTrialEstimates, against: Against) -> Iterator[ConstancyTest]:
     """Rows of one parameter against one condition: each vine alone where it has values of its own, and all."""
-    levels = np.array([against.level(trial) for trial in own.trials])
-    usable = np.isfinite(levels) & np.isfinite(own.deviation)
-    vines = np.array([trial.vine for trial in own.trials])
+    levels = np.array([against.level(trial) for trial in estimates.trials])
+    usable = np.isfinite(levels) & np.isfinite(estimates.deviation)
+    vines = np.array([trial.vine for trial in estimates.trials])
     varying = [vine for vine in dict.fromkeys(vines) if np.unique(levels[usable & (vines == vine)]).size > 1]
     if not varying:
-        if own.per_vine or np.unique(levels[usable]).size < 2:
+        if estimates.per_vine or np.unique(levels[usable]).size < 2:
             return
         choices = [("", usable)]
-    elif own.per_vine:
+    elif estimates.per_vine:
         choices = [(vine, usable & (vines == vine)) for vine in varying]
         choices += [("", usable & np.isin(vines, varying))] if len(varying) > 1 else []
     else:
         choices = [("", usable)]
     for vine, chosen in choices:
-        sums = sums_of(own, against.along(levels), levels, chosen)
+        sums = sums_of(estimates, against.along(levels), levels, chosen)
         if sums is None:
             continue
-        shown = [] if own.per_vine and not vine else _groups(own, against, levels, chosen, sums, vine)
-        yield _slope(own, against, levels[chosen], sums, vine, shown)
+        shown = [] if estimates.per_vine and not vine else _groups(estimates, against, levels, chosen, sums, vine)
+        yield _slope(estimates, against, levels[chosen], sums, vine, shown)
 
 
 def _slope(
-    own: PerTrialEstimates, against: Against, levels: Floats, sums: Sums, vine: str, groups: list[dict[str, object]]
+    estimates: PerTrialEstimates,
+    against: Against,
+    levels: Floats,
+    sums: Sums,
+    vine: str,
+    groups: list[dict[str, object]],
 ) -> ConstancyTest:
     from scipy.stats import t as student
 
@@ -215,37 +220,37 @@ def _slope(
     reach = float(np.diff(against.along(np.array([low, high])))[0])
     start, stop = (low, high) if slope >= 0 else (high, low)
     change, error = abs(slope) * reach, sigma * reach
-    if own.logarithmic:
+    if estimates.logarithmic:
         change, error = math.expm1(change), math.exp(change) * error
     p = float(2 * student.sf(abs(slope) / sigma, sums.dof))
     p_groups, z_constancy = constancy(sums)
     row: dict[str, object] = {
-        "parameter": own.key,
+        "parameter": estimates.key,
         "vine": vine,
-        "symbol": own.symbol,
-        "unit": own.unit,
+        "symbol": estimates.symbol,
+        "unit": estimates.unit,
         "against": against.column,
         "from_level": start,
         "to_level": stop,
         "change": change,
         "change_sigma": error,
-        "relative": own.logarithmic,
+        "relative": estimates.logarithmic,
         "z": as_deviate(p),
         "z_constancy": z_constancy,
         "dof": sums.dof,
         "n_trials": int(sums.x.size),
     }
-    row["sentence"] = _said(own, against, row, steadily=p <= p_groups)
+    row["sentence"] = _said(estimates, against, row, steadily=p <= p_groups)
     return ConstancyTest(row, min(1.0, 2 * min(p, p_groups)), groups)
 
 
-def _said(own: PerTrialEstimates, against: Against, row: Mapping[str, Any], *, steadily: bool) -> str:
+def _said(estimates: PerTrialEstimates, against: Against, row: Mapping[str, Any], *, steadily: bool) -> str:
     """A row in words; `steadily` where a straight line says more than that groups differ."""
-    who = f"{own.symbol} of {row['vine']}" if row["vine"] else own.symbol
+    who = f"{estimates.symbol} of {row['vine']}" if row["vine"] else estimates.symbol
     start, stop = against.shown(row["from_level"]), against.shown(row["to_level"])
     if steadily:
         return (
-            f"{who} rises by {_amount(own, row['change'], row['change_sigma'])} from {start} to {stop}"
+            f"{who} rises by {_amount(estimates, row['change'], row['change_sigma'])} from {start} to {stop}"
             f" of {against.words} ({row['z']:.1f} σ), though it should not know the {against.words}."
         )
     low, high = sorted((row["from_level"], row["to_level"]))
@@ -255,29 +260,34 @@ def _said(own: PerTrialEstimates, against: Against, row: Mapping[str, Any], *, s
     )
 
 
-def _amount(own: PerTrialEstimates, change: float, error: float) -> str:
+def _amount(estimates: PerTrialEstimates, change: float, error: float) -> str:
     """A change with its error, in per cent or in the unit it reads best in."""
-    unit, factor = ("%", 100.0) if own.logarithmic else display_unit(own.unit)
+    unit, factor = ("%", 100.0) if estimates.logarithmic else display_unit(estimates.unit)
     digits = max(decimals(error * factor) - 1, 0)
     return f"{change * factor:.{digits}f} ± {error * factor:.{digits}f} {unit}".rstrip()
 
 
 def _groups(
-    own: PerTrialEstimates, against: Against | None, levels: Floats, chosen: NDArray[np.bool_], sums: Sums, vine: str
+    estimates: PerTrialEstimates,
+    against: Against | None,
+    levels: Floats,
+    chosen: NDArray[np.bool_],
+    sums: Sums,
+    vine: str,
 ) -> list[dict[str, object]]:
     """Mean value of every group; error from the scatter of replicates."""
     rows = []
     for level in np.unique(levels[chosen]):
         k = np.flatnonzero(chosen & (levels == level))
-        w = 1 / own.variance[k]
-        mean = float(np.average(own.deviation[k], weights=w))
+        w = 1 / estimates.variance[k]
+        mean = float(np.average(estimates.deviation[k], weights=w))
         sigma = math.sqrt(sums.variance / float(np.sum(w)))
-        rows.append(_group_row(own, against, float(level), vine, mean, sigma, k))
+        rows.append(_group_row(estimates, against, float(level), vine, mean, sigma, k))
     return rows
 
 
 def _group_row(
-    own: PerTrialEstimates,
+    estimates: PerTrialEstimates,
     against: Against | None,
     level: float,
     vine: str,
@@ -285,18 +295,20 @@ def _group_row(
     sigma: float,
     k: NDArray[np.int_],
 ) -> dict[str, object]:
-    base = float(np.mean(own.base[k])) if np.ptp(own.base[k]) <= 1e-9 * abs(own.base[k][0]) else math.nan
-    if own.logarithmic:
+    base = (
+        float(np.mean(estimates.base[k])) if np.ptp(estimates.base[k]) <= 1e-9 * abs(estimates.base[k][0]) else math.nan
+    )
+    if estimates.logarithmic:
         ratio, ratio_sigma = math.exp(mean), math.exp(mean) * sigma
         value, value_sigma = base * ratio, base * ratio_sigma
     else:
         value, value_sigma = base + mean, sigma
         ratio, ratio_sigma = (value / base, sigma / abs(base)) if base != 0 else (math.nan, math.nan)
     return {
-        "parameter": own.key,
+        "parameter": estimates.key,
         "vine": vine,
-        "symbol": own.symbol,
-        "unit": own.unit,
+        "symbol": estimates.symbol,
+        "unit": estimates.unit,
         "against": against.column if against else "vine",
         "level": level if against else math.nan,
         "value": value,
@@ -338,24 +350,24 @@ def _vine_row(
     }
 
 
-def _between_vines(found: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
+def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
     """Whether a number that all trials share suits every vine: each is fitted alone, with all its numbers free."""
-    shared = [n.key for n in found.numbers if not n.vine and n.key != YIELD_PRESSURE]
-    parts = list(_alone(found, scatter)) if shared else []
+    shared = [n.key for n in fit.numbers if not n.vine and n.key != YIELD_PRESSURE]
+    parts = list(_alone(fit, scatter)) if shared else []
     for key in shared:
-        own = [(vine, alone[key], len(alone.trials)) for vine, alone in parts]
-        own = [one for one in own if math.isfinite(one[1].sigma) and one[1].sigma > 0]
-        if len(own) > 1:
-            yield _apart(found[key], own)
+        estimates = [(vine, alone[key], len(alone.trials)) for vine, alone in parts]
+        estimates = [one for one in estimates if math.isfinite(one[1].sigma) and one[1].sigma > 0]
+        if len(estimates) > 1:
+            yield _apart(fit[key], estimates)
 
 
-def _alone(found: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
+def _alone(fit: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
     """Every vine of several pressures fitted alone; trials scatter as replicates do."""
     spread = (max(scatter.pressure, LEAST_SPREAD[0]), max(scatter.damping, LEAST_SPREAD[1]))
-    state = replace(found.solution.state, spread=spread)
-    honest = replace(found, solution=replace(found.solution, state=state))
-    for vine in dict.fromkeys(trial.trial.vine for trial in found.trials):
-        members = [trial for trial in found.trials if trial.trial.vine == vine]
+    state = replace(fit.solution.state, spread=spread)
+    honest = replace(fit, solution=replace(fit.solution, state=state))
+    for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):
+        members = [trial for trial in fit.trials if trial.trial.vine == vine]
         if len({trial.trial.pressure_Pa for trial in members}) < 2:
             continue
         names = [trial.name for trial in members]
@@ -368,15 +380,15 @@ def _alone(found: Fit, scatter: Scatter) -> Iterator[tuple[str, Fit]]:
             continue
 
 
-def _apart(common: Number, own: Sequence[tuple[str, Number, int]]) -> ConstancyTest:
+def _apart(common: Number, estimates: Sequence[tuple[str, Number, int]]) -> ConstancyTest:
     """The values of single vines against one for all."""
     from scipy.stats import chi2 as chi_square
 
-    value, sigma = (np.array([getattr(number, name) for _, number, _ in own]) for name in ("value", "sigma"))
+    value, sigma = (np.array([getattr(number, name) for _, number, _ in estimates]) for name in ("value", "sigma"))
     mean = float(np.average(value, weights=1 / sigma**2))
-    p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(own) - 1))
-    groups = [_alone_group(*one, common.value) for one in own]
-    count = sum(one[2] for one in own)
+    p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(estimates) - 1))
+    groups = [_alone_group(*one, common.value) for one in estimates]
+    count = sum(one[2] for one in estimates)
     row = _vine_row(common.key, common.symbol, common.unit, groups, as_deviate(p), math.inf, count)
     return ConstancyTest(row, p, groups)
 

@@ -43,7 +43,7 @@ class _Halves:
     deviation: Floats
 
 
-def along_growth(found: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> Iterator[ConstancyTest]:
+def along_growth(fit: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> Iterator[ConstancyTest]:
     """Rows of B against the growth, for every vine and for all; `values` are those of B.
 
     Raises
@@ -53,34 +53,35 @@ def along_growth(found: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> I
     """
     if laid.predictor.damping_column < 0:
         return
-    halves = _halves(found, laid, values.own)
+    halves = _halves(fit, laid, values.trial_effects)
     vines = np.array([trial.vine for trial in halves.trials])
     known = np.isfinite(halves.deviation).all(axis=1)
     names = list(dict.fromkeys(vines[known]))
     for vine in [*names, *([""] if len(names) > 1 else [])]:
         chosen = np.flatnonzero(known & ((vines == vine) | (vine == "")))
-        tested = _tested(found, halves, str(vine), chosen)
+        tested = _tested(fit, halves, str(vine), chosen)
         if tested is not None:
             yield tested
 
 
-def _halves(found: Fit, laid: AlignedTrial, own: Floats) -> _Halves:
+def _halves(fit: Fit, laid: AlignedTrial, trial_effects: Floats) -> _Halves:
     """About each trial's own B: about the common one, its scatter would count in the second order."""
-    motions = motions_of(found, own)
+    motions = motions_of(fit, trial_effects)
     data = laid.predictor.data
-    columns = laid.predictor.linearise(np.empty(0), own)
+    columns = laid.predictor.linearise(np.empty(0), trial_effects)
     held = rest_is_seen(data)
     middles = [
-        0.5 * float(np.max(np.interp(item.time_s - own[i, RELEASE], motion.time_s, motion.lead_position_m)))
-        for i, (item, motion) in enumerate(zip(data, motions, strict=True))
+        0.5
+        * float(np.max(np.interp(trial_data.time_s - trial_effects[i, RELEASE], motion.time_s, motion.lead_position_m)))
+        for i, (trial_data, motion) in enumerate(zip(data, motions, strict=True))
     ]
     pushes = [_pushes(*one) for one in zip(motions, middles, strict=True)]
     deviation = np.full((len(data), 2), math.nan)
-    for i, answers in enumerate(push_sensitivities(found, own, motions, pushes)):
+    for i, answers in enumerate(push_sensitivities(fit, trial_effects, motions, pushes)):
         others = columns[i][:, [RELEASE]] if held[i] else columns[i][:, [RELEASE, ORIGIN]]
         if laid.predictor.feels_damping[i] and np.all(np.ptp(answers, axis=0) > 0):
             deviation[i] = np.linalg.lstsq(np.column_stack([answers, others]), columns[i][:, -1], rcond=1e-9)[0][:2]
-    return _Halves(tuple(item.trial for item in data), deviation + own[:, [DAMPING_DEVIATION]])
+    return _Halves(tuple(trial_data.trial for trial_data in data), deviation + trial_effects[:, [DAMPING_DEVIATION]])
 
 
 def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
@@ -94,7 +95,7 @@ def _pushes(motion: FittedMotion, middle_m: float) -> Floats:
     return np.column_stack([np.where(y < middle_m, push, 0.0), np.where(y < middle_m, 0.0, push)])
 
 
-def _tested(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> ConstancyTest | None:
+def _tested(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> ConstancyTest | None:
     """The mean difference of the halves against how replicates differ in it."""
     from scipy.stats import t as student
 
@@ -132,7 +133,7 @@ def _tested(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> Const
             " the way."
         ),
     }
-    return ConstancyTest(row, p, _groups(found, halves, vine, chosen) if vine else [])
+    return ConstancyTest(row, p, _groups(fit, halves, vine, chosen) if vine else [])
 
 
 def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
@@ -147,13 +148,13 @@ def _scatter(values: Floats, conditions: list[str]) -> tuple[float, int]:
     return math.sqrt(float(np.sum(left**2)) / max(dof, 1)), dof
 
 
-def _groups(found: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[dict[str, object]]:
+def _groups(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[dict[str, object]]:
     """Mean value of each half; the error is that of their difference, shared between them."""
     rows: list[dict[str, object]] = []
     conditions = [halves.trials[i].condition for i in chosen]
     rise = halves.deviation[chosen, 1] - halves.deviation[chosen, 0]
     sigma = max(_scatter(rise, conditions)[0], LEAST_SCATTER) / math.sqrt(2 * chosen.size)
-    base = float(found.model.parameters_for(vine)[found.model.parameter_names.index(DAMPING)])
+    base = float(fit.model.parameters_for(vine)[fit.model.parameter_names.index(DAMPING)])
     for half, level in enumerate(HALVES):
         ratio = math.exp(float(halves.deviation[chosen, half].mean()))
         rows.append(

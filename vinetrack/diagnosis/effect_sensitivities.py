@@ -50,19 +50,19 @@ class EffectSensitivities:
         return tuple(shape.effect.name for shape in self.shapes)
 
 
-def effect_sensitivities(found: Fit, shapes: Sequence[CandidateShape]) -> EffectSensitivities:
+def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSensitivities:
     """Ask every shape; those that do nothing by a small step are tried at finite sizes before they count as silent."""
-    plain = [trial.predicted_position_m - trial.origin_m for trial in found.trials]
+    plain = [trial.predicted_position_m - trial.origin_m for trial in fit.trials]
     kept: list[tuple[CandidateShape, list[Floats]]] = []
     heard: set[str] = set()
     names = dict.fromkeys(shape.effect.name for shape in shapes)
     for name in names:
         of_effect = [shape for shape in shapes if shape.effect.name == name]
-        answered = [one for shape in of_effect if (one := _answer(found, shape, plain)) is not None]
+        answered = [one for shape in of_effect if (one := _answer(fit, shape, plain)) is not None]
         if not answered and any(shape.effect.parameters for shape in of_effect):
             rest = of_effect[0].rest
             finite = whole_shapes(of_effect[0].effect, [rest])
-            answered = [one for shape in finite if (one := _answer(found, shape, plain)) is not None]
+            answered = [one for shape in finite if (one := _answer(fit, shape, plain)) is not None]
         kept += answered
         heard |= {name} if answered else set()
     columns = tuple(
@@ -74,11 +74,11 @@ def effect_sensitivities(found: Fit, shapes: Sequence[CandidateShape]) -> Effect
     )
 
 
-def _answer(found: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> tuple[CandidateShape, list[Floats]] | None:
+def _answer(fit: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> tuple[CandidateShape, list[Floats]] | None:
     """What one unit of its size does to every trial, and the shape with the step that was good; None where nothing."""
     try:
-        change = _change(found, shape, plain)
-        response = _response(found, change)
+        change = _change(fit, shape, plain)
+        response = _response(fit, change)
         if shape.whole:
             speaks = response > SILENT_RESPONSE and not _holds_back(plain, change)
             return (shape, [one / shape.step for one in change]) if speaks else None
@@ -89,8 +89,8 @@ def _answer(found: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> tuple
             step = shape.step * AIMED_RESPONSE / response
             room = size.bounds[1] - size.zero if shape.step > 0 else size.zero - size.bounds[0]
             shape = replace(shape, step=min(step, room) if room > 0 else step)
-            change = _change(found, shape, plain)
-            response = _response(found, change)
+            change = _change(fit, shape, plain)
+            response = _response(fit, change)
     except SimulationError:
         return None
     return (shape, [one / shape.step for one in change]) if response > SILENT_RESPONSE else None
@@ -103,19 +103,19 @@ def _holds_back(plain: Sequence[Floats], change: Sequence[Floats]) -> bool:
     )
 
 
-def _response(found: Fit, change: Sequence[Floats]) -> float:
+def _response(fit: Fit, change: Sequence[Floats]) -> float:
     """Largest answer, as part of a trial's travel; infinite where one cannot be followed."""
-    spans = [max(float(np.ptp(trial.lead_position_m)), 1e-9) for trial in found.trials]
+    spans = [max(float(np.ptp(trial.lead_position_m)), 1e-9) for trial in fit.trials]
     parts = [float(np.max(np.abs(one))) / span for one, span in zip(change, spans, strict=True)]
     worst = max(parts, default=0.0)
     return worst if math.isfinite(worst) else math.inf
 
 
-def _change(found: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> list[Floats]:
+def _change(fit: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> list[Floats]:
     """By how much the positions of every trial change with the step put in, m."""
-    predictor, state = found.predictor, found.solution.state
-    jobs = predictor.jobs(state.theta, state.own)
+    predictor, state = fit.predictor, fit.solution.state
+    jobs = predictor.jobs(state.theta, state.trial_effects)
     rows = np.array([[*job.row, *shape.values] for job in jobs]).reshape(len(jobs), -1)
-    model = found.predictor.layout.model + shape.effect
+    model = fit.predictor.layout.model + shape.effect
     moved = predictor.run_as(model, jobs, rows)
     return [moved_by(before, trajectory) for before, trajectory in zip(plain, moved, strict=True)]

@@ -60,50 +60,50 @@ class ForceFit:
     begin: each comes as near to its track as they let it, so that little is left for forces.
     """
 
-    def __init__(self, found: Fit, own: Floats, scatter: Scatter) -> None:
-        data, frame = found.predictor.data, found.solution.frame
+    def __init__(self, fit: Fit, trial_effects: Floats, scatter: Scatter) -> None:
+        data, problem = fit.predictor.data, fit.solution.problem
         rho = track_correlation(data)
-        noise = np.array([item.noise_m**2 for item in data]) * (1 - rho**2)
+        noise = np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2)
         spread = (max(scatter.pressure, LEAST_SPREAD[0]), max(scatter.damping, LEAST_SPREAD[1]))
-        before = found.solution.state
-        state = FitState(before.theta, own, spread, rho, np.maximum(noise, floor(data)))
-        still = replace(frame, free=np.zeros_like(frame.free))
+        before = fit.solution.state
+        state = FitState(before.theta, trial_effects, spread, rho, np.maximum(noise, floor(data)))
+        still = replace(problem, free=np.zeros_like(problem.free))
         held = FixedTerms(spread, (rho, state.variance))
-        solution = solve(found.predictor, still, state, held, warm=True, most_iterations=OWN_ITERATIONS)
-        self.data, self.frame = data, frame
+        solution = solve(fit.predictor, still, state, held, warm=True, most_iterations=OWN_ITERATIONS)
+        self.data, self.problem = data, problem
         self.state, self.columns = solution.state, solution.columns
-        self.precision = trial_effect_prior(frame, self.state)[1]
-        self.pull = -frame.prior_precision * (state.theta - frame.prior_mean)
-        self.conditions = [item.trial.condition for item in data]
-        self.points = float(sum(item.time_s.size for item in data))
+        self.precision = trial_effect_prior(problem, self.state)[1]
+        self.pull = -problem.prior_precision * (state.theta - problem.prior_mean)
+        self.conditions = [trial_data.trial.condition for trial_data in data]
+        self.points = float(sum(trial_data.time_s.size for trial_data in data))
 
     @property
-    def own(self) -> Floats:
+    def trial_effects(self) -> Floats:
         """The trials' own numbers, about which everything is linear, shape (n_trials, 4)."""
-        return self.state.own
+        return self.state.trial_effects
 
     def _blocks(self, answers: Sequence[Floats]) -> Floats:
         """Products of [keys, forces, residual] of every trial, its own numbers eliminated."""
         blocks = []
         for i, (columns, more) in enumerate(zip(self.columns, answers, strict=True)):
-            left = columns[:, -1] + columns[:, list(SPREAD_COLUMNS)] @ self.state.own[i, list(SPREAD_COLUMNS)]
+            left = columns[:, -1] + columns[:, list(SPREAD_COLUMNS)] @ self.state.trial_effects[i, list(SPREAD_COLUMNS)]
             rows = np.column_stack([columns[:, :-1], more, left])
             white = whiten(rows, self.data[i].first, self.state.rho, self.data[i].relative_sd)
             gram = white.T @ white / self.state.variance[i]
-            own = gram[:OWN, :OWN] + np.diag(self.precision[i])
-            blocks.append(gram[OWN:, OWN:] - gram[OWN:, :OWN] @ np.linalg.solve(own, gram[:OWN, OWN:]))
+            within_trial = gram[:OWN, :OWN] + np.diag(self.precision[i])
+            blocks.append(gram[OWN:, OWN:] - gram[OWN:, :OWN] @ np.linalg.solve(within_trial, gram[:OWN, OWN:]))
         return np.array(blocks)
 
     def _spread(self, blocks: Floats) -> tuple[Floats, Floats, Floats]:
         """Sums over trials: numbers with themselves (p, p), with forces and residual (p, L + 1), and the rest."""
-        k, p = self.frame.index.shape[1], self.pull.size
-        index = self.frame.index
+        k, p = self.problem.index.shape[1], self.pull.size
+        index = self.problem.index
         square, cross = np.zeros((p + 1, p + 1)), np.zeros((p + 1, blocks.shape[1] - k))
         np.add.at(square, (index[:, :, None], index[:, None, :]), blocks[:, :k, :k])
         np.add.at(cross, index, blocks[:, :k, k:])
-        square, cross = square[:p, :p] + np.diag(self.frame.prior_precision), cross[:p].copy()
+        square, cross = square[:p, :p] + np.diag(self.problem.prior_precision), cross[:p].copy()
         cross[:, -1] += self.pull
-        still = ~self.frame.free | ~(np.diag(square) > 0)
+        still = ~self.problem.free | ~(np.diag(square) > 0)
         square[still, :] = square[:, still] = cross[still] = 0.0
         return square, cross, blocks[:, k:, k:].sum(axis=0)
 
@@ -141,8 +141,8 @@ class ForceFit:
 
     def _scores(self, blocks: Floats, lever: Floats, place: slice, amplitude: Floats, numbers: Floats) -> Floats:
         """What single trials say beyond the fit about amplitudes, shape (n_trials, n_columns)."""
-        k = self.frame.index.shape[1]
-        index = self.frame.index
+        k = self.problem.index.shape[1]
+        index = self.problem.index
         moved = np.append(numbers, 0.0)[index]
         forces = slice(k + place.start, k + place.stop)
         left = blocks[:, :, -1] - np.einsum("nqk,nk->nq", blocks[:, :, :k], moved) - blocks[:, :, forces] @ amplitude
@@ -159,10 +159,10 @@ class ForceFit:
         count = answers[0].shape[1]
         wide = []
         for condition, one in zip(self.conditions, answers, strict=True):
-            own = np.zeros((len(one), count * len(names)))
+            block = np.zeros((len(one), count * len(names)))
             k = names.index(condition) * count
-            own[:, k : k + count] = one
-            wide.append(own)
+            block[:, k : k + count] = one
+            wide.append(block)
         return self.together(wide)
 
     @cached_property
@@ -187,8 +187,8 @@ class ForceFit:
         As smooth as generalised cross-validation finds best, the same in all conditions.
         """
         blocks = self._blocks(answers)
-        k = self.frame.index.shape[1]
-        moved = np.append(numbers, 0.0)[self.frame.index]
+        k = self.problem.index.shape[1]
+        moved = np.append(numbers, 0.0)[self.problem.index]
         names = list(dict.fromkeys(self.conditions))
         place = np.array([names.index(condition) for condition in self.conditions])
         count = answers[0].shape[1]

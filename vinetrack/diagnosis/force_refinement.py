@@ -80,7 +80,7 @@ class _Place:
     """Where the search stands; `motions` are those of these numbers, with the force."""
 
     theta: Floats
-    own: Floats
+    trial_effects: Floats
     law: Law
     amplitude: Floats
     motions: list[FittedMotion]
@@ -107,7 +107,7 @@ def refine(
     thorough
         Whether to search once more with care where the quick way leads nowhere.
     """
-    start = _Place(fit.state.theta, fit.own, law, 0.0 * gain.amplitude, list(motions))
+    start = _Place(fit.state.theta, fit.trial_effects, law, 0.0 * gain.amplitude, list(motions))
     best = _searched(found, fit, start, 0.0)
     if thorough and (best is None or best[1].cost > MENDED * fit.chi2):
         best = _searched(found, fit, start, FIRST_DAMPING)
@@ -161,53 +161,53 @@ def _force(place: _Place, motion: FittedMotion) -> Floats:
     return place.law.along(motion) @ place.amplitude
 
 
-def _as_driven(found: Fit, place: _Place) -> _Place:
+def _as_driven(fit: Fit, place: _Place) -> _Place:
     """The motions of these numbers and this force, corrected from those of the place before."""
-    jobs = found.predictor.jobs(place.theta, place.own)
-    motions = [with_derivatives(_with_numbers(found, *one)) for one in zip(place.motions, jobs, strict=True)]
+    jobs = fit.predictor.jobs(place.theta, place.trial_effects)
+    motions = [with_derivatives(_with_numbers(fit, *one)) for one in zip(place.motions, jobs, strict=True)]
     return replace(place, motions=pushed(motions, lambda motion: _force(place, motion), ROUNDS))
 
 
-def _with_numbers(found: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
+def _with_numbers(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
     """The motion as it is, its model and trial with other numbers."""
-    values = dict(zip(found.model.parameter_names, job.row.tolist(), strict=True))
-    trial = as_it_was(found.predictor.data[job.trial].trial, job)
-    return replace(motion, model=found.model.with_values(values), trial=trial)
+    values = dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True))
+    trial = as_it_was(fit.predictor.data[job.trial].trial, job)
+    return replace(motion, model=fit.model.with_values(values), trial=trial)
 
 
 def _normal(found: Fit, fit: ForceFit, place: _Place) -> _Normal:
     """Normal equations of all unknowns at a place."""
-    theta, own, q, s = place.theta, place.own, place.amplitude.size, len(place.law.shape_names)
-    p, n = theta.size, own.shape[0]
-    columns = push_sensitivities(found, own, place.motions, _pushes(found, place))
-    centre, precision = trial_effect_prior(fit.frame, fit.state)
+    theta, trial_effects, q, s = place.theta, place.trial_effects, place.amplitude.size, len(place.law.shape_names)
+    p, n = theta.size, trial_effects.shape[0]
+    columns = push_sensitivities(found, trial_effects, place.motions, _pushes(found, place))
+    centre, precision = trial_effect_prior(fit.problem, fit.state)
     size = p + q + s + n * OWN
     square, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
-    cost = float(np.sum(precision * (own - centre) ** 2))
-    cost += float(np.sum(fit.frame.prior_precision * (theta - fit.frame.prior_mean) ** 2))
-    for i, item in enumerate(found.predictor.data):
-        position, velocity = _seen(place.motions[i], item.time_s - own[i, RELEASE])
-        left = item.lead_position_m - own[i, ORIGIN] - position
+    cost = float(np.sum(precision * (trial_effects - centre) ** 2))
+    cost += float(np.sum(fit.problem.prior_precision * (theta - fit.problem.prior_mean) ** 2))
+    for i, trial_data in enumerate(found.predictor.data):
+        position, velocity = _seen(place.motions[i], trial_data.time_s - trial_effects[i, RELEASE])
+        left = trial_data.lead_position_m - trial_effects[i, ORIGIN] - position
         answers = columns[i]
         rows = np.column_stack([answers[:, 2:], -velocity, np.ones(left.size), answers[:, :2], left])
-        growing = _growing(item, own[i])
-        relative_sd = None if item.relative_sd is None else item.relative_sd[growing]
-        white = whiten(rows[growing], item.first[growing], fit.state.rho, relative_sd) / math.sqrt(
+        growing = _growing(trial_data, trial_effects[i])
+        relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[growing]
+        white = whiten(rows[growing], trial_data.first[growing], fit.state.rho, relative_sd) / math.sqrt(
             fit.state.variance[i]
         )
         gram = white.T @ white
         mine = p + q + s + i * OWN + np.arange(OWN)
-        keys = np.where(fit.frame.index[i] >= 0, fit.frame.index[i], size)
+        keys = np.where(fit.problem.index[i] >= 0, fit.problem.index[i], size)
         index = np.concatenate([keys, p + np.arange(q + s), mine])
         square[np.ix_(index, index)] += gram[:-1, :-1]
         np.add.at(slope, index, gram[:-1, -1])
         square[mine, mine] += precision[i]
-        slope[mine] -= precision[i] * (own[i] - centre[i])
+        slope[mine] -= precision[i] * (trial_effects[i] - centre[i])
         cost += float(gram[-1, -1])
     square, slope = square[:size, :size], slope[:size]
-    square[np.arange(p), np.arange(p)] += fit.frame.prior_precision
-    slope[:p] -= fit.frame.prior_precision * (theta - fit.frame.prior_mean)
-    still = np.flatnonzero(~fit.frame.free)
+    square[np.arange(p), np.arange(p)] += fit.problem.prior_precision
+    slope[:p] -= fit.problem.prior_precision * (theta - fit.problem.prior_mean)
+    still = np.flatnonzero(~fit.problem.free)
     square[still, :] = square[:, still] = slope[still] = 0.0
     return _Normal(cost, square, slope)
 
@@ -218,11 +218,11 @@ def _inverse(square: Floats) -> Floats:
     return np.asarray(inverse * scale[:, None] * scale)
 
 
-def _growing(item: FitTrial, own: Floats) -> slice:
+def _growing(trial_data: FitTrial, trial_effects: Floats) -> slice:
     """The points before the end of growth: a motion that is corrected does not end where it ought to."""
-    length_m = item.trial.length_m if math.isfinite(item.trial.length_m) else math.inf
-    beyond = np.flatnonzero(item.lead_position_m - own[ORIGIN] > END * length_m)
-    return slice(0, int(beyond[0]) if beyond.size else item.time_s.size)
+    length_m = trial_data.trial.length_m if math.isfinite(trial_data.trial.length_m) else math.inf
+    beyond = np.flatnonzero(trial_data.lead_position_m - trial_effects[ORIGIN] > END * length_m)
+    return slice(0, int(beyond[0]) if beyond.size else trial_data.time_s.size)
 
 
 def _seen(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
@@ -237,11 +237,11 @@ def _seen(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
     return np.asarray(curve(at) + offset), np.where(moving, curve(at, 1) * seen, 0.0)
 
 
-def _pushes(found: Fit, place: _Place) -> list[Floats]:
+def _pushes(fit: Fit, place: _Place) -> list[Floats]:
     """Accelerations by a unit of [pressure, B of the trial, every key, amplitudes, shapes], (n_times, n) each."""
-    layout, theta = found.predictor.layout, place.theta
-    jobs = found.predictor.jobs(theta, place.own)
-    damping = found.predictor.damping_column
+    layout, theta = fit.predictor.layout, place.theta
+    jobs = fit.predictor.jobs(theta, place.trial_effects)
+    damping = fit.predictor.damping_column
     pushes = []
     for i, (motion, job) in enumerate(zip(place.motions, jobs, strict=True)):
         varied = [replace(job, pressure_deviation=job.pressure_deviation + SMALL)]
@@ -259,9 +259,9 @@ def _pushes(found: Fit, place: _Place) -> list[Floats]:
                 k = layout.model.parameter_names.index(key)
                 factor = number.outside(at + SMALL) / number.outside(at) if number.logarithmic else 0.0
                 varied.append(_with(job, k, job.row[k] * factor if number.logarithmic else job.row[k] + change))
-        felt = [found.predictor.feels_pressure[i], found.predictor.feels_damping[i], *[True] * len(layout.keys)]
+        felt = [fit.predictor.feels_pressure[i], fit.predictor.feels_damping[i], *[True] * len(layout.keys)]
         changes = [
-            (_acceleration(found, motion, one) - motion.free) / SMALL if feels and one is not job else 0.0 * motion.free
+            (_acceleration(fit, motion, one) - motion.free) / SMALL if feels and one is not job else 0.0 * motion.free
             for one, feels in zip(varied, felt, strict=True)
         ]
         pushes.append(np.column_stack([*changes, _law_pushes(place, motion)]))
@@ -274,8 +274,8 @@ def _with(job: Job, column: int, value: float) -> Job:
     return replace(job, row=row)
 
 
-def _acceleration(found: Fit, motion: FittedMotion, job: Job) -> Floats:
-    other = _with_numbers(found, motion, job)
+def _acceleration(fit: Fit, motion: FittedMotion, job: Job) -> Floats:
+    other = _with_numbers(fit, motion, job)
     y, v = motion.lead_position_m, motion.lead_velocity_m_s
     return evaluate(other.model, other.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
 
@@ -303,8 +303,12 @@ def _stepped(fit: ForceFit, place: _Place, normal: _Normal, damping: float, *, s
         reach = 0.2 * law.size_of(name)
         law = law.shifted(name, float(np.clip(step[p + q + k], -reach, reach)))
     law = law.kept_inside(max(float(motion.lead_position_m.max()) for motion in place.motions))
-    reach_s = 2 * np.array([item.frame_s for item in fit.data])
-    own = place.own + step[p + q + len(law.shape_names) :].reshape(-1, OWN)
-    own[:, RELEASE] = place.own[:, RELEASE] + np.clip(own[:, RELEASE] - place.own[:, RELEASE], -reach_s, reach_s)
-    theta = np.clip(place.theta + step[:p], fit.frame.lower, fit.frame.upper)
-    return replace(place, theta=theta, own=own, law=law, amplitude=place.amplitude + step[p : p + q])
+    reach_s = 2 * np.array([trial_data.frame_s for trial_data in fit.data])
+    trial_effects = place.trial_effects + step[p + q + len(law.shape_names) :].reshape(-1, OWN)
+    trial_effects[:, RELEASE] = place.trial_effects[:, RELEASE] + np.clip(
+        trial_effects[:, RELEASE] - place.trial_effects[:, RELEASE], -reach_s, reach_s
+    )
+    theta = np.clip(place.theta + step[:p], fit.problem.lower, fit.problem.upper)
+    return replace(
+        place, theta=theta, trial_effects=trial_effects, law=law, amplitude=place.amplitude + step[p : p + q]
+    )

@@ -78,7 +78,7 @@ class FittedMotion:
         return self.trial.travel_ratio * self.lead_velocity_m_s
 
 
-def motions_of(found: Fit, own: Floats, theta: Floats | None = None) -> list[FittedMotion]:
+def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> list[FittedMotion]:
     """The fitted motions with these numbers of the trials' own, shape (n_trials, 4), and other numbers of the model.
 
     Raises
@@ -86,21 +86,22 @@ def motions_of(found: Fit, own: Floats, theta: Floats | None = None) -> list[Fit
     SimulationError
         If a trajectory cannot be followed.
     """
-    predictor = found.predictor
-    jobs = predictor.jobs(found.solution.state.theta if theta is None else theta, own)
-    trials = [as_it_was(item.trial, job) for item, job in zip(predictor.data, jobs, strict=True)]
+    predictor = fit.predictor
+    jobs = predictor.jobs(fit.solution.state.theta if theta is None else theta, trial_effects)
+    trials = [as_it_was(trial_data.trial, job) for trial_data, job in zip(predictor.data, jobs, strict=True)]
     grids = [
-        max(item.time_s[-1] - own[i, RELEASE] + SPARE_FRAMES * item.frame_s, 1e-6) * np.linspace(0, 1, STEPS + 1) ** 2
-        for i, item in enumerate(predictor.data)
+        max(trial_data.time_s[-1] - trial_effects[i, RELEASE] + SPARE_FRAMES * trial_data.frame_s, 1e-6)
+        * np.linspace(0, 1, STEPS + 1) ** 2
+        for i, trial_data in enumerate(predictor.data)
     ]
     traces = [
-        None if item.trace is None else (item.trace[0] - job.release_s, item.trace[1])
-        for item, job in zip(predictor.data, jobs, strict=True)
+        None if trial_data.trace is None else (trial_data.trace[0] - job.release_s, trial_data.trace[1])
+        for trial_data, job in zip(predictor.data, jobs, strict=True)
     ]
     runs = simulate_many(
-        found.model, trials, grids, traces=traces, parameters=np.array([job.row for job in jobs]), host=predictor.host
+        fit.model, trials, grids, traces=traces, parameters=np.array([job.row for job in jobs]), host=predictor.host
     )
-    return [_motion(found.model, *one) for one in zip(trials, jobs, runs, traces, strict=True)]
+    return [_motion(fit.model, *one) for one in zip(trials, jobs, runs, traces, strict=True)]
 
 
 def as_it_was(trial: Trial, job: Job) -> Trial:
@@ -157,7 +158,7 @@ def _seen(run: Trajectory) -> Floats:
 
 
 def force_sensitivities(
-    found: Fit, own: Floats, motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floats]
+    fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floats]
 ) -> list[Floats]:
     """What forces on the tail do to the positions seen at the points of every trial, shape (n_points, n_forces), m.
 
@@ -166,17 +167,23 @@ def force_sensitivities(
     force
         Gives the forces along a motion, N, shape (STEPS + 1, n_forces).
     """
-    return push_sensitivities(found, own, motions, [force(motion) / motion.mass_kg[:, None] for motion in motions])
+    return push_sensitivities(
+        fit, trial_effects, motions, [force(motion) / motion.mass_kg[:, None] for motion in motions]
+    )
 
 
 def push_sensitivities(
-    found: Fit, own: Floats, motions: Sequence[FittedMotion], pushes: Sequence[Floats]
+    fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], pushes: Sequence[Floats]
 ) -> list[Floats]:
     """As `force_sensitivities`, for further accelerations of the tail, m/s², shape (STEPS + 1, n) for each trial."""
     moved, _ = _followed(motions, np.array(pushes))
     return [
-        _at(item.time_s - own[i, RELEASE], motion, one * motion.seen[:, None] / motion.trial.travel_ratio)
-        for i, (item, motion, one) in enumerate(zip(found.predictor.data, motions, moved, strict=True))
+        _at(
+            trial_data.time_s - trial_effects[i, RELEASE],
+            motion,
+            one * motion.seen[:, None] / motion.trial.travel_ratio,
+        )
+        for i, (trial_data, motion, one) in enumerate(zip(fit.predictor.data, motions, moved, strict=True))
     ]
 
 
@@ -187,7 +194,7 @@ def pushed(motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floa
     if they are not that.
     """
     for _ in range(rounds):
-        lacks = np.array([one.free + force(one) / one.mass_kg - one.actual for one in motions])
+        lacks = np.array([motion.free + force(motion) / motion.mass_kg - motion.actual for motion in motions])
         moved, sped = (answer[:, :, 0] for answer in _followed(motions, lacks[:, :, None]))
         motions = [_moved(*one) for one in zip(motions, lacks, moved, sped, strict=True)]
     return list(motions)

@@ -112,12 +112,12 @@ def ladder(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
     return table
 
 
-def ladder_row(found: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
+def ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
     """The row of one model, and sentences about what could not be predicted."""
-    inside, outside, highest = in_sample(found), left_out(found), highest_pressure(found)
+    inside, outside, highest = in_sample(fit), left_out(fit), highest_pressure(fit)
     floor_m, floor_sigma_m = inside.floor
     row: dict[str, object] = {
-        "model": "+".join(found.model.names),
+        "model": "+".join(fit.model.names),
         "added": added,
         "rms_in_sample_m": inside.rms_m,
         "rms_left_out_m": outside.rms_m,
@@ -134,56 +134,54 @@ def excess(rms_m: float, floor_m: float) -> float:
     return math.sqrt(max(rms_m**2 - floor_m**2, 0.0)) if math.isfinite(rms_m + floor_m) else math.nan
 
 
-def in_sample(found: Fit) -> Errors:
+def in_sample(fit: Fit) -> Errors:
     """Predictions of the trials that the model was fitted to."""
-    return Errors(tuple(predict_prepared(found, found.predictor.data, from_rest=True)), {})
+    return Errors(tuple(predict_prepared(fit, fit.predictor.data, from_rest=True)), {})
 
 
-def left_out(found: Fit) -> Errors:
+def left_out(fit: Fit) -> Errors:
     """Predictions of every condition by the model fitted to all the others."""
-    conditions = dict.fromkeys(trial.trial.condition for trial in found.trials)
-    parts = [
-        _without(found, [trial.trial.condition == condition for trial in found.trials]) for condition in conditions
-    ]
+    conditions = dict.fromkeys(trial.trial.condition for trial in fit.trials)
+    parts = [_without(fit, [trial.trial.condition == condition for trial in fit.trials]) for condition in conditions]
     return _together(parts)
 
 
-def highest_pressure(found: Fit) -> Errors:
+def highest_pressure(fit: Fit) -> Errors:
     """Predictions of each vine's highest pressure by the model fitted to all lower ones."""
     highest: dict[str, float] = {}
-    for one in found.trials:
+    for one in fit.trials:
         trial = one.trial
         highest[trial.vine] = max(highest.get(trial.vine, -math.inf), trial.pressure_Pa)
-    return _without(found, [trial.trial.pressure_Pa >= highest[trial.trial.vine] for trial in found.trials])
+    return _without(fit, [trial.trial.pressure_Pa >= highest[trial.trial.vine] for trial in fit.trials])
 
 
-def _without(found: Fit, gone: Sequence[bool]) -> Errors:
+def _without(fit: Fit, gone: Sequence[bool]) -> Errors:
     """Predictions of the trials that are `gone` by the model fitted to the rest."""
-    data = [item for item, out in zip(found.predictor.data, gone, strict=True) if out]
+    data = [trial_data for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
         rest = fit_subset(
-            found,
+            fit,
             [not out for out in gone],
             hold_spreads=True,
             hold_noise=True,
             most_iterations=MOST_ITERATIONS,
         )
     except FitError as error:
-        return Errors((), {item.trial.name: str(error) for item in data})
-    alone = {item.trial.vine for item in data} - {trial.trial.vine for trial in rest.trials}
-    alone = {vine for vine in alone if _has_numbers_of_its_own(found, vine)}
-    known = [item for item in data if item.trial.vine not in alone]
+        return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
+    alone = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in rest.trials}
+    alone = {vine for vine in alone if _has_numbers_of_its_own(fit, vine)}
+    known = [trial_data for trial_data in data if trial_data.trial.vine not in alone]
     lost = {
-        item.trial.name: f"no other condition of the vine {item.trial.vine} says what its numbers are"
-        for item in data
-        if item.trial.vine in alone
+        trial_data.trial.name: f"no other condition of the vine {trial_data.trial.vine} says what its numbers are"
+        for trial_data in data
+        if trial_data.trial.vine in alone
     }
     predicted = predict_prepared(rest, known, from_rest=True) if known else []
     return Errors(tuple(predicted), lost)
 
 
-def _has_numbers_of_its_own(found: Fit, vine: str) -> bool:
-    return any(number.vine == vine and number.key in found.model.parameter_names for number in found.numbers)
+def _has_numbers_of_its_own(fit: Fit, vine: str) -> bool:
+    return any(number.vine == vine and number.key in fit.model.parameter_names for number in fit.numbers)
 
 
 def _together(parts: Sequence[Errors]) -> Errors:

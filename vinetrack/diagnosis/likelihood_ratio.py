@@ -87,7 +87,7 @@ def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> Like
     fall = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = _robust_ratio(after, [effect.name for effect in effects])
     plausible, reason = belief(effects, after)
-    parameters = {f"{effect.name}.{one.name}": one for effect in effects for one in effect.parameters}
+    parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
     nothing = compatible_with_nothing(effects, after)
     return LikelihoodRatio(
         effects=tuple(effects),
@@ -146,22 +146,22 @@ def _robust_ratio(after: Fit, names: Sequence[str]) -> float:
     return max([1.0, *(float(robust[k] / plain[k]) for k in mine)])
 
 
-def distance(one: Fit, other: Fit) -> float:
+def distance(fit: Fit, other: Fit) -> float:
     """Squared distance of what two fits predict, in units of the noise of the first, its correlation counted."""
-    rho = one.noise_correlation
+    rho = fit.noise_correlation
     total = 0.0
-    data = one.predictor.data
-    for a, b, variance, item in zip(one.trials, other.trials, one.solution.state.variance, data, strict=True):
+    data = fit.predictor.data
+    for a, b, variance, trial_data in zip(fit.trials, other.trials, fit.solution.state.variance, data, strict=True):
         gap = a.predicted_position_m - b.predicted_position_m
-        if item.relative_sd is not None:
-            gap = gap / item.relative_sd
+        if trial_data.relative_sd is not None:
+            gap = gap / trial_data.relative_sd
         total += float(np.sum((gap[1:] - rho * gap[:-1]) ** 2) + (1 - rho**2) * gap[0] ** 2) / float(variance)
     return total
 
 
-def complexity(one: LikelihoodRatio) -> int:
+def complexity(hypothesis: LikelihoodRatio) -> int:
     """Parameters that its effects bring."""
-    return sum(len(effect.parameters) for effect in one.effects)
+    return sum(len(effect.parameters) for effect in hypothesis.effects)
 
 
 def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, str]]:
@@ -173,14 +173,14 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     """
     highest = max(hypotheses, key=lambda one: one.fit.log_likelihood)
     likely = [
-        one
-        for one in hypotheses
-        if 2 * (highest.fit.log_likelihood - one.fit.log_likelihood) <= ANSWER_SET * highest.inflation
+        hypothese
+        for hypothese in hypotheses
+        if 2 * (highest.fit.log_likelihood - hypothese.fit.log_likelihood) <= ANSWER_SET * highest.inflation
     ]
     likely.sort(key=lambda one: -one.fit.log_likelihood)
 
-    def misfit(one: LikelihoodRatio) -> float:
-        return -2 * one.fit.log_likelihood / highest.inflation + one.surprise
+    def misfit(hypothesis: LikelihoodRatio) -> float:
+        return -2 * hypothesis.fit.log_likelihood / highest.inflation + hypothesis.surprise
 
     lowest = min(misfit(one) for one in likely)
     near = [one for one in likely if misfit(one) - lowest <= ANSWER_SET]
@@ -198,19 +198,19 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
             aside[one.label] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
         else:
             kept.append(one)
-    believed = [one for one in kept if one.credible]
+    believed = [hypothesis for hypothesis in kept if hypothesis.credible]
     if believed and len(believed) < len(kept):
-        aside |= {one.label: one.reason for one in kept if not one.credible}
+        aside |= {hypothesis.label: hypothesis.reason for hypothesis in kept if not hypothesis.credible}
         kept = believed
     return kept, aside
 
 
-def _comparable(one: LikelihoodRatio, other: LikelihoodRatio) -> bool:
+def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
     """Whether curves that agree mean that one is a limit of the other.
 
     With the deviation of B and pressure that every trial has, all hypotheses about levels of trials predict one curve.
     """
-    return all(one.effects[-1].kind != BETWEEN_TRIALS for one in (one, other))
+    return all(one.effects[-1].kind != BETWEEN_TRIALS for one in (hypothesis, other))
 
 
 def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
@@ -221,11 +221,14 @@ def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
     if not hypotheses:
         return {}
     inflation = max(hypotheses, key=lambda one: one.fit.log_likelihood).inflation
-    tempered = [one.log_evidence - one.fit.log_likelihood + one.fit.log_likelihood / inflation for one in hypotheses]
-    return dict(zip((one.label for one in hypotheses), posterior_weights(tempered), strict=True))
+    tempered = [
+        hypothese.log_evidence - hypothese.fit.log_likelihood + hypothese.fit.log_likelihood / inflation
+        for hypothese in hypotheses
+    ]
+    return dict(zip((hypothese.label for hypothese in hypotheses), posterior_weights(tempered), strict=True))
 
 
-def _contains(one: LikelihoodRatio, other: LikelihoodRatio) -> bool:
+def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
     """Whether an effect of one says that it contains that of the other."""
-    replaced = {name for effect in one.effects for name in effect.replaces}
+    replaced = {name for effect in hypothesis.effects for name in effect.replaces}
     return bool(replaced & set(other.names))

@@ -92,7 +92,7 @@ class Failure:
         return (*_where(self.by_condition, self.fails), *self.drift.sentences)
 
 
-def locate(found: Fit) -> Failure:
+def locate(fit: Fit) -> Failure:
     """Find where a fitted model fails.
 
     Raises
@@ -102,8 +102,8 @@ def locate(found: Fit) -> Failure:
     """
     import pandas as pd
 
-    courses, predicted = courses_of(found)
-    scatter = replicate_scatter(found, courses)
+    courses, predicted = courses_of(fit)
+    scatter = replicate_scatter(fit, courses)
     of = by_condition(courses)
     conditions = list(of)
     edges = {name: common_edges(members) for name, members in of.items()}
@@ -112,16 +112,16 @@ def locate(found: Fit) -> Failure:
         members = [trial for trial in predicted if trial.trial.condition == name]
         rows.append(_condition_row(members, stretches_of(of[name], "time_s", edges[name]), scatter))
     table = pd.DataFrame(rows, columns=list(CONDITION_COLUMNS))
-    vines = list(dict.fromkeys(one.trial.vine for one in courses))
-    whole = {vine: [one for one in courses if one.trial.vine == vine] for vine in vines}
+    vines = list(dict.fromkeys(course.trial.vine for course in courses))
+    whole = {vine: [course for course in courses if course.trial.vine == vine] for vine in vines}
     return Failure(
-        model="+".join(found.model.names),
+        model="+".join(fit.model.names),
         by_condition=table.sort_values("z", ascending=False, kind="stable", ignore_index=True),
         along_time=_table([(of[n], "time_s", edges[n], n) for n in conditions], TIME_COLUMNS, scatter),
         along_position=_along("lead_position_m", of, whole, POSITION_COLUMNS, scatter),
         along_speed=_along("lead_velocity_m_s", of, whole, SPEED_COLUMNS, scatter),
         scatter=scatter,
-        drift=drift(found, scatter),
+        drift=drift(fit, scatter),
     )
 
 
@@ -161,8 +161,8 @@ def _along(
     """Conditions of a vine along the same stretches, and all of its trials together."""
     parts = []
     for members in whole.values():
-        edges = np.linspace(0.0, max(float(getattr(one, along).max()) for one in members), STRETCHES + 1)
-        names = dict.fromkeys(one.trial.condition for one in members)
+        edges = np.linspace(0.0, max(float(getattr(member, along).max()) for member in members), STRETCHES + 1)
+        names = dict.fromkeys(member.trial.condition for member in members)
         parts += [(of[name], along, edges, name) for name in names] + [(members, along, edges, "")]
     return _table(parts, columns, scatter)
 
@@ -180,7 +180,7 @@ def _mean_rows(
     members: Sequence[Course], along: str, edges: Floats, condition: str, scatter: Scatter
 ) -> list[tuple[object, ...]]:
     """Mean residual of every stretch over the trials that reach it, and its error."""
-    parts = [means_of(one, along, edges) for one in members]
+    parts = [means_of(member, along, edges) for member in members]
     both = np.array([means for means, _ in parts])
     present = np.isfinite(both).all(axis=2)
     each = np.array([variances_of(*part, scatter) for part in zip(members, parts, strict=True)])
@@ -243,10 +243,10 @@ def _trend(table: pd.DataFrame) -> list[str]:
     ):
         usable = table[np.isfinite(table["ratio"])]
         steps = [group.sort_values(column)["ratio"].to_numpy(float) for _, group in usable.groupby("vine")]
-        steps = [one for one in steps if one.size > 2]
+        steps = [step for step in steps if step.size > 2]
         if not steps or len(set(usable[column])) < 3:
             continue
-        ranks = [np.corrcoef(np.arange(one.size), np.argsort(np.argsort(one)))[0, 1] for one in steps]
+        ranks = [np.corrcoef(np.arange(step.size), np.argsort(np.argsort(step)))[0, 1] for step in steps]
         if all(rank > 0.75 for rank in ranks):
             found.append(f"The {high} the {words}, the more it fails.")
         elif all(rank < -0.75 for rank in ranks):

@@ -144,8 +144,10 @@ class MisfitTests:
     def _allowed(self) -> float:
         """The part that may be missed: less where neither the tracks nor a gauge have slow errors to own up to."""
         data = self.found.predictor.data
-        smooth = float(np.median([one.position_systematic_m / np.ptp(one.lead_position_m) for one in data]))
-        slow = any(math.isfinite(item.tracker_sigma_m) or item.trace is not None for item in data)
+        smooth = float(
+            np.median([trial_data.position_systematic_m / np.ptp(trial_data.lead_position_m) for trial_data in data])
+        )
+        slow = any(math.isfinite(trial_data.tracker_sigma_m) or trial_data.trace is not None for trial_data in data)
         return max(OFF if slow else OFF_OTHERWISE, smooth)
 
     @property

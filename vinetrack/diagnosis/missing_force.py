@@ -121,8 +121,8 @@ def missing_force(found: Fit) -> MissingForce:
     """
     try:
         scatter = replicate_scatter(found, courses_of(found)[0])
-        begins = [found.solution.state.own, lay(found).own]
-        looks = [_look(found, ForceFit(found, own, scatter)) for own in begins]
+        begins = [found.solution.state.trial_effects, lay(found).trial_effects]
+        looks = [_look(found, ForceFit(found, trial_effects, scatter)) for trial_effects in begins]
     except SimulationError as error:
         raise FitError(f"The model cannot be followed: {error}") from error
     # All is linear about where the trials' own numbers are: the better place leaves less that no force explains.
@@ -130,12 +130,14 @@ def missing_force(found: Fit) -> MissingForce:
     fit, motions, everything = look.fit, look.motions, look.everything
 
     def answers(laws: Sequence[Law]) -> list[Floats]:
-        return force_sensitivities(found, fit.own, motions, lambda m: np.column_stack([one.along(m) for one in laws]))
+        return force_sensitivities(
+            found, fit.trial_effects, motions, lambda m: np.column_stack([law.along(m) for law in laws])
+        )
 
     ranked = _in_full(found, fit, motions, _ranked(fit, answers, motions, everything))
     families = _families(found, fit, motions)
-    whole = max([1e-300, everything.beyond, *families.values(), *(one.gain.beyond for one in ranked)])
-    laws = [replace(one, explained=one.gain.beyond / whole) for one in ranked]
+    whole = max([1e-300, everything.beyond, *families.values(), *(hypothesis.gain.beyond for hypothesis in ranked)])
+    laws = [replace(hypothesis, explained=hypothesis.gain.beyond / whole) for hypothesis in ranked]
     depends = {name: beyond / whole for name, beyond in families.items()}
     best = laws[0]
     gauge = best.gain.numbers if best.explained >= LIKE and best.seen else np.zeros_like(best.gain.numbers)
@@ -160,12 +162,12 @@ class _Look:
 
 
 def _look(found: Fit, fit: ForceFit) -> _Look:
-    motions = motions_of(found, fit.own)
+    motions = motions_of(found, fit.trial_effects)
     longest = {motion.trial.condition: 0.0 for motion in motions}
     for motion in motions:
         longest[motion.trial.condition] = max(longest[motion.trial.condition], float(motion.lead_position_m.max()))
     pieces = force_sensitivities(
-        found, fit.own, motions, lambda m: pieces_of(m.lead_position_m / longest[m.trial.condition])
+        found, fit.trial_effects, motions, lambda m: pieces_of(m.lead_position_m / longest[m.trial.condition])
     )
     return _Look(fit, motions, longest, pieces, fit.by_condition(pieces))
 
@@ -225,7 +227,7 @@ def _in_full(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion], laws: l
     Where the linear fit of the best leaves but noise, its rivals' will do.
     """
     rough = fit.chi2 - laws[0].gain.chi2 > ROUGH * fit.points
-    gains = [one.gain for one in laws]
+    gains = [law.gain for law in laws]
     for k, one in enumerate(laws[: IN_FULL if rough else 1]):
         if not one.seen or one.gain.chi2 < WORTH * fit.chi2:
             continue
@@ -234,7 +236,7 @@ def _in_full(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion], laws: l
             gains[k] = Gain(fit.chi2 - full.chi2, full.amplitude, full.sigma, full.numbers, one.gain.terms)
             laws = [*laws[:k], replace(one, law=full.law), *laws[k + 1 :]]
     most = max(gain.chi2 for gain in gains)
-    judged = _judged(fit, list(zip((one.law for one in laws), gains, strict=True)), most, _largest_N(motions))
+    judged = _judged(fit, list(zip((law.law for law in laws), gains, strict=True)), most, _largest_N(motions))
     return sorted(judged, key=lambda one: (not one.seen, one.bic))
 
 
@@ -276,12 +278,12 @@ def _families(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion]) -> dic
         top = max(float(along[name](motion).max()) for motion in motions)
         answers = force_sensitivities(
             found,
-            fit.own,
+            fit.trial_effects,
             motions,
             lambda m, a=along[name], t=top, n=count: curves(a(m) / t, n),  # type: ignore[misc]
         )
         explained[name] = fit.together(answers).beyond
-    constant = force_sensitivities(found, fit.own, motions, lambda m: np.ones((m.time_s.size, 1)))
+    constant = force_sensitivities(found, fit.trial_effects, motions, lambda m: np.ones((m.time_s.size, 1)))
     explained["condition"] = fit.by_condition(constant).beyond
     return explained
 
@@ -340,15 +342,15 @@ def _law_table(laws: Sequence[_Judged]) -> pd.DataFrame:
 
     rows = [
         (
-            one.law.kind,
-            one.law.words(one.gain.amplitude.tolist(), one.gain.sigma),
-            one.explained,
-            float(one.gain.amplitude[0]) if one.law.columns == 1 else float(np.hypot(*one.gain.amplitude)),
-            one.gain.sigma,
-            one.gain.chi2,
-            one.bic,
+            law.law.kind,
+            law.law.words(law.gain.amplitude.tolist(), law.gain.sigma),
+            law.explained,
+            float(law.gain.amplitude[0]) if law.law.columns == 1 else float(np.hypot(*law.gain.amplitude)),
+            law.gain.sigma,
+            law.gain.chi2,
+            law.bic,
         )
-        for one in laws
+        for law in laws
     ]
     return pd.DataFrame(rows, columns=list(LAW_COLUMNS))
 
@@ -390,12 +392,12 @@ def _sentence(laws: Sequence[_Judged], depends: Mapping[str, float], mended: flo
     # What not even a free force mends is the error of small forces where the force is none: laws are told apart less.
     nearly = EQUALLY + float(np.nan_to_num(1 - mended))
     others = [
-        one
-        for one in laws[1:]
-        if one.seen and one.explained > best.explained - nearly and one.law.shapes <= best.law.shapes
+        law
+        for law in laws[1:]
+        if law.seen and law.explained > best.explained - nearly and law.law.shapes <= best.law.shapes
     ]
     said = f"What is missing looks like {words}; that explains {best.explained:.0%} of what any force could."
     if others:
-        listed = "; ".join(one.law.words(one.gain.amplitude.tolist(), one.gain.sigma) for one in others[:2])
+        listed = "; ".join(other.law.words(other.gain.amplitude.tolist(), other.gain.sigma) for other in others[:2])
         said += f" These data would nearly as well have: {listed}."
     return said

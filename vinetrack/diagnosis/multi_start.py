@@ -84,10 +84,10 @@ class SubsetFit:
 class SubsetFitter:
     """Climbs from one fit, all on the same trials, so that their deviances can be held against each other."""
 
-    def __init__(self, found: Fit) -> None:
-        self.found = found
-        self.chosen = one_of_each(found.predictor.data)
-        self.data = [found.predictor.data[i] for i in self.chosen]
+    def __init__(self, fit: Fit) -> None:
+        self.found = fit
+        self.chosen = one_of_each(fit.predictor.data)
+        self.data = [fit.predictor.data[i] for i in self.chosen]
         self.correlation = track_correlation(self.data)
 
     def climb(
@@ -101,20 +101,20 @@ class SubsetFitter:
         model = model.with_values({**fitted, **start})
         layout = make_layout(model, self.data, fixed=self._fixed(model.parameter_names), shared={})
         predictor = Predictor(layout, self.data, self.found.predictor.host)
-        own = self.found.solution.state.own[self.chosen].copy()
-        own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+        trial_effects = self.found.solution.state.trial_effects[self.chosen].copy()
+        trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
         held = FixedTerms(spread=CLIMB_SPREADS, correlation=self.correlation)
         try:
             theta = layout.start
             if align_first:
-                own, _ = align(self.data, predictor, theta, own)
-            frame = make_problem(predictor, own)
-            state = first_state(self.data, theta, own)
-            solution = solve(predictor, frame, state, held, warm=True, most_iterations=iterations)
-            part = marginal(solution.grams, solution.frame, solution.state)
+                trial_effects, _ = align(self.data, predictor, theta, trial_effects)
+            problem = make_problem(predictor, trial_effects)
+            state = first_state(self.data, theta, trial_effects)
+            solution = solve(predictor, problem, state, held, warm=True, most_iterations=iterations)
+            part = marginal(solution.grams, solution.problem, solution.state)
         except (SimulationError, FitError, np.linalg.LinAlgError):
             return None
-        level = deviance(part, solution.frame, solution.state, CLIMB_SPREADS, restricted=False)
+        level = deviance(part, solution.problem, solution.state, CLIMB_SPREADS, restricted=False)
         return SubsetFit(tuple(effects), level, _values(layout, solution.state.theta)) if math.isfinite(level) else None
 
     def here(self) -> float:
@@ -185,7 +185,7 @@ def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -
     if not first:
         return None
     best = min(first, key=lambda one: one.deviance)
-    points = sum(item.time_s.size for item in slope.data)
+    points = sum(trial_data.time_s.size for trial_data in slope.data)
     if best.deviance - goal > HOPELESS * points:
         return best
     for _ in range(3):
@@ -222,7 +222,7 @@ def from_other_starts(found: Fit) -> Fit:
     if EXPONENT not in found.model.parameter_names or EXPONENT in found.options["fixed"]:
         return found
     slope = SubsetFitter(found)
-    points = sum(item.time_s.size for item in slope.data)
+    points = sum(trial_data.time_s.size for trial_data in slope.data)
     starts: list[Start] = [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
     return _from(slope, starts, slope.here(), LOWER_PER_POINT * points)
 

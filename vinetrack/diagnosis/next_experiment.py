@@ -166,7 +166,7 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
 def _judge(tied: Sequence[Fit]) -> None:
     if len(tied) < 2:
         raise FitError("A next experiment needs two hypotheses to tell apart: give the fits of at least two.")
-    names = [[item.trial.name for item in fit.predictor.data] for fit in tied]
+    names = [[trial_data.trial.name for trial_data in fit.predictor.data] for fit in tied]
     if any(others != names[0] for others in names[1:]):
         raise FitError("The fits to tell apart are not of the same trials: fit all of them to one set.")
 
@@ -216,13 +216,13 @@ def _options(bench: Bench, sides: list[Side], limits: Limits, seed: int) -> list
 
 def _by_effort(bench: Bench, sides: list[Side], trials: int) -> Iterator[NDArray[np.int_]]:
     """Conditions to choose from: on the rig so far, on others too, and with one or another new vine besides."""
-    efforts = np.array([one.effort for one in bench.conditions])
+    efforts = np.array([condition.effort for condition in bench.conditions])
     for effort in (SAME_RIG, OTHER_RIG):
         if (efforts == effort).any():
             yield np.flatnonzero(efforts <= effort)
     new = np.flatnonzero(efforts == NEW_VINE)
     if new.size:
-        vines = np.array([one.trial.vine for one in bench.conditions])
+        vines = np.array([condition.trial.vine for condition in bench.conditions])
         most = MOST_VINES_TRIED if len(sides) == 2 else 1
         for vine in likeliest_vines(sides, bench.conditions, new, trials, most):
             yield np.flatnonzero((efforts < NEW_VINE) | (vines == vine))
@@ -244,14 +244,14 @@ def _choice(options: Sequence[_Option]) -> _Option:
 def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperiment:
     best = _choice(options)
     best = _Option(best.design, np.concatenate([best.rises, expected(bench, best.design, [1], seed)]))
-    names = [one.name for one in bench.hypotheses]
+    names = [hypothese.name for hypothese in bench.hypotheses]
     to_expect = _by_pair(best.between)
     worth_it = max(to_expect.values()) >= SEPARATES
     draws = max(DRAWS_OBSERVED.get(len(names), 1) - (min(to_expect.values()) > PLAIN), 1)
     checked = _checked(observed(bench, best.design, range(draws), seed)) if worth_it else {}
     left = [place for place, sigma in to_expect.items() if min(sigma, checked.get(place, (sigma,))[0]) < SEPARATES]
     worth_it = worth_it and len(left) < len(to_expect)
-    fits = [one.fit for one in bench.hypotheses]
+    fits = [hypothese.fit for hypothese in bench.hypotheses]
     advice = calibration_for([(fits[a], fits[b]) for a, b in left or _measured(fits)])
     sigmas = {_pair(names, place): sigma for place, sigma in to_expect.items()}
     seen = {_pair(names, place): both for place, both in checked.items()}
@@ -298,7 +298,7 @@ def _checked(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
     found = {}
     for a, b in itertools.combinations(range(rises.shape[1]), 2):
         ways = [one[np.isfinite(one)] for one in (sigma[:, a, b], sigma[:, b, a])]
-        ways = [one for one in ways if one.size]
+        ways = [way for way in ways if way.size]
         if ways:
             least = min(ways, key=lambda one: float(np.mean(one)))
             found[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)

@@ -68,10 +68,10 @@ def payload_curves(found: Fit, final_at_fraction: float) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(CURVE_COLUMNS))
 
 
-def _families(found: Fit) -> list[tuple[list[Trial], float]]:
+def _families(fit: Fit) -> list[tuple[list[Trial], float]]:
     """Trials along the payload, for every vine and setting with more than one, and how long they may take, s."""
     alike: dict[str, list[tuple[float, float, Trial]]] = {}
-    for fitted in found.trials:
+    for fitted in fit.trials:
         trial = fitted.trial
         if math.isfinite(trial.length_m) and trial.pressure_Pa > 0:
             lasts_s = float(fitted.time_s[-1]) - fitted.release_s
@@ -93,25 +93,24 @@ def _but_for_payload(trial: Trial) -> str:
     return repr(replace(bare, capture_fps=nan, exposure_s=nan, m_per_px=nan, steady_window_s=None))
 
 
-def speeds_with_error(found: Fit, trials: Sequence[Trial], at_m: float, lasts_s: float) -> tuple[Floats, Floats]:
+def speeds_with_error(fit: Fit, trials: Sequence[Trial], at_m: float, lasts_s: float) -> tuple[Floats, Floats]:
     """Speed of the leading edge at `at_m` of growth and its standard error, m/s, shape (n_trials,) each.
 
     Trials of one vine. A motion that does not get there has speed 0.
     """
     vine = trials[0].vine
-    instants = _around_arrival(found, trials, at_m, lasts_s)
-    middle = _speeds(found, trials, None, at_m, instants)
-    felt = [i for i, number in enumerate(found.numbers) if _concerns(number, trials[0])]
+    instants = _around_arrival(fit, trials, at_m, lasts_s)
+    middle = _speeds(fit, trials, None, at_m, instants)
+    felt = [i for i, number in enumerate(fit.numbers) if _concerns(number, trials[0])]
     slopes = np.zeros((len(felt), len(trials)))
     for row, i in enumerate(felt):
-        number = found.numbers[i]
+        number = fit.numbers[i]
         step = STEP * (abs(number.value) or 1.0)
         up, down = (
-            _speeds(found, trials, replace(number, value=number.value + sign * step), at_m, instants)
-            for sign in (1, -1)
+            _speeds(fit, trials, replace(number, value=number.value + sign * step), at_m, instants) for sign in (1, -1)
         )
         slopes[row] = (up - down) / (2 * step)
-    covariance = np.nan_to_num(np.asarray(found.covariance, dtype=float)[np.ix_(felt, felt)])
+    covariance = np.nan_to_num(np.asarray(fit.covariance, dtype=float)[np.ix_(felt, felt)])
     variance = np.einsum("it,ij,jt->t", slopes, covariance, slopes)
     if not np.isfinite(variance).all():
         raise ValueError(f"the speeds of {vine} do not depend smoothly on the fitted numbers")
@@ -124,31 +123,31 @@ def _concerns(number: Number, trial: Trial) -> bool:
     return number.vine in ("", trial.vine, stated)
 
 
-def _around_arrival(found: Fit, trials: Sequence[Trial], at_m: float, lasts_s: float) -> list[Floats]:
+def _around_arrival(fit: Fit, trials: Sequence[Trial], at_m: float, lasts_s: float) -> list[Floats]:
     """For each trial, instants from release to a little after it gets to `at_m`; to the end where it does not."""
     whole = [lasts_s * np.linspace(0, 1, INSTANTS)] * len(trials)
     ends = []
-    for run in _runs(found, trials, None, whole):
+    for run in _runs(fit, trials, None, whole):
         there = np.flatnonzero(run.lead_position_m >= at_m)
         ends.append(run.time_s[there[0]] if there.size else lasts_s)
     return [MARGIN * end_s * np.linspace(0, 1, INSTANTS) for end_s in ends]
 
 
 def _speeds(
-    found: Fit, trials: Sequence[Trial], changed: Number | None, at_m: float, instants: Sequence[Floats]
+    fit: Fit, trials: Sequence[Trial], changed: Number | None, at_m: float, instants: Sequence[Floats]
 ) -> Floats:
-    runs = _runs(found, trials, changed, instants)
+    runs = _runs(fit, trials, changed, instants)
     speeds = [lead_velocity_at(run.lead_position_m, run.lead_velocity_m_s, at_m) for run in runs]
     return np.nan_to_num(np.array(speeds))
 
 
-def _runs(found: Fit, trials: Sequence[Trial], changed: Number | None, instants: Sequence[Floats]) -> list[Trajectory]:
+def _runs(fit: Fit, trials: Sequence[Trial], changed: Number | None, instants: Sequence[Floats]) -> list[Trajectory]:
     """Motions with the fitted numbers, but for one that was changed."""
-    theta = np.tile(found.model.parameters_for(trials[0].vine), (len(trials), 1))
+    theta = np.tile(fit.model.parameters_for(trials[0].vine), (len(trials), 1))
     moved = list(trials)
-    for number in (*found.numbers, *([changed] if changed is not None else [])):
+    for number in (*fit.numbers, *([changed] if changed is not None else [])):
         if number.key == YIELD_PRESSURE and _concerns(number, trials[0]):
             moved = [replace(trial, yield_pressure_Pa=number.value) for trial in moved]
     if changed is not None and changed.key != YIELD_PRESSURE:
-        theta[:, found.model.parameter_names.index(changed.key)] = changed.value
-    return simulate_many(found.model, moved, instants, parameters=theta)
+        theta[:, fit.model.parameter_names.index(changed.key)] = changed.value
+    return simulate_many(fit.model, moved, instants, parameters=theta)

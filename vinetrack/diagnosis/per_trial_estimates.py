@@ -49,7 +49,7 @@ class PerTrialEstimates:
     base: Floats
     deviation: Floats
     variance: Floats
-    own: Floats
+    trial_effects: Floats
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,11 @@ class AlignedTrial:
     """
 
     predictor: Predictor
-    own: Floats
+    trial_effects: Floats
     columns: tuple[Floats, ...]
 
 
-def lay(found: Fit) -> AlignedTrial:
+def lay(fit: Fit) -> AlignedTrial:
     """Lay the model on the trials that it was fitted to.
 
     Raises
@@ -72,14 +72,14 @@ def lay(found: Fit) -> AlignedTrial:
     FitError
         If it cannot be followed.
     """
-    predictor, own, _ = laid_on(found, found.predictor.data, from_rest=True)
+    predictor, trial_effects, _ = laid_on(fit, fit.predictor.data, from_rest=True)
     try:
-        return AlignedTrial(predictor, own, tuple(predictor.linearise(np.empty(0), own)))
+        return AlignedTrial(predictor, trial_effects, tuple(predictor.linearise(np.empty(0), trial_effects)))
     except SimulationError as error:
         raise FitError(f"The model cannot be followed: {error}") from error
 
 
-def per_trial_estimates(found: Fit, key: str, laid: AlignedTrial) -> PerTrialEstimates:
+def per_trial_estimates(fit: Fit, key: str, laid: AlignedTrial) -> PerTrialEstimates:
     """Find the best value of `key` for every trial: least squares of position, its release free.
 
     Raises
@@ -87,43 +87,45 @@ def per_trial_estimates(found: Fit, key: str, laid: AlignedTrial) -> PerTrialEst
     SimulationError
         If a trial cannot be followed on the way.
     """
-    predictor, own = laid.predictor, laid.own
-    parameter = _parameter(found, key)
-    column = found.model.parameter_names.index(key)
+    predictor, trial_effects = laid.predictor, laid.trial_effects
+    parameter = _parameter(fit, key)
+    column = fit.model.parameter_names.index(key)
     base = predictor.layout.base[:, column].copy()
     logarithmic = key == DAMPING
     scale = np.ones_like(base) if logarithmic else np.full_like(base, _scale(parameter, base))
     moved = np.zeros_like(base)
     projected = [np.zeros(0)] * base.size
     for _ in range(STEPS):
-        moved, own, projected = _improved(predictor, own, column, base, moved, scale, logarithmic)
+        moved, trial_effects, projected = _improved(predictor, trial_effects, column, base, moved, scale, logarithmic)
     felt = np.array([float(np.sum(one**2)) for one in projected])
-    known = felt > 1e-12 * np.array([np.ptp(item.lead_position_m) ** 2 * item.time_s.size for item in predictor.data])
+    known = felt > 1e-12 * np.array(
+        [np.ptp(trial_data.lead_position_m) ** 2 * trial_data.time_s.size for trial_data in predictor.data]
+    )
     known &= np.abs(moved) < 0.99 * ROOM
     deviation = np.where(known, moved * scale, np.nan)
     return PerTrialEstimates(
         key=key,
         symbol=parameter.symbol,
         unit=parameter.unit,
-        per_vine=any(number.key == key and number.vine for number in found.numbers),
+        per_vine=any(number.key == key and number.vine for number in fit.numbers),
         logarithmic=logarithmic,
-        trials=tuple(item.trial for item in predictor.data),
+        trials=tuple(trial_data.trial for trial_data in predictor.data),
         value=np.where(known, base * np.exp(moved) if logarithmic else base + moved * scale, np.nan),
         base=base,
         deviation=deviation,
         variance=_variance(laid, projected, scale),
-        own=_with_deviation(own, moved) if logarithmic else own,
+        trial_effects=_with_deviation(trial_effects, moved) if logarithmic else trial_effects,
     )
 
 
-def _with_deviation(own: Floats, moved: Floats) -> Floats:
-    changed = own.copy()
+def _with_deviation(trial_effects: Floats, moved: Floats) -> Floats:
+    changed = trial_effects.copy()
     changed[:, DAMPING_DEVIATION] = moved
     return changed
 
 
-def _parameter(found: Fit, key: str) -> Parameter:
-    for effect in found.model:
+def _parameter(fit: Fit, key: str) -> Parameter:
+    for effect in fit.model:
         for parameter in effect.parameters:
             if f"{effect.name}.{parameter.name}" == key:
                 return parameter
@@ -137,7 +139,7 @@ def _scale(parameter: Parameter, base: Floats) -> float:
 
 def _improved(
     predictor: Predictor,
-    own: Floats,
+    trial_effects: Floats,
     column: int,
     base: Floats,
     moved: Floats,
@@ -146,7 +148,7 @@ def _improved(
 ) -> tuple[Floats, Floats, list[Floats]]:
     """One step of Gauss and Newton for every trial; also what its positions answer, release and origin taken away."""
     step = 1e-3
-    plain = predictor.jobs(np.empty(0), own)
+    plain = predictor.jobs(np.empty(0), trial_effects)
 
     def at(shift: float) -> list[Floats]:
         rows = []
@@ -159,20 +161,20 @@ def _improved(
 
     jobs = [replace(job, row=row) for shift in (0.0, step) for job, row in zip(plain, at(shift), strict=True)]
     runs = predictor.run(jobs)
-    own, moved, projected = own.copy(), moved.copy(), []
+    trial_effects, moved, projected = trial_effects.copy(), moved.copy(), []
     held = rest_is_seen(predictor.data)
-    for i, item in enumerate(predictor.data):
+    for i, trial_data in enumerate(predictor.data):
         here, there = runs[i], runs[i + base.size]
         answer = (there.observed_position_m - here.observed_position_m) / step
         others = [-here.lead_velocity_m_s] if held[i] else [-here.lead_velocity_m_s, np.ones(answer.size)]
-        left = item.lead_position_m - own[i, ORIGIN] - here.observed_position_m
+        left = trial_data.lead_position_m - trial_effects[i, ORIGIN] - here.observed_position_m
         design = np.column_stack([answer, *others])
         best = np.linalg.lstsq(design, left, rcond=1e-9)[0]
         moved[i] = np.clip(moved[i] + np.clip(best[0], -LARGEST_STEP, LARGEST_STEP), -ROOM, ROOM)
-        own[i, RELEASE] += np.clip(best[1], -2 * item.frame_s, 2 * item.frame_s)
-        own[i, ORIGIN] += 0.0 if held[i] else best[2]
+        trial_effects[i, RELEASE] += np.clip(best[1], -2 * trial_data.frame_s, 2 * trial_data.frame_s)
+        trial_effects[i, ORIGIN] += 0.0 if held[i] else best[2]
         projected.append(without(answer, np.column_stack(others)))
-    return moved, own, projected
+    return moved, trial_effects, projected
 
 
 def without(answer: Floats, others: Floats) -> Floats:

@@ -84,13 +84,13 @@ def scatter_sensitivities(laid: AlignedTrial) -> list[Floats]:
     return found
 
 
-def find_scatter(found: Fit, groups: Sequence[Stretches]) -> Scatter:
+def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
     """The three numbers that make the differences between replicates most likely; a group is a condition."""
     from scipy.optimize import minimize
 
     dof = sum(len(group.means_m) - 1 for group in groups)
     if dof < 1:
-        spreads = [found.spreads[name].value if name in found.spreads else 0.0 for name in ("pressure", "B")]
+        spreads = [fit.spreads[name].value if name in fit.spreads else 0.0 for name in ("pressure", "B")]
         return Scatter(spreads[0], spreads[1], FIRST_GUESS[2], 0)
     parts = []
     for group in groups:

@@ -57,14 +57,14 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
     end_s = longest.time_s[-1] - longest.release_s
     time_s = begin_s + frame_s * np.arange(math.floor((end_s - begin_s) / frame_s + 1e-6) + 1)
     model_m = _growth(longest, time_s)
-    own = np.array([sampled(time_s, t.release_s, t.time_s, t.residual_m) for t in trials])
+    residuals_m = np.array([sampled(time_s, t.release_s, t.time_s, t.residual_m) for t in trials])
     alignment = align_replicates(trials)
     # The two clocks differ by what the releases do on average, which the mean of the replicates cannot tell.
     shift_s = float(np.mean(alignment.release_s - [trial.release_s for trial in trials]))
     variance_m2 = sampled(time_s, 0.0, alignment.time_s + shift_s, alignment.variance_m2)
     begin_moving_s = min(float(trial.time_s[first_that_counts(trial)]) - trial.release_s for trial in trials)
-    present = np.isfinite(own).sum(axis=0).astype(float)
-    return Replicates(time_s, model_m, own, present, begin_moving_s - 1e-9, variance_m2, alignment)
+    present = np.isfinite(residuals_m).sum(axis=0).astype(float)
+    return Replicates(time_s, model_m, residuals_m, present, begin_moving_s - 1e-9, variance_m2, alignment)
 
 
 def first_that_counts(trial: TrialFit) -> int:

@@ -107,13 +107,15 @@ class Scores:
         return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
 
 
-def products_of(found: Fit, answers: EffectSensitivities, doubts: Sequence[Floats]) -> Products:
+def products_of(fit: Fit, answers: EffectSensitivities, doubts: Sequence[Floats]) -> Products:
     """All sums of products that the tests need; `doubts` are those of `doubts_of`."""
-    columns = found.solution.columns
+    columns = fit.solution.columns
     grams = np.stack(
         [
-            products(np.column_stack([own, more, doubt]), item.first, item.relative_sd)
-            for own, more, doubt, item in zip(columns, answers.columns, doubts, found.predictor.data, strict=True)
+            products(np.column_stack([trial_effects, more, doubt]), trial_data.first, trial_data.relative_sd)
+            for trial_effects, more, doubt, trial_data in zip(
+                columns, answers.columns, doubts, fit.predictor.data, strict=True
+            )
         ]
     )
     return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes), doubts[0].shape[1])
@@ -133,17 +135,19 @@ def _projected(found: Fit, sums: Products, state: FitState) -> tuple[Floats, Flo
     moving : indices
         Of the free numbers that can give way.
     """
-    frame = found.solution.frame
-    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, frame, state)
-    p, size = sums.n_keys, frame.prior_mean.size
+    problem = found.solution.problem
+    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, problem, state)
+    p, size = sums.n_keys, problem.prior_mean.size
     asked = sums.n_shapes + sums.n_doubts
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
-    square = cross_products(blocks[:, X, X], frame) + np.diag(frame.prior_precision)
-    slope = cross_products_vector(blocks[:, X, r], frame) - frame.prior_precision * (state.theta - frame.prior_mean)
+    square = cross_products(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
+    slope = cross_products_vector(blocks[:, X, r], problem) - problem.prior_precision * (
+        state.theta - problem.prior_mean
+    )
     cross = np.zeros((size + 1, asked))
-    np.add.at(cross, frame.index, blocks[:, X, C])
+    np.add.at(cross, problem.index, blocks[:, X, C])
     cross = cross[:size]
-    moving = np.flatnonzero(frame.free & (np.diag(square) > 0) & ~_pressed(found))
+    moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(found))
     inverse = inverse_among(square, moving)
     return blocks, cross, inverse @ cross, inverse @ slope, moving
 
@@ -178,11 +182,11 @@ def scores_of(found: Fit, sums: Products, state: FitState | None = None) -> Scor
     return _systematics_aside(scores_with_systematics(found, sums, state), sums.n_shapes)
 
 
-def scores_with_systematics(found: Fit, sums: Products, state: FitState | None = None) -> Scores:
+def scores_with_systematics(fit: Fit, sums: Products, state: FitState | None = None) -> Scores:
     """Scores of the shapes and, behind them, of the systematic errors, none integrated out."""
-    frame, state = found.solution.frame, state or found.solution.state
-    blocks, cross, lever, step, moving = _projected(found, sums, state)
-    index, asked, p = frame.index, sums.n_shapes + sums.n_doubts, sums.n_keys
+    problem, state = fit.solution.problem, state or fit.solution.state
+    blocks, cross, lever, step, moving = _projected(fit, sums, state)
+    index, asked, p = problem.index, sums.n_shapes + sums.n_doubts, sums.n_keys
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
     total = blocks[:, C, C].sum(axis=0)
     information = total - cross.T @ lever
@@ -228,9 +232,9 @@ def _systematics_aside(scores: Scores, n_shapes: int) -> Scores:
     return Scores(score, information, scores.scores @ turn, informations, scores.degrees)
 
 
-def _pressed(found: Fit) -> NDArray[np.bool_]:
+def _pressed(fit: Fit) -> NDArray[np.bool_]:
     """Numbers at a bound, which cannot give way."""
-    return np.array([math.isfinite(number.bound) for number in found.numbers], dtype=bool)
+    return np.array([math.isfinite(number.bound) for number in fit.numbers], dtype=bool)
 
 
 def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
@@ -240,11 +244,11 @@ def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats
     fit has taken in what it misses, and says nothing of what is missing.
     """
     state = found.solution.state
-    points = found.solution.frame.points
+    points = found.solution.problem.points
     total = points.sum()
     variance = state.variance
     for _ in range(4):
-        trial_state = FitState(state.theta, state.own, (0.01, 0.03), rho, variance)
+        trial_state = FitState(state.theta, state.trial_effects, (0.01, 0.03), rho, variance)
         scores = scores_of(found, sums, trial_state)
         rest = _rest(found, sums, trial_state)
         variance = np.full_like(variance, float(np.mean(variance)) * max(rest / total, 1e-6))
@@ -256,30 +260,30 @@ def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats
 
 def _rest(found: Fit, sums: Products, state: FitState) -> float:
     """Sum of squares that the fit's own numbers leave, with the priors' part."""
-    frame = found.solution.frame
-    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, frame, state)
+    problem = found.solution.problem
+    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, problem, state)
     p = sums.n_keys
-    square = cross_products(blocks[:, :p, :p], frame) + np.diag(frame.prior_precision)
-    away = state.theta - frame.prior_mean
-    slope = cross_products_vector(blocks[:, :p, p], frame) - frame.prior_precision * away
+    square = cross_products(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
+    away = state.theta - problem.prior_mean
+    slope = cross_products_vector(blocks[:, :p, p], problem) - problem.prior_precision * away
     step = np.linalg.lstsq(square, slope, rcond=1e-11)[0]
-    whole = blocks[:, p, p].sum() + float(np.sum(frame.prior_precision * away**2))
+    whole = blocks[:, p, p].sum() + float(np.sum(problem.prior_precision * away**2))
     return max(float(whole - step @ slope), 1e-9 * float(whole))
 
 
-def probe_shapes(found: Fit) -> list[CandidateShape]:
+def probe_shapes(fit: Fit) -> list[CandidateShape]:
     """Bumps of force along the growth, over speed and over time, with and without a factor P."""
-    longest_s = max(float(trial.time_s[-1] - trial.release_s) for trial in found.trials)
+    longest_s = max(float(trial.time_s[-1] - trial.release_s) for trial in fit.trials)
     fastest = max(
-        trial.trial.travel_ratio * float(np.quantile(trial.predicted_velocity_m_s, 0.98)) for trial in found.trials
+        trial.trial.travel_ratio * float(np.quantile(trial.predicted_velocity_m_s, 0.98)) for trial in fit.trials
     )
-    lengths = [trial.trial.length_m for trial in found.trials]
-    reaches = [float(np.max(trial.lead_position_m) - trial.origin_m) for trial in found.trials]
+    lengths = [trial.trial.length_m for trial in fit.trials]
+    reaches = [float(np.max(trial.lead_position_m) - trial.origin_m) for trial in fit.trials]
     reach = max(
         grown / length if math.isfinite(length) and length > 0 else grown
         for grown, length in zip(reaches, lengths, strict=True)
     )
-    varied = len({round(trial.trial.pressure_Pa, 1) for trial in found.trials}) > 1
+    varied = len({round(trial.trial.pressure_Pa, 1) for trial in fit.trials}) > 1
     shapes = []
     for kind, count, top in ((0, BUMPS_ALONG, reach), (1, BUMPS_SPEED, fastest), (2, BUMPS_TIME, longest_s)):
         centres = (np.arange(count) + 0.5) / count * top

@@ -87,7 +87,7 @@ def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, aga
         return slack
     search = CandidateFits(questions, report)
     tried = search.singles()
-    between = between_fits(found, among, max((one.delta_chi2 for one in tried), default=0.0), report)
+    between = between_fits(found, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
     tried += between
     if not questions.something and not differ and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
@@ -105,8 +105,8 @@ def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, aga
         return alone
     if not questions.something and not questions.suspect:
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
-    tried = [one for one in tried if one not in between]
-    believed = [one for one in tried if one.credible]
+    tried = [hypothesis for hypothesis in tried if hypothesis not in between]
+    believed = [hypothesis for hypothesis in tried if hypothesis.credible]
     if not believed or best_of(believed).sigma < questions.threshold:
         # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
         loud = questions.possible.max(initial=0.0) > questions.threshold + LOUD
@@ -162,7 +162,7 @@ def _alone(
         tuple(kept),
         tuple(tried),
         tuple(aside.items()),
-        tuple(one.names[0] for one in kept),
+        tuple(hypothesis.names[0] for hypothesis in kept),
         search,
         confounded=confounders_of(after, kept[0].names) if verdict == MISSING else (),
     )
@@ -186,8 +186,10 @@ def _mending(
     something, those next to it are asked, as far as misjudged noise could have put them behind.
     """
     kept, aside = answer_set(hypotheses)
-    best = max(one.fit.log_likelihood for one in hypotheses)
-    behind = sorted((one for one in hypotheses if one not in kept), key=lambda one: -one.fit.log_likelihood)
+    best = max(hypothese.fit.log_likelihood for hypothese in hypotheses)
+    behind = sorted(
+        (hypothese for hypothese in hypotheses if hypothese not in kept), key=lambda one: -one.fit.log_likelihood
+    )
     next_to_it = [
         one
         for one in behind
@@ -214,7 +216,7 @@ def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
 
     Where nothing in it is physics that is missing, the measurement or the trials are at fault.
     """
-    if all(one.effects[-1].kind in NOT_PHYSICAL for one in kept):
+    if all(hypothesis.effects[-1].kind in NOT_PHYSICAL for hypothesis in kept):
         return ARTEFACT
     return MISSING if len(kept) == 1 else AMBIGUOUS
 
@@ -237,10 +239,10 @@ def _together(
     kept, aside, after = _mending(both, search)
     if after is None or 2 * (kept[0].fit.log_likelihood - ranked[0].fit.log_likelihood) < after.threshold**2:
         return nothing
-    common = set.intersection(*(set(one.names) for one in kept))
-    by_name = {one.names[0]: one for one in ranked if len(one.names) == 1}
+    common = set.intersection(*(set(hypothesis.names) for hypothesis in kept))
+    by_name = {hypothesis.names[0]: hypothesis for hypothesis in ranked if len(hypothesis.names) == 1}
     if not common:
-        names = tuple(dict.fromkeys(name for one in kept for name in one.names))
+        names = tuple(dict.fromkeys(name for hypothesis in kept for name in hypothesis.names))
         answer = _ordered(names, by_name)
         first = SelectionStep(AMBIGUOUS, questions, tuple(kept), (*ranked, *both), tuple(aside.items()), answer, search)
         return [first]
@@ -263,10 +265,10 @@ def _in_order(
     after: MisfitTests,
 ) -> list[SelectionStep]:
     """Two rounds from pairs that share an effect: that one first, physics before faults of the measurement."""
-    kinds = {effect.name: effect.kind for one in kept for effect in one.effects}
+    kinds = {effect.name: effect.kind for hypothesis in kept for effect in hypothesis.effects}
     order = sorted(common, key=lambda name: (kinds[name] == "measurement", -_alone_gain(name, by_name)))
     first_name = order[0]
-    turned = [_turned(one, first_name) for one in kept]
+    turned = [_turned(hypothesis, first_name) for hypothesis in kept]
     verdict = ARTEFACT if kinds[first_name] == "measurement" else MISSING
     first = SelectionStep(
         verdict, questions, tuple(turned[:1]), tuple(tried), tuple(aside.items()), (first_name,), search,
@@ -278,7 +280,7 @@ def _in_order(
     later = misfit_tests(base.fit if base else turned[0].fit, questions.effects, LATER_LEVEL)
     seconds = tuple(likelihood_ratio(later.found, one.effects[1:], one.fit) for one in turned)
     second_verdict = verdict_of(seconds)
-    names = tuple(one.names[0] for one in seconds)
+    names = tuple(second.names[0] for second in seconds)
     confounded = confounders_of(after, kept[0].names) if second_verdict == MISSING else ()
     second = SelectionStep(second_verdict, later, seconds, seconds, answer=names, confounded=confounded)
     return [first, second, SelectionStep(ADEQUATE, after)] if second_verdict == MISSING else [first, second]
@@ -288,12 +290,12 @@ def _alone_gain(name: str, by_name: dict[str, LikelihoodRatio]) -> float:
     return by_name[name].delta_chi2 if name in by_name else 0.0
 
 
-def _turned(one: LikelihoodRatio, first: str) -> LikelihoodRatio:
+def _turned(hypothesis: LikelihoodRatio, first: str) -> LikelihoodRatio:
     """The same pair with the effect of that name in front."""
     from dataclasses import replace
 
-    ordered = sorted(one.effects, key=lambda effect: effect.name != first)
-    return replace(one, effects=tuple(ordered))
+    ordered = sorted(hypothesis.effects, key=lambda effect: effect.name != first)
+    return replace(hypothesis, effects=tuple(ordered))
 
 
 def _why_not(ranked: Sequence[LikelihoodRatio], both: Sequence[LikelihoodRatio]) -> tuple[tuple[str, str], ...]:

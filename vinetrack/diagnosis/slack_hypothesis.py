@@ -41,25 +41,25 @@ PUSHES = 0.02
 of it their errors ask for a fit in vain, at twice a push of 4 % of the drive goes untried."""
 
 
-def pushes(found: Fit) -> bool:
+def pushes(fit: Fit) -> bool:
     """Whether the fitted model has the tail of some trial push, where the trial does not let it go slack."""
-    return any(_pushes(found, trial) for trial in found.trials)
+    return any(_pushes(fit, trial) for trial in fit.trials)
 
 
-def _pushes(found: Fit, trial: TrialFit) -> bool:
+def _pushes(fit: Fit, trial: TrialFit) -> bool:
     if trial.trial.tail_slack == "free" or trial.trial.travel_ratio == 1:
         return False
     moving = trial.time_s > trial.release_s
     if not moving.any():
         return False
     since_s = trial.time_s[moving] - trial.release_s
-    trace = next(item.trace for item in found.predictor.data if item.trial is trial.trial)
+    trace = next(trial_data.trace for trial_data in fit.predictor.data if trial_data.trial is trial.trial)
     measured_Pa = None if trace is None else np.interp(trial.time_s[moving], *trace)
     position_m = trial.predicted_position_m[moving] - trial.origin_m
     velocity_m_s = trial.predicted_velocity_m_s[moving]
     pressed = replace(trial.trial, pressure_Pa=trial.trial.pressure_Pa * (1 + trial.pressure_deviation))
     try:
-        terms = evaluate(found.model, pressed, since_s, position_m, velocity_m_s, measured_Pa=measured_Pa)
+        terms = evaluate(fit.model, pressed, since_s, position_m, velocity_m_s, measured_Pa=measured_Pa)
     except EffectError:
         return False
     ratio = trial.trial.travel_ratio
@@ -72,7 +72,9 @@ def slack_fit(found: Fit) -> LikelihoodRatio | None:
     """The model refitted with tails that may go slack; None where no tail pushes or the fit does not get through."""
     if not pushes(found):
         return None
-    data = [replace(item, trial=replace(item.trial, tail_slack="free")) for item in found.predictor.data]
+    data = [
+        replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in found.predictor.data
+    ]
     predictor = Predictor(found.predictor.layout, data, found.predictor.host)
     try:
         after = refit(replace(found, predictor=predictor), thorough=False)

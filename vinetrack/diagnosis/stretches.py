@@ -64,18 +64,18 @@ def courses_of(found: Fit) -> tuple[list[Course], tuple[TrialFit, ...]]:
 
 def by_condition(courses: Sequence[Course]) -> dict[str, list[Course]]:
     """Courses by name of condition, in order."""
-    names = dict.fromkeys(one.trial.condition for one in courses)
-    return {name: [one for one in courses if one.trial.condition == name] for name in names}
+    names = dict.fromkeys(course.trial.condition for course in courses)
+    return {name: [course for course in courses if course.trial.condition == name] for name in names}
 
 
-def replicate_scatter(found: Fit, courses: Sequence[Course]) -> Scatter:
+def replicate_scatter(fit: Fit, courses: Sequence[Course]) -> Scatter:
     """How much replicates scatter, from stretches of time that all of a condition were filmed in."""
     groups = by_condition(courses).values()
-    return find_scatter(found, [stretches_of(members, "time_s", common_edges(members)) for members in groups])
+    return find_scatter(fit, [stretches_of(members, "time_s", common_edges(members)) for members in groups])
 
 
-def _course(trial: TrialFit, answers: Floats, item: FitTrial) -> Course:
-    noise_m2 = item.mean_noise_m**2 * (1 + item.correlation) / (1 - item.correlation)
+def _course(trial: TrialFit, answers: Floats, trial_data: FitTrial) -> Course:
+    noise_m2 = trial_data.mean_noise_m**2 * (1 + trial_data.correlation) / (1 - trial_data.correlation)
     begin = first_that_counts(trial)
     growth = trial.predicted_position_m - trial.origin_m
     return Course(
@@ -86,22 +86,22 @@ def _course(trial: TrialFit, answers: Floats, item: FitTrial) -> Course:
         lead_position_m=growth[begin:],
         lead_velocity_m_s=trial.predicted_velocity_m_s[begin:],
         noise_m2=noise_m2,
-        rest_m2=noise_m2 / max(item.n_rest, 1),
+        rest_m2=noise_m2 / max(trial_data.n_rest, 1),
     )
 
 
 def common_edges(members: Sequence[Course]) -> Floats:
     """Edges of stretches of time that every replicate was filmed in."""
-    begin = max(float(one.time_s[0]) for one in members)
-    end = min(float(one.time_s[-1]) for one in members)
-    frames = min(int(np.count_nonzero((one.time_s >= begin) & (one.time_s <= end))) for one in members)
+    begin = max(float(member.time_s[0]) for member in members)
+    end = min(float(member.time_s[-1]) for member in members)
+    frames = min(int(np.count_nonzero((member.time_s >= begin) & (member.time_s <= end))) for member in members)
     count = max(min(STRETCHES, frames // FEWEST_FRAMES), 1)
     return np.linspace(begin, max(end, begin), count + 1)
 
 
-def means_of(one: Course, along: str, edges: Floats) -> tuple[Floats, Floats]:
+def means_of(course: Course, along: str, edges: Floats) -> tuple[Floats, Floats]:
     """Means of [residual, answers] in each stretch, shape (n_stretches, 3), NaN where no frame is; and the frames."""
-    values, at = np.column_stack([one.residual_m, one.answers]), getattr(one, along)
+    values, at = np.column_stack([course.residual_m, course.answers]), getattr(course, along)
     place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
     inside = (at >= edges[0]) & (at <= edges[-1])
     total, count = np.zeros((edges.size - 1, values.shape[1])), np.zeros(edges.size - 1)
@@ -112,20 +112,20 @@ def means_of(one: Course, along: str, edges: Floats) -> tuple[Floats, Floats]:
 
 def stretches_of(members: Sequence[Course], along: str, edges: Floats) -> Stretches:
     """The stretches that all of the members have frames in."""
-    parts = [means_of(one, along, edges) for one in members]
+    parts = [means_of(member, along, edges) for member in members]
     both = np.array([means for means, _ in parts])
     reached = np.isfinite(both).all(axis=(0, 2))
     noise = np.mean([_noise(one, count[reached]) for one, (_, count) in zip(members, parts, strict=True)], axis=0)
     return Stretches(both[:, reached, 0], both[:, reached, 1:].mean(axis=0), noise)
 
 
-def _noise(one: Course, count: Floats) -> Floats:
+def _noise(course: Course, count: Floats) -> Floats:
     """Covariance of the means of stretches of so many frames; the error of the origin is common to all."""
-    return np.asarray(np.diag(one.noise_m2 / np.maximum(count, 1.0)) + one.rest_m2)
+    return np.asarray(np.diag(course.noise_m2 / np.maximum(count, 1.0)) + course.rest_m2)
 
 
-def variances_of(one: Course, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
+def variances_of(course: Course, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
     """Variances of the means of one trial's stretches, shape (n_stretches,)."""
     means, count = part
-    alone = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(one, count))
+    alone = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(course, count))
     return np.diag(stretch_covariance(scatter, alone))

@@ -35,21 +35,21 @@ FEW_PER_CENT = 0.02
 vines may do."""
 
 
-def conditions_apart(found: Fit) -> float:
+def conditions_apart(fit: Fit) -> float:
     """Chance at which conditions differ in their trials' own pressure, or B, by so much more than replicates do.
 
     1 where replicates are too few, or where conditions differ by no more than an experimenter's care allows.
     """
     stated = [
-        trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in found.trials if trial.trial.pressure_Pa > 0
+        trial.trial.pressure_sigma_Pa / trial.trial.pressure_Pa for trial in fit.trials if trial.trial.pressure_Pa > 0
     ]
     known = [one for one in stated if math.isfinite(one)]
     pressure = max(MORE_THAN_STATED * float(np.median(known)) if known else 0.0, FEW_PER_CENT)
-    conditions = [trial.trial.condition for trial in found.trials]
-    fitted = sum(1 for number in found.numbers if not math.isfinite(number.bound))
+    conditions = [trial.trial.condition for trial in fit.trials]
+    fitted = sum(1 for number in fit.numbers if not math.isfinite(number.bound))
     chances = [
-        _one_way(np.array([trial.pressure_deviation for trial in found.trials]), conditions, fitted, pressure),
-        _one_way(np.log1p([trial.damping_deviation for trial in found.trials]), conditions, fitted, MORE_THAN_VINES),
+        _one_way(np.array([trial.pressure_deviation for trial in fit.trials]), conditions, fitted, pressure),
+        _one_way(np.log1p([trial.damping_deviation for trial in fit.trials]), conditions, fitted, MORE_THAN_VINES),
     ]
     return min(2 * min(chances), 1.0)
 
@@ -60,9 +60,9 @@ def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
 
     names = sorted(set(groups))
     members = [values[[group == name for group in groups]] for name in names]
-    within = sum(float(np.sum((one - one.mean()) ** 2)) for one in members)
+    within = sum(float(np.sum((member - member.mean()) ** 2)) for member in members)
     inner, outer = values.size - len(names), max(len(names) - fitted, 1)
-    between = sum(one.size * float(one.mean()) ** 2 for one in members)
+    between = sum(member.size * float(member.mean()) ** 2 for member in members)
     if inner < FEWEST_REPLICATED or not within > 0 or math.sqrt(between / values.size) < allowed:
         return 1.0
     # Those of replicates that hardly differ are held against what an experimenter's care allows.
@@ -70,7 +70,7 @@ def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     return float(f.sf(between / outer / care, outer, inner))
 
 
-def noisier_in_motion(found: Fit) -> float:
+def noisier_in_motion(fit: Fit) -> float:
     """Chance at which positions in motion are so much noisier, over stretches, than at rest; 1 where nobody can tell.
 
     Positions read from recordings are not asked, for a tracker's slow errors in motion are larger than those at rest,
@@ -81,14 +81,14 @@ def noisier_in_motion(found: Fit) -> float:
     rest: list[Floats] = []
     motion: list[Floats] = []
     freedom = 0.0
-    for trial, item in zip(found.trials, found.predictor.data, strict=True):
-        if math.isfinite(item.tracker_sigma_m) or item.gauge_error > 0:
+    for trial, trial_data in zip(fit.trials, fit.predictor.data, strict=True):
+        if math.isfinite(trial_data.tracker_sigma_m) or trial_data.gauge_error > 0:
             continue
-        here = _sums(trial.whitened[: item.n_rest])
+        here = _sums(trial.whitened[: trial_data.n_rest])
         if here.size < 2:
             continue
         rest.append((here - here.mean()) * math.sqrt(here.size / (here.size - 1)))
-        motion.append(_sums(trial.whitened[item.n_rest :]))
+        motion.append(_sums(trial.whitened[trial_data.n_rest :]))
         freedom += here.size - 1
     if freedom < FEWEST_STRETCHES:
         return 1.0

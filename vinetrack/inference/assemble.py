@@ -70,9 +70,9 @@ def assemble(
     numbers = _numbers(predictor, solution, wide.state.theta, by_noise, known, profile=profile)
     between = _outside(layout, numbers, _between(pooled, len(numbers)))
     chi2 = chi2_per_dof(predictor, solution)
-    weights = np.array([item.time_s.size for item in predictor.data], dtype=float)
+    weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
     variance = float(np.average(state.variance, weights=weights)) / (1 - state.rho**2)
-    felt = [bool(solution.frame.feels[:, k].any()) for k in range(2)]
+    felt = [bool(solution.problem.feels[:, k].any()) for k in range(2)]
     return Fit(
         model=fitted_model(layout, numbers),
         numbers=numbers,
@@ -110,7 +110,7 @@ def _pooled(predictor: Predictor, solution: Solution, options: Mapping[str, Any]
     held = options.get("held")
     if held is not None and held.noise is not None:
         return None
-    if few_trials(predictor, solution) or not solution.frame.feels.any():
+    if few_trials(predictor, solution) or not solution.problem.feels.any():
         return pool(predictor, solution, len(predictor.layout.free))
     return None
 
@@ -139,9 +139,9 @@ def _with_unknown(covariance: Floats, known: Precision) -> Floats:
 
 def log_likelihood(solution: Solution) -> float:
     """Marginal ln L, spreads at their best for it (not the restricted one, which cannot compare models)."""
-    part = marginal(solution.grams, solution.frame, solution.state)
-    spread = estimate_spreads(part, solution.frame, solution.state, solution.estimable, restricted=False)
-    return -0.5 * deviance(part, solution.frame, solution.state, spread, restricted=False)
+    part = marginal(solution.grams, solution.problem, solution.state)
+    spread = estimate_spreads(part, solution.problem, solution.state, solution.estimable, restricted=False)
+    return -0.5 * deviance(part, solution.problem, solution.state, spread, restricted=False)
 
 
 def fitted_model(layout: ParameterMap, numbers: Sequence[Number]) -> Model:
@@ -169,7 +169,7 @@ def _numbers(
     profile: bool,
 ) -> tuple[Number, ...]:
     """The free numbers at `theta`, which holds them first, with their errors and intervals."""
-    layout, frame = predictor.layout, solution.frame
+    layout, problem = predictor.layout, solution.problem
     sigma = np.sqrt(np.diag(known.covariance))
     dof = known.degrees
     reach = student(dof)
@@ -178,14 +178,14 @@ def _numbers(
     for k, number in enumerate(layout.free):
         low, high, method = theta[k] - reach[k] * sigma[k], theta[k] + reach[k] * sigma[k], "linear"
         if not math.isfinite(sigma[k]):
-            low, high, method = frame.lower[k], frame.upper[k], "none"
+            low, high, method = problem.lower[k], problem.upper[k], "none"
         elif doubtful[k] and profile:
             # The likelihood knows of the noise alone: it is followed as much further as the error is wider.
             narrow = math.sqrt(by_noise.covariance[k, k])
             low, high = profile_interval(predictor, solution, k, narrow, float(reach[k] * sigma[k] / narrow))
             method = "profile"
-        low, high = max(low, frame.lower[k]), min(high, frame.upper[k])
-        at = [b for b in (frame.lower[k], frame.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]
+        low, high = max(low, problem.lower[k]), min(high, problem.upper[k])
+        at = [b for b in (problem.lower[k], problem.upper[k]) if abs(theta[k] - b) <= 1e-9 * max(abs(b), 1.0)]
         numbers.append(
             Number(
                 key=number.key,
@@ -220,9 +220,9 @@ def _outside(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats
 
 def own_sigma(solution: Solution, known: Precision) -> Floats:
     """Standard errors of each trial's own numbers, shape (n_trials, 4), those of the shared numbers included."""
-    frame, state = solution.frame, solution.state
+    problem, state = solution.problem, solution.state
     white = at_correlation(solution.grams, state.rho) / state.variance[:, None, None]
-    precision_own = trial_effect_prior(frame, state)[1]
+    precision_own = trial_effect_prior(problem, state)[1]
     square = white[:, :OWN, :OWN] + precision_own[:, :, None] * np.eye(OWN)
     scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
     even = square * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(OWN)
@@ -230,45 +230,52 @@ def own_sigma(solution: Solution, known: Precision) -> Floats:
     lever = inverse @ white[:, :OWN, OWN:-1]
     shared = np.zeros((state.theta.size + 1,) * 2)
     shared[:-1, :-1] = np.where(np.isfinite(known.covariance), known.covariance, 0.0)
-    mine = shared[frame.index[:, :, None], frame.index[:, None, :]]
+    mine = shared[problem.index[:, :, None], problem.index[:, None, :]]
     total = inverse + lever @ mine @ np.swapaxes(lever, 1, 2)
     sigma = np.sqrt(np.maximum(np.einsum("nkk->nk", total), 0.0))
     for k, column in enumerate((PRESSURE, DAMPING_DEVIATION)):
-        sigma[~frame.feels[:, k], column] = 0.0
+        sigma[~problem.feels[:, k], column] = 0.0
     return np.asarray(sigma)
 
 
 def _trial_fits(predictor: Predictor, solution: Solution, known: Precision) -> tuple[TrialFit, ...]:
     state, sigma = solution.state, own_sigma(solution, known)
-    moved = predictor.run(predictor.jobs(state.theta, state.own))
+    moved = predictor.run(predictor.jobs(state.theta, state.trial_effects))
     return tuple(
-        trial_fit(item, state.own[i], sigma[i], moved[i].observed_position_m, moved[i].lead_velocity_m_s, state.rho,
+        trial_fit(trial_data, state.trial_effects[i], sigma[i], moved[i].observed_position_m,
+                  moved[i].lead_velocity_m_s, state.rho,
                   float(state.variance[i]))
-        for i, item in enumerate(predictor.data)
+        for i, trial_data in enumerate(predictor.data)
     )  # fmt: skip
 
 
 def trial_fit(
-    item: FitTrial, own: Floats, sigma: Floats, position_m: Floats, velocity_m_s: Floats, rho: float, variance: float
+    trial_data: FitTrial,
+    trial_effects: Floats,
+    sigma: Floats,
+    position_m: Floats,
+    velocity_m_s: Floats,
+    rho: float,
+    variance: float,
 ) -> TrialFit:
     """One trial with its own numbers and what the model says of it."""
-    predicted_m = position_m + own[ORIGIN]
-    residual_m = item.lead_position_m - predicted_m
+    predicted_m = position_m + trial_effects[ORIGIN]
+    residual_m = trial_data.lead_position_m - predicted_m
     return TrialFit(
-        trial=item.trial,
-        time_s=item.time_s,
-        lead_position_m=item.lead_position_m,
+        trial=trial_data.trial,
+        time_s=trial_data.time_s,
+        lead_position_m=trial_data.lead_position_m,
         predicted_position_m=predicted_m,
         predicted_velocity_m_s=velocity_m_s,
         residual_m=residual_m,
-        whitened=whiten(residual_m, item.first, rho, item.relative_sd) / math.sqrt(variance),
-        release_s=float(own[RELEASE]),
+        whitened=whiten(residual_m, trial_data.first, rho, trial_data.relative_sd) / math.sqrt(variance),
+        release_s=float(trial_effects[RELEASE]),
         release_sigma_s=float(sigma[RELEASE]),
-        origin_m=float(own[ORIGIN]),
+        origin_m=float(trial_effects[ORIGIN]),
         origin_sigma_m=float(sigma[ORIGIN]),
-        pressure_deviation=float(own[PRESSURE]),
+        pressure_deviation=float(trial_effects[PRESSURE]),
         pressure_deviation_sigma=float(sigma[PRESSURE]),
-        damping_deviation=math.expm1(own[DAMPING_DEVIATION]),
+        damping_deviation=math.expm1(trial_effects[DAMPING_DEVIATION]),
         damping_deviation_sigma=float(sigma[DAMPING_DEVIATION]),
         noise_m=math.sqrt(variance / (1 - rho**2)),
     )
@@ -294,7 +301,7 @@ def _messages(
         found.append(f"cannot be told apart at all by these data: {', '.join(titles)}")
     found += _close_pairs(numbers, known)
     for k, name in enumerate(SPREAD_NAMES):
-        if solution.frame.feels[:, k].any() and not solution.estimable[k]:
+        if solution.problem.feels[:, k].any() and not solution.estimable[k]:
             found.append(f"the spread of {name} from trial to trial is taken as {100 * solution.state.spread[k]:.2g} %")
     if chi2 > MISSES:
         found.append(
@@ -306,13 +313,13 @@ def _messages(
 
 def _free_in_trials(solution: Solution) -> str:
     """What every trial may have of its own, where it may: a falling body has neither B nor pressure."""
-    felt = [SPREAD_NAMES[k] for k in (1, 0) if solution.frame.feels[:, k].any()]
+    felt = [SPREAD_NAMES[k] for k in (1, 0) if solution.problem.feels[:, k].any()]
     return f", with {' and '.join(felt)} of every trial free to help" if felt else ""
 
 
 def _weighted(data: Sequence[FitTrial]) -> list[str]:
     """What is to be said of points that do not count alike."""
-    weighted = [item for item in data if item.relative_sd is not None]
+    weighted = [trial_data for trial_data in data if trial_data.relative_sd is not None]
     if not weighted:
         return []
     if weighted[0].blur_s > 0:

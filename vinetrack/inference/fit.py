@@ -157,12 +157,12 @@ def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
     FitError
         If no trial moves.
     """
-    moved = predictor.run(predictor.jobs(solution.state.theta, solution.state.own))
+    moved = predictor.run(predictor.jobs(solution.state.theta, solution.state.trial_effects))
     if any(float(np.ptp(one.observed_position_m)) > STANDSTILL_M for one in moved):
         return
     model = " + ".join(predictor.layout.model.names)
-    angles = sorted({round(math.degrees(item.trial.growth_angle_rad)) for item in predictor.data})
-    pressures = sorted({round(item.trial.pressure_Pa / 1e3, 1) for item in predictor.data})
+    angles = sorted({round(math.degrees(trial_data.trial.growth_angle_rad)) for trial_data in predictor.data})
+    pressures = sorted({round(trial_data.trial.pressure_Pa / 1e3, 1) for trial_data in predictor.data})
     angle, pressure = (_range_in_words(values) for values in (angles, pressures))
     raise FitError(
         f"The model {model} moves no trial: at a growth angle of {angle}° and {pressure} kPa nothing in it drives"
@@ -187,10 +187,10 @@ def _solve_from_scratch(predictor: Predictor, held: FixedTerms, watch: Watch | N
     found: list[Solution] = []
     reason = ""
     starts = candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]
-    for _, theta, own in starts:
+    for _, theta, trial_effects in starts:
         try:
             most = MOST_ITERATIONS if thorough else ITERATIONS_ONCE_MORE
-            found.append(_solve_from(predictor, theta, own, held, most_iterations=most, watch=watch))
+            found.append(_solve_from(predictor, theta, trial_effects, held, most_iterations=most, watch=watch))
         except SimulationError as error:
             reason = str(error)
             continue
@@ -201,7 +201,10 @@ def _solve_from_scratch(predictor: Predictor, held: FixedTerms, watch: Watch | N
     best = min(found, key=_deviance)
     if not is_poor_fit(predictor, best):
         return best
-    guided = [_guided(predictor, theta, own, held, watch) for _, theta, own in (starts if thorough else starts[:1])]
+    guided = [
+        _guided(predictor, theta, trial_effects, held, watch)
+        for _, theta, trial_effects in (starts if thorough else starts[:1])
+    ]
     return _sane(predictor, best, [one for one in guided if one is not None])
 
 
@@ -217,8 +220,8 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
 def missed_fraction(predictor: Predictor, solution: Solution) -> float:
     """Root mean square of what is missed, as part of the growth that was seen; of the median trial."""
     parts = [
-        math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(item.lead_position_m)), 1e-9)
-        for columns, item in zip(solution.columns, predictor.data, strict=True)
+        math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
+        for columns, trial_data in zip(solution.columns, predictor.data, strict=True)
     ]
     return float(np.median(parts))
 
@@ -234,7 +237,13 @@ def _sane(predictor: Predictor, free: Solution, guided: list[Solution]) -> Solut
 
 
 def _guided(
-    predictor: Predictor, theta: Floats, own: Floats, held: FixedTerms, watch: Watch | None, *, freed: bool = True
+    predictor: Predictor,
+    theta: Floats,
+    trial_effects: Floats,
+    held: FixedTerms,
+    watch: Watch | None,
+    *,
+    freed: bool = True,
 ) -> Solution | None:
     """A solution led by what is missed: the noise is as correlated as in the tracks until the numbers have settled.
 
@@ -244,20 +253,22 @@ def _guided(
     if held.noise is not None:
         return None
     guide = FixedTerms(spread=held.spread or GUIDING_SPREADS, correlation=track_correlation(predictor.data))
-    state, frame = first_state(predictor.data, theta, own), make_problem(predictor, own)
+    state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
     try:
-        first = solve(predictor, frame, state, guide, warm=True, most_iterations=GUIDED_ITERATIONS, watch=watch)
+        first = solve(predictor, problem, state, guide, warm=True, most_iterations=GUIDED_ITERATIONS, watch=watch)
         if not freed:
             return first
-        own, _ = align(predictor.data, predictor, first.state.theta, initial_trial_effects(predictor.data))
-        free = _solve_from(predictor, first.state.theta, own, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+        trial_effects, _ = align(predictor.data, predictor, first.state.theta, initial_trial_effects(predictor.data))
+        free = _solve_from(
+            predictor, first.state.theta, trial_effects, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch
+        )
         return first if is_poor_fit(predictor, free) else free
     except SimulationError:
         return None
 
 
 def _strictly(
-    predictor: Predictor, theta: Floats, own: Floats, held: FixedTerms, watch: Watch | None
+    predictor: Predictor, theta: Floats, trial_effects: Floats, held: FixedTerms, watch: Watch | None
 ) -> Solution | None:
     """A solution led by the noise of the tracks, which nothing missed can enlarge, from numbers that are nearly right.
 
@@ -265,19 +276,21 @@ def _strictly(
     """
     if held.noise is not None:
         return None
-    state, frame = first_state(predictor.data, theta, own), make_problem(predictor, own)
+    state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
     noise = FixedTerms(spread=held.spread or STRICT_SPREADS, noise=(state.rho, state.variance))
     try:
-        first = solve(predictor, frame, state, noise, warm=True, most_iterations=STRICT_ITERATIONS, watch=watch)
+        first = solve(predictor, problem, state, noise, warm=True, most_iterations=STRICT_ITERATIONS, watch=watch)
         if chi2_per_dof(predictor, first) > HOPELESS:
             return None
         if not first.converged:
             first = solve(
-                predictor, frame, first.state, noise, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch
+                predictor, problem, first.state, noise, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch
             )
         if chi2_per_dof(predictor, first) > POOR_FIT:
             return None
-        return solve(predictor, frame, first.state, held, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+        return solve(
+            predictor, problem, first.state, held, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch
+        )
     except SimulationError:
         return None
 
@@ -285,15 +298,17 @@ def _strictly(
 def _solve_from(
     predictor: Predictor,
     theta: Floats,
-    own: Floats,
+    trial_effects: Floats,
     held: FixedTerms,
     *,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
 ) -> Solution:
     """Solve with the noise and the spreads that are assumed before anything is fitted."""
-    state = first_state(predictor.data, theta, own)
-    return solve(predictor, make_problem(predictor, own), state, held, most_iterations=most_iterations, watch=watch)
+    state = first_state(predictor.data, theta, trial_effects)
+    return solve(
+        predictor, make_problem(predictor, trial_effects), state, held, most_iterations=most_iterations, watch=watch
+    )
 
 
 def _found_again(
@@ -304,19 +319,19 @@ def _found_again(
         return solution
     theta = solution.state.theta
     try:
-        own, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
+        trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
     except SimulationError:
         return solution
-    strict = _strictly(predictor, theta, own, held, watch)
+    strict = _strictly(predictor, theta, trial_effects, held, watch)
     if strict is not None and not is_poor_fit(predictor, strict):
         return strict
-    guided = _guided(predictor, theta, own, held, watch, freed=thorough)
+    guided = _guided(predictor, theta, trial_effects, held, watch, freed=thorough)
     return solution if guided is None else _sane(predictor, solution, [guided])
 
 
 def _deviance(solution: Solution) -> float:
-    part = marginal(solution.grams, solution.frame, solution.state)
-    return deviance(part, solution.frame, solution.state, solution.state.spread)
+    part = marginal(solution.grams, solution.problem, solution.state)
+    return deviance(part, solution.problem, solution.state, solution.state.spread)
 
 
 def refit(
@@ -391,12 +406,12 @@ def refit(
     held = FixedTerms(old.spread if hold_spreads else None, (old.rho, old.variance) if hold_noise else None)
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
-            own, _ = align(data, predictor, theta, initial_trial_effects(data))
-            solution = _solve_from(predictor, theta, own, held, most_iterations=most_iterations, watch=watch)
+            trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))
+            solution = _solve_from(predictor, theta, trial_effects, held, most_iterations=most_iterations, watch=watch)
         else:
-            frame = replace(make_problem(predictor, old.own), own_centre=before.solution.frame.own_centre)
-            state = _led_back(predictor, frame, replace(old, theta=theta), held)
-            solution = solve(predictor, frame, state, held, warm=True, most_iterations=most_iterations, watch=watch)
+            problem = replace(make_problem(predictor, old.trial_effects), own_centre=before.solution.problem.own_centre)
+            state = _led_back(predictor, problem, replace(old, theta=theta), held)
+            solution = solve(predictor, problem, state, held, warm=True, most_iterations=most_iterations, watch=watch)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
     solution = _found_again(predictor, solution, held, watch, thorough=thorough)
@@ -404,20 +419,20 @@ def refit(
     return replace(found, pairs=before.pairs)
 
 
-def _led_back(predictor: Predictor, frame: MixedProblem, state: FitState, held: FixedTerms) -> FitState:
+def _led_back(predictor: Predictor, problem: MixedProblem, state: FitState, held: FixedTerms) -> FitState:
     """The state, or, where its numbers miss by far more than its noise, the one that this noise leads to.
 
     With the noise to be found as well, all that a bad start misses would pass for noise, and hold the fit there.
     """
-    if held.noise is not None or cost(predictor, frame, state) < BAD_START * float(np.sum(frame.points)):
+    if held.noise is not None or cost(predictor, problem, state) < BAD_START * float(np.sum(problem.points)):
         return state
     # What was taken for a late release may be what the new effect holds back: every trial begins where it fits best.
-    aligned, _ = align(predictor.data, predictor, state.theta, state.own)
-    ways = [state, replace(state, own=aligned)]
-    best = np.argmin([trial_costs(predictor, frame, way) for way in ways], axis=0)
-    state = replace(state, own=np.array([ways[way].own[i] for i, way in enumerate(best)]))
+    aligned, _ = align(predictor.data, predictor, state.theta, state.trial_effects)
+    ways = [state, replace(state, trial_effects=aligned)]
+    best = np.argmin([trial_costs(predictor, problem, way) for way in ways], axis=0)
+    state = replace(state, trial_effects=np.array([ways[way].trial_effects[i] for i, way in enumerate(best)]))
     noise = FixedTerms(held.spread or state.spread, (state.rho, state.variance))
-    return solve(predictor, frame, state, noise, warm=True, most_iterations=GUIDED_ITERATIONS).state
+    return solve(predictor, problem, state, noise, warm=True, most_iterations=GUIDED_ITERATIONS).state
 
 
 def _belongs(name: str, names: Iterable[str]) -> bool:

@@ -159,7 +159,7 @@ def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:
 
     A tracker's own points are left as they are: it states what each errs by, and leaves out the worst.
     """
-    places = [i for i, item in enumerate(data) if not math.isfinite(item.tracker_sigma_m)]
+    places = [i for i, trial_data in enumerate(data) if not math.isfinite(trial_data.tracker_sigma_m)]
     shape = noise_shape(
         [data[i].time_s for i in places], [data[i].lead_position_m for i in places], [data[i].stated_m for i in places]
     )

@@ -57,19 +57,19 @@ def among_first(known: Precision, count: int) -> Precision:
 
 def precision(solution: Solution) -> Precision:
     """Covariance at the end of a fit, by the model of the noise and the scatter."""
-    part = marginal(solution.grams, solution.frame, solution.state)
-    covariance, silent, tied = _covariance(part, solution.frame, solution.state, solution.state.spread)
+    part = marginal(solution.grams, solution.problem, solution.state)
+    covariance, silent, tied = _covariance(part, solution.problem, solution.state, solution.state.spread)
     return Precision(covariance, degrees_of_freedom(solution), silent, tied)
 
 
 def _covariance(
-    part: Marginal, frame: MixedProblem, state: FitState, spread: tuple[float, float]
+    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
 ) -> tuple[Floats, np.ndarray, np.ndarray]:
     """Covariance of the free numbers, which of them are silent, and which are tied."""
-    information = normal_equations(part, frame, state, spread)[0]
+    information = normal_equations(part, problem, state, spread)[0]
     diagonal = np.diag(information)
-    silent = frame.free & ~(diagonal > SILENT)
-    k = np.flatnonzero(frame.free & ~silent)
+    silent = problem.free & ~(diagonal > SILENT)
+    k = np.flatnonzero(problem.free & ~silent)
     covariance = np.zeros_like(information)
     tied = np.zeros(diagonal.size, dtype=bool)
     if k.size:
@@ -87,12 +87,12 @@ def _covariance(
 
 def degrees_of_freedom(solution: Solution) -> Floats:
     """Satterthwaite's degrees of freedom of every free number, shape (n_free,); infinite where no spread matters."""
-    frame, state = solution.frame, solution.state
+    problem, state = solution.problem, solution.state
     active = [k for k in range(2) if solution.estimable[k] and state.spread[k] > 1e-4]
-    size = frame.prior_mean.size
+    size = problem.prior_mean.size
     if not active:
         return np.full(size, math.inf)
-    part = marginal(solution.grams, frame, state)
+    part = marginal(solution.grams, problem, state)
 
     def moved(shifts: Floats) -> tuple[float, float]:
         spread = list(state.spread)
@@ -102,23 +102,24 @@ def degrees_of_freedom(solution: Solution) -> Floats:
 
     steps = LOG_STEP * np.eye(len(active))
     slopes = [
-        (_variances(part, frame, state, moved(step)) - _variances(part, frame, state, moved(-step))) / (2 * LOG_STEP)
+        (_variances(part, problem, state, moved(step)) - _variances(part, problem, state, moved(-step)))
+        / (2 * LOG_STEP)
         for step in steps
     ]
-    curvature = _curvature(lambda shifts: 0.5 * deviance(part, frame, state, moved(shifts)), len(active))
+    curvature = _curvature(lambda shifts: 0.5 * deviance(part, problem, state, moved(shifts)), len(active))
     values, vectors = np.linalg.eigh(curvature)
     seen = values > 1e-3
     spread_covariance = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
     gradient = np.column_stack(slopes)
     uncertainty = np.einsum("pi,ij,pj->p", gradient, spread_covariance, gradient)
-    variances = _variances(part, frame, state, state.spread)
+    variances = _variances(part, problem, state, state.spread)
     with np.errstate(divide="ignore", invalid="ignore"):
         found = 2 * variances**2 / uncertainty
     return np.where(uncertainty > 0, np.maximum(found, 2.0), math.inf)
 
 
-def _variances(part: Marginal, frame: MixedProblem, state: FitState, spread: tuple[float, float]) -> Floats:
-    return np.nan_to_num(np.diag(_covariance(part, frame, state, spread)[0]), posinf=0.0)
+def _variances(part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]) -> Floats:
+    return np.nan_to_num(np.diag(_covariance(part, problem, state, spread)[0]), posinf=0.0)
 
 
 def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
@@ -144,8 +145,8 @@ def student(dof: Floats) -> Floats:
 
 def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
     """Which numbers have a bound within reach of their error, shape (n_free,)."""
-    frame, theta = solution.frame, solution.state.theta
-    room = np.minimum(theta - frame.lower, frame.upper - theta)
+    problem, theta = solution.problem, solution.state.theta
+    room = np.minimum(theta - problem.lower, problem.upper - theta)
     return np.isfinite(sigma) & (room < NEAR_A_BOUND * sigma)
 
 
@@ -157,11 +158,11 @@ def profile_interval(
     Spreads and noise stay those of the best fit, so that for a straight line this is the interval ± `reach` · `sigma`.
     A side that meets a bound first ends there.
     """
-    frame, state = solution.frame, solution.state
+    problem, state = solution.problem, solution.state
     held = FixedTerms(state.spread, (state.rho, state.variance))
     best = _lowest(solution)
     ends = []
-    for side, bound in ((-1, frame.lower[place]), (1, frame.upper[place])):
+    for side, bound in ((-1, problem.lower[place]), (1, problem.upper[place])):
         value, tried = float(state.theta[place]), [(0.0, 0.0)]
         away = reach * sigma
         for _ in range(6):
@@ -178,25 +179,27 @@ def profile_interval(
 
 
 def _lowest(solution: Solution) -> float:
-    part = marginal(solution.grams, solution.frame, solution.state)
-    return deviance(part, solution.frame, solution.state, solution.state.spread, restricted=False)
+    part = marginal(solution.grams, solution.problem, solution.state)
+    return deviance(part, solution.problem, solution.state, solution.state.spread, restricted=False)
 
 
 def _rise(predictor: Predictor, solution: Solution, held: FixedTerms, place: int, value: float, best: float) -> float:
     """By how much −2 ln L rises when one number is held at `value` and all others are fitted again."""
-    free = solution.frame.free.copy()
+    free = solution.problem.free.copy()
     free[place] = False
     theta = solution.state.theta.copy()
     step = value - theta[place]
-    part = marginal(solution.grams, solution.frame, solution.state)
-    covariance = _covariance(part, solution.frame, solution.state, solution.state.spread)[0]
+    part = marginal(solution.grams, solution.problem, solution.state)
+    covariance = _covariance(part, solution.problem, solution.state, solution.state.spread)[0]
     if math.isfinite(covariance[place, place]) and covariance[place, place] > 0:
         along = np.nan_to_num(covariance[:, place] / covariance[place, place], posinf=0.0)
-        theta = np.clip(theta + along * step, solution.frame.lower, solution.frame.upper)
+        theta = np.clip(theta + along * step, solution.problem.lower, solution.problem.upper)
     theta[place] = value
-    frame = replace(solution.frame, free=free)
+    problem = replace(solution.problem, free=free)
     try:
-        constrained = solve(predictor, frame, replace(solution.state, theta=theta), held, warm=True, most_iterations=8)
+        constrained = solve(
+            predictor, problem, replace(solution.state, theta=theta), held, warm=True, most_iterations=8
+        )
     except SimulationError:
         return 1e6
     return _lowest(constrained) - best
@@ -204,8 +207,8 @@ def _rise(predictor: Predictor, solution: Solution, held: FixedTerms, place: int
 
 def _next_guess(tried: list[tuple[float, float]], reach: float) -> float:
     """Where the root of the rise reaches its aim, by the chord through the two points nearest to it."""
-    below = max((one for one in tried if one[1] <= reach), key=lambda one: one[0])
-    above = min((one for one in tried if one[1] > reach), key=lambda one: one[0], default=None)
+    below = max((hypothesis for hypothesis in tried if hypothesis[1] <= reach), key=lambda one: one[0])
+    above = min((hypothesis for hypothesis in tried if hypothesis[1] > reach), key=lambda one: one[0], default=None)
     if above is None:
         return below[0] * float(np.clip(reach / max(below[1], 0.2), 1.2, 3.0))
     return below[0] + (above[0] - below[0]) * (reach - below[1]) / (above[1] - below[1])

@@ -63,21 +63,29 @@ def predict_prepared(found: Fit, data: Sequence[FitTrial], *, from_rest: bool = 
     """
     rho = 0.0 if from_rest else found.noise_correlation
     variance = found.noise_m**2 * (1 - rho**2)
-    predictor, own, square = laid_on(found, data, from_rest=from_rest)
+    predictor, trial_effects, square = laid_on(found, data, from_rest=from_rest)
     data = predictor.data
     try:
-        moved = predictor.run(predictor.jobs(np.empty(0), own))
+        moved = predictor.run(predictor.jobs(np.empty(0), trial_effects))
     except SimulationError as error:
         raise FitError(f"The model cannot be followed: {error}") from error
     sigma = np.zeros((len(data), OWN))
     sigma[:, :2] = np.sqrt(np.einsum("nkk->nk", np.linalg.pinv(square / variance, hermitian=True)))
     return [
-        trial_fit(item, own[i], sigma[i], moved[i].observed_position_m, moved[i].lead_velocity_m_s, rho, variance)
-        for i, item in enumerate(data)
+        trial_fit(
+            trial_data,
+            trial_effects[i],
+            sigma[i],
+            moved[i].observed_position_m,
+            moved[i].lead_velocity_m_s,
+            rho,
+            variance,
+        )
+        for i, trial_data in enumerate(data)
     ]
 
 
-def laid_on(found: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
+def laid_on(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
     """The fitted model laid on trials: see `predict_prepared`.
 
     Returns
@@ -91,14 +99,16 @@ def laid_on(found: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[P
     FitError
         As `predict_prepared`.
     """
-    data = [_known_yield(found, item) for item in data]
-    predictor = Predictor(_nothing_free(found, data), data, found.predictor.host)
+    data = [_known_yield(fit, trial_data) for trial_data in data]
+    predictor = Predictor(_nothing_free(fit, data), data, fit.predictor.host)
     try:
-        own, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
-        own, square = _settle(predictor, own, 0.0 if from_rest else found.noise_correlation, from_rest)
+        trial_effects, _ = align(data, predictor, np.empty(0), initial_trial_effects(data))
+        trial_effects, square = _settle(
+            predictor, trial_effects, 0.0 if from_rest else fit.noise_correlation, from_rest
+        )
     except SimulationError as error:
         raise FitError(f"The model cannot be followed: {error}") from error
-    return predictor, own, square
+    return predictor, trial_effects, square
 
 
 def told_apart(design: Floats, left: Floats, least: float) -> Floats:
@@ -112,7 +122,9 @@ def told_apart(design: Floats, left: Floats, least: float) -> Floats:
 
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
     """Trials filmed long enough at rest to say where they began, shape (n_trials,)."""
-    return np.array([item.n_rest >= FEWEST_AT_REST or item.vague_rest is not None for item in data], dtype=bool)
+    return np.array(
+        [trial_data.n_rest >= FEWEST_AT_REST or trial_data.vague_rest is not None for trial_data in data], dtype=bool
+    )
 
 
 def _prepared(trial: Trial, track: Track) -> FitTrial:
@@ -122,40 +134,40 @@ def _prepared(trial: Trial, track: Track) -> FitTrial:
         raise FitError(f"Trial {trial.name}: {error}.") from error
 
 
-def _known_yield(found: Fit, item: FitTrial) -> FitTrial:
+def _known_yield(found: Fit, trial_data: FitTrial) -> FitTrial:
     """The trial with the yield pressure that the fit found for its vine, where it found one."""
-    stated = f"{item.trial.vine}, {item.trial.yield_pressure_Pa / 1e3:g} kPa"
+    stated = f"{trial_data.trial.vine}, {trial_data.trial.yield_pressure_Pa / 1e3:g} kPa"
     for number in found.numbers:
-        if number.key == YIELD_PRESSURE and number.vine in (item.trial.vine, stated):
-            return replace(item, trial=replace(item.trial, yield_pressure_Pa=number.value))
-    return item
+        if number.key == YIELD_PRESSURE and number.vine in (trial_data.trial.vine, stated):
+            return replace(trial_data, trial=replace(trial_data.trial, yield_pressure_Pa=number.value))
+    return trial_data
 
 
 def _nothing_free(found: Fit, data: Sequence[FitTrial]) -> ParameterMap:
     try:
-        base = np.array([found.model.parameters_for(item.trial.vine) for item in data])
+        base = np.array([found.model.parameters_for(trial_data.trial.vine) for trial_data in data])
     except EffectError as error:
         raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
     base = base.reshape(len(data), len(found.model.parameter_names))
     return ParameterMap(found.model, (), (), np.zeros((len(data), 0), dtype=int), base)
 
 
-def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> tuple[Floats, Floats]:
+def _settle(predictor: Predictor, trial_effects: Floats, rho: float, from_rest: bool) -> tuple[Floats, Floats]:
     """Newton's steps in release and origin, no longer than two frames; the own numbers, and their information.
 
     A trial that has settled is left alone: it costs as much to simulate as one that has not.
     """
     data = predictor.data
-    frames = np.array([item.frame_s for item in data])
+    frames = np.array([trial_data.frame_s for trial_data in data])
     held = rest_is_seen(data) & from_rest
-    own, square = own.copy(), np.zeros((len(data), 2, 2))
-    own[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-    let_in = np.array([item.let_in for item in data], dtype=bool)
+    trial_effects, square = trial_effects.copy(), np.zeros((len(data), 2, 2))
+    trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+    let_in = np.array([trial_data.let_in for trial_data in data], dtype=bool)
     for i in np.flatnonzero(held).tolist():
-        own[i, ORIGIN] = data[i].rest_origin_m
+        trial_effects[i, ORIGIN] = data[i].rest_origin_m
     moving = np.arange(len(data))
     for _ in range(MOST_STEPS):
-        sums = _sums(predictor, own, moving, rho)
+        sums = _sums(predictor, trial_effects, moving, rho)
         square[moving] = sums[:, :2, :2]
         sums[held[moving], ORIGIN, :] = sums[held[moving], :, ORIGIN] = 0.0
         sums[let_in[moving], RELEASE, :] = sums[let_in[moving], :, RELEASE] = 0.0
@@ -167,20 +179,20 @@ def _settle(predictor: Predictor, own: Floats, rho: float, from_rest: bool) -> t
         step = np.einsum("nij,nj->ni", inverse, sums[:, :2, -1])
         reach = 2 * frames[moving]
         step[:, RELEASE] = np.clip(step[:, RELEASE], -reach, reach)
-        own[moving, :2] += step
+        trial_effects[moving, :2] += step
         moving = moving[np.abs(step[:, RELEASE]) >= SETTLED_FRAMES * frames[moving]]
         if not moving.size:
             break
-    return own, square
+    return trial_effects, square
 
 
-def _sums(predictor: Predictor, own: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
+def _sums(predictor: Predictor, trial_effects: Floats, rows: NDArray[np.int_], rho: float) -> Floats:
     """Whitened products of [release, origin, residual] of some trials, shape (n_rows, 3, 3)."""
-    jobs = predictor.jobs(np.empty(0), own)
+    jobs = predictor.jobs(np.empty(0), trial_effects)
     later = [row for row in rows.tolist() if not predictor.plain_release[row]]
     steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in later}
     moved = predictor.run(
-        [jobs[row] for row in rows] + [replace(jobs[k], release_s=own[k, RELEASE] + steps[k]) for k in later]
+        [jobs[row] for row in rows] + [replace(jobs[k], release_s=trial_effects[k, RELEASE] + steps[k]) for k in later]
     )
     shifted = dict(zip(later, moved[rows.size :], strict=True))
     columns = []
@@ -188,6 +200,6 @@ def _sums(predictor: Predictor, own: Floats, rows: NDArray[np.int_], rho: float)
         answer = -plain.lead_velocity_m_s
         if row in shifted:
             answer = (shifted[row].observed_position_m - plain.observed_position_m) / steps[row]
-        residual = predictor.data[row].lead_position_m - own[row, ORIGIN] - plain.observed_position_m
+        residual = predictor.data[row].lead_position_m - trial_effects[row, ORIGIN] - plain.observed_position_m
         columns.append(np.column_stack([answer, np.ones_like(answer), residual]))
     return at_correlation(all_products(columns, [predictor.data[row].first for row in rows]), rho)

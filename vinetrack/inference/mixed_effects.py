@@ -56,7 +56,7 @@ class FitState:
     """
 
     theta: Floats
-    own: Floats
+    trial_effects: Floats
     spread: tuple[float, float]
     rho: float
     variance: Floats
@@ -89,96 +89,96 @@ class MixedProblem:
     random: NDArray[np.bool_] | None = None
 
 
-def trial_effect_prior(frame: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
+def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
     """Centre and precision of each trial's own numbers, shape (n_trials, 4) each."""
-    n = frame.index.shape[0]
+    n = problem.index.shape[0]
     centre, precision = np.zeros((n, OWN)), np.ones((n, OWN))
-    centre[:, :2], precision[:, :2] = frame.own_centre, frame.own_precision
-    precision[:, SPREAD_COLUMNS] = 1 / np.maximum(spreads(frame, state.spread), LEAST_SPREAD) ** 2
+    centre[:, :2], precision[:, :2] = problem.own_centre, problem.own_precision
+    precision[:, SPREAD_COLUMNS] = 1 / np.maximum(spreads(problem, state.spread), LEAST_SPREAD) ** 2
     return centre, precision
 
 
-def spreads(frame: MixedProblem, spread: tuple[float, float]) -> Floats:
+def spreads(problem: MixedProblem, spread: tuple[float, float]) -> Floats:
     """Standard deviations of each trial's pressure and B, shape (n_trials, 2): a measured pressure has its own."""
-    each = np.tile(spread, (frame.gauge_error.size, 1))
-    each[:, 0] = np.where(frame.gauge_error > 0, frame.gauge_error, each[:, 0])
+    each = np.tile(spread, (problem.gauge_error.size, 1))
+    each[:, 0] = np.where(problem.gauge_error > 0, problem.gauge_error, each[:, 0])
     return each
 
 
-def shared_penalty(frame: MixedProblem, state: FitState) -> float:
+def shared_penalty(problem: MixedProblem, state: FitState) -> float:
     """What the priors of the free numbers add to the sum of squares."""
-    return float(np.sum(frame.prior_precision * (state.theta - frame.prior_mean) ** 2))
+    return float(np.sum(problem.prior_precision * (state.theta - problem.prior_mean) ** 2))
 
 
-def trial_effect_penalty(frame: MixedProblem, state: FitState) -> Floats:
+def trial_effect_penalty(problem: MixedProblem, state: FitState) -> Floats:
     """What the priors of the trials' own numbers add, shape (n_trials,)."""
-    centre, precision = trial_effect_prior(frame, state)
-    return np.asarray(np.sum(precision * (state.own - centre) ** 2, axis=1))
+    centre, precision = trial_effect_prior(problem, state)
+    return np.asarray(np.sum(precision * (state.trial_effects - centre) ** 2, axis=1))
 
 
-def cross_products(blocks: Floats, frame: MixedProblem) -> Floats:
+def cross_products(blocks: Floats, problem: MixedProblem) -> Floats:
     """Sum blocks of the trials' columns, shape (n_trials, n_keys, n_keys), into those of all free numbers."""
-    p = frame.prior_mean.size
+    p = problem.prior_mean.size
     total = np.zeros((p + 1, p + 1))
-    np.add.at(total, (frame.index[:, :, None], frame.index[:, None, :]), blocks)
+    np.add.at(total, (problem.index[:, :, None], problem.index[:, None, :]), blocks)
     return total[:p, :p]
 
 
-def cross_products_vector(blocks: Floats, frame: MixedProblem) -> Floats:
+def cross_products_vector(blocks: Floats, problem: MixedProblem) -> Floats:
     """As `cross_products`, for vectors, shape (n_trials, n_keys)."""
-    total = np.zeros(frame.prior_mean.size + 1)
-    np.add.at(total, frame.index, blocks)
+    total = np.zeros(problem.prior_mean.size + 1)
+    np.add.at(total, problem.index, blocks)
     return total[:-1]
 
 
-def newton_step(grams: Floats, frame: MixedProblem, state: FitState, damping: float) -> tuple[Floats, Floats, float]:
+def newton_step(grams: Floats, problem: MixedProblem, state: FitState, damping: float) -> tuple[Floats, Floats, float]:
     """Step of all unknowns towards the minimum of the penalised sum of squares, and the decrease it promises.
 
     Numbers at a bound that want to go beyond it stay. `damping` is that of Levenberg and Marquardt.
     """
     white = at_correlation(grams, state.rho) / state.variance[:, None, None]
-    centre, precision = trial_effect_prior(frame, state)
+    centre, precision = trial_effect_prior(problem, state)
     own_square = white[:, :OWN, :OWN] + precision[:, :, None] * np.eye(OWN)
-    own_slope = white[:, :OWN, -1] - precision * (state.own - centre)
+    own_slope = white[:, :OWN, -1] - precision * (state.trial_effects - centre)
     damped = own_square * (1 + damping * np.eye(OWN))
     mixed = white[:, :OWN, OWN:-1]
     solved = solve_each(damped, np.concatenate([mixed, own_slope[:, :, None]], axis=2))
-    square = cross_products(white[:, OWN:-1, OWN:-1], frame) + np.diag(frame.prior_precision)
-    slope = cross_products_vector(white[:, OWN:-1, -1], frame) - frame.prior_precision * (
-        state.theta - frame.prior_mean
+    square = cross_products(white[:, OWN:-1, OWN:-1], problem) + np.diag(problem.prior_precision)
+    slope = cross_products_vector(white[:, OWN:-1, -1], problem) - problem.prior_precision * (
+        state.theta - problem.prior_mean
     )
     reduced = square * (1 + damping * np.eye(square.shape[0]))
-    reduced = reduced - cross_products(np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], frame)
-    reduced_slope = slope - cross_products_vector(np.einsum("nuk,nu->nk", mixed, solved[:, :, -1]), frame)
-    step = _bounded_solve(reduced, reduced_slope, frame, state.theta)
-    spread_out = np.append(step, 0.0)[frame.index]
+    reduced = reduced - cross_products(np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
+    reduced_slope = slope - cross_products_vector(np.einsum("nuk,nu->nk", mixed, solved[:, :, -1]), problem)
+    step = _bounded_solve(reduced, reduced_slope, problem, state.theta)
+    spread_out = np.append(step, 0.0)[problem.index]
     trial_effect_step = solved[:, :, -1] - np.einsum("nuk,nk->nu", solved[:, :, :-1], spread_out)
     promised = float(step @ slope + np.sum(trial_effect_step * own_slope))
     return step, trial_effect_step, promised
 
 
-def trial_effect_step(grams: Floats, frame: MixedProblem, state: FitState, *, pinned: bool = False) -> Floats:
+def trial_effect_step(grams: Floats, problem: MixedProblem, state: FitState, *, pinned: bool = False) -> Floats:
     """Step of the trials' own numbers alone, shape (n_trials, 4); `pinned` leaves the release where it is."""
     white = at_correlation(grams, state.rho) / state.variance[:, None, None]
-    centre, precision = trial_effect_prior(frame, state)
+    centre, precision = trial_effect_prior(problem, state)
     square = white[:, :OWN, :OWN] + precision[:, :, None] * np.eye(OWN)
-    slope = white[:, :OWN, -1] - precision * (state.own - centre)
+    slope = white[:, :OWN, -1] - precision * (state.trial_effects - centre)
     if pinned:
         square[:, RELEASE, :] = square[:, :, RELEASE] = slope[:, RELEASE] = 0.0
         square[:, RELEASE, RELEASE] = 1.0
     return np.asarray(solve_each(square, slope[:, :, None])[:, :, 0])
 
 
-def _bounded_solve(square: Floats, slope: Floats, frame: MixedProblem, theta: Floats) -> Floats:
+def _bounded_solve(square: Floats, slope: Floats, problem: MixedProblem, theta: Floats) -> Floats:
     """Solve for the numbers that may move; one at its bound that would leave it is held and the rest solved again."""
-    moving = frame.free & (np.diag(square) > 0)
+    moving = problem.free & (np.diag(square) > 0)
     step = np.zeros_like(slope)
     for _ in range(slope.size + 1):
         step[:] = 0.0
         k = np.flatnonzero(moving)
         if k.size:
             step[k] = solve_scaled(square[np.ix_(k, k)], slope[k])
-        out = moving & (((theta <= frame.lower) & (step < 0)) | ((theta >= frame.upper) & (step > 0)))
+        out = moving & (((theta <= problem.lower) & (step < 0)) | ((theta >= problem.upper) & (step > 0)))
         if not out.any():
             break
         moving &= ~out
@@ -208,23 +208,23 @@ def solve_each(square: Floats, right: Floats) -> Floats:
     return np.asarray(scale[:, :, None] * np.linalg.solve(even, scale[:, :, None] * right))
 
 
-def trial_effects_eliminated(grams: Floats, n_keys: int, frame: MixedProblem, state: FitState) -> Floats:
+def trial_effects_eliminated(grams: Floats, n_keys: int, problem: MixedProblem, state: FitState) -> Floats:
     """Products of keys, residual and what follows in units of the noise, each trial's own numbers integrated out.
 
     `grams` are those of [own numbers, keys, residual, more].
     """
     white = at_correlation(grams, state.rho) / state.variance[:, None, None]
     white = _put_back(white, state, OWN + n_keys)
-    own = white[:, :OWN, :OWN] + trial_effect_prior(frame, state)[1][:, :, None] * np.eye(OWN)
+    within_trial = white[:, :OWN, :OWN] + trial_effect_prior(problem, state)[1][:, :, None] * np.eye(OWN)
     side = white[:, :OWN, OWN:]
-    return np.asarray(white[:, OWN:, OWN:] - np.swapaxes(side, 1, 2) @ solve_each(own, side))
+    return np.asarray(white[:, OWN:, OWN:] - np.swapaxes(side, 1, 2) @ solve_each(within_trial, side))
 
 
 def _put_back(white: Floats, state: FitState, residual: int) -> Floats:
     """The products with what the deviations explain so far put back into the column of the residual."""
     turn = np.broadcast_to(np.eye(white.shape[1]), white.shape).copy()
     for column in SPREAD_COLUMNS:
-        turn[:, column, residual] = state.own[:, column]
+        turn[:, column, residual] = state.trial_effects[:, column]
     return np.asarray(np.swapaxes(turn, 1, 2) @ white @ turn)
 
 
@@ -240,50 +240,50 @@ class Marginal:
     log_constant: float
 
 
-def marginal(grams: Floats, frame: MixedProblem, state: FitState) -> Marginal:
+def marginal(grams: Floats, problem: MixedProblem, state: FitState) -> Marginal:
     """Eliminate release and origin, and put back what the deviations explain so far."""
     white = at_correlation(grams, state.rho) / state.variance[:, None, None]
     white = _put_back(white, state, -1)
-    flat = white[:, :2, :2] + frame.own_precision[:, :, None] * np.eye(2)
+    flat = white[:, :2, :2] + problem.own_precision[:, :, None] * np.eye(2)
     rest = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_each(flat, white[:, :2, 2:])
-    log_noise = np.sum(frame.points * np.log(state.variance)) - np.sum(frame.stretches) * math.log(1 - state.rho**2)
-    log_flat = np.sum(np.linalg.slogdet(flat)[1] - np.log(frame.own_precision).sum(axis=1))
-    return Marginal(rest, float(log_noise + log_flat + np.sum(frame.points) * math.log(2 * math.pi)))
+    log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
+    log_flat = np.sum(np.linalg.slogdet(flat)[1] - np.log(problem.own_precision).sum(axis=1))
+    return Marginal(rest, float(log_noise + log_flat + np.sum(problem.points) * math.log(2 * math.pi)))
 
 
-def left_to_keys(part: Marginal, frame: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
+def left_to_keys(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
     """What every trial says of its keys once all it has of its own is integrated out, and what that took.
 
     Shapes (n_trials, n_keys + 1, n_keys + 1), the last row and column the rest, and (n_trials, 2, 2).
     """
-    root = spreads(frame, spread) * frame.feels
+    root = spreads(problem, spread) * problem.feels
     inner = np.eye(2) + root[:, :, None] * part.blocks[:, :2, :2] * root[:, None, :]
     side = root[:, :, None] * part.blocks[:, :2, 2:]
     return part.blocks[:, 2:, 2:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(inner, side), inner
 
 
 def normal_equations(
-    part: Marginal, frame: MixedProblem, state: FitState, spread: tuple[float, float]
+    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
 ) -> tuple[Floats, Floats, float, float]:
     """Information of the free numbers, its slope, the sum of squares and the log-determinant at these spreads."""
-    left, inner = left_to_keys(part, frame, spread)
-    information = cross_products(left[:, :-1, :-1], frame) + np.diag(frame.prior_precision)
-    away = state.theta - frame.prior_mean
-    slope = cross_products_vector(left[:, :-1, -1], frame) - frame.prior_precision * away
-    square = float(np.sum(left[:, -1, -1]) + np.sum(frame.prior_precision * away**2))
+    left, inner = left_to_keys(part, problem, spread)
+    information = cross_products(left[:, :-1, :-1], problem) + np.diag(problem.prior_precision)
+    away = state.theta - problem.prior_mean
+    slope = cross_products_vector(left[:, :-1, -1], problem) - problem.prior_precision * away
+    square = float(np.sum(left[:, -1, -1]) + np.sum(problem.prior_precision * away**2))
     return information, slope, square, float(np.sum(np.linalg.slogdet(inner)[1]))
 
 
 def deviance(
-    part: Marginal, frame: MixedProblem, state: FitState, spread: tuple[float, float], *, restricted: bool = True
+    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float], *, restricted: bool = True
 ) -> float:
     """−2 ln of the (restricted) likelihood of the spreads, the free numbers at their best for them."""
-    information, slope, square, log_det = normal_equations(part, frame, state, spread)
-    moves = frame.free & (np.diag(information) > 0)
-    if ((state.theta <= frame.lower) | (state.theta >= frame.upper)).any():
+    information, slope, square, log_det = normal_equations(part, problem, state, spread)
+    moves = problem.free & (np.diag(information) > 0)
+    if ((state.theta <= problem.lower) | (state.theta >= problem.upper)).any():
         # What would rather lie beyond its bound must not be credited with what it would explain there.
-        step = _bounded_solve(information, slope, frame, state.theta)
-        moves &= (step != 0) | ((state.theta > frame.lower) & (state.theta < frame.upper))
+        step = _bounded_solve(information, slope, problem, state.theta)
+        moves &= (step != 0) | ((state.theta > problem.lower) & (state.theta < problem.upper))
     k = np.flatnonzero(moves)
     total = square + log_det + part.log_constant
     if k.size:
@@ -291,8 +291,8 @@ def deviance(
         total -= float(slope[k] @ solve_scaled(inside, slope[k]))
         if restricted:
             total += float(np.linalg.slogdet(inside)[1])
-        elif frame.random is not None and frame.random[k].any():
-            total += _groups_integrated(inside, frame.prior_precision[k], frame.random[k])
+        elif problem.random is not None and problem.random[k].any():
+            total += _groups_integrated(inside, problem.prior_precision[k], problem.random[k])
     return total
 
 
@@ -308,7 +308,7 @@ def _groups_integrated(information: Floats, prior_precision: Floats, random: NDA
 
 def estimate_spreads(
     part: Marginal,
-    frame: MixedProblem,
+    problem: MixedProblem,
     state: FitState,
     estimable: tuple[bool, bool],
     *,
@@ -332,7 +332,7 @@ def estimate_spreads(
         return spread[0], spread[1]
 
     def cost(logs: Floats) -> float:
-        return deviance(part, frame, state, at(logs), restricted=restricted)
+        return deviance(part, problem, state, at(logs), restricted=restricted)
 
     start = np.log(np.maximum([state.spread[k] for k in which], 1e-3))
     if search:
@@ -347,7 +347,7 @@ def estimate_spreads(
 
 
 def estimate_noise(
-    grams: Floats, frame: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
+    grams: Floats, problem: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
 ) -> tuple[float, Floats]:
     """Correlation of the noise, the same for all trials, and the variance of its innovations in each, m².
 
@@ -356,11 +356,11 @@ def estimate_noise(
     the shared numbers in every trial too, so that what trials disagree by does not pass for noise.
     """
     grid = CORRELATIONS if rho is None else np.array([rho])
-    centre, precision = trial_effect_prior(frame, state)
+    centre, precision = trial_effect_prior(problem, state)
     stiff = precision * state.variance[:, None]
-    pull_back = stiff * (state.own - centre)
-    freed = OWN + frame.index.shape[1] if within else OWN
-    shared = 0.0 if within else np.count_nonzero(frame.free) / frame.index.shape[0]
+    pull_back = stiff * (state.trial_effects - centre)
+    freed = OWN + problem.index.shape[1] if within else OWN
+    shared = 0.0 if within else np.count_nonzero(problem.free) / problem.index.shape[0]
     if within:
         stiff = np.concatenate([stiff, _loose(grams, freed)], axis=1)
         pull_back = np.pad(pull_back, ((0, 0), (0, freed - OWN)))
@@ -369,17 +369,17 @@ def estimate_noise(
         white = at_correlation(grams, float(value))
         inner = white[:, :freed, :freed] + stiff[:, :, None] * np.eye(freed)
         taken = np.einsum("nkk->n", solve_each(inner, white[:, :freed, :freed])) + shared
-        dof = np.maximum(frame.points - taken, 1.0)
+        dof = np.maximum(problem.points - taken, 1.0)
         pull = white[:, :freed, -1] - pull_back
         gain = np.sum(pull * solve_each(inner, pull[:, :, None])[:, :, 0], axis=1)
         least = WITHIN_LEAST if within else 0.2
         square = np.maximum(white[:, -1, -1] - gain, least * white[:, -1, -1])
-        score = np.sum(dof * np.log(square / dof)) - np.sum(frame.stretches) * math.log(1 - value**2)
+        score = np.sum(dof * np.log(square / dof)) - np.sum(problem.stretches) * math.log(1 - value**2)
         scores.append(score + np.sum(np.linalg.slogdet(inner)[1]))
         squares.append((square, dof))
     best = int(np.argmin(scores))
     if rho is None:
-        return estimate_noise(grams, frame, state, _lowest(grid, np.array(scores), best), within=within)
+        return estimate_noise(grams, problem, state, _lowest(grid, np.array(scores), best), within=within)
     return rho, _draw_together(*squares[0])
 
 

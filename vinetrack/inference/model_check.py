@@ -77,11 +77,11 @@ def _steady_covariance(damping: Mapping[str, Any], vine: str) -> Floats:
     return np.array(damping["covariance"]["matrix"], dtype=float)[np.ix_(k, k)]
 
 
-def _trajectory_covariance(found: Fit, name: str) -> Floats:
+def _trajectory_covariance(fit: Fit, name: str) -> Floats:
     """Covariance of n and ln B from the trajectories."""
-    k = [found.numbers.index(found[EXPONENT]), found.numbers.index(found[name])]
-    slopes = np.array([1.0, 1 / found[name].value])
-    return np.asarray(found.covariance[np.ix_(k, k)] * slopes[:, None] * slopes)
+    k = [fit.numbers.index(fit[EXPONENT]), fit.numbers.index(fit[name])]
+    slopes = np.array([1.0, 1 / fit[name].value])
+    return np.asarray(fit.covariance[np.ix_(k, k)] * slopes[:, None] * slopes)
 
 
 def _deviate(apart: Floats, covariance: Floats) -> float:

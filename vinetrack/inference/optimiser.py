@@ -91,7 +91,7 @@ class Solution:
     """Where the iterations ended. `grams` and `columns` belong to `state`, see `whitened` and `sensitivity`."""
 
     state: FitState
-    frame: MixedProblem
+    problem: MixedProblem
     grams: Floats
     columns: tuple[Floats, ...]
     estimable: tuple[bool, bool]
@@ -116,76 +116,80 @@ Watch = Callable[[Step], None]
 """Told of every step; what it raises ends the fit."""
 
 
-def make_problem(predictor: Predictor, own: Floats) -> MixedProblem:
+def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
     """What stays the same during the iterations; `own` holds the first guess of releases and origins."""
     layout, data = predictor.layout, predictor.data
     lower, upper = layout.bounds
-    durations = np.array([item.time_s[-1] - item.time_s[0] for item in data])
-    spans = np.array([np.ptp(item.lead_position_m) for item in data])
-    frames = np.array([item.frame_s for item in data])
-    rests = np.array([item.shows_rest for item in data])
-    known = rests | np.array([item.let_in for item in data])
-    vague = np.array([0.0 if item.vague_rest is None else item.vague_rest.sigma_m for item in data])
+    durations = np.array([trial_data.time_s[-1] - trial_data.time_s[0] for trial_data in data])
+    spans = np.array([np.ptp(trial_data.lead_position_m) for trial_data in data])
+    frames = np.array([trial_data.frame_s for trial_data in data])
+    rests = np.array([trial_data.shows_rest for trial_data in data])
+    known = rests | np.array([trial_data.let_in for trial_data in data])
+    vague = np.array([0.0 if trial_data.vague_rest is None else trial_data.vague_rest.sigma_m for trial_data in data])
     release_sd = np.where(rests, RELEASE_ROOM_FRAMES * frames, 3 * durations)
-    release_sd[[item.let_in for item in data]] = KNOWN_RELEASE_S
-    noise = np.array([item.noise_m for item in data])
+    release_sd[[trial_data.let_in for trial_data in data]] = KNOWN_RELEASE_S
+    noise = np.array([trial_data.noise_m for trial_data in data])
     room = np.maximum(ORIGIN_ROOM_SIGMAS * np.maximum(noise, vague), 1e-4 * spans)
     origin_sd = np.where(rests, room, 3 * spans)
     return MixedProblem(
         index=layout.index,
         feels=np.column_stack([predictor.feels_pressure, predictor.feels_damping]),
-        gauge_error=np.array([item.gauge_error for item in data]),
-        own_centre=np.where(known[:, None], initial_trial_effects(data)[:, :2], own[:, :2]),
+        gauge_error=np.array([trial_data.gauge_error for trial_data in data]),
+        own_centre=np.where(known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
         own_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
         prior_mean=layout.start,
         prior_precision=layout.prior_precision,
         lower=lower,
         upper=upper,
         free=np.ones(lower.size, dtype=bool),
-        points=np.array([float(item.time_s.size) for item in data]),
-        stretches=np.array([float(np.count_nonzero(item.first)) for item in data]),
+        points=np.array([float(trial_data.time_s.size) for trial_data in data]),
+        stretches=np.array([float(np.count_nonzero(trial_data.first)) for trial_data in data]),
         random=layout.random if layout.between else None,
     )
 
 
-def first_state(data: Sequence[FitTrial], theta: Floats, own: Floats) -> FitState:
+def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) -> FitState:
     """A state to begin from: noise of the tracks alone, spreads as the sheet and experience say."""
     rho = track_correlation(data)
-    variance = np.array([item.noise_m**2 * (1 - item.correlation**2) for item in data])
-    return FitState(theta, own, stated_spreads(data), rho, np.maximum(variance, floor(data)))
+    variance = np.array([trial_data.noise_m**2 * (1 - trial_data.correlation**2) for trial_data in data])
+    return FitState(theta, trial_effects, stated_spreads(data), rho, np.maximum(variance, floor(data)))
 
 
 def track_correlation(data: Sequence[FitTrial]) -> float:
     """Lag-one correlation of the noise as the tracks alone show it."""
-    return float(np.average([item.correlation for item in data], weights=[item.time_s.size for item in data]))
+    return float(
+        np.average(
+            [trial_data.correlation for trial_data in data], weights=[trial_data.time_s.size for trial_data in data]
+        )
+    )
 
 
 def stated_spreads(data: Sequence[FitTrial]) -> tuple[float, float]:
     """Spread of pressure that the sheet states, and 3 % for B."""
     relative = [
-        item.trial.pressure_sigma_Pa / item.trial.pressure_Pa
-        for item in data
-        if item.trial.pressure_Pa > 0 and np.isfinite(item.trial.pressure_sigma_Pa)
+        trial_data.trial.pressure_sigma_Pa / trial_data.trial.pressure_Pa
+        for trial_data in data
+        if trial_data.trial.pressure_Pa > 0 and np.isfinite(trial_data.trial.pressure_sigma_Pa)
     ]
     return (float(np.mean(relative)) if relative else FIRST_SPREADS[0]), FIRST_SPREADS[1]
 
 
 def floor(data: Sequence[FitTrial]) -> Floats:
     """Least variance of a position that the integrator can answer for, m², shape (n_trials,)."""
-    return np.array([(EXACT_PART * np.ptp(item.lead_position_m)) ** 2 for item in data])
+    return np.array([(EXACT_PART * np.ptp(trial_data.lead_position_m)) ** 2 for trial_data in data])
 
 
-def estimable(frame: MixedProblem) -> tuple[bool, bool]:
+def estimable(problem: MixedProblem) -> tuple[bool, bool]:
     """Whether there are trials enough to estimate the spread of pressure, and that of B."""
-    needed = np.count_nonzero(frame.prior_precision == 0) + FEWEST_TO_SPARE
-    varied = frame.feels & np.column_stack([frame.gauge_error == 0, np.ones(frame.gauge_error.size, dtype=bool)])
+    needed = np.count_nonzero(problem.prior_precision == 0) + FEWEST_TO_SPARE
+    varied = problem.feels & np.column_stack([problem.gauge_error == 0, np.ones(problem.gauge_error.size, dtype=bool)])
     pressure, damping = (bool(np.count_nonzero(varied[:, k]) >= needed) for k in range(2))
     return pressure, damping
 
 
 def solve(
     predictor: Predictor,
-    frame: MixedProblem,
+    problem: MixedProblem,
     state: FitState,
     held: FixedTerms | None = None,
     *,
@@ -201,7 +205,7 @@ def solve(
         If the trajectories of the start cannot be followed.
     """
     held = held or FixedTerms()
-    can = (False, False) if held.spread is not None else estimable(frame)
+    can = (False, False) if held.spread is not None else estimable(problem)
     if held.spread is not None:
         state = replace(state, spread=held.spread)
     if held.noise is not None:
@@ -217,15 +221,15 @@ def solve(
         search = early and iteration > EARLY_ITERATIONS and near
         early = early and not search
         before = state
-        state = _update_variances(predictor, frame, grams, state, can, held, early=early, search=search)
+        state = _update_variances(predictor, problem, grams, state, can, held, early=early, search=search)
         moved = variances_moved(before, state)
-        step, own_change, promised = newton_step(grams, frame, state, damping)
+        step, own_change, promised = newton_step(grams, problem, state, damping)
         if watch is not None:
             watch(_step_report(predictor, state, iteration, promised))
         settled = promised < SETTLED_DECREASE
         if looks and (settled or (promised < NEARLY_SETTLED and not in_vain) or iteration >= looked + PATIENCE):
             looked, in_vain = iteration, True
-            jumped = search_releases(predictor, frame, state)
+            jumped = search_releases(predictor, problem, state)
             if jumped is not None:
                 state, (columns, grams) = jumped, _about(predictor, jumped)
                 looks, in_vain = looks - 1, False
@@ -234,7 +238,7 @@ def solve(
         if settled and moved < SETTLED_SPREAD and not early:
             converged = True
             break
-        taken, damping = _take_step(predictor, frame, grams, state, step, own_change, damping)
+        taken, damping = _take_step(predictor, problem, grams, state, step, own_change, damping)
         if taken is None:
             # No step helps: a corner of the cost, where a frame meets the end of growth. It is as low as it gets.
             converged = moved < SETTLED_SPREAD
@@ -247,12 +251,12 @@ def solve(
             # A neighbour of the new place cannot be followed: what was reached before is worth more than nothing.
             break
         state = taken
-    return Solution(state, frame, grams, tuple(columns), can, converged, iteration)
+    return Solution(state, problem, grams, tuple(columns), can, converged, iteration)
 
 
 def _about(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:
     """Sensitivities at a state, and their sums of products."""
-    columns = predictor.linearise(state.theta, state.own)
+    columns = predictor.linearise(state.theta, state.trial_effects)
     return columns, predictor.products(columns)
 
 
@@ -265,17 +269,17 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     """What the model leaves against the noise that the tracks show alone, of their correlation; NaN if none do."""
     data = predictor.data
     rho = track_correlation(data)
-    noise = np.array([item.noise_m**2 for item in data]) * (1 - rho**2)
+    noise = np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2)
     if not (noise > 0).all():
         return math.nan
     left = at_correlation(solution.grams, rho)[:, -1, -1]
-    taken = np.count_nonzero(solution.frame.free) / left.size + 2 + solution.frame.feels.any(axis=1)
-    return float(np.sum(left / noise) / np.sum(np.maximum(solution.frame.points - taken, 1.0)))
+    taken = np.count_nonzero(solution.problem.free) / left.size + 2 + solution.problem.feels.any(axis=1)
+    return float(np.sum(left / noise) / np.sum(np.maximum(solution.problem.points - taken, 1.0)))
 
 
 def _update_variances(
     predictor: Predictor,
-    frame: MixedProblem,
+    problem: MixedProblem,
     grams: Floats,
     state: FitState,
     can: tuple[bool, bool],
@@ -287,10 +291,10 @@ def _update_variances(
     """Noise and spreads anew; while the trajectories are still far off only the size of what is left."""
     if held.noise is None:
         known = state.rho if early or held.correlation is not None else None
-        rho, variance = estimate_noise(grams, frame, state, known)
+        rho, variance = estimate_noise(grams, problem, state, known)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
     if not early and any(can):
-        spread = estimate_spreads(marginal(grams, frame, state), frame, state, can, search=search)
+        spread = estimate_spreads(marginal(grams, problem, state), problem, state, can, search=search)
         state = replace(state, spread=spread)
     return state
 
@@ -304,7 +308,7 @@ def variances_moved(before: FitState, after: FitState) -> float:
 
 def _take_step(
     predictor: Predictor,
-    frame: MixedProblem,
+    problem: MixedProblem,
     grams: Floats,
     state: FitState,
     step: Floats,
@@ -315,36 +319,36 @@ def _take_step(
 
     A step too long for a curved valley is right in its direction, which damping would turn across the valley.
     """
-    now = cost(predictor, frame, state)
+    now = cost(predictor, problem, state)
     for part in SHORTER:
-        tried = _tried(predictor, frame, state, part * step, part * own_change, now)
+        tried = _tried(predictor, problem, state, part * step, part * own_change, now)
         if tried is not None:
             return tried, damping * 0.1 if damping > 1e-6 else 0.0
     for _ in range(MOST_DAMPED):
         damping = max(10 * damping, 1e-4)
-        step, own_change, _ = newton_step(grams, frame, state, damping)
-        tried = _tried(predictor, frame, state, step, own_change, now)
+        step, own_change, _ = newton_step(grams, problem, state, damping)
+        tried = _tried(predictor, problem, state, step, own_change, now)
         if tried is not None:
             return tried, damping * 0.1
     return None, 0.0
 
 
 def _tried(
-    predictor: Predictor, frame: MixedProblem, state: FitState, step: Floats, own_change: Floats, now: float
+    predictor: Predictor, problem: MixedProblem, state: FitState, step: Floats, own_change: Floats, now: float
 ) -> FitState | None:
     """The state after a step, if that lowers the sum of squares."""
-    theta = np.clip(state.theta + step, frame.lower, frame.upper)
+    theta = np.clip(state.theta + step, problem.lower, problem.upper)
     try:
-        there = replace(state, theta=theta, own=limited(predictor, state.own, own_change))
-        there, costs = follow_trial_effects(predictor, frame, there)
+        there = replace(state, theta=theta, trial_effects=limited(predictor, state.trial_effects, own_change))
+        there, costs = follow_trial_effects(predictor, problem, there)
     except SimulationError:
         return None
-    return there if float(np.sum(costs)) + shared_penalty(frame, there) < now else None
+    return there if float(np.sum(costs)) + shared_penalty(problem, there) < now else None
 
 
-def cost(predictor: Predictor, frame: MixedProblem, state: FitState) -> float:
+def cost(predictor: Predictor, problem: MixedProblem, state: FitState) -> float:
     """Whitened sum of squares of all trials with what the priors add."""
-    return float(np.sum(trial_costs(predictor, frame, state))) + shared_penalty(frame, state)
+    return float(np.sum(trial_costs(predictor, problem, state))) + shared_penalty(problem, state)
 
 
 __all__ = ["FixedTerms", "Solution", "Step", "Watch", "cost", "estimable", "first_state", "make_problem", "solve"]

@@ -203,7 +203,7 @@ def make_layout(
         if how not in ("all", "vine"):
             raise FitError(f"{name} is shared by {how!r}: say 'all' or 'vine'.")
     chosen = [name for name in known if name not in held and (name in wanted or not known[name].held)]
-    vines = [item.trial.vine for item in data]
+    vines = [trial_data.trial.vine for trial_data in data]
     numbers: list[FreeParameter] = []
     index = np.full((len(data), 0), -1)
     for name in chosen:
@@ -282,10 +282,10 @@ def _yield_pressures(data: Sequence[FitTrial], offset: int) -> tuple[list[FreePa
     numbers: list[FreeParameter] = []
     places: dict[tuple[str, float], int] = {}
     column = np.full(len(data), -1)
-    stated = {(item.trial.vine, round(item.trial.yield_pressure_Pa, 3)) for item in data}
+    stated = {(trial_data.trial.vine, round(trial_data.trial.yield_pressure_Pa, 3)) for trial_data in data}
     several = {vine for vine, _ in stated if sum(vine == other for other, _ in stated) > 1}
-    for i, item in enumerate(data):
-        trial = item.trial
+    for i, trial_data in enumerate(data):
+        trial = trial_data.trial
         sigma_Pa, stated_Pa = trial.yield_pressure_sigma_Pa, trial.yield_pressure_Pa
         if trial.travel_ratio == 1 or not (math.isfinite(sigma_Pa) and sigma_Pa > 0 and math.isfinite(stated_Pa)):
             continue

@@ -81,7 +81,7 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
         return None
     shapes = _shapes(predictor, solution)
     count = shapes[0].shape[1]
-    problem = with_shapes(solution.frame, count) if count else solution.frame
+    problem = with_shapes(solution.problem, count) if count else solution.problem
     state = replace(solution.state, theta=np.append(solution.state.theta, np.zeros(count)))
     columns: Sequence[Floats] = solution.columns
     for _ in range(MOST_STEPS):
@@ -89,7 +89,7 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
         grams = predictor.products(wide)
         rho, variance = estimate_noise(grams, problem, state, within=True)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
-        found = _weighed(replace(solution, state=state, frame=problem, grams=grams, columns=tuple(wide)), shared)
+        found = _weighed(replace(solution, state=state, problem=problem, grams=grams, columns=tuple(wide)), shared)
         step = found.covariance @ _slope(found, problem, state)
         scatter = np.sqrt(np.diag(found.covariance) + np.diag(found.between))
         longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
@@ -99,7 +99,7 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
         step = step * min(1.0, LONGEST_STEP / longest)
         state = _moved(found.solution, state, step)
         try:
-            columns = predictor.linearise(state.theta[:shared], state.own)
+            columns = predictor.linearise(state.theta[:shared], state.trial_effects)
         except SimulationError:
             return None
     return None
@@ -107,8 +107,10 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
 
 def _shapes(predictor: Predictor, solution: Solution) -> list[Floats]:
     grown = [
-        item.lead_position_m - own[ORIGIN] - columns[:, -1]
-        for item, own, columns in zip(predictor.data, solution.state.own, solution.columns, strict=True)
+        trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
+        for trial_data, trial_effects, columns in zip(
+            predictor.data, solution.state.trial_effects, solution.columns, strict=True
+        )
     ]
     return position_shapes(predictor, grown)
 
@@ -126,27 +128,27 @@ def _slope(found: Pooled, problem: MixedProblem, state: FitState) -> Floats:
 
 def _moved(solution: Solution, state: FitState, step: Floats) -> FitState:
     """The state a step further, releases, origins and deviations of the trials following to first order."""
-    frame = solution.frame
-    theta = np.clip(state.theta + step, frame.lower, frame.upper)
-    change = np.append(theta - state.theta, 0.0)[frame.index]
+    problem = solution.problem
+    theta = np.clip(state.theta + step, problem.lower, problem.upper)
+    change = np.append(theta - state.theta, 0.0)[problem.index]
     turned = solution.grams.copy()
     # The residual once the numbers have moved: r − X δ.
     turned[..., -1] -= np.einsum("nsik,nk->nsi", solution.grams[..., OWN:-1], change)
-    own = state.own + trial_effect_step(turned, frame, state)
-    return replace(state, theta=theta, own=own)
+    trial_effects = state.trial_effects + trial_effect_step(turned, problem, state)
+    return replace(state, theta=theta, trial_effects=trial_effects)
 
 
 def _weighed(solution: Solution, shared: int) -> Pooled:
     """Weights of the trials at a state, τ² at its most likely value."""
-    frame, state = solution.frame, solution.state
-    size = frame.prior_mean.size
+    problem, state = solution.problem, solution.state
+    size = problem.prior_mean.size
     information, scores = trial_information(solution)
-    total = information.sum(axis=0) + np.diag(frame.prior_precision)
-    inside = (state.theta > frame.lower) & (state.theta < frame.upper)
-    live = np.flatnonzero(frame.free & inside & (np.diag(total) > 0))
+    total = information.sum(axis=0) + np.diag(problem.prior_precision)
+    inside = (state.theta > problem.lower) & (state.theta < problem.upper)
+    live = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
     root = _typical_root(inverse_among(total, live), information, shared)
-    prior = np.diag(frame.prior_precision)
-    own = state.theta - frame.prior_mean
+    prior = np.diag(problem.prior_precision)
+    trial_effects = state.theta - problem.prior_mean
 
     def weighed(tau2: float) -> tuple[Floats, Floats, float]:
         inner = np.eye(size) + tau2 * root.T @ information @ root
@@ -154,7 +156,7 @@ def _weighed(solution: Solution, shared: int) -> Pooled:
         weight = information - information @ less @ information
         score = scores - np.einsum("nij,nj->ni", information @ less, scores)
         inside_all = (weight.sum(axis=0) + prior)[np.ix_(live, live)]
-        slope = (score.sum(axis=0) - frame.prior_precision * own)[live]
+        slope = (score.sum(axis=0) - problem.prior_precision * trial_effects)[live]
         scale = 1 / np.sqrt(np.diag(inside_all))
         even = inside_all * scale[:, None] * scale
         gained = float((scale * slope) @ np.linalg.lstsq(even, scale * slope, rcond=1e-11)[0])
@@ -180,12 +182,12 @@ def trial_information(solution: Solution) -> tuple[Floats, Floats]:
     information : array, shape (n_trials, n_free, n_free)
     scores : array, shape (n_trials, n_free), the slopes of ln L
     """
-    frame = solution.frame
-    size, p = frame.prior_mean.size, frame.index.shape[1]
-    blocks = trial_effects_eliminated(solution.grams, p, frame, solution.state)
+    problem = solution.problem
+    size, p = problem.prior_mean.size, problem.index.shape[1]
+    blocks = trial_effects_eliminated(solution.grams, p, problem, solution.state)
     information = np.zeros((len(blocks), size + 1, size + 1))
     scores = np.zeros((len(blocks), size + 1))
-    for i, (block, places) in enumerate(zip(blocks, frame.index, strict=True)):
+    for i, (block, places) in enumerate(zip(blocks, problem.index, strict=True)):
         np.add.at(information[i], (places[:, None], places[None, :]), block[:p, :p])
         np.add.at(scores[i], places, block[:p, p])
     return information[:, :size, :size], scores[:, :size]
@@ -205,7 +207,7 @@ def _most_likely(deviance: Callable[[float], float]) -> float:
     from scipy.optimize import minimize_scalar
 
     logs = np.linspace(math.log(1e-2), math.log(LARGEST_TAU2), 24)
-    levels = [deviance(math.exp(one)) for one in logs]
+    levels = [deviance(math.exp(log)) for log in logs]
     best = int(np.argmin(levels))
     low, high = logs[max(best - 1, 0)], logs[min(best + 1, logs.size - 1)]
     found = minimize_scalar(lambda one: deviance(math.exp(one)), bounds=(low, high), method="bounded")

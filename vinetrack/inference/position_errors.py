@@ -63,7 +63,7 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
     `grown_m` is the growth at each point; a trial whose positions have no systematic error has zeros. The interval of
     the polynomials is that of all growth, for one camera sees all trials. No shapes where no trial has such an error.
     """
-    sigma_m = np.array([item.position_systematic_m for item in predictor.data])
+    sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
     if not (sigma_m > 0).any():
         return [np.zeros((one.size, 0)) for one in grown_m]
     reach = max(float(np.max(one)) for one in grown_m)
@@ -92,8 +92,10 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
     Trajectories are not followed anew: positions move by tenths of a millimetre, over which they are straight.
     """
     grown = [
-        item.lead_position_m - own[ORIGIN] - columns[:, -1]
-        for item, own, columns in zip(predictor.data, solution.state.own, solution.columns, strict=True)
+        trial_data.lead_position_m - trial_effects[ORIGIN] - columns[:, -1]
+        for trial_data, trial_effects, columns in zip(
+            predictor.data, solution.state.trial_effects, solution.columns, strict=True
+        )
     ]
     shapes = position_shapes(predictor, grown)
     count = shapes[0].shape[1]
@@ -104,19 +106,21 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
         for columns, shape in zip(solution.columns, shapes, strict=True)
     ]
     held = held or FixedTerms()
-    problem = with_shapes(solution.frame, count)
+    problem = with_shapes(solution.problem, count)
     start = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
     state, grams, moved, level = _iterated(predictor, solution, wide, problem, start, held)
     # A fit far off is not at its minimum, and a straight line promises more than there is: that part is the same
     # without the shapes, and is not theirs.
-    bare = _iterated(predictor, solution, solution.columns, solution.frame, solution.state, held)[3]
+    bare = _iterated(predictor, solution, solution.columns, solution.problem, solution.state, held)[3]
     left = [one[:, -1] - one[:, :-1] @ change for one, change in zip(wide, moved, strict=True)]
     return SmoothErrors(
-        solution=replace(solution, state=state, frame=problem, grams=grams, columns=tuple(_with_residual(wide, left))),
+        solution=replace(
+            solution, state=state, problem=problem, grams=grams, columns=tuple(_with_residual(wide, left))
+        ),
         gain=max(level - bare, 0.0),
         whitened=tuple(
-            whiten(one, item.first, state.rho, item.relative_sd) / np.sqrt(variance)
-            for one, item, variance in zip(left, predictor.data, state.variance, strict=True)
+            whiten(one, trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(variance)
+            for one, trial_data, variance in zip(left, predictor.data, state.variance, strict=True)
         ),
         displacement_m=tuple(shape @ state.theta[-count:] for shape in shapes),
     )
@@ -139,7 +143,7 @@ def _iterated(
         theta = np.clip(state.theta + step, problem.lower, problem.upper)
         change = np.column_stack([own_step, np.append(theta - state.theta, 0.0)[problem.index]])
         grams, moved = _moved(grams, change), moved + change
-        before = replace(state, theta=theta, own=state.own + own_step)
+        before = replace(state, theta=theta, trial_effects=state.trial_effects + own_step)
         state = _variances(predictor, problem, grams, before, solution, held)
         if promised < SETTLED and variances_moved(before, state) < SETTLED_SPREAD:
             break

@@ -60,55 +60,55 @@ DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
 error and bends it by 1e-4."""
 
 
-def search_releases(predictor: Predictor, frame: MixedProblem, state: FitState) -> FitState | None:
+def search_releases(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
     """The state with likelier releases; None if none is.
 
     Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than noise:
     another release would make up for something else.
     """
-    missed = trial_costs(predictor, frame, state) * state.variance / (1 - state.rho**2) / frame.points
+    missed = trial_costs(predictor, problem, state) * state.variance / (1 - state.rho**2) / problem.points
     places = [
         i
-        for i, item in enumerate(predictor.data)
-        if item.trace is None and (not item.shows_rest or missed[i] < HARDLY_MISSED * item.noise_m**2)
+        for i, trial_data in enumerate(predictor.data)
+        if trial_data.trace is None and (not trial_data.shows_rest or missed[i] < HARDLY_MISSED * trial_data.noise_m**2)
     ]
     if not places:
         return None
-    plain = predictor.jobs(state.theta, state.own)
-    releases = [_releases(predictor.data[i], float(state.own[i, RELEASE])) for i in places]
+    plain = predictor.jobs(state.theta, state.trial_effects)
+    releases = [_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
     answers = _answers(predictor, [plain[i] for i in places], releases)
-    own = state.own.copy()
+    trial_effects = state.trial_effects.copy()
     claimed = False
     for i, tried_s, answer in zip(places, releases, answers, strict=True):
-        there, gain = _best(predictor.data[i], i, frame, state, tried_s, *answer)
+        there, gain = _best(predictor.data[i], i, problem, state, tried_s, *answer)
         if gain > WORTH_MOVING:
-            own[i], claimed = there, True
-    kept = _borne_out(predictor, frame, state, replace(state, own=own)) if claimed else state
-    return None if np.array_equal(kept.own, state.own) else kept
+            trial_effects[i], claimed = there, True
+    kept = _borne_out(predictor, problem, state, replace(state, trial_effects=trial_effects)) if claimed else state
+    return None if np.array_equal(kept.trial_effects, state.trial_effects) else kept
 
 
-def _borne_out(predictor: Predictor, frame: MixedProblem, state: FitState, tried: FitState) -> FitState:
+def _borne_out(predictor: Predictor, problem: MixedProblem, state: FitState, tried: FitState) -> FitState:
     """Of both states the own numbers that fit a trial better, once those tried have settled: lines are not straight."""
     for _ in range(IMPROVED):
-        tried = follow_trial_effects(predictor, frame, tried)[0]
-    better = _levels(predictor, frame, tried) < _levels(predictor, frame, state) - WORTH_MOVING
-    return replace(state, own=np.where(better[:, None], tried.own, state.own))
+        tried = follow_trial_effects(predictor, problem, tried)[0]
+    better = _levels(predictor, problem, tried) < _levels(predictor, problem, state) - WORTH_MOVING
+    return replace(state, trial_effects=np.where(better[:, None], tried.trial_effects, state.trial_effects))
 
 
-def _levels(predictor: Predictor, frame: MixedProblem, state: FitState) -> Floats:
+def _levels(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
     """−2 ln L of every trial with its own numbers integrated out about where they stand, shape (n_trials,)."""
-    columns = predictor.linearise(state.theta, state.own, own_only=True)
+    columns = predictor.linearise(state.theta, state.trial_effects, own_only=True)
     white = at_correlation(predictor.products(columns), state.rho)
     square = white[:, :OWN, :OWN] / state.variance[:, None, None]
-    precision = trial_effect_prior(frame, state)[1]
+    precision = trial_effect_prior(problem, state)[1]
     log_volume = np.linalg.slogdet(square + precision[:, :, None] * np.eye(OWN))[1]
-    return np.asarray(trial_costs(predictor, frame, state) + log_volume)
+    return np.asarray(trial_costs(predictor, problem, state) + log_volume)
 
 
 def _best(
-    item: FitTrial,
+    trial_data: FitTrial,
     i: int,
-    frame: MixedProblem,
+    problem: MixedProblem,
     state: FitState,
     releases: Floats,
     times: Floats,
@@ -116,13 +116,15 @@ def _best(
     answers: Floats,
 ) -> tuple[Floats, float]:
     """The own numbers of one trial at its likeliest release, and the fall of −2 ln L from the last of the releases."""
-    own = state.own[i]
-    centre, precision = (part[i] for part in trial_effect_prior(frame, state))
-    since = np.clip(item.time_s - releases[:, None], 0.0, times[-1])
+    trial_effects = state.trial_effects[i]
+    centre, precision = (part[i] for part in trial_effect_prior(problem, state))
+    since = np.clip(trial_data.time_s - releases[:, None], 0.0, times[-1])
     moved = [np.interp(since, times, one) for one in (*answers, plain)]
-    moved[-1] = item.lead_position_m - own[ORIGIN] - moved[-1]
-    white = whiten(np.stack(moved, axis=-1), item.first, state.rho, item.relative_sd) / np.sqrt(state.variance[i])
-    tried = np.tile(own, (releases.size, 1))
+    moved[-1] = trial_data.lead_position_m - trial_effects[ORIGIN] - moved[-1]
+    white = whiten(np.stack(moved, axis=-1), trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(
+        state.variance[i]
+    )
+    tried = np.tile(trial_effects, (releases.size, 1))
     tried[:, RELEASE] = releases
     square = np.swapaxes(white, 1, 2) @ white
     inner = square[:, :-1, :-1] + np.diag(precision)
@@ -135,12 +137,12 @@ def _best(
     return tried[k], float(levels[-1] - levels[k])
 
 
-def _releases(item: FitTrial, release_s: float) -> Floats:
+def _releases(trial_data: FitTrial, release_s: float) -> Floats:
     """Where the release of a trial may be, s, shape (n,); the last is where it is held to be."""
-    if item.shows_rest:
-        return np.append(release_s + item.frame_s * NEAR_FRAMES, release_s)
-    duration_s = float(item.time_s[-1] - item.time_s[0])
-    return np.append(item.time_s[0] - np.geomspace(0.1 * item.frame_s, duration_s, RELEASES), release_s)
+    if trial_data.shows_rest:
+        return np.append(release_s + trial_data.frame_s * NEAR_FRAMES, release_s)
+    duration_s = float(trial_data.time_s[-1] - trial_data.time_s[0])
+    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, RELEASES), release_s)
 
 
 def _answers(

@@ -56,7 +56,7 @@ def few_trials(predictor: Predictor, solution: Solution) -> bool:
     -------
     bool
     """
-    spare = len(predictor.data) - np.count_nonzero(solution.frame.free)
+    spare = len(predictor.data) - np.count_nonzero(solution.problem.free)
     return len(predictor.data) < FEWEST_CLUSTERS or bool(spare < FEWEST_DEGREES)
 
 
@@ -97,7 +97,7 @@ def widened_covariance(
         at_most = np.where(np.diag(pooled.between) > 0, np.minimum(at_most, few), at_most)
     elif len(trials) >= FEWEST_CLUSTERS and spare >= FEWEST_DEGREES:
         ratio[live] = np.sqrt(np.maximum(np.diag(robust)[live] / diagonal[live], 1.0))
-        clusters = len(set(coarsest_groups([item.trial for item in predictor.data])))
+        clusters = len(set(coarsest_groups([trial_data.trial for trial_data in predictor.data])))
         few = np.full(diagonal.size, float(min(int(spare), clusters - 1)))
     else:
         variance, few = _few_trials(*trial_information(wide or solution), wide or solution, plain)
@@ -111,7 +111,7 @@ def widened_covariance(
 
 def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:
     """Covariance of the free numbers as the fit holds them, from the noise model and from the scatter of trials."""
-    nothing = [np.zeros((item.time_s.size, 0)) for item in predictor.data]
+    nothing = [np.zeros((trial_data.time_s.size, 0)) for trial_data in predictor.data]
     plain, robust, _ = _sandwich(predictor, solution, nothing)
     return plain, robust
 
@@ -140,7 +140,7 @@ def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: 
     root = _root(plain[np.ix_(live, live)])
     score = (scores - scores.mean(axis=0))[:, live] @ root
     shares, mended = [], []
-    constant = root.T @ np.diag(solution.frame.prior_precision[live]) @ root
+    constant = root.T @ np.diag(solution.problem.prior_precision[live]) @ root
     for single in information:
         share = root.T @ single[np.ix_(live, live)] @ root
         values, vectors = np.linalg.eigh(share)
@@ -179,31 +179,34 @@ def _sandwich(predictor: Predictor, solution: Solution, doubts: Sequence[Floats]
 
     Numbers at a bound stay there.
     """
-    frame, state = solution.frame, solution.state
-    p, size = solution.columns[0].shape[1] - OWN - 1, frame.prior_mean.size
+    problem, state = solution.problem, solution.state
+    p, size = solution.columns[0].shape[1] - OWN - 1, problem.prior_mean.size
     grams = solution.grams
     if doubts[0].shape[1]:
         both = zip(solution.columns, doubts, predictor.data, strict=True)
         grams = np.stack(
-            [products(np.column_stack([own, doubt]), item.first, item.relative_sd) for own, doubt, item in both]
+            [
+                products(np.column_stack([sensitivities, doubt]), trial_data.first, trial_data.relative_sd)
+                for sensitivities, doubt, trial_data in both
+            ]
         )
-    blocks = trial_effects_eliminated(grams, p, frame, state)
-    square = cross_products(blocks[:, :p, :p], frame) + np.diag(frame.prior_precision)
-    inside = (state.theta > frame.lower) & (state.theta < frame.upper)
-    live = np.flatnonzero(frame.free & inside & (np.diag(square) > 0))
+    blocks = trial_effects_eliminated(grams, p, problem, state)
+    square = cross_products(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
+    inside = (state.theta > problem.lower) & (state.theta < problem.upper)
+    live = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
     plain = inverse_among(square, live)
-    single = _scores(blocks[:, :p, p], frame.index, size)
+    single = _scores(blocks[:, :p, p], problem.index, size)
     trials = len(blocks)
     # The prior's information does not scatter from trial to trial, yet it is uncertain all the same.
-    prior = np.diag(frame.prior_precision)
+    prior = np.diag(problem.prior_precision)
     meat = single.T @ single * trials / max(trials - live.size, 1) + prior
     robust = plain @ meat @ plain
-    groups = coarsest_groups([item.trial for item in predictor.data])
+    groups = coarsest_groups([trial_data.trial for trial_data in predictor.data])
     if len(set(groups)) < trials:
         by_group = plain @ (group_scatter(single, groups, live.size) + prior) @ plain
         np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
     cross = np.zeros((size + 1, doubts[0].shape[1]))
-    np.add.at(cross, frame.index, blocks[:, :p, p + 1 :])
+    np.add.at(cross, problem.index, blocks[:, :p, p + 1 :])
     lever = plain @ cross[:size]
     return plain, robust, lever @ lever.T
 

@@ -69,17 +69,21 @@ class Predictor:
         self.damping_column = model.parameter_names.index(DAMPING) if DAMPING in model.parameter_names else -1
         driven = "pressure_drive" in model
         self.feels_pressure = np.array(
-            [driven and (item.trial.pressure_Pa > 0 if item.trace is None else item.gauge_error > 0) for item in data],
+            [
+                driven
+                and (trial_data.trial.pressure_Pa > 0 if trial_data.trace is None else trial_data.gauge_error > 0)
+                for trial_data in data
+            ],
             dtype=bool,
         )
         self.feels_damping = np.array(
-            [self.damping_column >= 0 and item.trial.travel_ratio != 1 for item in data], dtype=bool
+            [self.damping_column >= 0 and trial_data.trial.travel_ratio != 1 for trial_data in data], dtype=bool
         )
-        check_needs(model, *(item.trial for item in data))
-        self.rigs = np.array([trial_inputs(item.trial) for item in data], dtype=float)
-        self.bends = [bends_of(item.trial) for item in data]
+        check_needs(model, *(trial_data.trial for trial_data in data))
+        self.rigs = np.array([trial_inputs(trial_data.trial) for trial_data in data], dtype=float)
+        self.bends = [bends_of(trial_data.trial) for trial_data in data]
         measured_otherwise = any({"true_time", "observed_position"} & set(effect.functions) for effect in model)
-        self.plain_release = [item.trace is None and not measured_otherwise for item in data]
+        self.plain_release = [trial_data.trace is None and not measured_otherwise for trial_data in data]
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
 
@@ -106,63 +110,67 @@ class Predictor:
             [self.bends[job.trial] for job in jobs],
             [
                 time_s - job.release_s
-                for time_s, job in zip(times_s or [item.time_s for item in data], jobs, strict=True)
+                for time_s, job in zip(times_s or [trial_data.time_s for trial_data in data], jobs, strict=True)
             ],
             traces=[
                 None
-                if item.trace is None
-                else (item.trace[0] - job.release_s, item.trace[1] * (1 + job.pressure_deviation))
-                for item, job in zip(data, jobs, strict=True)
+                if trial_data.trace is None
+                else (trial_data.trace[0] - job.release_s, trial_data.trace[1] * (1 + job.pressure_deviation))
+                for trial_data, job in zip(data, jobs, strict=True)
             ],
             parameters=rows,
             host=self.host,
         )
-        return trajectories(batch, [item.trial.travel_ratio for item in data], [item.trial.name for item in data])
+        return trajectories(
+            batch,
+            [trial_data.trial.travel_ratio for trial_data in data],
+            [trial_data.trial.name for trial_data in data],
+        )
 
-    def jobs(self, theta: Floats, own: Floats) -> list[Job]:
+    def jobs(self, theta: Floats, trial_effects: Floats) -> list[Job]:
         """The unmoved trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4)."""
         rows, yields = self.layout.rows(theta)
-        own = self._deviations(theta, own)
+        trial_effects = self._deviations(theta, trial_effects)
         if self.damping_column >= 0:
-            rows[:, self.damping_column] *= np.exp(own[:, DAMPING_DEVIATION])
+            rows[:, self.damping_column] *= np.exp(trial_effects[:, DAMPING_DEVIATION])
         return [
-            Job(i, rows[i], float(yields[i]), float(own[i, PRESSURE]), float(own[i, RELEASE]))
+            Job(i, rows[i], float(yields[i]), float(trial_effects[i, PRESSURE]), float(trial_effects[i, RELEASE]))
             for i in range(len(self.data))
         ]
 
-    def _deviations(self, theta: Floats, own: Floats) -> Floats:
+    def _deviations(self, theta: Floats, trial_effects: Floats) -> Floats:
         """The trials' own numbers, their deviations with what trials differ by systematically put in."""
         if not self.layout.between:
-            return own
-        whole = own.copy()
+            return trial_effects
+        whole = trial_effects.copy()
         whole[:, [PRESSURE, DAMPING_DEVIATION]] += self.layout.shifts(theta)
         return whole
 
-    def residuals(self, theta: Floats, own: Floats) -> list[Floats]:
+    def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted position of every trial, m."""
-        moved = self.run(self.jobs(theta, own))
-        return [self._residual(i, moved[i], own) for i in range(len(self.data))]
+        moved = self.run(self.jobs(theta, trial_effects))
+        return [self._residual(i, moved[i], trial_effects) for i in range(len(self.data))]
 
-    def _residual(self, i: int, moved: Trajectory, own: Floats) -> Floats:
-        return self.data[i].lead_position_m - own[i, ORIGIN] - moved.observed_position_m
+    def _residual(self, i: int, moved: Trajectory, trial_effects: Floats) -> Floats:
+        return self.data[i].lead_position_m - trial_effects[i, ORIGIN] - moved.observed_position_m
 
-    def linearise(self, theta: Floats, own: Floats, *, own_only: bool = False) -> list[Floats]:
+    def linearise(self, theta: Floats, trial_effects: Floats, *, own_only: bool = False) -> list[Floats]:
         """Columns [own numbers, keys of the layout, residual] of every trial, shape (n_points, 4 + n_keys + 1).
 
         `own_only` leaves the columns of the keys empty, but for B.
         """
-        plain, whole = self.jobs(theta, own), self._deviations(theta, own)
+        plain, whole = self.jobs(theta, trial_effects), self._deviations(theta, trial_effects)
         jobs, moves = list(plain), [(-1, 0.0)] * len(plain)
         for i, job in enumerate(plain):
             for place, step, varied in self._variations(i, job, theta, whole, own_only):
                 jobs.append(varied)
                 moves.append((place, step))
         moved = self.run(jobs)
-        columns = [np.zeros((item.time_s.size, OWN + len(self.layout.keys) + 1)) for item in self.data]
+        columns = [np.zeros((trial_data.time_s.size, OWN + len(self.layout.keys) + 1)) for trial_data in self.data]
         for i in range(len(plain)):
             columns[i][:, ORIGIN] = 1.0
             columns[i][:, RELEASE] = -moved[i].lead_velocity_m_s
-            columns[i][:, -1] = self._residual(i, moved[i], own)
+            columns[i][:, -1] = self._residual(i, moved[i], trial_effects)
         for job, (place, step), other in zip(jobs, moves, moved, strict=True):
             if place >= 0:
                 columns[job.trial][:, place] = _change(moved[job.trial], other) / step
@@ -174,9 +182,15 @@ class Predictor:
 
     def products(self, columns: Sequence[Floats]) -> Floats:
         """Sums of products of the trials' columns under their noise, shape (n_trials, 3, k, k), see `whitening`."""
-        return all_products(columns, [item.first for item in self.data], [item.relative_sd for item in self.data])
+        return all_products(
+            columns,
+            [trial_data.first for trial_data in self.data],
+            [trial_data.relative_sd for trial_data in self.data],
+        )
 
-    def _variations(self, i: int, job: Job, theta: Floats, own: Floats, own_only: bool) -> list[tuple[int, float, Job]]:
+    def _variations(
+        self, i: int, job: Job, theta: Floats, trial_effects: Floats, own_only: bool
+    ) -> list[tuple[int, float, Job]]:
         """What to simulate for the differences of one trial: place of the column, step, and the moved trajectory."""
         found: list[tuple[int, float, Job]] = []
         if not self.plain_release[i]:
@@ -204,7 +218,7 @@ class Predictor:
                 row, k = job.row.copy(), self.layout.model.parameter_names.index(key)
                 row[k] += number.outside(theta[place] + step) - number.outside(theta[place])
                 if key == DAMPING:
-                    row[k] = number.outside(theta[place] + step + own[i, DAMPING_DEVIATION])
+                    row[k] = number.outside(theta[place] + step + trial_effects[i, DAMPING_DEVIATION])
                 varied = replace(job, row=row)
             found.append((OWN + column, step, varied))
         return found
@@ -228,7 +242,7 @@ class Predictor:
 
     def _adapt(self, columns: list[Floats]) -> None:
         """Steps for the next time, from how far these moved the trajectories."""
-        spans = np.array([np.ptp(item.lead_position_m) for item in self.data])
+        spans = np.array([np.ptp(trial_data.lead_position_m) for trial_data in self.data])
         answers = np.array([np.max(np.abs(column), axis=0) for column in columns]) / spans[:, None]
         for column in range(len(self.layout.keys)):
             self.steps[column] = _step(float(np.max(answers[:, OWN + column])), float(self.steps[column]))

@@ -26,19 +26,22 @@ POINTS_LOOKED_AT = 60
 
 def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
     """Release and origin of every trial from its rest frames, shape (n_trials, 4); deviations 0."""
-    own = np.zeros((len(data), OWN))
-    for i, item in enumerate(data):
-        if item.n_rest > 0:
-            own[i, RELEASE] = item.time_s[item.n_rest - 1]
-            own[i, ORIGIN] = np.mean(item.lead_position_m[: max(item.n_rest - 1, 1)])
-        elif item.vague_rest is not None:
-            own[i, RELEASE], own[i, ORIGIN] = item.vague_rest.release_s, item.vague_rest.origin_m
+    trial_effects = np.zeros((len(data), OWN))
+    for i, trial_data in enumerate(data):
+        if trial_data.n_rest > 0:
+            trial_effects[i, RELEASE] = trial_data.time_s[trial_data.n_rest - 1]
+            trial_effects[i, ORIGIN] = np.mean(trial_data.lead_position_m[: max(trial_data.n_rest - 1, 1)])
+        elif trial_data.vague_rest is not None:
+            trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = (
+                trial_data.vague_rest.release_s,
+                trial_data.vague_rest.origin_m,
+            )
         else:
-            own[i, RELEASE], own[i, ORIGIN] = item.time_s[0], item.lead_position_m[0]
-        if item.let_in:
-            assert item.trace is not None
-            own[i, RELEASE] = min(item.time_s[0], item.trace[0][0])
-    return own
+            trial_effects[i, RELEASE], trial_effects[i, ORIGIN] = trial_data.time_s[0], trial_data.lead_position_m[0]
+        if trial_data.let_in:
+            assert trial_data.trace is not None
+            trial_effects[i, RELEASE] = min(trial_data.time_s[0], trial_data.trace[0][0])
+    return trial_effects
 
 
 def candidates(
@@ -49,14 +52,14 @@ def candidates(
     For each exponent, and each further value worth a try, every vine takes the B that misses its trials least; the
     release of each trial is scanned along.
     """
-    own = initial_trial_effects(data)
+    trial_effects = initial_trial_effects(data)
     tries = [sorted({number.start, *number.tries}) if number.tries else [number.start] for number in layout.free]
     combined = list(itertools.islice(itertools.product(*tries), 12))
     found: list[tuple[Floats, Floats]] = []
     for values in combined:
         theta = np.array([number.inside(value) for value, number in zip(values, layout.free, strict=True)])
-        starts = _scan(layout, data, predictor, theta, own) if DAMPING in layout.keys else [theta]
-        found += [(start, own) for start in starts]
+        starts = _scan(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
+        found += [(start, trial_effects) for start in starts]
     scored = []
     for theta, begin in found:
         try:
@@ -70,19 +73,19 @@ def candidates(
 def one_of_each_condition(data: Sequence[FitTrial]) -> list[int]:
     """Places of one trial of every condition, the one with the most points."""
     best: dict[str, int] = {}
-    for i, item in enumerate(data):
-        condition = item.trial.condition
-        if condition not in best or item.time_s.size > data[best[condition]].time_s.size:
+    for i, trial_data in enumerate(data):
+        condition = trial_data.trial.condition
+        if condition not in best or trial_data.time_s.size > data[best[condition]].time_s.size:
             best[condition] = i
     return sorted(best.values())
 
 
 def _scan(
-    layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Floats
+    layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
 ) -> list[Floats]:
     """For each exponent the best B of every vine."""
-    speed = np.array([_speed(item) for item in data])
-    drive = np.array([_drive(item) for item in data])
+    speed = np.array([_speed(trial_data) for trial_data in data])
+    drive = np.array([_drive(trial_data) for trial_data in data])
     free_n = [k for k, number in enumerate(layout.free) if number.key == EXPONENT]
     key = layout.keys.index(DAMPING)
     place = layout.index[:, key]
@@ -100,7 +103,7 @@ def _scan(
                 free = layout.free[k]
                 values[k] = free.inside(float(np.clip(factor * B, free.lower, free.upper)))
             try:
-                _, misfit = align(data, predictor, values, own)
+                _, misfit = align(data, predictor, values, trial_effects)
             except SimulationError:
                 continue
             for k in guess:
@@ -119,68 +122,70 @@ def _held_exponent(layout: ParameterMap) -> float:
     return float(layout.base[0, names.index(EXPONENT)]) if EXPONENT in names else 1.0
 
 
-def _speed(item: FitTrial) -> float:
+def _speed(trial_data: FitTrial) -> float:
     """Tail speed in the last part of the motion, m/s."""
-    y = item.lead_position_m - item.lead_position_m[: max(item.n_rest, 1)].mean()
+    y = trial_data.lead_position_m - trial_data.lead_position_m[: max(trial_data.n_rest, 1)].mean()
     total = float(np.max(y))
     low, high = (int(np.argmax(y >= part * total)) for part in (0.4, 0.85))
     high = max(high, low + 1) if low + 1 < y.size else low
-    elapsed = item.time_s[high] - item.time_s[low] or item.frame_s
-    return max(item.trial.travel_ratio * float(y[high] - y[low]) / float(elapsed), 1e-6)
+    elapsed = trial_data.time_s[high] - trial_data.time_s[low] or trial_data.frame_s
+    return max(trial_data.trial.travel_ratio * float(y[high] - y[low]) / float(elapsed), 1e-6)
 
 
-def _drive(item: FitTrial) -> float:
+def _drive(trial_data: FitTrial) -> float:
     """Force on the tip less what it takes to begin, N; what the trace says where there is one."""
-    trial = item.trial
-    pressure_Pa = float(np.median(item.trace[1])) if item.trace is not None else trial.pressure_Pa
+    trial = trial_data.trial
+    pressure_Pa = float(np.median(trial_data.trace[1])) if trial_data.trace is not None else trial.pressure_Pa
     over_Pa = pressure_Pa - np.nan_to_num(trial.yield_pressure_Pa)
     return max(float(over_Pa) * trial.area_m2, 1e-3 * abs(pressure_Pa) * trial.area_m2, 1e-9)
 
 
-def align(data: Sequence[FitTrial], predictor: Predictor, theta: Floats, own: Floats) -> tuple[Floats, Floats]:
+def align(
+    data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
+) -> tuple[Floats, Floats]:
     """Own numbers with the release at which each trial fits best, and the logarithm of its relative misfit.
 
     One trajectory a trial is simulated, at a subset of its frames, and shifted by interpolation.
     """
-    thin = [_thinned(item) for item in data]
-    jobs = predictor.jobs(theta, own)
+    thin = [_thinned(trial_data) for trial_data in data]
+    jobs = predictor.jobs(theta, trial_effects)
     durations = [
-        item.time_s[-1] - min(item.time_s[0], begin) + 25 * item.frame_s
-        for item, begin in zip(data, own[:, RELEASE], strict=True)
+        trial_data.time_s[-1] - min(trial_data.time_s[0], begin) + 25 * trial_data.frame_s
+        for trial_data, begin in zip(data, trial_effects[:, RELEASE], strict=True)
     ]
     grids = [np.linspace(0.0, duration, 4 * POINTS_LOOKED_AT) for duration in durations]
     moved = simulate_many(
         predictor.layout.model,
-        [item.trial for item in data],
+        [trial_data.trial for trial_data in data],
         grids,
         traces=[
-            None if item.trace is None else (item.trace[0] - job.release_s, item.trace[1])
-            for item, job in zip(data, jobs, strict=True)
+            None if trial_data.trace is None else (trial_data.trace[0] - job.release_s, trial_data.trace[1])
+            for trial_data, job in zip(data, jobs, strict=True)
         ],
         parameters=np.array([job.row for job in jobs]).reshape(len(jobs), -1),
         host=predictor.host,
     )
-    best, misfit = own.copy(), np.zeros(len(data))
-    for i, (item, (time_s, y)) in enumerate(zip(data, thin, strict=True)):
-        if item.let_in:
+    best, misfit = trial_effects.copy(), np.zeros(len(data))
+    for i, (trial_data, (time_s, y)) in enumerate(zip(data, thin, strict=True)):
+        if trial_data.let_in:
             shifts = np.zeros(1)
-        elif item.shows_rest:
-            shifts = item.frame_s * np.arange(-6, 3.01, 0.5)
+        elif trial_data.shows_rest:
+            shifts = trial_data.frame_s * np.arange(-6, 3.01, 0.5)
         else:
-            shifts = -np.geomspace(0.25 * item.frame_s, durations[i], 30)
-        since = time_s[None, :] - own[i, RELEASE] - shifts[:, None]
+            shifts = -np.geomspace(0.25 * trial_data.frame_s, durations[i], 30)
+        since = time_s[None, :] - trial_effects[i, RELEASE] - shifts[:, None]
         predicted = np.interp(since, grids[i], moved[i].observed_position_m)
         gap = y[None, :] - predicted
         origin = gap.mean(axis=1)
         square = np.mean((gap - origin[:, None]) ** 2, axis=1)
         k = int(np.argmin(square))
-        best[i, RELEASE], best[i, ORIGIN] = own[i, RELEASE] + shifts[k], origin[k]
+        best[i, RELEASE], best[i, ORIGIN] = trial_effects[i, RELEASE] + shifts[k], origin[k]
         misfit[i] = 0.5 * np.log(square[k] / np.ptp(y) ** 2 + 1e-8)
     return best, misfit
 
 
-def _thinned(item: FitTrial) -> tuple[Floats, Floats]:
+def _thinned(trial_data: FitTrial) -> tuple[Floats, Floats]:
     """At most sixty points, most of them in motion."""
-    begin = 0 if item.let_in else max(item.n_rest - 5, 0)
-    take = np.unique(np.linspace(begin, item.time_s.size - 1, POINTS_LOOKED_AT).astype(int))
-    return item.time_s[take], item.lead_position_m[take]
+    begin = 0 if trial_data.let_in else max(trial_data.n_rest - 5, 0)
+    take = np.unique(np.linspace(begin, trial_data.time_s.size - 1, POINTS_LOOKED_AT).astype(int))
+    return trial_data.time_s[take], trial_data.lead_position_m[take]

@@ -54,10 +54,10 @@ def fit_subset(
     places = numbers_felt(found.predictor.layout, rows)
     predictor = subset_predictor(found.predictor, rows, places)
     state = subset_state(found.solution.state, rows, places)
-    frame = subset_frame(found.solution.frame, predictor.layout, rows, places)
+    problem = subset_frame(found.solution.problem, predictor.layout, rows, places)
     names = set(held)
     free = [not names & {number.name, number.key} for number in predictor.layout.free]
-    frame = replace(frame, free=frame.free & np.array(free, dtype=bool))
+    problem = replace(problem, free=problem.free & np.array(free, dtype=bool))
     # The numbers of a fit include what smooth errors of position moved them by; its state does not.
     reported = {number.name: number.value for number in found.numbers}
     stays = [
@@ -70,7 +70,7 @@ def fit_subset(
         state.spread if hold_spreads else told.spread, (state.rho, state.variance) if hold_noise else told.noise
     )
     try:
-        solution = solve(predictor, frame, state, told, warm=True, most_iterations=most_iterations)
+        solution = solve(predictor, problem, state, told, warm=True, most_iterations=most_iterations)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed on part of the trials: {error}") from error
     return assemble(predictor, solution, found.left_out, {**found.options, "held": told}, profile=False)
@@ -130,30 +130,32 @@ def subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Pr
 
 def subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
     """The state of these trials and numbers."""
-    return replace(state, theta=state.theta[places], own=state.own[rows], variance=state.variance[rows])
+    return replace(
+        state, theta=state.theta[places], trial_effects=state.trial_effects[rows], variance=state.variance[rows]
+    )
 
 
-def subset_frame(frame: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
+def subset_frame(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
     """The frame of these trials and numbers; `layout` is theirs already."""
 
     def numbers(values: Floats) -> Floats:
         return values[places]
 
     return replace(
-        frame,
+        problem,
         index=layout.index,
-        feels=frame.feels[rows],
-        gauge_error=frame.gauge_error[rows],
-        own_centre=frame.own_centre[rows],
-        own_precision=frame.own_precision[rows],
-        prior_mean=numbers(frame.prior_mean),
-        prior_precision=numbers(frame.prior_precision),
-        lower=numbers(frame.lower),
-        upper=numbers(frame.upper),
-        free=frame.free[places],
-        points=frame.points[rows],
-        stretches=frame.stretches[rows],
-        random=None if frame.random is None else frame.random[places],
+        feels=problem.feels[rows],
+        gauge_error=problem.gauge_error[rows],
+        own_centre=problem.own_centre[rows],
+        own_precision=problem.own_precision[rows],
+        prior_mean=numbers(problem.prior_mean),
+        prior_precision=numbers(problem.prior_precision),
+        lower=numbers(problem.lower),
+        upper=numbers(problem.upper),
+        free=problem.free[places],
+        points=problem.points[rows],
+        stretches=problem.stretches[rows],
+        random=None if problem.random is None else problem.random[places],
     )
 
 

@@ -51,7 +51,7 @@ def systematics_of(
         _tracker(predictor, trials),
     )
     parts = zip(*ways, position_shapes(predictor, grown), strict=True) if positions else zip(*ways, strict=True)
-    return [np.column_stack(one) for one in parts]
+    return [np.column_stack(part) for part in parts]
 
 
 def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> list[Floats]:
@@ -62,7 +62,7 @@ def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFi
     columns = [np.zeros((trial.time_s.size, len(places))) for trial in trials]
     if not loaded:
         return columns
-    jobs = predictor.jobs(solution.state.theta, solution.state.own)
+    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     try:
         heavier = predictor.run([replace(jobs[i], payload_factor=1 + PAYLOAD_STEP) for i in loaded])
     except SimulationError:
@@ -76,20 +76,20 @@ def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFi
 
 def _set_pressures(predictor: Predictor, solution: Solution) -> list[Floats]:
     """The error of the pressure that was set for a condition; its replicates have it together."""
-    data = [item.trial for item in predictor.data]
-    feels = predictor.feels_pressure & np.array([item.trace is None for item in predictor.data])
+    data = [trial_data.trial for trial_data in predictor.data]
+    feels = predictor.feels_pressure & np.array([trial_data.trace is None for trial_data in predictor.data])
     conditions = dict.fromkeys(trial.condition for trial, felt in zip(data, feels, strict=True) if felt)
     places = {condition: k for k, condition in enumerate(conditions)}
-    columns = [np.zeros((len(own), len(places))) for own in solution.columns]
-    for column, trial, own, felt in zip(columns, data, solution.columns, feels, strict=True):
+    columns = [np.zeros((len(sensitivities), len(places))) for sensitivities in solution.columns]
+    for column, trial, sensitivities, felt in zip(columns, data, solution.columns, feels, strict=True):
         if felt:
-            column[:, places[trial.condition]] = PRESSURE_ERROR_PA / trial.pressure_Pa * own[:, PRESSURE]
+            column[:, places[trial.condition]] = PRESSURE_ERROR_PA / trial.pressure_Pa * sensitivities[:, PRESSURE]
     return columns
 
 
 def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
     """Slow errors along the picture, of the size of the error that is stated of positions read from recordings."""
-    stated = np.array([item.tracker_sigma_m for item in predictor.data])
+    stated = np.array([trial_data.tracker_sigma_m for trial_data in predictor.data])
     if not np.isfinite(stated).any():
         return [np.zeros((trial.time_s.size, 0)) for trial in trials]
     sigma_m = float(np.nanmedian(stated))

@@ -19,43 +19,48 @@ LARGEST_DEVIATION = 0.9
 LARGEST_RELEASE_STEP_FRAMES = 2.0
 
 
-def follow_trial_effects(predictor: Predictor, frame: MixedProblem, state: FitState) -> tuple[FitState, Floats]:
+def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: FitState) -> tuple[FitState, Floats]:
     """The trials' own numbers brought to their best for the others, and the costs there.
 
     They are known so well that a step of the shared numbers leaves the valley by its curvature alone. Every trial
     takes what serves it best: where a release meets a frame, the cost has a corner at which no full step helps.
     """
-    columns = predictor.linearise(state.theta, state.own, own_only=True)
+    columns = predictor.linearise(state.theta, state.trial_effects, own_only=True)
     grams = predictor.products(columns)
     ways = [
         state,
         *(
-            replace(state, own=limited(predictor, state.own, trial_effect_step(grams, frame, state, pinned=pinned)))
+            replace(
+                state,
+                trial_effects=limited(
+                    predictor, state.trial_effects, trial_effect_step(grams, problem, state, pinned=pinned)
+                ),
+            )
             for pinned in (False, True)
         ),
     ]
-    costs = np.array([trial_costs(predictor, frame, way) for way in ways])
+    costs = np.array([trial_costs(predictor, problem, way) for way in ways])
     best = np.argmin(costs, axis=0)
-    own = np.array([ways[way].own[i] for i, way in enumerate(best)])
-    return replace(state, own=own), np.min(costs, axis=0)
+    trial_effects = np.array([ways[way].trial_effects[i] for i, way in enumerate(best)])
+    return replace(state, trial_effects=trial_effects), np.min(costs, axis=0)
 
 
-def limited(predictor: Predictor, own: Floats, step: Floats) -> Floats:
+def limited(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats:
     """Own numbers after a step: the release moves by two frames at most, a deviation by 0.3."""
-    reach = LARGEST_RELEASE_STEP_FRAMES * np.array([item.frame_s for item in predictor.data])
-    moved = own + step
-    moved[:, RELEASE] = own[:, RELEASE] + np.clip(step[:, RELEASE], -reach, reach)
+    reach = LARGEST_RELEASE_STEP_FRAMES * np.array([trial_data.frame_s for trial_data in predictor.data])
+    moved = trial_effects + step
+    moved[:, RELEASE] = trial_effects[:, RELEASE] + np.clip(step[:, RELEASE], -reach, reach)
     deviations = [PRESSURE, DAMPING_DEVIATION]
     stride = np.clip(step[:, deviations], -LARGEST_DEVIATION_STEP, LARGEST_DEVIATION_STEP)
-    moved[:, deviations] = np.clip(own[:, deviations] + stride, -LARGEST_DEVIATION, LARGEST_DEVIATION)
+    moved[:, deviations] = np.clip(trial_effects[:, deviations] + stride, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     return moved
 
 
-def trial_costs(predictor: Predictor, frame: MixedProblem, state: FitState) -> Floats:
+def trial_costs(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
     """Whitened sum of squares of every trial with what the priors of its own numbers add, shape (n_trials,)."""
-    residuals = predictor.residuals(state.theta, state.own)
+    residuals = predictor.residuals(state.theta, state.trial_effects)
     squares = [
-        float(np.sum(whiten(residual, item.first, state.rho, item.relative_sd) ** 2)) / variance
-        for item, residual, variance in zip(predictor.data, residuals, state.variance, strict=True)
+        float(np.sum(whiten(residual, trial_data.first, state.rho, trial_data.relative_sd) ** 2)) / variance
+        for trial_data, residual, variance in zip(predictor.data, residuals, state.variance, strict=True)
     ]
-    return np.array(squares) + trial_effect_penalty(frame, state)
+    return np.array(squares) + trial_effect_penalty(problem, state)

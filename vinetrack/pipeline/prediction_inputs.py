@@ -106,7 +106,7 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
         model=planned.settings.model,
         effects=tuple(name for name, _ in sizes),
         sizes={name: size for _, of_effect in sizes for name, size in of_effect.items()},
-        experiment_effects=user_effects,
+        user_effects=user_effects,
         spreads=asked.spreads,
     )
     return Ground(planned, stated, fit)

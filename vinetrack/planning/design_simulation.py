@@ -104,7 +104,7 @@ class PartlyLinear(Predictor):
             One for each old trial.
         """
         change = np.append(theta[: self.at.theta.size] - self.at.theta, np.zeros(theta.size - self.at.theta.size + 1))
-        steps = np.hstack([trial_effects[: self.old] - self.at.own, change[self.layout.index[: self.old]]])
+        steps = np.hstack([trial_effects[: self.old] - self.at.trial_effects, change[self.layout.index[: self.old]]])
         return [known[:, -1] - known[:, :-1] @ step for known, step in zip(self.known, steps, strict=True)]
 
 
@@ -237,9 +237,10 @@ def _refitted(hypothesis: Hypothesis, seen: Sequence[tuple[int, FitTrial]], *, t
     quick = PartlyLinear(layout, hypothesis.fit.predictor, old, items)
     try:
         state = _wider_state(hypothesis, quick, items)
-        problem = make_problem(quick, state.own)
+        problem = make_problem(quick, state.trial_effects)
         problem = replace(
-            problem, own_centre=np.concatenate([old.frame.own_centre, problem.own_centre[len(old.frame.own_centre) :]])
+            problem,
+            own_centre=np.concatenate([old.problem.own_centre, problem.own_centre[len(old.problem.own_centre) :]]),
         )
         # Spreads and noise stay until the numbers have moved: what is only not yet fitted must not pass for scatter.
         told = FixedTerms(state.spread, (state.rho, state.variance))
@@ -278,7 +279,9 @@ def _wider_state(hypothesis: Hypothesis, predictor: PartlyLinear, items: Sequenc
     theta[: before.theta.size] = before.theta
     trial_effects, _ = align(predictor.new.data, predictor.new, theta, initial_trial_effects(items))
     variance = np.concatenate([before.variance, np.full(len(items), hypothesis.variance)])
-    return replace(before, theta=theta, own=np.concatenate([before.own, trial_effects]), variance=variance)
+    return replace(
+        before, theta=theta, trial_effects=np.concatenate([before.trial_effects, trial_effects]), variance=variance
+    )
 
 
 __all__ = ["Bench", "PartlyLinear", "drawn", "expected", "observed", "separation"]

@@ -158,7 +158,7 @@ def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
 
 def _views(fit: Fit, precision_of_new: Floats) -> tuple[View, ...]:
     """What the trials so far say, with all the scatter that a refit may come to; new numbers by their priors alone."""
-    state, problem = fit.solution.state, fit.solution.frame
+    state, problem = fit.solution.state, fit.solution.problem
     part = marginal(fit.solution.grams, problem, state)
     views: dict[tuple[float, float], View] = {}
     plain = 0.0

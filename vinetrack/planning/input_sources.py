@@ -58,7 +58,7 @@ class StatedValues:
     model: tuple[str, ...] = BASE_EFFECTS
     effects: tuple[str, ...] = ()
     sizes: Mapping[str, Size] = field(default_factory=dict)
-    experiment_effects: Mapping[str, Effect] = field(default_factory=dict)
+    user_effects: Mapping[str, Effect] = field(default_factory=dict)
     spreads: tuple[float, float] | None = None
 
 
@@ -118,12 +118,10 @@ def predictive_inputs(
     """
     stated = stated or StatedValues()
     if fit is not None and not isinstance(fit, FitNumbers):
-        stated = replace(
-            stated, experiment_effects={**{effect.name: effect for effect in fit.model}, **stated.experiment_effects}
-        )
+        stated = replace(stated, user_effects={**{effect.name: effect for effect in fit.model}, **stated.user_effects})
         fit = numbers_of(fit)
     making = _Making(trial, fit)
-    model = wanted_model(fit.model if fit else stated.model, stated.effects, stated.experiment_effects)
+    model = wanted_model(fit.model if fit else stated.model, stated.effects, stated.user_effects)
     if fit is not None and DAMPING not in fit.keys:
         raise FitError(f"{fit.source} is not a fit of everting vines: it has no B to predict with.")
     anchor = _anchor(making)

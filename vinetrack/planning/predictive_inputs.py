@@ -164,7 +164,7 @@ def _within_bounds(draws: Draws, model: Model) -> Draws:
 def wanted_model(
     names: Iterable[str] = BASE_EFFECTS,
     further: Iterable[str] = (),
-    experiment_effects: Mapping[str, Effect] | None = None,
+    user_effects: Mapping[str, Effect] | None = None,
 ) -> Model:
     """A model of these effects and further ones, each once.
 
@@ -174,7 +174,7 @@ def wanted_model(
         Effects of the model.
     further : iterable of str
         Effects added to them.
-    experiment_effects : mapping, optional
+    user_effects : mapping, optional
         Effects of the user by name, beside the catalogue.
 
     Returns
@@ -186,7 +186,7 @@ def wanted_model(
     EffectError
         If a name is unknown.
     """
-    return make_model(dict.fromkeys([*names, *further]), experiment_effects)
+    return make_model(dict.fromkeys([*names, *further]), user_effects)
 
 
 @dataclass(frozen=True)
