@@ -24,9 +24,9 @@ from vinetrack.diagnosis.score_test import (
 )
 from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_motion
 from vinetrack.effects import Effect
-from vinetrack.inference.fit import is_poor_fit, missed_fraction
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import track_correlation
+from vinetrack.inference.solving import is_poor_fit, missed_fraction
 from vinetrack.inference.systematics import systematics_of
 
 FIRST_LEVEL, LATER_LEVEL = 3e-3, 1e-4

@@ -18,13 +18,14 @@ from vinetrack.diagnosis.candidates import CandidateShape, is_plausible
 from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
-from vinetrack.inference.fit import is_poor_fit, refit
+from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import deviance, marginal
 from vinetrack.inference.optimiser import FixedTerms, first_state, make_problem, solve, track_correlation
 from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
+from vinetrack.inference.solving import is_poor_fit
 from vinetrack.inference.starts import align, one_of_each_condition
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]
