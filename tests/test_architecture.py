@@ -154,10 +154,8 @@ def test_a_benchmark_finds_what_it_imports(path: Path) -> None:
                     importlib.import_module(f"{node.module}.{alias.name}")
 
 
-DOCUMENTED = frozenset(
-    {"core", "tracks", "effects", "experiment", "video", "dynamics", "kinematics", "laboratory", "paper", "results"}
-)
-"""Rooms in which the rules of `house_rules` hold; they are to grow to all."""
+UNDOCUMENTED = frozenset({"inference", "diagnosis", "setup_page", "interface"})
+"""Rooms in which the rules of `house_rules` do not hold yet; to be emptied."""
 
 
 @pytest.mark.parametrize(
@@ -171,5 +169,13 @@ DOCUMENTED = frozenset(
     ids=lambda rule: rule.__name__,
 )
 def test_a_documented_room_breaks_no_rule(rule: Callable[[Path], list[house_rules.Place]]) -> None:
-    broken = [str(place) for place in rule(PACKAGE) if place.file.split("/")[0] in DOCUMENTED]
+    broken = [str(place) for place in rule(PACKAGE) if place.file.split("/")[0] not in UNDOCUMENTED]
     assert not broken
+
+
+def test_no_two_public_classes_share_a_name() -> None:
+    assert set(house_rules.repeated_classes(PACKAGE)) <= {"AlignedTrial", "Choice", "Course", "Plan", "Size", "View"}
+
+
+def test_no_two_modules_share_a_name() -> None:
+    assert not house_rules.repeated_modules(PACKAGE)

@@ -37,7 +37,7 @@ _HOMES = {
     "read_experiment": "vinetrack.experiment.folder",
     "refit": "vinetrack.inference.fit",
     "simulate": "vinetrack.dynamics.simulate",
-    "tracks_from_frame": "vinetrack.interface.frames",
+    "tracks_from_frame": "vinetrack.interface.data_frames",
 }
 
 _RENAMED = {"Said": "StatedValues", "believe": "predictive_inputs", "foresee": "predict_vine"}

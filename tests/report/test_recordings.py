@@ -10,7 +10,13 @@ from test_report import EVIL, SVG, Tags, page, trials
 from vinetrack.report import trials_section as report_trials
 from vinetrack.report.build import LARGEST_CLIP_BYTES, Clip
 from vinetrack.report.svg import inline_svg
-from vinetrack.report.trials_section import LARGEST_SVG_BYTES, SHARED_ERROR, Recording, calibration_table, count_frames
+from vinetrack.report.trials_section import (
+    LARGEST_SVG_BYTES,
+    SHARED_ERROR,
+    TrackedRecording,
+    calibration_table,
+    count_frames,
+)
 
 BOARD = {
     "kind": "charuco",
@@ -24,8 +30,8 @@ BOARD = {
 }
 
 
-def recording(**changes: object) -> Recording:
-    return Recording(SVG, ["before_release", "", "", "doubtful"], {**BOARD, **changes})
+def recording(**changes: object) -> TrackedRecording:
+    return TrackedRecording(SVG, ["before_release", "", "", "doubtful"], {**BOARD, **changes})
 
 
 def test_strip_and_motion_stand_side_by_side_and_the_motion_once() -> None:
@@ -85,7 +91,7 @@ def test_an_error_that_is_not_known_is_said_so(unknown: float | None) -> None:
 
 def test_a_failed_recording_shows_its_reason_and_no_picture() -> None:
     failed = trials("a", status="failed", reason="a.mp4: not a video")
-    html = page(trials=failed, recordings={"a": Recording(SVG, [])}, trial_figures={"a": SVG})
+    html = page(trials=failed, recordings={"a": TrackedRecording(SVG, [])}, trial_figures={"a": SVG})
     assert "a.mp4: not a video" in html
     assert '<div class="pair">' not in html
 
@@ -114,7 +120,7 @@ def test_a_clip_too_large_for_the_page_does_not_play_in_it() -> None:
 
 
 def test_a_strip_too_large_for_the_page_is_left_out() -> None:
-    html = page(recordings={"a": Recording(SVG + " " * LARGEST_SVG_BYTES, [""])})
+    html = page(recordings={"a": TrackedRecording(SVG + " " * LARGEST_SVG_BYTES, [""])})
     assert "Strip of a" not in html
 
 

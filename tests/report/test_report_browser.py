@@ -16,7 +16,7 @@ from vinetrack.figures.ladder_figures import draw_before_after, draw_ladder
 from vinetrack.figures.style import render
 from vinetrack.report.build import Clip, ReportFigure
 from vinetrack.report.diagnosis_section import DiagnosisResult
-from vinetrack.report.trials_section import Recording
+from vinetrack.report.trials_section import TrackedRecording
 from vinetrack.video.write import write_clip
 
 pytest.importorskip("tornado", reason="the browser is driven through bokeh's server, which is not installed")
@@ -52,7 +52,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
         kinematics=curves(*names),
         figures=[ReportFigure(key, key, "caption", svg, f"{key}.csv", "a\n1\n") for key, svg in pictures.items()],
         trial_figures=dict.fromkeys(names, pictures["before_after"]),
-        recordings={name: Recording(pictures["ladder"], ["", "doubtful"]) for name in names},
+        recordings={name: TrackedRecording(pictures["ladder"], ["", "doubtful"]) for name in names},
         clip=Clip(names[0], (folder / "a.mp4").read_bytes(), "caption"),
         diagnosis=DiagnosisResult(Diagnosis.from_json(diagnosis("ambiguous")), steps, moved()),
     )

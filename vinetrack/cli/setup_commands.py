@@ -9,7 +9,12 @@ import typer
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the command line."""
+    """Add the command to the command line.
+
+    Parameters
+    ----------
+    app : the command line.
+    """
     app.command(name="setup")(setup)
 
 
@@ -17,7 +22,13 @@ def setup(
     folder: Annotated[Path, typer.Argument(help="A folder of recordings.", metavar="FOLDER")],
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
-    """Make trials.csv and experiment.yaml of a folder of recordings, with blanks to fill."""
+    """Make trials.csv and experiment.yaml of a folder of recordings, with blanks to fill.
+
+    Parameters
+    ----------
+    folder : of recordings.
+    log : file for messages and tracebacks; none if None.
+    """
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):

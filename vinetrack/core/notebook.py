@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PLOTTING_BACKEND = "vinetrack.interface.plots"
+PLOTTING_BACKEND = "vinetrack.interface.plotting"
 """Module whose `figure_of(object, name, **options)` draws an object of this package."""
 
 

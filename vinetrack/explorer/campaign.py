@@ -173,6 +173,8 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
 
     Parameters
     ----------
+    folder : of the results.
+    experiment : whose results they are.
     user_effects
         The user's own effects, see `vinetrack.pipeline.effects_stage.effects_of`.
 

@@ -138,6 +138,7 @@ def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, f
     ----------
     key : `effect.parameter`.
     value : present value, SI.
+    parameter : its default, bounds and plausible range, SI.
 
     Returns
     -------
@@ -220,6 +221,8 @@ def chosen(
 
     Parameters
     ----------
+    campaign : what is explored.
+    start : the choice that is changed.
     add, drop
         Names of effects.
     sizes

@@ -381,6 +381,7 @@ class FitProgress:
         ----------
         now : monotonic clock, s.
         about : what is fitted.
+        other : the step of what has to be done first; None where nothing has.
 
         Returns
         -------

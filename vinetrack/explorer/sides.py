@@ -341,18 +341,18 @@ def read_summary(folder: Path) -> DiagnosisSummary | None:
     DiagnosisSummary or None
     """
     try:
-        found = read_diagnosis(Results(folder))
+        diagnosis = read_diagnosis(Results(folder))
     except ResultsError:
         return None
-    if found is None:
+    if diagnosis is None:
         return None
-    first = found.rounds[0] if found.rounds else None
+    first = diagnosis.rounds[0] if diagnosis.rounds else None
     return DiagnosisSummary(
-        verdict=found.verdict or "not diagnosed",
-        explanation=found.explanation,
-        answer_set=found.answer_set,
-        suspects=tuple(RankedCandidate(c.effect, c.delta_chi2, c.in_answer_set, c.reason) for c in found.ranking),
+        verdict=diagnosis.verdict or "not diagnosed",
+        explanation=diagnosis.explanation,
+        answer_set=diagnosis.answer_set,
+        suspects=tuple(RankedCandidate(c.effect, c.delta_chi2, c.in_answer_set, c.reason) for c in diagnosis.ranking),
         cosine_names=first.cosine_names if first else (),
         cosines=tuple(tuple(row) for row in first.cosines) if first else (),
-        next_experiment=found.next_experiment,
+        next_experiment=diagnosis.next_experiment,
     )

@@ -114,6 +114,7 @@ def log_force_sigma(fit: dict[str, Any], vine: str, x_ss_m_s: np.ndarray) -> np.
     ----------
     fit : one method's entry of `damping.json`.
     x_ss_m_s : steady tail speeds, shape (n_points,).
+    vine : its name in `fit`.
 
     Returns
     -------

@@ -87,6 +87,7 @@ def compose(view: View, picture: NDArray[Any], frame: int, time_ms: float, edges
 
     Parameters
     ----------
+    view : how the picture is laid out.
     picture : the recording's frame in grey levels, uint8 (see `levels`).
     frame : its number, which the edges count by.
     time_ms : since release.

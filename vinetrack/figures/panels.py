@@ -29,6 +29,7 @@ def panel_grid(fig: Figure, count: int, n_columns: int, **keywords: Any) -> list
 
     Parameters
     ----------
+    fig : to be divided.
     count : panels to be drawn in.
     n_columns : panels in a row.
     keywords : of `Figure.subplots`, such as `sharey`.
@@ -77,6 +78,7 @@ def line_key(label: str, **style: Any) -> Line2D:
 
     Parameters
     ----------
+    label : its text.
     style : properties of `matplotlib.lines.Line2D`.
 
     Returns
@@ -93,10 +95,12 @@ def error_points(ax: Axes, x: ArrayLike, y: ArrayLike, sigma: ArrayLike, index: 
 
     Parameters
     ----------
+    ax : to draw in.
     x, y : shape (n_points,).
     sigma : shape (n_points,), or (2, n_points) for bars below and above; NaN for no bar.
     index : which group, counted from 0.
     style : further properties of `Axes.errorbar`.
+    label : of the group in the legend.
     """
     properties: dict[str, Any] = {"ms": 6, "capsize": 3, **style}
     colour, marker = VINE_COLOURS[index % len(VINE_COLOURS)], VINE_MARKERS[index % len(VINE_MARKERS)]
@@ -109,7 +113,10 @@ def fitting_size(text: str, width_pt: float, largest: float, bold: bool = True) 
 
     Parameters
     ----------
+    text : one line.
     width_pt : the room there is.
+    largest : font size at most, pt.
+    bold : whether the text is bold.
 
     Returns
     -------
@@ -128,6 +135,7 @@ def legend_above(ax: Axes, n_columns: int = 2, **keywords: Any) -> None:
 
     Parameters
     ----------
+    ax : whose legend it is.
     n_columns : entries beside each other.
     keywords : of `Axes.legend`; `handles` replace those of the axes.
     """
@@ -152,6 +160,7 @@ def note_below(fig: Figure, note: str) -> None:
 
     Parameters
     ----------
+    fig : below whose panels it stands.
     note : one or more sentences; blank for none.
     """
     if note:
@@ -165,6 +174,7 @@ def up_from_zero(ax: Axes, *, x: bool = False) -> None:
 
     Parameters
     ----------
+    ax : with everything drawn.
     x : whether the horizontal axis begins at zero too.
     """
     ax.set_ylim(0, _HEADROOM * ax.dataLim.y1 if ax.dataLim.y1 > 0 else None)
@@ -195,6 +205,7 @@ def plain_log_ticks(ax: Axes, which: str = "both") -> None:
 
     Parameters
     ----------
+    ax : with logarithmic axes.
     which : `x`, `y` or `both`.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator

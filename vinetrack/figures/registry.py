@@ -129,6 +129,7 @@ def draw(name: str, *inputs: Any, **options: Any) -> Figure:
 
     Parameters
     ----------
+    name : of the figure.
     inputs, options : what the drawing function of that figure takes.
 
     Returns

@@ -151,6 +151,7 @@ def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 15
 
     Parameters
     ----------
+    fig : the figure.
     formats : of `png`, `svg`, `pdf`.
     dpi : pixels an inch of a PNG.
 

@@ -51,14 +51,14 @@ def fit(model: Model, source: Source, **options: Any) -> Fit:
     if "tracks" in options:
         return fit_pairs(model, source, **options)  # type: ignore[arg-type]
     given = read_source(source)
-    found = fit_pairs(model, given.pairs, **options)
-    return found if not given.left_out else _with_left_out(found, given)
+    fitted = fit_pairs(model, given.pairs, **options)
+    return fitted if not given.left_out else _with_left_out(fitted, given)
 
 
-def _with_left_out(found: Fit, given: TrialSource) -> Fit:
+def _with_left_out(fitted: Fit, given: TrialSource) -> Fit:
     from dataclasses import replace
 
-    return replace(found, left_out={**given.left_out, **found.left_out})
+    return replace(fitted, left_out={**given.left_out, **fitted.left_out})
 
 
 def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
@@ -98,12 +98,12 @@ def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
     return diagnose_pairs(given.experiment, tracks=given.tracks, **options)
 
 
-def compare(found: Fit | Source, source: Source | None = None, **options: Any) -> Comparison:
+def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) -> Comparison:
     """Hold a fitted model against the trials, condition by condition, beside what replicates differ by.
 
     Parameters
     ----------
-    found : a fit; or any source of trials, to which the model that the experiment names (else the base model) is
+    fitted : a fit; or any source of trials, to which the model that the experiment names (else the base model) is
         fitted first.
     source : the trials to compare with, as in `fit`; None for those that the model was fitted to.
     options : of `vinetrack.diagnosis.compare.compare`, such as `final_at_fraction` and `tracks`.
@@ -126,18 +126,18 @@ def compare(found: Fit | Source, source: Source | None = None, **options: Any) -
     >>> list(comparison.table.columns)[:3]
     ['model', 'condition', 'rms_position_m']
     """
-    if not isinstance(found, Fit):
-        given = read_source(found)
+    if not isinstance(fitted, Fit):
+        given = read_source(fitted)
         model = make_model() if given.experiment is None else named_model(given)
         return compare_pairs(fit_pairs(model, given.pairs), given.pairs, kinematics=given.kinematics, **options)
     if "tracks" in options:
-        return compare_pairs(found, source, **options)  # type: ignore[arg-type]
+        return compare_pairs(fitted, source, **options)  # type: ignore[arg-type]
     if source is None:
-        if not found.pairs:
+        if not fitted.pairs:
             raise FitError("The fit does not carry its tracks: name the trials to compare with.")
-        return compare_pairs(found, found.pairs, **options)
+        return compare_pairs(fitted, fitted.pairs, **options)
     given = read_source(source)
-    return compare_pairs(found, given.pairs, **{"kinematics": given.kinematics, **options})
+    return compare_pairs(fitted, given.pairs, **{"kinematics": given.kinematics, **options})
 
 
 def named_model(given: TrialSource) -> Model:

@@ -103,11 +103,11 @@ class LoadedResults:
     @cached_property
     def final_model(self) -> Model:
         """The model that the diagnosis ended with, with its fitted values; the initial one where nothing was added."""
-        found = self.diagnosis
-        if found is None or not found.effects:
+        diagnosis = self.diagnosis
+        if diagnosis is None or not diagnosis.effects:
             return self.initial_model
-        values = FitSummary(found.final_model, found.parameters).fitted_values
-        return self._model(found.final_model, values)
+        values = FitSummary(diagnosis.final_model, diagnosis.parameters).fitted_values
+        return self._model(diagnosis.final_model, values)
 
     def _model(self, names: tuple[str, ...], values: Mapping[str, Any]) -> Model:
         from vinetrack.effects import catalogue
@@ -153,9 +153,9 @@ class LoadedResults:
 
     def _state(self) -> str:
         usable = int(self.trials["status"].isin(["ok", "warning"]).sum())
-        found = self.diagnosis
-        named = ", ".join(found.effects or found.answer_set) if found is not None else ""
-        verdict = "not diagnosed" if found is None or not found.verdict else found.verdict
+        diagnosis = self.diagnosis
+        named = ", ".join(diagnosis.effects or diagnosis.answer_set) if diagnosis is not None else ""
+        verdict = "not diagnosed" if diagnosis is None or not diagnosis.verdict else diagnosis.verdict
         return f"{usable} of {len(self.trials)} trials; {verdict}{f': {named}' if named else ''}"
 
     def _repr_html_(self) -> str:

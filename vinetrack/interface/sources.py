@@ -12,7 +12,7 @@ from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.experiment.folder import Experiment, read_experiment
 from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.inference.fit_data import Pairs
-from vinetrack.interface.frames import tracks_from_frame
+from vinetrack.interface.data_frames import tracks_from_frame
 from vinetrack.interface.loaded import LoadedResults
 
 Source = LoadedResults | Experiment | Path | str | pd.DataFrame | Pairs

@@ -28,6 +28,7 @@ def campaign_lines(
 
     Parameters
     ----------
+    planned : the best campaign, the others, and the nearest where none will do.
     inputs : predictive inputs of each vine.
     n_error : standard error of n that is wanted.
     B_error : relative standard error of B that is wanted.

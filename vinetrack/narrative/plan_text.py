@@ -175,6 +175,7 @@ def in_words(
     left : pairs that the trials do not separate.
     advice : the text of `calibration_for`.
     worth_it : whether the best design separates a pair by `least`, in standard deviations.
+    least : separation that is worth a trial, standard deviations.
 
     Returns
     -------

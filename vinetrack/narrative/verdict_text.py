@@ -138,15 +138,15 @@ def confounders_in_words(confounders: Sequence[Confounder]) -> str:
         number = alike[0].number
         unit, factor = display_unit(number.unit)
         tail, digits = f" {unit}" if unit else "", decimals(number.sigma * factor)
-        smaller = [_part_in_words(one, digits, "of") for one in alike if abs(one.value) < abs(number.value)]
-        larger = [_part_in_words(one, digits, "beside") for one in alike if abs(one.value) >= abs(number.value)]
+        smaller = [_part_in_words(rival, digits, "of") for rival in alike if abs(rival.value) < abs(number.value)]
+        larger = [_part_in_words(rival, digits, "beside") for rival in alike if abs(rival.value) >= abs(number.value)]
         parts = [f"includes up to {joined(smaller, 'or')}"] if smaller else []
         parts += [f"would be larger by up to {joined(larger, 'or')}"] if larger else []
-        low, high = min(one.low_95 for one in alike) * factor, max(one.high_95 for one in alike) * factor
+        low, high = min(rival.low_95 for rival in alike) * factor, max(rival.high_95 for rival in alike) * factor
         text += (
             f" This {number.title} {', or '.join(parts)}: the data do not exclude that. "
-            f"With {joined([one.effect for one in alike])} left open, {number.title} lies between {low:.{digits}f} and "
-            f"{high:.{digits}f}{tail} (95 %)."
+            f"With {joined([rival.effect for rival in alike])} left open, {number.title} lies between "
+            f"{low:.{digits}f} and {high:.{digits}f}{tail} (95 %)."
         )
     return text
 

@@ -62,8 +62,10 @@ def _understood(results: Results, trial: Trial) -> str:
         ("tube", row["tube_width_mm"], "mm wide", trial.diameter_m),
         ("growth", row["growth_mm"], "mm", trial.length_m),
     )
-    said = [f"{what} {number(seen)} {unit} (sheet {1e3 * stated:g})" for what, seen, unit, stated in sizes if seen]
-    return "; ".join([words, f"{number(row['mm_per_px'], 4)} mm/px", *said])
+    sizes_seen = [
+        f"{what} {number(seen)} {unit} (sheet {1e3 * stated:g})" for what, seen, unit, stated in sizes if seen
+    ]
+    return "; ".join([words, f"{number(row['mm_per_px'], 4)} mm/px", *sizes_seen])
 
 
 def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: RunSettings) -> tuple[str, str]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.pipeline.diagnosis_tables import DiagnosisTables
     from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
-    from vinetrack.report.trials_section import Recording
+    from vinetrack.report.trials_section import TrackedRecording
 
 MOST_CURVE_ROWS = 6000
 """Rows of the curves of all trials as data to download; chosen: about 300 kB of the page."""
@@ -197,11 +197,11 @@ def _poster(path: Path) -> bytes:
     return file.getvalue()
 
 
-def _recording(results: Results, name: str) -> Recording:
-    from vinetrack.report.trials_section import Recording
+def _recording(results: Results, name: str) -> TrackedRecording:
+    from vinetrack.report.trials_section import TrackedRecording
 
     strip = results.strip_figure(name, ".svg")
-    return Recording(
+    return TrackedRecording(
         strip=strip.read_text(encoding="utf-8") if strip.exists() else "",
         flags=read_result(results.track(name))["flag"].tolist(),
         calibration=read_json(results.analysed(name)).get("calibration"),

@@ -35,6 +35,10 @@ def implied_ratio(trial: Trial, mean_speed_m_s: float, pressure_Pa: float, yield
     trial : its tube.
     mean_speed_m_s : of the leading edge over the middle of its growth.
     pressure_Pa, yield_pressure_Pa : gauge pressures.
+
+    Returns
+    -------
+    a ratio.
     """
     drive_N = (pressure_Pa - yield_pressure_Pa) * trial.area_m2
     if not (drive_N > 0 and mean_speed_m_s > 0 and math.isfinite(mean_speed_m_s)):

@@ -28,7 +28,7 @@ from vinetrack.report.trials_section import (
     LARGEST_SVG_BYTES,
     METHODS,
     SHARED_ERROR,
-    Recording,
+    TrackedRecording,
     calibration_table,
     trial_entries,
 )
@@ -71,7 +71,7 @@ class ReportContent:
     kinematics: Mapping[str, pd.DataFrame]
     figures: Sequence[ReportFigure] = ()
     trial_figures: Mapping[str, str] = field(default_factory=dict)
-    recordings: Mapping[str, Recording] = field(default_factory=dict)
+    recordings: Mapping[str, TrackedRecording] = field(default_factory=dict)
     clips: Mapping[str, str] = field(default_factory=dict)
     clip: Clip | None = None
     model: ModelResult | None = None

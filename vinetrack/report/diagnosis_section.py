@@ -50,28 +50,30 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
     """
     if result is None:
         return None
-    found = result.diagnosis
-    drifting = [str(row["sentence"]) for row in found.drift if row.get("sentence") and row.get("significant", True)]
+    diagnosis = result.diagnosis
+    drifting = [str(row["sentence"]) for row in diagnosis.drift if row.get("sentence") and row.get("significant", True)]
     return {
-        "badge": BADGES.get(found.verdict, BADGES["none"]),
-        "kind": found.verdict if found.verdict in BADGES else "none",
-        "sentence": sentence(found),
-        "meaning": meaning(found),
-        "summaries": [result.summaries[name] for name in found.effects or found.answer_set if name in result.summaries],
-        "facts": facts(found, result.ladder),
-        "explanation": found.explanation,
+        "badge": BADGES.get(diagnosis.verdict, BADGES["none"]),
+        "kind": diagnosis.verdict if diagnosis.verdict in BADGES else "none",
+        "sentence": sentence(diagnosis),
+        "meaning": meaning(diagnosis),
+        "summaries": [
+            result.summaries[name] for name in diagnosis.effects or diagnosis.answer_set if name in result.summaries
+        ],
+        "facts": facts(diagnosis, result.ladder),
+        "explanation": diagnosis.explanation,
         "ladder": ladder_table(result.ladder),
-        "where": [line for line in found.where if line not in drifting],
-        "force": missing_force(found.missing_force),
-        "rounds": [_round(i, entry) for i, entry in enumerate(found.rounds)],
-        "hidden": _hidden(found, result.units),
-        "blind": _blind(found.ranking),
-        "tied": tied_pairs(found.rounds[0]) if found.rounds else [],
-        "next": next_experiment(found.next_experiment),
+        "where": [line for line in diagnosis.where if line not in drifting],
+        "force": missing_force(diagnosis.missing_force),
+        "rounds": [_round(i, entry) for i, entry in enumerate(diagnosis.rounds)],
+        "hidden": _hidden(diagnosis, result.units),
+        "blind": _blind(diagnosis.ranking),
+        "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
+        "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
         "moved": moved_table(result.moved),
         "laws": law_table(result.laws),
-        "notes": list(found.notes),
+        "notes": list(diagnosis.notes),
     }
 
 
@@ -149,9 +151,9 @@ def round_question(entry: Round) -> str:
     return f"which effect is missing from {listed(entry.model)}?"
 
 
-def _hidden(found: Diagnosis, units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
+def _hidden(diagnosis: Diagnosis, units: Mapping[str, tuple[str, str]]) -> ReportTable | None:
     """Upper limits on undetected effects, where no effect is missing: only then they hold."""
-    return hidden_table(found.rounds[-1].ranking, units) if found.final_verdict == ADEQUATE else None
+    return hidden_table(diagnosis.rounds[-1].ranking, units) if diagnosis.final_verdict == ADEQUATE else None
 
 
 def hidden_table(

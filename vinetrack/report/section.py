@@ -76,6 +76,7 @@ def section_entry(section: ReportSection, largest_svg_bytes: int) -> dict[str, A
 
     Parameters
     ----------
+    section : of the page.
     largest_svg_bytes : of a picture in the page.
 
     Returns

@@ -297,6 +297,7 @@ def moved(commands: Sequence[Command], x: float, y: float) -> list[Command]:
 
     Parameters
     ----------
+    commands : letter and numbers of each, pt.
     x, y : the shift, pt.
 
     Returns

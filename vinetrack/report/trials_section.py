@@ -61,7 +61,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class Recording:
+class TrackedRecording:
     """A recording in the report: its strip as SVG ("" for none), the flags of its frames, and its calibration.
 
     `calibration` is what the recording's stage wrote: `kind, image, mm_per_px, scale_rel_sigma, reprojection_px,
@@ -93,7 +93,7 @@ def count_frames(flags: Iterable[str]) -> str:
     return f"{len(flags)} frames" + (f": {', '.join(parts)}" if parts else "")
 
 
-def calibration_table(recordings: Mapping[str, Recording]) -> list[dict[str, Any]]:
+def calibration_table(recordings: Mapping[str, TrackedRecording]) -> list[dict[str, Any]]:
     """One row a calibration, with what it found and the trials that rest on it.
 
     Parameters

@@ -67,8 +67,8 @@ def list_recordings(folder: Path) -> list[str]:
         Films, folders of at least `FEWEST_PICTURES` pictures and stacks of pictures; results, the calibration and
         hidden files are left out.
     """
-    found = [path.relative_to(folder).as_posix() for path in _recordings(folder, DEEPEST)]
-    return sorted(found, key=_natural)
+    names = [path.relative_to(folder).as_posix() for path in _recordings(folder, DEEPEST)]
+    return sorted(names, key=_natural)
 
 
 def list_pictures(folder: Path) -> list[str]:
@@ -222,10 +222,13 @@ def units_of(column: str) -> list[str]:
     >>> units_of("payload_g"), units_of("bends")
     (['g', 'mg', 'oz', 'lb', 'kg'], [])
     """
-    own = split_unit(column)[1]
-    if own not in UNITS or COLUMNS[column].kind != "number":
+    unit_of_column = split_unit(column)[1]
+    if unit_of_column not in UNITS or COLUMNS[column].kind != "number":
         return []
-    return [own, *(key for key, unit in UNITS.items() if unit.si == UNITS[own].si and key != own)]
+    return [
+        unit_of_column,
+        *(key for key, unit in UNITS.items() if unit.si == UNITS[unit_of_column].si and key != unit_of_column),
+    ]
 
 
 def _recordings(folder: Path, depth: int) -> Iterator[Path]:

@@ -107,19 +107,23 @@ def write_draft(folder: Path, sheet: SheetDraft, settings: str, stamp: str) -> l
     return written
 
 
-def same_cells(one: SheetDraft, other: SheetDraft) -> bool:
+def same_cells(first: SheetDraft, other: SheetDraft) -> bool:
     """Whether two sheets hold the same columns and cells, however they are written.
 
     Parameters
     ----------
-    one, other : sheets.
+    first, other : sheets.
+
+    Returns
+    -------
+    bool
     """
-    if one.columns != other.columns or len(one.rows) != len(other.rows):
+    if first.columns != other.columns or len(first.rows) != len(other.rows):
         return False
     return all(
         a.get(column, "") == b.get(column, "")
-        for a, b in zip(one.rows, other.rows, strict=True)
-        for column in one.columns
+        for a, b in zip(first.rows, other.rows, strict=True)
+        for column in first.columns
     )
 
 

@@ -69,7 +69,7 @@ def _drawn(inputs: Mapping[str, tuple[Any, ...]], name: str) -> Figure:
 def _of_comparison(shown: Comparison) -> dict[str, tuple[Any, ...]]:
     from vinetrack.pipeline.figures_stage import label_conditions
 
-    table = label_conditions(shown.table, _described([one.trial for one in shown.trials]))
+    table = label_conditions(shown.table, _described([compared.trial for compared in shown.trials]))
     return {name: (table, dict(shown.trajectories)) for name in MODEL_FIGURES}
 
 
@@ -108,19 +108,24 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
         curves = pd.DataFrame(columns=list(CURVE_COLUMNS))
         return assemble_tables(shown, _described([]), curves, nothing, nothing, nothing)
     before, after = shown.fits[0], shown.fits[-1]
-    later = {one.name: one for one in in_sample(after).trials} if after is not before else {}
+    later = {motion.name: motion for motion in in_sample(after).trials} if after is not before else {}
     parts = []
-    for one in in_sample(before).trials:
-        last = later[one.name].predicted_position_m if later else np.full(one.time_s.size, math.nan)
-        positions = (one.lead_position_m, one.predicted_position_m, last)
-        columns = (one.name, one.trial.condition, one.time_s - one.release_s, *(y - one.origin_m for y in positions))
+    for motion in in_sample(before).trials:
+        last = later[motion.name].predicted_position_m if later else np.full(motion.time_s.size, math.nan)
+        positions = (motion.lead_position_m, motion.predicted_position_m, last)
+        columns = (
+            motion.name,
+            motion.trial.condition,
+            motion.time_s - motion.release_s,
+            *(y - motion.origin_m for y in positions),
+        )
         parts.append(pd.DataFrame(dict(zip(CURVE_COLUMNS, columns, strict=True))))
     located, drifting = nothing, nothing
     if shown.failure is not None:
         located = shown.failure.along_position
         drifting = drift_groups(shown.failure.drift, after if later else None)
     force = nothing if shown.force_table is None else shown.force_table
-    conditions = _described([one.trial for one in before.trials])
+    conditions = _described([fitted.trial for fitted in before.trials])
     return assemble_tables(shown, conditions, pd.concat(parts, ignore_index=True), located, drifting, force)
 
 
@@ -137,7 +142,9 @@ def _of_results(shown: LoadedResults, name: str, trial: str) -> Figure:
         names = list(shown.trials["trial"])
         if trial not in names:
             raise ResultsError(f"There is no trial {trial!r}; there are {', '.join(names)}.")
-        return draw_trial(shown.folder, next((one for one in known if one.name == trial), None), trial)
+        return draw_trial(
+            shown.folder, next((known_trial for known_trial in known if known_trial.name == trial), None), trial
+        )
     inputs = campaign_inputs(shown.folder, known)
     chosen = name or ("ladder" if "ladder" in inputs else "damping_law")
     return _drawn(inputs, chosen)
