@@ -11,16 +11,8 @@ from scipy.linalg import toeplitz
 from scipy.stats import multivariate_normal
 
 from vinetrack.inference.intervals import degrees_of_freedom, precision
-from vinetrack.inference.mixed_effects import (
-    FitState,
-    MixedProblem,
-    cross_products,
-    deviance,
-    estimate_noise,
-    estimate_spreads,
-    marginal,
-    newton_step,
-)
+from vinetrack.inference.marginal_likelihood import deviance, estimate_noise, estimate_spreads, marginal
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, cross_products, newton_step
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten

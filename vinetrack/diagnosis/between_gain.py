@@ -10,9 +10,11 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.result import N_BY_VINE
+from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, deviance, estimate_spreads, marginal
-from vinetrack.inference.optimiser import Solution, make_problem
+from vinetrack.inference.marginal_likelihood import deviance, estimate_spreads, marginal
+from vinetrack.inference.mixed_effects import FitState, MixedProblem
+from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import BetweenTerm, ParameterMap, make_layout
 from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, Predictor

@@ -12,9 +12,10 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.replicate_scatter import LEAST_SPREAD, Scatter
+from vinetrack.inference.fit_problem import floor, track_correlation
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import SPREAD_COLUMNS, FitState, trial_effect_prior
-from vinetrack.inference.optimiser import FixedTerms, floor, solve, track_correlation
+from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import OWN
 from vinetrack.inference.whitening import whiten
 

@@ -24,8 +24,8 @@ from vinetrack.diagnosis.score_test import (
 )
 from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_motion
 from vinetrack.effects import Effect
+from vinetrack.inference.fit_problem import track_correlation
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.optimiser import track_correlation
 from vinetrack.inference.solving import is_poor_fit, missed_fraction
 from vinetrack.inference.systematics import systematics_of
 

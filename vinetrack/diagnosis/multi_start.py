@@ -20,9 +20,10 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, FitTrial
+from vinetrack.inference.fit_problem import first_state, make_problem, track_correlation
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import deviance, marginal
-from vinetrack.inference.optimiser import FixedTerms, first_state, make_problem, solve, track_correlation
+from vinetrack.inference.marginal_likelihood import deviance, marginal
+from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
 from vinetrack.inference.solving import is_poor_fit

@@ -16,7 +16,8 @@ from vinetrack.dynamics.model import Model, Value
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, TrialFit
 from vinetrack.inference.intervals import Precision, among_first, near_bound, precision, profile_interval, student
-from vinetrack.inference.mixed_effects import deviance, estimate_spreads, marginal, trial_effect_prior
+from vinetrack.inference.marginal_likelihood import deviance, estimate_spreads, marginal
+from vinetrack.inference.mixed_effects import trial_effect_prior
 from vinetrack.inference.optimiser import Solution, chi2_per_dof
 from vinetrack.inference.parameters import YIELD_PRESSURE, FreeParameter, ParameterMap
 from vinetrack.inference.pooling import Pooled, pool
@@ -53,7 +54,25 @@ def assemble(
     *,
     profile: bool,
 ) -> Fit:
-    """Everything that is said about a fit."""
+    """Assemble a `Fit` from where the iterations ended: numbers with errors and intervals, trial effects, messages.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+    left_out : mapping
+        Trials that could not be used, with the reason.
+    options : mapping
+        What the fit was told (`fixed`, `free`, `shared`, `held`), kept for refits.
+    profile : bool
+        Whether intervals near a bound are found by profile.
+
+    Returns
+    -------
+    Fit
+    """
     layout, state = predictor.layout, solution.state
     plain = log_likelihood(solution)
     smooth = smooth_errors(predictor, solution, options.get("held"))
@@ -64,9 +83,9 @@ def assemble(
     if pooled is not None:
         wide, by_noise = pooled.solution, replace(by_noise, covariance=_with_unknown(pooled.covariance, by_noise))
     if smooth is not None:
-        trials = tuple(replace(one, whitened=white) for one, white in zip(trials, smooth.whitened, strict=True))
+        trials = tuple(replace(trial, whitened=white) for trial, white in zip(trials, smooth.whitened, strict=True))
     known = widened_covariance(predictor, solution, trials, by_noise, wide if smooth else None, pooled)
-    by_noise, known = (among_first(one, len(layout.free)) for one in (by_noise, known))
+    by_noise, known = (among_first(trial, len(layout.free)) for trial in (by_noise, known))
     numbers = _numbers(predictor, solution, wide.state.theta, by_noise, known, profile=profile)
     between = _outside(layout, numbers, _between(pooled, len(numbers)))
     chi2 = chi2_per_dof(predictor, solution)
@@ -74,7 +93,7 @@ def assemble(
     variance = float(np.average(state.variance, weights=weights)) / (1 - state.rho**2)
     felt = [bool(solution.problem.feels[:, k].any()) for k in range(2)]
     return Fit(
-        model=fitted_model(layout, numbers),
+        model=_fitted_model(layout, numbers),
         numbers=numbers,
         covariance=_outside(layout, numbers, known.covariance),
         spreads={
@@ -122,14 +141,14 @@ def _between(pooled: Pooled | None, count: int) -> Floats:
 def _disagreements(numbers: Sequence[Number], between: Floats) -> list[str]:
     """Numbers that trials disagree about by more than the error of their mean, in words."""
     sd = np.sqrt(np.diag(between))
-    found = [
+    disagreements = [
         f"{n.title} by ± {sd[k] * display_unit(n.unit)[1]:.2g} {display_unit(n.unit)[0]}".rstrip()
         for k, n in enumerate(numbers)
         if sd[k] > DISAGREE * n.sigma and math.isfinite(n.sigma)
     ]
-    if not found:
+    if not disagreements:
         return []
-    return [f"trials disagree by more than their noise, in {', '.join(found)}: they count nearly alike"]
+    return [f"trials disagree by more than their noise, in {', '.join(disagreements)}: they count nearly alike"]
 
 
 def _with_unknown(covariance: Floats, known: Precision) -> Floats:
@@ -138,13 +157,23 @@ def _with_unknown(covariance: Floats, known: Precision) -> Floats:
 
 
 def log_likelihood(solution: Solution) -> float:
-    """Marginal ln L, spreads at their best for it (not the restricted one, which cannot compare models)."""
+    """Marginal ln L, spreads at their best for it (not the restricted one, which cannot compare models).
+
+    Parameters
+    ----------
+    solution
+        Where the iterations ended.
+
+    Returns
+    -------
+    float
+    """
     part = marginal(solution.grams, solution.problem, solution.state)
     spread = estimate_spreads(part, solution.problem, solution.state, solution.estimable, restricted=False)
     return -0.5 * deviance(part, solution.problem, solution.state, spread, restricted=False)
 
 
-def fitted_model(layout: ParameterMap, numbers: Sequence[Number]) -> Model:
+def _fitted_model(layout: ParameterMap, numbers: Sequence[Number]) -> Model:
     """The model with the fitted values; yield pressures belong to the trials and stay in the numbers."""
     values: dict[str, Value] = {}
     for number in numbers:
@@ -218,7 +247,7 @@ def _outside(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats
     return np.asarray(covariance * slopes[:, None] * slopes)
 
 
-def own_sigma(solution: Solution, known: Precision) -> Floats:
+def _own_sigma(solution: Solution, known: Precision) -> Floats:
     """Standard errors of each trial's own numbers, shape (n_trials, 4), those of the shared numbers included."""
     problem, state = solution.problem, solution.state
     white = at_correlation(solution.grams, state.rho) / state.variance[:, None, None]
@@ -239,7 +268,7 @@ def own_sigma(solution: Solution, known: Precision) -> Floats:
 
 
 def _trial_fits(predictor: Predictor, solution: Solution, known: Precision) -> tuple[TrialFit, ...]:
-    state, sigma = solution.state, own_sigma(solution, known)
+    state, sigma = solution.state, _own_sigma(solution, known)
     moved = predictor.run(predictor.jobs(state.theta, state.trial_effects))
     return tuple(
         trial_fit(trial_data, state.trial_effects[i], sigma[i], moved[i].observed_position_m,
@@ -258,7 +287,29 @@ def trial_fit(
     rho: float,
     variance: float,
 ) -> TrialFit:
-    """One trial with its own numbers and what the model says of it."""
+    """One trial with its own numbers and what the model says of it.
+
+    Parameters
+    ----------
+    trial_data
+        The trial as the fit sees it.
+    trial_effects : array, shape (4,)
+        Release, s; origin, m; deviations of pressure and ln B.
+    sigma : array, shape (4,)
+        Their standard errors.
+    position_m : array, shape (n_points,), m
+        Positions by the model, from an origin of 0.
+    velocity_m_s : array, shape (n_points,), m/s
+        Speed of the leading edge by the model.
+    rho : float
+        Lag-one correlation of the noise.
+    variance : float
+        Variance of its innovations, m².
+
+    Returns
+    -------
+    TrialFit
+    """
     predicted_m = position_m + trial_effects[ORIGIN]
     residual_m = trial_data.lead_position_m - predicted_m
     return TrialFit(
@@ -285,30 +336,38 @@ def _messages(
     layout: ParameterMap, solution: Solution, numbers: Sequence[Number], known: Precision, chi2: float
 ) -> list[str]:
     """What to beware of, in words."""
-    found = []
+    messages = []
     if not solution.converged:
-        found.append(f"the fit did not settle in {solution.iterations} iterations: its numbers are not to be trusted")
+        messages.append(
+            f"the fit did not settle in {solution.iterations} iterations: its numbers are not to be trusted"
+        )
     for k, number in enumerate(numbers):
         free = layout.free[k]
         if known.silent[k]:
-            found.append(f"{number.title} ({number.key}) never moved the trajectories: it stays at {number.value:.4g}")
+            messages.append(
+                f"{number.title} ({number.key}) never moved the trajectories: it stays at {number.value:.4g}"
+            )
         elif math.isfinite(number.bound):
-            found.append(f"{number.title} ({number.key}) sits at its bound {number.bound:.4g}: the data want it beyond")
+            messages.append(
+                f"{number.title} ({number.key}) sits at its bound {number.bound:.4g}: the data want it beyond"
+            )
         elif math.isfinite(free.prior_sd) and number.sigma > ADDS_NOTHING * free.prior_sd:
-            found.append(f"{number.title}: the trajectories say no more than the sheet does")
+            messages.append(f"{number.title}: the trajectories say no more than the sheet does")
     if known.tied.any():
         titles = [f"{n.title} ({n.key})" for n, tied in zip(numbers, known.tied, strict=True) if tied]
-        found.append(f"cannot be told apart at all by these data: {', '.join(titles)}")
-    found += _close_pairs(numbers, known)
+        messages.append(f"cannot be told apart at all by these data: {', '.join(titles)}")
+    messages += _close_pairs(numbers, known)
     for k, name in enumerate(SPREAD_NAMES):
         if solution.problem.feels[:, k].any() and not solution.estimable[k]:
-            found.append(f"the spread of {name} from trial to trial is taken as {100 * solution.state.spread[k]:.2g} %")
+            messages.append(
+                f"the spread of {name} from trial to trial is taken as {100 * solution.state.spread[k]:.2g} %"
+            )
     if chi2 > MISSES:
-        found.append(
+        messages.append(
             f"the model leaves {math.sqrt(chi2):.3g} times the noise of the tracks{_free_in_trials(solution)}:"
             " something is missing, or tracks err slowly by more than their noise"
         )
-    return found
+    return messages
 
 
 def _free_in_trials(solution: Solution) -> str:
@@ -329,12 +388,12 @@ def _weighted(data: Sequence[FitTrial]) -> list[str]:
 
 
 def _close_pairs(numbers: Sequence[Number], known: Precision) -> list[str]:
-    found = []
+    pairs = []
     variance = np.diag(known.covariance)
     usable = np.flatnonzero(np.isfinite(variance) & (variance > 0))
     for i, j in itertools.combinations(usable.tolist(), 2):
         correlation = known.covariance[i, j] / math.sqrt(variance[i] * variance[j])
         if abs(correlation) > HARD_TO_TELL_APART:
-            one, other = numbers[i].title, numbers[j].title
-            found.append(f"{one} and {other} can hardly be told apart (correlation {correlation:.3f})")
-    return found
+            first, second = numbers[i].title, numbers[j].title
+            pairs.append(f"{first} and {second} can hardly be told apart (correlation {correlation:.3f})")
+    return pairs

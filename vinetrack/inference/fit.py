@@ -23,16 +23,10 @@ from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
+from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_trials
-from vinetrack.inference.optimiser import (
-    MOST_ITERATIONS,
-    FixedTerms,
-    Solution,
-    Watch,
-    make_problem,
-    solve,
-)
+from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch, solve
 from vinetrack.inference.parameters import BetweenTerm, make_layout
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import POOR_FIT, led_back, solve_again, solve_from, solve_from_scratch
@@ -67,29 +61,35 @@ def fit(
 
     Parameters
     ----------
+    model
+        Sum of effects; its values are those of numbers that are held.
     experiment
         An experiment or its folder, or pairs of trial and track.
-    tracks
+    tracks : mapping, optional
         Tracks by name of trial, where the experiment brings recordings.
-    fixed, free
+    fixed, free : iterable of str
         Parameters to hold at the model's values, or to fit although known beforehand (g). `n` will do for
         `eversion_damping.n` where no other effect has an n; the yield pressure is `P_y`.
-    shared
+    shared : mapping, optional
         `"all"` or `"vine"` by name of parameter, in place of what the effect says.
-    start
-        Values of further parameters to begin from; B and n are always looked for.
-    spreads
-        Relative spread of pressure and of B from trial to trial, in place of their estimates.
-    noise
+    start : mapping, optional
+        Values of further parameters to begin from, SI; B and n are always looked for.
+    spreads : (float, float), optional
+        Relative between-trial standard deviations of pressure and of B, in place of their estimates.
+    noise : (float, float), optional
         Standard deviation of a position, m, and its lag-one correlation, in place of their estimates.
-    profile
+    profile : bool
         Whether intervals near a bound are found by profile, which costs a few refits each.
-    host
+    host : Model, optional
         A larger model whose compiled form serves this one and every `refit` that follows: nothing is compiled anew.
-    thorough
+    thorough : bool
         Whether a poor fit is begun from other starts too. One that will only be questioned for what it lacks need not.
-    watch
-        Told of every step of the iterations; what it raises ends the fit.
+    watch : callable, optional
+        Called with each step of the iterations; what it raises ends the fit.
+
+    Returns
+    -------
+    Fit
 
     Raises
     ------
@@ -113,8 +113,8 @@ def fit(
     held = _held(spreads, noise, data)
     solution = solve_from_scratch(predictor, held, watch, thorough=thorough)
     _refuse_a_standstill(predictor, solution)
-    found = assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
-    return replace(found, pairs=tuple(pairs))
+    fitted = assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
+    return replace(fitted, pairs=tuple(pairs))
 
 
 def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
@@ -126,7 +126,7 @@ def _refuse_a_standstill(predictor: Predictor, solution: Solution) -> None:
         If no trial moves.
     """
     moved = predictor.run(predictor.jobs(solution.state.theta, solution.state.trial_effects))
-    if any(float(np.ptp(one.observed_position_m)) > STANDSTILL_M for one in moved):
+    if any(float(np.ptp(trajectory.observed_position_m)) > STANDSTILL_M for trajectory in moved):
         return
     model = " + ".join(predictor.layout.model.names)
     angles = sorted({round(math.degrees(trial_data.trial.growth_angle_rad)) for trial_data in predictor.data})
@@ -171,25 +171,40 @@ def refit(
 
     Parameters
     ----------
-    model
+    before
+        The fit whose data, numbers and trial effects are taken over.
+    model : Model, optional
         The other model; its values are those of the fit where it has the same parameters.
-    shared
+    fixed, free : iterable of str, optional
+        In place of what the fit was told.
+    shared : mapping, optional
         `"all"` or `"vine"` by name of parameter, beside what the fit was told.
-    between
+    between : sequence of BetweenTerm, optional
         Differences between trials to fit along, in place of those of the fit.
-    start
+    start : mapping, optional
         Values of parameters to begin from, of a new effect above all: a time constant begun at zero stays there.
-    hold_spreads, hold_noise
+    hold_spreads, hold_noise : bool
         Keep spreads and noise of the fit instead of estimating them again.
-    most_iterations
+    profile : bool
+        Whether intervals near a bound are found by profile.
+    most_iterations : int
         How long to go on: what is only to be ruled out need not settle.
-    thorough
+    thorough : bool
         Whether a fit far off that takes what it misses for slow noise is led on by what it misses until nothing moves;
         else it is only led so far that it can be held against others.
-    afresh
+    afresh : bool
         Whether releases, deviations and noise begin as the tracks show them, and not as the fit left them.
-    watch
-        Told of every step of the iterations; what it raises ends the fit.
+    watch : callable, optional
+        Called with each step of the iterations; what it raises ends the fit.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    FitError
+        If a name is that of no parameter, or the model cannot be followed.
 
     Examples
     --------
@@ -231,18 +246,29 @@ def refit(
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
     solution = solve_again(predictor, solution, held, watch, thorough=thorough)
-    found = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
-    return replace(found, pairs=before.pairs)
+    fitted = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
+    return replace(fitted, pairs=before.pairs)
 
 
 def _belongs(name: str, names: Iterable[str]) -> bool:
     return any(name in (full, full.split(".")[1]) for full in names)
 
 
-def predict(found: Fit, pairs: Pairs) -> list[TrialFit]:
+def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
     """What a fitted model says of trials that were not in the fit.
 
     Each gets its own release and origin, nothing else: its deviations of pressure and B are zero.
+
+    Parameters
+    ----------
+    fitted
+        A fit.
+    pairs : iterable of (Trial, Track)
+        Trials to predict.
+
+    Returns
+    -------
+    list of TrialFit
 
     Raises
     ------
@@ -257,4 +283,4 @@ def predict(found: Fit, pairs: Pairs) -> list[TrialFit]:
     >>> [trial.name for trial in vt.predict(fit, pairs[6:])]
     ['P48_1', 'P48_2']
     """
-    return predict_trials(found, pairs)
+    return predict_trials(fitted, pairs)

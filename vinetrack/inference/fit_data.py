@@ -144,7 +144,18 @@ Pairs = Iterable[tuple[Trial, Track]]
 
 
 def prepare(pairs: Pairs) -> tuple[list[FitTrial], dict[str, str]]:
-    """Trials that can be fitted, and for the others the reason why not, by name."""
+    """Trials that can be fitted, and for the others the reason why not, by name.
+
+    Parameters
+    ----------
+    pairs : iterable of (Trial, Track)
+
+    Returns
+    -------
+    data : list of FitTrial
+    left_out : dict
+        Reason by name of trial.
+    """
     data, left_out = [], {}
     for trial, track in pairs:
         try:
@@ -183,6 +194,17 @@ def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:
 
 def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     """The usable points of a track, rest included, with what they say of their own noise.
+
+    Parameters
+    ----------
+    trial
+        Row of the sheet.
+    track
+        Its positions.
+
+    Returns
+    -------
+    FitTrial
 
     Raises
     ------
@@ -246,7 +268,7 @@ def _trace(track: Track, moving_s: Floats) -> tuple[tuple[Floats, Floats] | None
     known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
     if np.count_nonzero(known) < 2:
         return None, 0.0
-    clock_s, pressure_Pa = (one[known].astype(float) for one in (track.time_s, track.pressure_Pa))
+    clock_s, pressure_Pa = (values[known].astype(float) for values in (track.time_s, track.pressure_Pa))
     told = (clock_s >= moving_s[0]) & (clock_s <= moving_s[-1])
     typical_Pa = abs(float(np.median(pressure_Pa[told]))) if told.any() else math.nan
     smooth_Pa = without_noise(pressure_Pa)
@@ -269,17 +291,17 @@ def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], 
     vague = known & (sigma_m > VAGUE * np.median(better_m))
     places = np.flatnonzero(usable)
     at_rest = places[: rest_points(track.lead_position_m[places])]
-    rest = None
+    vague_rest = None
     if 0 < at_rest.size < places.size and np.mean(vague[at_rest]) > MOSTLY:
         # The few that are left of such a rest would hold the origin alone.
         vague[at_rest] = True
-        rest = VagueRest(
+        vague_rest = VagueRest(
             release_s=float(track.time_s[at_rest[-1]]),
             origin_m=float(np.median(track.lead_position_m[at_rest])),
             sigma_m=float(np.median(sigma_m[at_rest])),
         )
     enough = np.count_nonzero(usable & ~vague) >= max(FEWEST_POINTS, FEWEST_CLEAR * np.count_nonzero(usable))
-    return (vague, rest) if enough else (np.zeros(usable.size, dtype=bool), None)
+    return (vague, vague_rest) if enough else (np.zeros(usable.size, dtype=bool), None)
 
 
 def _undriven(trial: Trial) -> bool:
@@ -323,8 +345,14 @@ def pairs_of(
     ----------
     experiment
         An experiment, the path of its folder, or pairs of trial and track.
-    tracks
+    tracks : mapping, optional
         Tracks by name of trial, for recordings that were tracked before; else they are read from the experiment.
+
+    Returns
+    -------
+    pairs : list of (Trial, Track)
+    left_out : dict
+        Reason by name of trial.
 
     Raises
     ------

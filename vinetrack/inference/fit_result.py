@@ -163,9 +163,19 @@ class NumberTable:
             raise FitError(f"{name!r} is {'no number' if not fits else 'more than one number'} of the fit: {known}.")
         return fits[0]
 
-    def correlation(self, one: str, other: str) -> float:
-        """Correlation of the errors of two numbers."""
-        i, j = self.numbers.index(self[one]), self.numbers.index(self[other])
+    def correlation(self, first: str, second: str) -> float:
+        """Correlation of the errors of two numbers.
+
+        Parameters
+        ----------
+        first, second : str
+            Names of numbers, as for indexing.
+
+        Returns
+        -------
+        float
+        """
+        i, j = self.numbers.index(self[first]), self.numbers.index(self[second])
         return float(self.covariance[i, j] / math.sqrt(self.covariance[i, i] * self.covariance[j, j]))
 
     def table(self) -> pd.DataFrame:
@@ -212,7 +222,17 @@ class Fit(NumberTable):
     between: Floats | None = None
 
     def trial(self, name: str) -> TrialFit:
-        """The trial of that name; KeyError where there is none."""
+        """The trial of that name; KeyError where there is none.
+
+        Parameters
+        ----------
+        name : str
+            Name of the trial.
+
+        Returns
+        -------
+        TrialFit
+        """
         return {trial.name: trial for trial in self.trials}[name]
 
     @property
@@ -245,7 +265,19 @@ class Fit(NumberTable):
         return pd.concat(parts, ignore_index=True)
 
     def plot(self, name: str = "model_comparison", **options: Any) -> Figure:
-        """Return a figure of the report for this model: `model_comparison` or `model_residuals`."""
+        """Return a figure of the report for this model: `model_comparison` or `model_residuals`.
+
+        Parameters
+        ----------
+        name : str
+            Name of the figure.
+        **options
+            Passed on to the drawing.
+
+        Returns
+        -------
+        Figure
+        """
         return plot(self, name, **options)
 
     def __repr__(self) -> str:
@@ -262,26 +294,26 @@ class Fit(NumberTable):
         return "\n".join([head, *numbers_text(self)])
 
 
-def numbers_text(found: Any) -> list[str]:
+def numbers_text(fit: Any) -> list[str]:
     """Return the numbers of a fit and of its noise as lines of text, and what to beware of.
 
     Parameters
     ----------
-    found : a `Fit`, or a `FitSummary`.
+    fit : a `Fit`, or a `FitSummary`.
 
     Returns
     -------
     list of str
     """
-    lines = aligned([("", "value", "error", "95 % interval", "unit"), *map(number_row, found.numbers)])
-    lines += [_spread_line(name, spread) for name, spread in found.spreads.items()]
+    lines = aligned([("", "value", "error", "95 % interval", "unit"), *map(number_row, fit.numbers)])
+    lines += [_spread_line(name, spread) for name, spread in fit.spreads.items()]
     lines.append(
-        f"noise {found.noise_m * 1e3:.3g} mm, correlation {found.noise_correlation:.2f};"
-        f" χ² per degree of freedom {found.chi2_per_dof:.3g}; ln L {found.log_likelihood:.1f}"
+        f"noise {fit.noise_m * 1e3:.3g} mm, correlation {fit.noise_correlation:.2f};"
+        f" χ² per degree of freedom {fit.chi2_per_dof:.3g}; ln L {fit.log_likelihood:.1f}"
     )
-    lines += [f"! {message}" for message in found.messages]
-    if found.left_out:
-        lines.append(f"left out: {'; '.join(f'{name} ({why})' for name, why in found.left_out.items())}")
+    lines += [f"! {message}" for message in fit.messages]
+    if fit.left_out:
+        lines.append(f"left out: {'; '.join(f'{name} ({why})' for name, why in fit.left_out.items())}")
     return lines
 
 
@@ -305,7 +337,17 @@ def number_row(number: Number) -> tuple[str, ...]:
 
 
 def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Rows of (name, value, error, interval, unit) as lines of text in columns; values to the right, the rest left."""
+    """Rows of (name, value, error, interval, unit) as lines of text in columns; values to the right, the rest left.
+
+    Parameters
+    ----------
+    rows : sequence of tuple of str
+        All of one length.
+
+    Returns
+    -------
+    list of str
+    """
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     lines = []
     for row in rows:

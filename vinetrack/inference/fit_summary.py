@@ -62,20 +62,22 @@ class FitSummary(NumberTable):
     @property
     def fitted_values(self) -> dict[str, float | dict[str, float]]:
         """Fitted values by `effect.parameter`, SI, as `Model.with_values` takes them."""
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         for number in self.numbers:
             if number.vine:
-                found.setdefault(number.key, {})[number.vine] = number.value
+                values.setdefault(number.key, {})[number.vine] = number.value
             else:
-                found[number.key] = number.value
-        return found
+                values[number.key] = number.value
+        return values
 
     def trial_table(self) -> pd.DataFrame:
         """A row a trial: `trial, release_s, release_sigma_s, origin_m, …`; deviations are relative."""
         import pandas as pd
 
-        columns = ["trial", *(one.name for one in fields(TrialEstimates))]
-        return pd.DataFrame([{"trial": name, **asdict(one)} for name, one in self.trials.items()], columns=columns)
+        columns = ["trial", *(entry.name for entry in fields(TrialEstimates))]
+        return pd.DataFrame(
+            [{"trial": name, **asdict(estimates)} for name, estimates in self.trials.items()], columns=columns
+        )
 
     def to_json(self) -> dict[str, Any]:
         """As `fit.json` holds it, SI; a refused fit has its model and the reason alone."""
@@ -94,7 +96,7 @@ class FitSummary(NumberTable):
             "messages": list(self.messages),
             "warnings": list(self.warnings),
             "left_out": dict(self.left_out),
-            "trials": {name: asdict(one) for name, one in self.trials.items()},
+            "trials": {name: asdict(estimates) for name, estimates in self.trials.items()},
         }
 
     @classmethod
@@ -111,7 +113,7 @@ class FitSummary(NumberTable):
         """
         numbers = tuple(Number.from_json(entry) for entry in content.get("numbers") or ())
         matrix = [[or_nan(cell) for cell in row] for row in content.get("covariance") or ()]
-        keys = [one.name for one in fields(TrialEstimates)]
+        keys = [entry.name for entry in fields(TrialEstimates)]
         return cls(
             names=tuple(content["model"]),
             numbers=numbers,
@@ -129,8 +131,8 @@ class FitSummary(NumberTable):
             warnings=tuple(content.get("warnings") or ()),
             left_out=dict(content.get("left_out") or {}),
             trials={
-                str(name): TrialEstimates(*(or_nan(one.get(key)) for key in keys))
-                for name, one in (content.get("trials") or {}).items()
+                str(name): TrialEstimates(*(or_nan(estimates.get(key)) for key in keys))
+                for name, estimates in (content.get("trials") or {}).items()
             },
             refused=str(content.get("refused") or ""),
         )
@@ -153,12 +155,12 @@ class FitSummary(NumberTable):
         return "\n".join([head, *numbers_text(self)])
 
 
-def summary_of(found: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
+def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
     """Return what is quoted from a fit.
 
     Parameters
     ----------
-    found : the fit.
+    fit : the fit.
     warnings : of the audit.
     further_messages : beside those of the fit.
 
@@ -166,19 +168,19 @@ def summary_of(found: Fit, warnings: Sequence[str] = (), further_messages: Seque
     -------
     FitSummary
     """
-    keys = [one.name for one in fields(TrialEstimates)]
+    keys = [entry.name for entry in fields(TrialEstimates)]
     return FitSummary(
-        names=tuple(found.model.names),
-        numbers=found.numbers,
-        covariance=found.covariance,
-        spreads=found.spreads,
-        noise_m=found.noise_m,
-        noise_correlation=found.noise_correlation,
-        chi2_per_dof=found.chi2_per_dof,
-        log_likelihood=found.log_likelihood,
-        converged=found.converged,
-        messages=(*found.messages, *further_messages),
+        names=tuple(fit.model.names),
+        numbers=fit.numbers,
+        covariance=fit.covariance,
+        spreads=fit.spreads,
+        noise_m=fit.noise_m,
+        noise_correlation=fit.noise_correlation,
+        chi2_per_dof=fit.chi2_per_dof,
+        log_likelihood=fit.log_likelihood,
+        converged=fit.converged,
+        messages=(*fit.messages, *further_messages),
         warnings=tuple(warnings),
-        left_out=found.left_out,
-        trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in found.trials},
+        left_out=fit.left_out,
+        trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},
     )

@@ -43,6 +43,15 @@ def without_noise(pressure_Pa: Floats) -> Floats:
     """Pressure, shape (n,), of samples about evenly spaced, with white noise taken out.
 
     Returns the same values where there is no noise to speak of, or too few samples (under 9) to tell.
+
+    Parameters
+    ----------
+    pressure_Pa : array, shape (n,), Pa
+        Samples of a trace.
+
+    Returns
+    -------
+    array, shape (n,), Pa
     """
     if pressure_Pa.size < FEWEST:
         return pressure_Pa
@@ -89,7 +98,18 @@ def _lines(pressure_Pa: Floats, sigma: float) -> Floats:
 
 
 def noise_of(pressure_Pa: Floats) -> float:
-    """Standard deviation of white noise on a smooth course, from third differences; their variance is 20 σ²."""
+    """Standard deviation of white noise on a smooth course, from third differences; their variance is 20 σ².
+
+    Parameters
+    ----------
+    pressure_Pa : array, shape (n,), Pa
+        Samples of a trace.
+
+    Returns
+    -------
+    float
+        Pa
+    """
     third = np.diff(pressure_Pa, 3)
     return float(1.4826 * np.median(np.abs(third)) / np.sqrt(20))
 
@@ -105,9 +125,9 @@ def _line(y: Floats, half: int) -> tuple[Floats, Floats, Floats, Floats]:
     place = np.arange(y.size)
     first, last = np.maximum(place - half, 0), np.minimum(place + half, y.size - 1) + 1
     x = place - 0.5 * (y.size - 1)
-    sums = [np.concatenate([[0.0], np.cumsum(one)]) for one in (x, x * x, y, x * y, y * y)]
+    sums = [np.concatenate([[0.0], np.cumsum(values)]) for values in (x, x * x, y, x * y, y * y)]
     count = (last - first).astype(float)
-    mean_x, mean_xx, mean_y, mean_xy, mean_yy = ((one[last] - one[first]) / count for one in sums)
+    mean_x, mean_xx, mean_y, mean_xy, mean_yy = ((values[last] - values[first]) / count for values in sums)
     spread = mean_xx - mean_x**2
     away = x - mean_x
     joint = mean_xy - mean_x * mean_y

@@ -16,7 +16,8 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.mixed_effects import FitState, Marginal, MixedProblem, deviance, marginal, normal_equations
+from vinetrack.inference.marginal_likelihood import Marginal, deviance, marginal, normal_equations
+from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import FixedTerms, Solution, solve
 from vinetrack.inference.sensitivity import Predictor
 
@@ -51,12 +52,34 @@ class Precision:
 
 
 def among_first(known: Precision, count: int) -> Precision:
-    """What is known of the first `count` numbers, the others being integrated out."""
+    """What is known of the first `count` numbers, the others being integrated out.
+
+    Parameters
+    ----------
+    known
+        Covariance of all numbers.
+    count : int
+        How many are kept.
+
+    Returns
+    -------
+    Precision
+    """
     return Precision(known.covariance[:count, :count], known.degrees[:count], known.silent[:count], known.tied[:count])
 
 
 def precision(solution: Solution) -> Precision:
-    """Covariance at the end of a fit, by the model of the noise and the scatter."""
+    """Covariance at the end of a fit, by the model of the noise and the scatter.
+
+    Parameters
+    ----------
+    solution
+        Where the iterations ended.
+
+    Returns
+    -------
+    Precision
+    """
     part = marginal(solution.grams, solution.problem, solution.state)
     covariance, silent, tied = _covariance(part, solution.problem, solution.state, solution.state.spread)
     return Precision(covariance, degrees_of_freedom(solution), silent, tied)
@@ -75,10 +98,10 @@ def _covariance(
     if k.size:
         scale = 1 / np.sqrt(diagonal[k])
         values, vectors = np.linalg.eigh(information[np.ix_(k, k)] * scale[:, None] * scale)
-        lost = values < SINGULAR
-        for column in np.flatnonzero(lost):
+        singular = values < SINGULAR
+        for column in np.flatnonzero(singular):
             tied[k] |= np.abs(vectors[:, column]) > 0.1
-        inverse = (vectors[:, ~lost] / values[~lost]) @ vectors[:, ~lost].T
+        inverse = (vectors[:, ~singular] / values[~singular]) @ vectors[:, ~singular].T
         covariance[np.ix_(k, k)] = inverse * scale[:, None] * scale
     unknown = np.flatnonzero(silent | tied)
     covariance[unknown, unknown] = math.inf
@@ -86,7 +109,20 @@ def _covariance(
 
 
 def degrees_of_freedom(solution: Solution) -> Floats:
-    """Satterthwaite's degrees of freedom of every free number, shape (n_free,); infinite where no spread matters."""
+    """Satterthwaite's degrees of freedom of every free number, shape (n_free,); infinite where no spread matters.
+
+    Source: Giesbrecht & Burns, Biometrics 41, 477 (1985): 2V²/var(V), var(V) from the curvature of the restricted
+    likelihood in the logarithms of the between-trial standard deviations.
+
+    Parameters
+    ----------
+    solution
+        Where the iterations ended.
+
+    Returns
+    -------
+    array, shape (n_free,)
+    """
     problem, state = solution.problem, solution.state
     active = [k for k in range(2) if solution.estimable[k] and state.spread[k] > 1e-4]
     size = problem.prior_mean.size
@@ -114,8 +150,8 @@ def degrees_of_freedom(solution: Solution) -> Floats:
     uncertainty = np.einsum("pi,ij,pj->p", gradient, spread_covariance, gradient)
     variances = _variances(part, problem, state, state.spread)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = 2 * variances**2 / uncertainty
-    return np.where(uncertainty > 0, np.maximum(found, 2.0), math.inf)
+        degrees = 2 * variances**2 / uncertainty
+    return np.where(uncertainty > 0, np.maximum(degrees, 2.0), math.inf)
 
 
 def _variances(part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]) -> Floats:
@@ -137,14 +173,36 @@ def _curvature(function: Callable[[Floats], float], size: int) -> Floats:
 
 
 def student(dof: Floats) -> Floats:
-    """Half width of 95 % in standard errors."""
+    """Half width of 95 % in standard errors.
+
+    Parameters
+    ----------
+    dof : array
+        Degrees of freedom, infinite for a normal distribution.
+
+    Returns
+    -------
+    array
+    """
     from scipy.stats import t
 
     return np.asarray(t.ppf(0.975, np.minimum(dof, 1e6)))
 
 
 def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
-    """Which numbers have a bound within reach of their error, shape (n_free,)."""
+    """Which numbers have a bound within reach of their error, shape (n_free,).
+
+    Parameters
+    ----------
+    solution
+        Where the iterations ended.
+    sigma : array, shape (n_free,)
+        Standard errors, scaled.
+
+    Returns
+    -------
+    array of bool, shape (n_free,)
+    """
     problem, theta = solution.problem, solution.state.theta
     room = np.minimum(theta - problem.lower, problem.upper - theta)
     return np.isfinite(sigma) & (room < NEAR_A_BOUND * sigma)
@@ -157,6 +215,24 @@ def profile_interval(
 
     Spreads and noise stay those of the best fit, so that for a straight line this is the interval ± `reach` · `sigma`.
     A side that meets a bound first ends there.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+    place : int
+        Place of the number among the free ones.
+    sigma : float
+        Its standard error, scaled.
+    reach : float
+        Half width of the interval in standard errors.
+
+    Returns
+    -------
+    low, high : float
+        Scaled.
     """
     problem, state = solution.problem, solution.state
     held = FixedTerms(state.spread, (state.rho, state.variance))
@@ -207,8 +283,8 @@ def _rise(predictor: Predictor, solution: Solution, held: FixedTerms, place: int
 
 def _next_guess(tried: list[tuple[float, float]], reach: float) -> float:
     """Where the root of the rise reaches its aim, by the chord through the two points nearest to it."""
-    below = max((hypothesis for hypothesis in tried if hypothesis[1] <= reach), key=lambda one: one[0])
-    above = min((hypothesis for hypothesis in tried if hypothesis[1] > reach), key=lambda one: one[0], default=None)
+    below = max((hypothesis for hypothesis in tried if hypothesis[1] <= reach), key=lambda point: point[0])
+    above = min((hypothesis for hypothesis in tried if hypothesis[1] > reach), key=lambda point: point[0], default=None)
     if above is None:
         return below[0] * float(np.clip(reach / max(below[1], 0.2), 1.2, 3.0))
     return below[0] + (above[0] - below[0]) * (reach - below[1]) / (above[1] - below[1])

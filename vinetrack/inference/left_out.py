@@ -38,32 +38,66 @@ MOST_STEPS = 20
 hundredth of a good tracker's error."""
 
 SETTLED_FRAMES = 1e-3
+"""Shift of the release below which the alignment has settled, frames. Chosen: a hundredth of what a good tracker
+resolves; half takes one more step, twice is still not seen."""
+
 FEWEST_AT_REST = 5
 """Frames before the motion that tell where a vine started, to half the noise of one. Derived: the mean of five frames
 errs by 0.45 of one frame's noise."""
 
 
-def predict_trials(found: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[TrialFit]:
+def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[TrialFit]:
     """Trials with their own release and origin, deviations zero; see `vinetrack.inference.fit.predict`.
 
     With `from_rest` the origin is where a vine is seen at rest before it moves, and release (and the origin where no
     rest was filmed) are where the root mean square is least. Else both weigh errors with the correlation that the fit
     found, which where a model fails is nearly 1, and leaves the origin to the misfit.
+
+    Parameters
+    ----------
+    fit
+        A fit.
+    pairs : iterable of (Trial, Track)
+        Trials to predict.
+    from_rest : bool
+        Whether the origin is where the vine rests.
+
+    Returns
+    -------
+    list of TrialFit
+
+    Raises
+    ------
+    FitError
+        If a trial cannot be used, or its vine was not in the fit and B is one per vine.
     """
-    return predict_prepared(found, [_prepared(trial, track) for trial, track in pairs], from_rest=from_rest)
+    return predict_prepared(fit, [_prepared(trial, track) for trial, track in pairs], from_rest=from_rest)
 
 
-def predict_prepared(found: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
+def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
     """As `predict_trials`, for trials that were laid out for a fit already.
+
+    Parameters
+    ----------
+    fit
+        A fit.
+    data : sequence of FitTrial
+        Trials to predict.
+    from_rest : bool
+        Whether the origin is where the vine rests.
+
+    Returns
+    -------
+    list of TrialFit
 
     Raises
     ------
     FitError
         If a vine was not in the fit and B is one per vine, or the model cannot be followed.
     """
-    rho = 0.0 if from_rest else found.noise_correlation
-    variance = found.noise_m**2 * (1 - rho**2)
-    predictor, trial_effects, square = laid_on(found, data, from_rest=from_rest)
+    rho = 0.0 if from_rest else fit.noise_correlation
+    variance = fit.noise_m**2 * (1 - rho**2)
+    predictor, trial_effects, square = laid_on(fit, data, from_rest=from_rest)
     data = predictor.data
     try:
         moved = predictor.run(predictor.jobs(np.empty(0), trial_effects))
@@ -88,11 +122,23 @@ def predict_prepared(found: Fit, data: Sequence[FitTrial], *, from_rest: bool = 
 def laid_on(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Predictor, Floats, Floats]:
     """The fitted model laid on trials: see `predict_prepared`.
 
+    Parameters
+    ----------
+    fit
+        A fit.
+    data : sequence of FitTrial
+        Trials to lay it on.
+    from_rest : bool
+        Whether the origin is where the vine rests.
+
     Returns
     -------
-    predictor : of these trials with nothing free
-    own : array, shape (n_trials, 4), the release and origin found, deviations 0
-    square : array, shape (n_trials, 2, 2), whitened products of release and origin
+    predictor : Predictor
+        Of these trials with nothing free.
+    trial_effects : array, shape (n_trials, 4)
+        Release and origin found; deviations 0.
+    square : array, shape (n_trials, 2, 2)
+        Whitened products of release and origin.
 
     Raises
     ------
@@ -115,13 +161,34 @@ def told_apart(design: Floats, left: Floats, least: float) -> Floats:
     """Least squares of columns brought to one length, shape (n_columns,); what is hardly told apart is left alone.
 
     At constant speed a later release and a higher origin are one. `least` is the least singular value that counts.
+
+    Parameters
+    ----------
+    design : array, shape (n_points, n_columns)
+    left : array, shape (n_points,)
+        What the columns have to explain.
+    least : float
+        Least singular value that counts, relative to the largest.
+
+    Returns
+    -------
+    array, shape (n_columns,)
     """
     length = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     return np.asarray(np.linalg.lstsq(design / length, left, rcond=least)[0] / length)
 
 
 def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
-    """Trials filmed long enough at rest to say where they began, shape (n_trials,)."""
+    """Trials filmed long enough at rest to say where they began, shape (n_trials,).
+
+    Parameters
+    ----------
+    data : sequence of FitTrial
+
+    Returns
+    -------
+    array of bool, shape (n_trials,)
+    """
     return np.array(
         [trial_data.n_rest >= FEWEST_AT_REST or trial_data.vague_rest is not None for trial_data in data], dtype=bool
     )
@@ -134,22 +201,22 @@ def _prepared(trial: Trial, track: Track) -> FitTrial:
         raise FitError(f"Trial {trial.name}: {error}.") from error
 
 
-def _known_yield(found: Fit, trial_data: FitTrial) -> FitTrial:
+def _known_yield(fit: Fit, trial_data: FitTrial) -> FitTrial:
     """The trial with the yield pressure that the fit found for its vine, where it found one."""
     stated = f"{trial_data.trial.vine}, {trial_data.trial.yield_pressure_Pa / 1e3:g} kPa"
-    for number in found.numbers:
+    for number in fit.numbers:
         if number.key == YIELD_PRESSURE and number.vine in (trial_data.trial.vine, stated):
             return replace(trial_data, trial=replace(trial_data.trial, yield_pressure_Pa=number.value))
     return trial_data
 
 
-def _nothing_free(found: Fit, data: Sequence[FitTrial]) -> ParameterMap:
+def _nothing_free(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap:
     try:
-        base = np.array([found.model.parameters_for(trial_data.trial.vine) for trial_data in data])
+        base = np.array([fit.model.parameters_for(trial_data.trial.vine) for trial_data in data])
     except EffectError as error:
         raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
-    base = base.reshape(len(data), len(found.model.parameter_names))
-    return ParameterMap(found.model, (), (), np.zeros((len(data), 0), dtype=int), base)
+    base = base.reshape(len(data), len(fit.model.parameter_names))
+    return ParameterMap(fit.model, (), (), np.zeros((len(data), 0), dtype=int), base)
 
 
 def _settle(predictor: Predictor, trial_effects: Floats, rho: float, from_rest: bool) -> tuple[Floats, Floats]:

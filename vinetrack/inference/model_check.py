@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 CHECK_COLUMNS = ("vine", "n_steady", "n_trajectory", "B_steady", "B_trajectory", "z")
 
 
-def check_damping(found: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
+def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
     """A row a vine, as `model_check.csv` holds it.
 
     Parameters
     ----------
-    found
+    fit
         A fit with B and n free.
     damping
         One fit of `damping.json`: `both_axes` or `log_log`.
@@ -47,13 +47,13 @@ def check_damping(found: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    if EXPONENT not in [number.key for number in found.numbers]:
+    if EXPONENT not in [number.key for number in fit.numbers]:
         raise FitError("The exponent n was held in this fit: there is nothing to check the steady windows against.")
-    n = found[EXPONENT]
+    n = fit[EXPONENT]
     rows = []
-    for vine in dict.fromkeys(trial.trial.vine for trial in found.trials):
+    for vine in dict.fromkeys(trial.trial.vine for trial in fit.trials):
         steady = (damping.get("vines") or {}).get(vine)
-        B = next((b for b in found.numbers if b.key == DAMPING and b.vine in (vine, "")), None)
+        B = next((b for b in fit.numbers if b.key == DAMPING and b.vine in (vine, "")), None)
         n_steady = damping.get("n")
         row: dict[str, object] = {
             "vine": vine,
@@ -65,7 +65,7 @@ def check_damping(found: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
         }
         if steady and B and n_steady is not None:
             apart = np.array([n_steady - n.value, math.log(steady["B"] / B.value)])
-            row["z"] = _deviate(apart, _steady_covariance(damping, vine) + _trajectory_covariance(found, B.name))
+            row["z"] = _deviate(apart, _steady_covariance(damping, vine) + _trajectory_covariance(fit, B.name))
         rows.append(row)
     return pd.DataFrame(rows, columns=list(CHECK_COLUMNS))
 

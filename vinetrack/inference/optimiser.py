@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.mixed_effects import (
-    FitState,
-    MixedProblem,
-    estimate_noise,
-    estimate_spreads,
-    marginal,
-    newton_step,
-    shared_penalty,
-)
+from vinetrack.inference.fit_problem import estimable, floor, track_correlation
+from vinetrack.inference.marginal_likelihood import estimate_noise, estimate_spreads, marginal
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_step, shared_penalty
 from vinetrack.inference.release_search import search_releases
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.starts import initial_trial_effects
 from vinetrack.inference.trial_effects import follow_trial_effects, limited, trial_costs
 from vinetrack.inference.whitening import at_correlation
 
@@ -48,29 +40,9 @@ promises more than this of −2 ln L: what is only not yet fitted must not pass 
 misses by less than that after three steps, or needs more; at half the spreads soak up what the first steps have not
 fitted yet."""
 
-FIRST_SPREADS = (0.01, 0.03)
-"""Chosen as a usual batch of vines: one per cent of pressure and three of B."""
-
-EXACT_PART = 2e-6
-"""Least noise, as part of a trial's travel: the integrator is no better. Measured: the integrator errs by at most 7e-7
-(benchmarks/integrator.py)."""
-
-RELEASE_ROOM_FRAMES, ORIGIN_ROOM_SIGMAS = 10.0, 10.0
-"""Where the rest is seen it says of release and origin what it says through its points, a hundred times less a second
-time: that only counts where a wrong model would drag both along. Chosen: ten standard deviations make the prior a
-hundredth of what the frames say."""
-
-KNOWN_RELEASE_S = 1e-6
-"""The release of a vine whose pressure was let in while it was recorded: nothing to find. Chosen far below any
-frame."""
-
 SHORTER, MOST_DAMPED = (1.0, 0.4, 0.15), 11
 """Parts of a step that are tried, and how often it is damped further if none of them helps. Chosen: a line search in
 factors of about 0.4, then damping in factors of ten."""
-
-FEWEST_TO_SPARE = 3
-"""A spread is estimated where this many more trials feel it than there are numbers without a prior. Chosen: with fewer
-degrees of freedom a variance is known to worse than a factor of two."""
 
 
 @dataclass(frozen=True)
@@ -116,77 +88,6 @@ Watch = Callable[[Step], None]
 """Told of every step; what it raises ends the fit."""
 
 
-def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
-    """What stays the same during the iterations; `own` holds the first guess of releases and origins."""
-    layout, data = predictor.layout, predictor.data
-    lower, upper = layout.bounds
-    durations = np.array([trial_data.time_s[-1] - trial_data.time_s[0] for trial_data in data])
-    spans = np.array([np.ptp(trial_data.lead_position_m) for trial_data in data])
-    frames = np.array([trial_data.frame_s for trial_data in data])
-    rests = np.array([trial_data.shows_rest for trial_data in data])
-    known = rests | np.array([trial_data.let_in for trial_data in data])
-    vague = np.array([0.0 if trial_data.vague_rest is None else trial_data.vague_rest.sigma_m for trial_data in data])
-    release_sd = np.where(rests, RELEASE_ROOM_FRAMES * frames, 3 * durations)
-    release_sd[[trial_data.let_in for trial_data in data]] = KNOWN_RELEASE_S
-    noise = np.array([trial_data.noise_m for trial_data in data])
-    room = np.maximum(ORIGIN_ROOM_SIGMAS * np.maximum(noise, vague), 1e-4 * spans)
-    origin_sd = np.where(rests, room, 3 * spans)
-    return MixedProblem(
-        index=layout.index,
-        feels=np.column_stack([predictor.feels_pressure, predictor.feels_damping]),
-        gauge_error=np.array([trial_data.gauge_error for trial_data in data]),
-        own_centre=np.where(known[:, None], initial_trial_effects(data)[:, :2], trial_effects[:, :2]),
-        own_precision=np.column_stack([1 / release_sd**2, 1 / origin_sd**2]),
-        prior_mean=layout.start,
-        prior_precision=layout.prior_precision,
-        lower=lower,
-        upper=upper,
-        free=np.ones(lower.size, dtype=bool),
-        points=np.array([float(trial_data.time_s.size) for trial_data in data]),
-        stretches=np.array([float(np.count_nonzero(trial_data.first)) for trial_data in data]),
-        random=layout.random if layout.between else None,
-    )
-
-
-def first_state(data: Sequence[FitTrial], theta: Floats, trial_effects: Floats) -> FitState:
-    """A state to begin from: noise of the tracks alone, spreads as the sheet and experience say."""
-    rho = track_correlation(data)
-    variance = np.array([trial_data.noise_m**2 * (1 - trial_data.correlation**2) for trial_data in data])
-    return FitState(theta, trial_effects, stated_spreads(data), rho, np.maximum(variance, floor(data)))
-
-
-def track_correlation(data: Sequence[FitTrial]) -> float:
-    """Lag-one correlation of the noise as the tracks alone show it."""
-    return float(
-        np.average(
-            [trial_data.correlation for trial_data in data], weights=[trial_data.time_s.size for trial_data in data]
-        )
-    )
-
-
-def stated_spreads(data: Sequence[FitTrial]) -> tuple[float, float]:
-    """Spread of pressure that the sheet states, and 3 % for B."""
-    relative = [
-        trial_data.trial.pressure_sigma_Pa / trial_data.trial.pressure_Pa
-        for trial_data in data
-        if trial_data.trial.pressure_Pa > 0 and np.isfinite(trial_data.trial.pressure_sigma_Pa)
-    ]
-    return (float(np.mean(relative)) if relative else FIRST_SPREADS[0]), FIRST_SPREADS[1]
-
-
-def floor(data: Sequence[FitTrial]) -> Floats:
-    """Least variance of a position that the integrator can answer for, m², shape (n_trials,)."""
-    return np.array([(EXACT_PART * np.ptp(trial_data.lead_position_m)) ** 2 for trial_data in data])
-
-
-def estimable(problem: MixedProblem) -> tuple[bool, bool]:
-    """Whether there are trials enough to estimate the spread of pressure, and that of B."""
-    needed = np.count_nonzero(problem.prior_precision == 0) + FEWEST_TO_SPARE
-    varied = problem.feels & np.column_stack([problem.gauge_error == 0, np.ones(problem.gauge_error.size, dtype=bool)])
-    pressure, damping = (bool(np.count_nonzero(varied[:, k]) >= needed) for k in range(2))
-    return pressure, damping
-
-
 def solve(
     predictor: Predictor,
     problem: MixedProblem,
@@ -198,6 +99,30 @@ def solve(
     watch: Watch | None = None,
 ) -> Solution:
     """Iterate to the end. `warm` says that the state is near it already.
+
+    Method: Lindstrom & Bates, Biometrics 46, 673 (1990), Gauss–Newton steps of the linear mixed model in turns with
+    estimates of noise and spreads, damped after Levenberg and Marquardt.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    problem
+        What does not change during the fit.
+    state
+        Where to begin.
+    held : FixedTerms, optional
+        Spreads and noise that are not estimated.
+    warm : bool
+        Whether the state is near the end already.
+    most_iterations : int
+        Steps at most.
+    watch : callable, optional
+        Called with each step.
+
+    Returns
+    -------
+    Solution
 
     Raises
     ------
@@ -266,7 +191,19 @@ def _step_report(predictor: Predictor, state: FitState, iteration: int, promised
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
-    """What the model leaves against the noise that the tracks show alone, of their correlation; NaN if none do."""
+    """What the model leaves against the noise that the tracks show alone, of their correlation; NaN if none do.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+
+    Returns
+    -------
+    float
+    """
     data = predictor.data
     rho = track_correlation(data)
     noise = np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2)
@@ -300,7 +237,17 @@ def _update_variances(
 
 
 def variances_moved(before: FitState, after: FitState) -> float:
-    """Largest relative change among spreads and noise; spreads below a thousandth count as none."""
+    """Largest relative change among spreads and noise; spreads below a thousandth count as none.
+
+    Parameters
+    ----------
+    before, after
+        States.
+
+    Returns
+    -------
+    float
+    """
     spreads = [abs(np.log((b + 1e-3) / (a + 1e-3))) for a, b in zip(before.spread, after.spread, strict=True)]
     noise = np.max(np.abs(np.log(after.variance / before.variance)))
     return float(max(*spreads, noise, abs(after.rho - before.rho)))
@@ -347,8 +294,19 @@ def _tried(
 
 
 def cost(predictor: Predictor, problem: MixedProblem, state: FitState) -> float:
-    """Whitened sum of squares of all trials with what the priors add."""
+    """Whitened sum of squares of all trials with what the priors add.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+
+    Returns
+    -------
+    float
+    """
     return float(np.sum(trial_costs(predictor, problem, state))) + shared_penalty(problem, state)
-
-
-__all__ = ["FixedTerms", "Solution", "Step", "Watch", "cost", "estimable", "first_state", "make_problem", "solve"]

@@ -83,13 +83,32 @@ class FreeParameter:
         return f"{self.key}[{self.vine}]" if self.vine else self.key
 
     def inside(self, value: float) -> float:
-        """The value as the fit holds it."""
+        """The value as the fit holds it.
+
+        Parameters
+        ----------
+        value : float, SI
+
+        Returns
+        -------
+        float
+        """
         if self.logarithmic:
             return math.log(max(value, LEAST_DAMPING))
         return value / self.scale
 
     def outside(self, theta: float) -> float:
-        """The value, SI, of what the fit holds."""
+        """The value, SI, of what the fit holds.
+
+        Parameters
+        ----------
+        theta : float
+            As the fit holds it.
+
+        Returns
+        -------
+        float
+        """
         return math.exp(theta) if self.logarithmic else theta * self.scale
 
 
@@ -127,11 +146,33 @@ class ParameterMap:
         return np.array([(number.scale / number.prior_sd) ** 2 for number in self.free])
 
     def values(self, theta: Floats) -> Floats:
-        """Values in SI, shape (n_free,)."""
-        return np.array([number.outside(float(one)) for number, one in zip(self.free, theta, strict=True)])
+        """Values in SI, shape (n_free,).
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            As the fit holds them.
+
+        Returns
+        -------
+        array, shape (n_free,)
+        """
+        return np.array([number.outside(float(scaled)) for number, scaled in zip(self.free, theta, strict=True)])
 
     def rows(self, theta: Floats) -> tuple[Floats, Floats]:
-        """Model parameters (n_trials, n_parameters) and yield pressures (n_trials,), Pa, for scaled values `theta`."""
+        """Model parameters (n_trials, n_parameters) and yield pressures (n_trials,), Pa, for scaled values `theta`.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            As the fit holds them.
+
+        Returns
+        -------
+        rows : array, shape (n_trials, n_parameters), SI
+        yields : array, shape (n_trials,), Pa
+            NaN where the sheet's value holds.
+        """
         rows = self.base.copy()
         values = self.values(theta)
         yields = np.full(rows.shape[0], math.nan)
@@ -144,7 +185,17 @@ class ParameterMap:
         return rows, yields
 
     def term(self, key: str) -> BetweenTerm | None:
-        """The difference between trials that this key is the coefficient of; None for a parameter of the model."""
+        """The difference between trials that this key is the coefficient of; None for a parameter of the model.
+
+        Parameters
+        ----------
+        key : str
+            A key of the map.
+
+        Returns
+        -------
+        BetweenTerm or None
+        """
         return next((term for term in self.between if term.key == key), None)
 
     @property
@@ -154,7 +205,17 @@ class ParameterMap:
         return np.array([number.key in keys for number in self.free], dtype=bool)
 
     def shifts(self, theta: Floats) -> Floats:
-        """Deviations of pressure (relative) and of ln B by the differences between trials, shape (n_trials, 2)."""
+        """Deviations of pressure (relative) and of ln B by the differences between trials, shape (n_trials, 2).
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            As the fit holds them.
+
+        Returns
+        -------
+        array, shape (n_trials, 2)
+        """
         shifts = np.zeros((self.index.shape[0], 2))
         values = np.append(self.values(theta), 0.0) if self.between else np.zeros(1)
         for term in self.between:
@@ -181,13 +242,20 @@ def make_layout(
 
     Parameters
     ----------
-    fixed, free
+    model
+        Sum of effects with its values.
+    data : sequence of FitTrial
+    fixed, free : iterable of str
         Names to hold at the value of the model, or to find although held. The parameter's own name will do where it is
         the only one of that name.
-    shared
+    shared : mapping, optional
         `"all"` or `"vine"` by name, in place of what the effect says.
-    between
+    between : sequence of BetweenTerm
         Differences between trials that are fitted along.
+
+    Returns
+    -------
+    ParameterMap
 
     Raises
     ------
@@ -196,9 +264,9 @@ def make_layout(
     """
     known = {f"{effect.name}.{parameter.name}": parameter for effect in model for parameter in effect.parameters}
     names = [*known, *([YIELD_PRESSURE] if "yield_pressure" in model else [])]
-    held = {find_name(name, names) for name in fixed}
-    wanted = {find_name(name, names) for name in free}
-    sharing = {find_name(name, names): how for name, how in (shared or {}).items()}
+    held = {_find_name(name, names) for name in fixed}
+    wanted = {_find_name(name, names) for name in free}
+    sharing = {_find_name(name, names): how for name, how in (shared or {}).items()}
     for name, how in sharing.items():
         if how not in ("all", "vine"):
             raise FitError(f"{name} is shared by {how!r}: say 'all' or 'vine'.")
@@ -215,9 +283,9 @@ def make_layout(
         index = np.column_stack([index, column])
     keys = list(chosen)
     if YIELD_PRESSURE in names and YIELD_PRESSURE not in held:
-        found, column = _yield_pressures(data, len(numbers))
-        if found:
-            numbers, keys, index = [*numbers, *found], [*keys, YIELD_PRESSURE], np.column_stack([index, column])
+        yield_numbers, column = _yield_pressures(data, len(numbers))
+        if yield_numbers:
+            numbers, keys, index = [*numbers, *yield_numbers], [*keys, YIELD_PRESSURE], np.column_stack([index, column])
     for term in between:
         members = [group for group in dict.fromkeys(term.groups) if group]
         place = {group: len(numbers) + i for i, group in enumerate(members)} | {"": -1}
@@ -241,7 +309,7 @@ def _coefficient(term: BetweenTerm, group: str) -> FreeParameter:
     )
 
 
-def find_name(name: str, names: Sequence[str]) -> str:
+def _find_name(name: str, names: Sequence[str]) -> str:
     """The full name among `names` that `name` stands for.
 
     Raises

@@ -24,15 +24,16 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_problem import floor
+from vinetrack.inference.marginal_likelihood import estimate_noise
 from vinetrack.inference.mixed_effects import (
     FitState,
     MixedProblem,
-    estimate_noise,
     inverse_among,
     trial_effect_step,
     trial_effects_eliminated,
 )
-from vinetrack.inference.optimiser import Solution, floor
+from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import position_shapes, with_shapes
 from vinetrack.inference.sensitivity import ORIGIN, OWN, Predictor
 
@@ -69,8 +70,12 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
 
     Parameters
     ----------
-    solution : where the fit ended
-    shared : how many of its free numbers may scatter between trials: the first ones
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the fit ended.
+    shared : int
+        How many of its free numbers may scatter between trials: the first ones.
 
     Returns
     -------
@@ -89,15 +94,15 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
         grams = predictor.products(wide)
         rho, variance = estimate_noise(grams, problem, state, within=True)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
-        found = _weighed(replace(solution, state=state, problem=problem, grams=grams, columns=tuple(wide)), shared)
-        step = found.covariance @ _slope(found, problem, state)
-        scatter = np.sqrt(np.diag(found.covariance) + np.diag(found.between))
+        pooled = _weighed(replace(solution, state=state, problem=problem, grams=grams, columns=tuple(wide)), shared)
+        step = pooled.covariance @ _slope(pooled, problem, state)
+        scatter = np.sqrt(np.diag(pooled.covariance) + np.diag(pooled.between))
         longest = float(np.max(np.abs(step) / np.maximum(scatter, 1e-300), initial=0.0))
-        errors = np.sqrt(np.maximum(np.diag(found.covariance), 1e-300))
+        errors = np.sqrt(np.maximum(np.diag(pooled.covariance), 1e-300))
         if float(np.max(np.abs(step) / errors, initial=0.0)) < SETTLED:
-            return found
+            return pooled
         step = step * min(1.0, LONGEST_STEP / longest)
-        state = _moved(found.solution, state, step)
+        state = _moved(pooled.solution, state, step)
         try:
             columns = predictor.linearise(state.theta[:shared], state.trial_effects)
         except SimulationError:
@@ -117,13 +122,13 @@ def _shapes(predictor: Predictor, solution: Solution) -> list[Floats]:
 
 def _with_shapes(columns: Sequence[Floats], shapes: Sequence[Floats], sizes: Floats) -> list[Floats]:
     return [
-        np.column_stack([one[:, :-1], shape, one[:, -1] - shape @ sizes])
-        for one, shape in zip(columns, shapes, strict=True)
+        np.column_stack([block[:, :-1], shape, block[:, -1] - shape @ sizes])
+        for block, shape in zip(columns, shapes, strict=True)
     ]
 
 
-def _slope(found: Pooled, problem: MixedProblem, state: FitState) -> Floats:
-    return np.asarray(found.scores.sum(axis=0) - problem.prior_precision * (state.theta - problem.prior_mean))
+def _slope(pooled: Pooled, problem: MixedProblem, state: FitState) -> Floats:
+    return np.asarray(pooled.scores.sum(axis=0) - problem.prior_precision * (state.theta - problem.prior_mean))
 
 
 def _moved(solution: Solution, state: FitState, step: Floats) -> FitState:
@@ -148,7 +153,7 @@ def _weighed(solution: Solution, shared: int) -> Pooled:
     live = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
     root = _typical_root(inverse_among(total, live), information, shared)
     prior = np.diag(problem.prior_precision)
-    trial_effects = state.theta - problem.prior_mean
+    offset = state.theta - problem.prior_mean
 
     def weighed(tau2: float) -> tuple[Floats, Floats, float]:
         inner = np.eye(size) + tau2 * root.T @ information @ root
@@ -156,7 +161,7 @@ def _weighed(solution: Solution, shared: int) -> Pooled:
         weight = information - information @ less @ information
         score = scores - np.einsum("nij,nj->ni", information @ less, scores)
         inside_all = (weight.sum(axis=0) + prior)[np.ix_(live, live)]
-        slope = (score.sum(axis=0) - problem.prior_precision * trial_effects)[live]
+        slope = (score.sum(axis=0) - problem.prior_precision * offset)[live]
         scale = 1 / np.sqrt(np.diag(inside_all))
         even = inside_all * scale[:, None] * scale
         gained = float((scale * slope) @ np.linalg.lstsq(even, scale * slope, rcond=1e-11)[0])
@@ -210,5 +215,5 @@ def _most_likely(deviance: Callable[[float], float]) -> float:
     levels = [deviance(math.exp(log)) for log in logs]
     best = int(np.argmin(levels))
     low, high = logs[max(best - 1, 0)], logs[min(best + 1, logs.size - 1)]
-    found = minimize_scalar(lambda one: deviance(math.exp(one)), bounds=(low, high), method="bounded")
-    return float(math.exp(found.x)) if found.fun < deviance(0.0) else 0.0
+    minimum = minimize_scalar(lambda log_tau2: deviance(math.exp(log_tau2)), bounds=(low, high), method="bounded")
+    return float(math.exp(minimum.x)) if minimum.fun < deviance(0.0) else 0.0

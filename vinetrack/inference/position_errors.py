@@ -18,16 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.inference.mixed_effects import (
-    FitState,
-    MixedProblem,
-    deviance,
-    estimate_noise,
-    estimate_spreads,
-    marginal,
-    newton_step,
-)
-from vinetrack.inference.optimiser import SETTLED_SPREAD, FixedTerms, Solution, floor, variances_moved
+from vinetrack.inference.fit_problem import floor
+from vinetrack.inference.marginal_likelihood import deviance, estimate_noise, estimate_spreads, marginal
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_step
+from vinetrack.inference.optimiser import SETTLED_SPREAD, FixedTerms, Solution, variances_moved
 from vinetrack.inference.sensitivity import ORIGIN, Predictor
 from vinetrack.inference.whitening import whiten
 
@@ -62,17 +56,28 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
 
     `grown_m` is the growth at each point; a trial whose positions have no systematic error has zeros. The interval of
     the polynomials is that of all growth, for one camera sees all trials. No shapes where no trial has such an error.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials.
+    grown_m : sequence of arrays, shape (n_points,), m
+        Growth at each point of each trial.
+
+    Returns
+    -------
+    list of arrays, shape (n_points, n_shapes), m
     """
     sigma_m = np.array([trial_data.position_systematic_m for trial_data in predictor.data])
     if not (sigma_m > 0).any():
-        return [np.zeros((one.size, 0)) for one in grown_m]
-    reach = max(float(np.max(one)) for one in grown_m)
+        return [np.zeros((growth_m.size, 0)) for growth_m in grown_m]
+    reach = max(float(np.max(growth_m)) for growth_m in grown_m)
     select = np.eye(max(ORDERS) + 1)[list(ORDERS)].T
     # P_l(−1) = (−1)^l: an error of the position at rest is the origin's, which is free.
     at_rest = (-1.0) ** np.array(ORDERS)
     return [
-        sigma * (np.polynomial.legendre.legval(2 * np.clip(one / reach, 0, 1) - 1, select).T - at_rest)
-        for one, sigma in zip(grown_m, sigma_m.tolist(), strict=True)
+        sigma * (np.polynomial.legendre.legval(2 * np.clip(growth_m / reach, 0, 1) - 1, select).T - at_rest)
+        for growth_m, sigma in zip(grown_m, sigma_m.tolist(), strict=True)
     ]
 
 
@@ -81,7 +86,12 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
 
     Parameters
     ----------
-    held : spreads and noise that the fit was told instead of estimating them
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+    held : FixedTerms, optional
+        Spreads and noise that the fit was told instead of estimating them.
 
     Returns
     -------
@@ -112,15 +122,15 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
     # A fit far off is not at its minimum, and a straight line promises more than there is: that part is the same
     # without the shapes, and is not theirs.
     bare = _iterated(predictor, solution, solution.columns, solution.problem, solution.state, held)[3]
-    left = [one[:, -1] - one[:, :-1] @ change for one, change in zip(wide, moved, strict=True)]
+    left = [values[:, -1] - values[:, :-1] @ change for values, change in zip(wide, moved, strict=True)]
     return SmoothErrors(
         solution=replace(
             solution, state=state, problem=problem, grams=grams, columns=tuple(_with_residual(wide, left))
         ),
         gain=max(level - bare, 0.0),
         whitened=tuple(
-            whiten(one, trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(variance)
-            for one, trial_data, variance in zip(left, predictor.data, state.variance, strict=True)
+            whiten(values, trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(variance)
+            for values, trial_data, variance in zip(left, predictor.data, state.variance, strict=True)
         ),
         displacement_m=tuple(shape @ state.theta[-count:] for shape in shapes),
     )
@@ -153,11 +163,23 @@ def _iterated(
 
 
 def _with_residual(columns: Sequence[Floats], residual: Sequence[Floats]) -> list[Floats]:
-    return [np.column_stack([one[:, :-1], left]) for one, left in zip(columns, residual, strict=True)]
+    return [np.column_stack([block[:, :-1], left]) for block, left in zip(columns, residual, strict=True)]
 
 
 def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
-    """The problem with the sizes of the shapes as further free numbers, each with a normal prior of mean 0 and sd 1."""
+    """The problem with the sizes of the shapes as further free numbers, each with a normal prior of mean 0 and sd 1.
+
+    Parameters
+    ----------
+    problem
+        Of the fit.
+    count : int
+        Number of shapes.
+
+    Returns
+    -------
+    MixedProblem
+    """
     places = problem.prior_mean.size + np.arange(count)
     # A trial's column that belongs to no free number has the place −1: the last of an appended zero.
     index = np.column_stack([problem.index, np.tile(places, (len(problem.index), 1))])

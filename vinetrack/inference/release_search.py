@@ -65,6 +65,19 @@ def search_releases(predictor: Predictor, problem: MixedProblem, state: FitState
 
     Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than noise:
     another release would make up for something else.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+
+    Returns
+    -------
+    FitState or None
     """
     missed = trial_costs(predictor, problem, state) * state.variance / (1 - state.rho**2) / problem.points
     places = [
@@ -119,7 +132,7 @@ def _best(
     trial_effects = state.trial_effects[i]
     centre, precision = (part[i] for part in trial_effect_prior(problem, state))
     since = np.clip(trial_data.time_s - releases[:, None], 0.0, times[-1])
-    moved = [np.interp(since, times, one) for one in (*answers, plain)]
+    moved = [np.interp(since, times, values) for values in (*answers, plain)]
     moved[-1] = trial_data.lead_position_m - trial_effects[ORIGIN] - moved[-1]
     white = whiten(np.stack(moved, axis=-1), trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(
         state.variance[i]
@@ -170,14 +183,14 @@ def _answers(
             moves.append(move)
             jobs.append(varied)
             grids.append(longest_s * np.linspace(0.0, 1.0, GRID_POINTS) ** 1.5)
-    found: list[tuple[Floats, Floats, Floats]] = []
+    answers_found: list[tuple[Floats, Floats, Floats]] = []
     for (place, step), times, moved in zip(moves, grids, predictor.run(jobs, times_s=grids), strict=True):
         y = moved.observed_position_m
         if place < 0:
             answers = np.zeros((OWN, times.size))
             answers[RELEASE] = -np.gradient(y, times)
             answers[ORIGIN] = 1.0
-            found.append((times, y, answers))
+            answers_found.append((times, y, answers))
         else:
-            found[-1][2][place] = (y - found[-1][1]) / step
-    return found
+            answers_found[-1][2][place] = (y - answers_found[-1][1]) / step
+    return answers_found

@@ -38,6 +38,17 @@ def scatter_of(single: Floats, degrees: float) -> Floats:
     """Variance of sums over trials from how single trials, shape (n_trials, n), scatter; 0 where they are too few.
 
     Priors' parts belong to no trial: the mean is taken out.
+
+    Parameters
+    ----------
+    single : array, shape (n_trials, n)
+        What each trial adds.
+    degrees : float
+        Degrees of freedom of the scatter.
+
+    Returns
+    -------
+    array, shape (n,)
     """
     trials = len(single)
     if trials < FEWEST_CLUSTERS:
@@ -50,7 +61,10 @@ def few_trials(predictor: Predictor, solution: Solution) -> bool:
 
     Parameters
     ----------
-    solution : at the end of the fit
+    predictor
+        Of the trials that were fitted.
+    solution
+        At the end of the fit.
 
     Returns
     -------
@@ -72,18 +86,25 @@ def widened_covariance(
 
     Parameters
     ----------
-    solution : at the end of the fit
-    trials : its trials
-    known : covariance and degrees of freedom by the noise model
-    wide : the fit with smooth errors of position among its numbers, to which `known` then belongs
-    pooled : its trials weighed by how much they disagree, to which `known` then belongs; `wide` is its solution
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+    trials : sequence of TrialFit
+        In the order of the fit.
+    known
+        Covariance by the noise model.
+    wide : Solution, optional
+        The fit with smooth errors of position among its numbers, to which `known` then belongs.
+    pooled : Pooled, optional
+        Numbers with trials weighed by how much they disagree; its covariance is then widened.
 
     Returns
     -------
     Precision
     """
-    doubts = systematics_of(predictor, solution, trials, positions=wide is None)
-    plain, robust, shared = _sandwich(predictor, wide or solution, doubts)
+    systematics = systematics_of(predictor, solution, trials, positions=wide is None)
+    plain, robust, shared = _sandwich(predictor, wide or solution, systematics)
     diagonal = np.diag(plain)
     live = diagonal > 0
     ratio = np.ones(diagonal.size)
@@ -110,7 +131,20 @@ def widened_covariance(
 
 
 def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats, Floats]:
-    """Covariance of the free numbers as the fit holds them, from the noise model and from the scatter of trials."""
+    """Covariance of the free numbers as the fit holds them, from the noise model and from the scatter of trials.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+
+    Returns
+    -------
+    plain, robust : arrays, shape (n_free, n_free)
+        Scaled as the fit holds the numbers.
+    """
     nothing = [np.zeros((trial_data.time_s.size, 0)) for trial_data in predictor.data]
     plain, robust, _ = _sandwich(predictor, solution, nothing)
     return plain, robust
@@ -174,7 +208,7 @@ def _scores(rows: Floats, index: np.ndarray, size: int) -> Floats:
     return np.asarray(single[:, :size] - single[:, :size].mean(axis=0))
 
 
-def _sandwich(predictor: Predictor, solution: Solution, doubts: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
+def _sandwich(predictor: Predictor, solution: Solution, systematics: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
     """Covariance by the noise model, by the scatter of trials, and what the doubts add, shape (n_free, n_free) each.
 
     Numbers at a bound stay there.
@@ -182,12 +216,12 @@ def _sandwich(predictor: Predictor, solution: Solution, doubts: Sequence[Floats]
     problem, state = solution.problem, solution.state
     p, size = solution.columns[0].shape[1] - OWN - 1, problem.prior_mean.size
     grams = solution.grams
-    if doubts[0].shape[1]:
-        both = zip(solution.columns, doubts, predictor.data, strict=True)
+    if systematics[0].shape[1]:
+        both = zip(solution.columns, systematics, predictor.data, strict=True)
         grams = np.stack(
             [
-                products(np.column_stack([sensitivities, doubt]), trial_data.first, trial_data.relative_sd)
-                for sensitivities, doubt, trial_data in both
+                products(np.column_stack([sensitivities, systematic]), trial_data.first, trial_data.relative_sd)
+                for sensitivities, systematic, trial_data in both
             ]
         )
     blocks = trial_effects_eliminated(grams, p, problem, state)
@@ -205,7 +239,7 @@ def _sandwich(predictor: Predictor, solution: Solution, doubts: Sequence[Floats]
     if len(set(groups)) < trials:
         by_group = plain @ (group_scatter(single, groups, live.size) + prior) @ plain
         np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
-    cross = np.zeros((size + 1, doubts[0].shape[1]))
+    cross = np.zeros((size + 1, systematics[0].shape[1]))
     np.add.at(cross, problem.index, blocks[:, :p, p + 1 :])
     lever = plain @ cross[:size]
     return plain, robust, lever @ lever.T

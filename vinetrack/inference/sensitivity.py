@@ -88,14 +88,39 @@ class Predictor:
         self.steps = np.full(len(layout.keys), 1e-3)
 
     def run(self, jobs: Sequence[Job], times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
-        """Simulate at the instants of each job's trial, or at those of `times_s`, one array a job."""
+        """Simulate at the instants of each job's trial, or at those of `times_s`, one array a job.
+
+        Parameters
+        ----------
+        jobs : sequence of Job
+        times_s : sequence of arrays, optional
+            Instants since the recording began, s, one array a job.
+
+        Returns
+        -------
+        list of Trajectory
+        """
         rows = np.array([job.row for job in jobs]).reshape(len(jobs), -1)
         return self.run_as(self.layout.model, jobs, rows, times_s)
 
     def run_as(
         self, model: Model, jobs: Sequence[Job], rows: Floats, times_s: Sequence[Floats] | None = None
     ) -> list[Trajectory]:
-        """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials."""
+        """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials.
+
+        Parameters
+        ----------
+        model
+            Simulated in place of the fit's.
+        jobs : sequence of Job
+        rows : array, shape (n_jobs, n_parameters), SI
+        times_s : sequence of arrays, optional
+            Instants, s, one array a job.
+
+        Returns
+        -------
+        list of Trajectory
+        """
         places = np.array([job.trial for job in jobs], dtype=int)
         rigs = with_pressures(
             self.rigs[places],
@@ -128,7 +153,19 @@ class Predictor:
         )
 
     def jobs(self, theta: Floats, trial_effects: Floats) -> list[Job]:
-        """The unmoved trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4)."""
+        """The unmoved trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4).
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        trial_effects : array, shape (n_trials, 4)
+
+        Returns
+        -------
+        list of Job
+            One a trial.
+        """
         rows, yields = self.layout.rows(theta)
         trial_effects = self._deviations(theta, trial_effects)
         if self.damping_column >= 0:
@@ -147,7 +184,18 @@ class Predictor:
         return whole
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
-        """Measured minus predicted position of every trial, m."""
+        """Measured minus predicted position of every trial, m.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        trial_effects : array, shape (n_trials, 4)
+
+        Returns
+        -------
+        list of arrays, shape (n_points,)
+        """
         moved = self.run(self.jobs(theta, trial_effects))
         return [self._residual(i, moved[i], trial_effects) for i in range(len(self.data))]
 
@@ -158,6 +206,20 @@ class Predictor:
         """Columns [own numbers, keys of the layout, residual] of every trial, shape (n_points, 4 + n_keys + 1).
 
         `own_only` leaves the columns of the keys empty, but for B.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        trial_effects : array, shape (n_trials, 4)
+        own_only : bool
+            Leave the columns of the keys empty, but for B.
+
+        Returns
+        -------
+        list of arrays, shape (n_points, 4 + n_keys + 1)
+            Derivatives of the predicted position, m per unit of the column (trial effects SI, keys scaled); the last
+            column is the residual, m.
         """
         plain, whole = self.jobs(theta, trial_effects), self._deviations(theta, trial_effects)
         jobs, moves = list(plain), [(-1, 0.0)] * len(plain)
@@ -181,7 +243,16 @@ class Predictor:
         return columns
 
     def products(self, columns: Sequence[Floats]) -> Floats:
-        """Sums of products of the trials' columns under their noise, shape (n_trials, 3, k, k), see `whitening`."""
+        """Sums of products of the trials' columns under their noise, shape (n_trials, 3, k, k), see `whitening`.
+
+        Parameters
+        ----------
+        columns : sequence of arrays, shape (n_points, k)
+
+        Returns
+        -------
+        array, shape (n_trials, 3, k, k)
+        """
         return all_products(
             columns,
             [trial_data.first for trial_data in self.data],
@@ -192,17 +263,17 @@ class Predictor:
         self, i: int, job: Job, theta: Floats, trial_effects: Floats, own_only: bool
     ) -> list[tuple[int, float, Job]]:
         """What to simulate for the differences of one trial: place of the column, step, and the moved trajectory."""
-        found: list[tuple[int, float, Job]] = []
+        variations: list[tuple[int, float, Job]] = []
         if not self.plain_release[i]:
             step = RELEASE_STEP_FRAMES * self.data[i].frame_s
-            found.append((RELEASE, step, replace(job, release_s=job.release_s + step)))
+            variations.append((RELEASE, step, replace(job, release_s=job.release_s + step)))
         if self.feels_pressure[i]:
             step = float(self.pressure_step[i])
-            found.append((PRESSURE, step, replace(job, pressure_deviation=job.pressure_deviation + step)))
+            variations.append((PRESSURE, step, replace(job, pressure_deviation=job.pressure_deviation + step)))
         if self.feels_damping[i] and DAMPING not in self.layout.keys:
             row = job.row.copy()
             row[self.damping_column] *= np.exp(DAMPING_STEP)
-            found.append((DAMPING_DEVIATION, DAMPING_STEP, replace(job, row=row)))
+            variations.append((DAMPING_DEVIATION, DAMPING_STEP, replace(job, row=row)))
         upper = self.layout.bounds[1]
         for column, key in enumerate(self.layout.keys):
             place = self.layout.index[i, column]
@@ -220,8 +291,8 @@ class Predictor:
                 if key == DAMPING:
                     row[k] = number.outside(theta[place] + step + trial_effects[i, DAMPING_DEVIATION])
                 varied = replace(job, row=row)
-            found.append((OWN + column, step, varied))
-        return found
+            variations.append((OWN + column, step, varied))
+        return variations
 
     def _share_damping(self, columns: list[Floats]) -> None:
         """A trial's deviation of B and ln B itself are one sensitivity."""
@@ -260,7 +331,19 @@ def _change(plain: Trajectory, other: Trajectory) -> Floats:
 
 
 def moved_by(before: Floats, after: Trajectory) -> Floats:
-    """How far the observed positions of a trial moved from those `before`, m, shape (n_points,)."""
+    """How far the observed positions of a trial moved from those `before`, m, shape (n_points,).
+
+    Parameters
+    ----------
+    before : array, shape (n_points,), m
+        Observed positions of the unmoved trajectory.
+    after
+        The trajectory that was moved.
+
+    Returns
+    -------
+    array, shape (n_points,), m
+    """
     change = after.observed_position_m - before
     if after.status == "ended":
         # Behind the end of growth the film stands still: what delays the end moves nothing there.

@@ -15,19 +15,10 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitError
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, deviance, marginal
-from vinetrack.inference.optimiser import (
-    MOST_ITERATIONS,
-    FixedTerms,
-    Solution,
-    Watch,
-    chi2_per_dof,
-    cost,
-    first_state,
-    make_problem,
-    solve,
-    track_correlation,
-)
+from vinetrack.inference.fit_problem import first_state, make_problem, track_correlation
+from vinetrack.inference.marginal_likelihood import deviance, marginal
+from vinetrack.inference.mixed_effects import FitState, MixedProblem
+from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch, chi2_per_dof, cost, solve
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import align, candidates, initial_trial_effects
 from vinetrack.inference.trial_effects import trial_costs
@@ -46,6 +37,8 @@ MOST_STARTS = 3
 minimum."""
 
 ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 40
+"""Steps of a solution that is taken up again, and of one that is guided. Chosen for time: most settle in half of them;
+at half some stay unsettled and say so, at twice hopeless starts cost twice the time."""
 
 BAD_START = 1.5
 """χ² per point from which a start misses by more than the noise of the fit it came from. Chosen: below it the
@@ -62,29 +55,50 @@ afterwards."""
 
 
 def solve_from_scratch(predictor: Predictor, held: FixedTerms, watch: Watch | None, *, thorough: bool) -> Solution:
-    """The best of the solutions from the likeliest starts; the first will do where it explains the data."""
-    found: list[Solution] = []
+    """The best of the solutions from the likeliest starts; the first will do where it explains the data.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    held
+        Spreads and noise that are not estimated.
+    watch : callable or None
+        Called with each step.
+    thorough : bool
+        Whether a poor solution is begun from other starts.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    FitError
+        If the model cannot be followed from any start.
+    """
+    solutions: list[Solution] = []
     reason = ""
     starts = candidates(predictor.layout, predictor.data, predictor)[:MOST_STARTS]
     for _, theta, trial_effects in starts:
         try:
             most = MOST_ITERATIONS if thorough else ITERATIONS_ONCE_MORE
-            found.append(solve_from(predictor, theta, trial_effects, held, most_iterations=most, watch=watch))
+            solutions.append(solve_from(predictor, theta, trial_effects, held, most_iterations=most, watch=watch))
         except SimulationError as error:
             reason = str(error)
             continue
-        if found[-1].converged or not thorough:
+        if solutions[-1].converged or not thorough:
             break
-    if not found:
+    if not solutions:
         raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
-    best = min(found, key=_deviance)
+    best = min(solutions, key=_deviance)
     if not is_poor_fit(predictor, best):
         return best
     guided = [
         _guided(predictor, theta, trial_effects, held, watch)
         for _, theta, trial_effects in (starts if thorough else starts[:1])
     ]
-    return _sane(predictor, best, [one for one in guided if one is not None])
+    return _sane(predictor, best, [solution for solution in guided if solution is not None])
 
 
 def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
@@ -92,12 +106,35 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
 
     A tracker whose frames agree to a hundredth of a millimetre may err by a few tenths along the way: far beyond their
     noise, and no reason to begin elsewhere.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+
+    Returns
+    -------
+    bool
     """
     return bool(chi2_per_dof(predictor, solution) > POOR_FIT and missed_fraction(predictor, solution) > LOST)
 
 
 def missed_fraction(predictor: Predictor, solution: Solution) -> float:
-    """Root mean square of what is missed, as part of the growth that was seen; of the median trial."""
+    """Root mean square of what is missed, as part of the growth that was seen; of the median trial.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+
+    Returns
+    -------
+    float
+    """
     parts = [
         math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
         for columns, trial_data in zip(solution.columns, predictor.data, strict=True)
@@ -111,8 +148,8 @@ def _sane(predictor: Predictor, free: Solution, guided: list[Solution]) -> Solut
     Noise of correlation 1 wanders as it likes, and makes anything likely. So where a solution is lost, likelihood only
     chooses among those whose noise is as correlated as that of the tracks.
     """
-    found = [one for one in guided if not is_poor_fit(predictor, one)]
-    return min(found or guided or [free], key=_deviance)
+    sound = [solution for solution in guided if not is_poor_fit(predictor, solution)]
+    return min(sound or guided or [free], key=_deviance)
 
 
 def _guided(
@@ -183,7 +220,27 @@ def solve_from(
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
 ) -> Solution:
-    """Solve with the noise and the spreads that are assumed before anything is fitted."""
+    """Solve with the noise and the spreads that are assumed before anything is fitted.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    theta : array, shape (n_free,)
+        Numbers to begin from, scaled.
+    trial_effects : array, shape (n_trials, 4)
+        Trial effects to begin from.
+    held
+        Spreads and noise that are not estimated.
+    most_iterations : int
+        Steps at most.
+    watch : callable, optional
+        Called with each step.
+
+    Returns
+    -------
+    Solution
+    """
     state = first_state(predictor.data, theta, trial_effects)
     return solve(
         predictor, make_problem(predictor, trial_effects), state, held, most_iterations=most_iterations, watch=watch
@@ -193,7 +250,25 @@ def solve_from(
 def solve_again(
     predictor: Predictor, solution: Solution, held: FixedTerms, watch: Watch | None, *, thorough: bool
 ) -> Solution:
-    """A solution, or, where it is lost, the one led from its numbers by what is missed."""
+    """A solution, or, where it is lost, the one led from its numbers by what is missed.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    solution
+        Where the iterations ended.
+    held
+        Spreads and noise that are not estimated.
+    watch : callable or None
+        Called with each step.
+    thorough : bool
+        Whether a guided solution is freed again.
+
+    Returns
+    -------
+    Solution
+    """
     if not is_poor_fit(predictor, solution):
         return solution
     theta = solution.state.theta
@@ -217,6 +292,21 @@ def led_back(predictor: Predictor, problem: MixedProblem, state: FitState, held:
     """The state, or, where its numbers miss by far more than its noise, the one that this noise leads to.
 
     With the noise to be found as well, all that a bad start misses would pass for noise, and hold the fit there.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    problem
+        What does not change during the fit.
+    state
+        Where a warm start would begin.
+    held
+        Spreads and noise that are not estimated.
+
+    Returns
+    -------
+    FitState
     """
     if held.noise is not None or cost(predictor, problem, state) < BAD_START * float(np.sum(problem.points)):
         return state

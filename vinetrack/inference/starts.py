@@ -25,7 +25,16 @@ POINTS_LOOKED_AT = 60
 
 
 def initial_trial_effects(data: Sequence[FitTrial]) -> Floats:
-    """Release and origin of every trial from its rest frames, shape (n_trials, 4); deviations 0."""
+    """Release and origin of every trial from its rest frames, shape (n_trials, 4); deviations 0.
+
+    Parameters
+    ----------
+    data : sequence of FitTrial
+
+    Returns
+    -------
+    array, shape (n_trials, 4)
+    """
     trial_effects = np.zeros((len(data), OWN))
     for i, trial_data in enumerate(data):
         if trial_data.n_rest > 0:
@@ -51,27 +60,49 @@ def candidates(
 
     For each exponent, and each further value worth a try, every vine takes the B that misses its trials least; the
     release of each trial is scanned along.
+
+    Parameters
+    ----------
+    layout
+        Free numbers of the fit.
+    data : sequence of FitTrial
+    predictor
+        Of these trials.
+
+    Returns
+    -------
+    list of (misfit, theta, trial_effects)
+        Shapes (), (n_free,), (n_trials, 4).
     """
     trial_effects = initial_trial_effects(data)
     tries = [sorted({number.start, *number.tries}) if number.tries else [number.start] for number in layout.free]
     combined = list(itertools.islice(itertools.product(*tries), 12))
-    found: list[tuple[Floats, Floats]] = []
+    starts_found: list[tuple[Floats, Floats]] = []
     for values in combined:
         theta = np.array([number.inside(value) for value, number in zip(values, layout.free, strict=True)])
         starts = _scan(layout, data, predictor, theta, trial_effects) if DAMPING in layout.keys else [theta]
-        found += [(start, trial_effects) for start in starts]
+        starts_found += [(start, trial_effects) for start in starts]
     scored = []
-    for theta, begin in found:
+    for theta, begin in starts_found:
         try:
             releases, misfit = align(data, predictor, theta, begin)
         except SimulationError:
             continue
         scored.append((float(np.sum(misfit)), theta, releases))
-    return sorted(scored, key=lambda one: one[0])
+    return sorted(scored, key=lambda scored_start: scored_start[0])
 
 
 def one_of_each_condition(data: Sequence[FitTrial]) -> list[int]:
-    """Places of one trial of every condition, the one with the most points."""
+    """Places of one trial of every condition, the one with the most points.
+
+    Parameters
+    ----------
+    data : sequence of FitTrial
+
+    Returns
+    -------
+    list of int
+    """
     best: dict[str, int] = {}
     for i, trial_data in enumerate(data):
         condition = trial_data.trial.condition
@@ -89,7 +120,7 @@ def _scan(
     free_n = [k for k, number in enumerate(layout.free) if number.key == EXPONENT]
     key = layout.keys.index(DAMPING)
     place = layout.index[:, key]
-    found = []
+    starts = []
     for n in EXPONENTS if free_n else (_held_exponent(layout),):
         values = theta.copy()
         values[free_n] = [layout.free[k].inside(n) for k in free_n]
@@ -113,8 +144,8 @@ def _scan(
         values = values.copy()
         for k, (_, B) in best.items():
             values[k] = B
-        found.append(values)
-    return found
+        starts.append(values)
+    return starts
 
 
 def _held_exponent(layout: ParameterMap) -> float:
@@ -146,6 +177,22 @@ def align(
     """Own numbers with the release at which each trial fits best, and the logarithm of its relative misfit.
 
     One trajectory a trial is simulated, at a subset of its frames, and shifted by interpolation.
+
+    Parameters
+    ----------
+    data : sequence of FitTrial
+    predictor
+        Of these trials.
+    theta : array, shape (n_free,)
+        Free numbers, scaled.
+    trial_effects : array, shape (n_trials, 4)
+        Where to look from.
+
+    Returns
+    -------
+    trial_effects : array, shape (n_trials, 4)
+    misfit : array, shape (n_trials,)
+        ln of the root mean square as part of the travel.
     """
     thin = [_thinned(trial_data) for trial_data in data]
     jobs = predictor.jobs(theta, trial_effects)

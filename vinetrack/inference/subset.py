@@ -26,7 +26,7 @@ Indices = NDArray[np.int_]
 
 
 def fit_subset(
-    found: Fit,
+    fit: Fit,
     keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_],
     *,
     held: Iterable[str] = (),
@@ -38,34 +38,42 @@ def fit_subset(
 
     Parameters
     ----------
-    keep
-        Names of trials, or a mask over `found.trials`.
-    held
+    fit
+        The fit to all trials.
+    keep : iterable of str, or mask
+        Names of trials, or a mask over `fit.trials`.
+    held : iterable of str
         Names of numbers (`Number.name`) or of parameters (`effect.parameter`) that stay at their values.
-    hold_spreads, hold_noise
-        Whether spreads and noise stay those of `found`.
+    hold_spreads, hold_noise : bool
+        Whether spreads and noise stay those of `fit`.
+    most_iterations : int
+        Steps at most.
+
+    Returns
+    -------
+    Fit
 
     Raises
     ------
     FitError
         If no trial is kept, one is unknown, or the model cannot be followed.
     """
-    rows = _rows(found, keep)
-    places = numbers_felt(found.predictor.layout, rows)
-    predictor = subset_predictor(found.predictor, rows, places)
-    state = subset_state(found.solution.state, rows, places)
-    problem = subset_frame(found.solution.problem, predictor.layout, rows, places)
+    rows = _rows(fit, keep)
+    places = _numbers_felt(fit.predictor.layout, rows)
+    predictor = _subset_predictor(fit.predictor, rows, places)
+    state = _subset_state(fit.solution.state, rows, places)
+    problem = _subset_frame(fit.solution.problem, predictor.layout, rows, places)
     names = set(held)
     free = [not names & {number.name, number.key} for number in predictor.layout.free]
     problem = replace(problem, free=problem.free & np.array(free, dtype=bool))
     # The numbers of a fit include what smooth errors of position moved them by; its state does not.
-    reported = {number.name: number.value for number in found.numbers}
+    reported = {number.name: number.value for number in fit.numbers}
     stays = [
         number.inside(reported[number.name]) if not moves and number.name in reported else theta
         for number, moves, theta in zip(predictor.layout.free, free, state.theta, strict=True)
     ]
     state = replace(state, theta=np.array(stays, dtype=float))
-    told = _told(found, rows)
+    told = _told(fit, rows)
     told = FixedTerms(
         state.spread if hold_spreads else told.spread, (state.rho, state.variance) if hold_noise else told.noise
     )
@@ -73,14 +81,14 @@ def fit_subset(
         solution = solve(predictor, problem, state, told, warm=True, most_iterations=most_iterations)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed on part of the trials: {error}") from error
-    return assemble(predictor, solution, found.left_out, {**found.options, "held": told}, profile=False)
+    return assemble(predictor, solution, fit.left_out, {**fit.options, "held": told}, profile=False)
 
 
-def _rows(found: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) -> Indices:
+def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) -> Indices:
     """Places of the trials kept, in the order of the fit."""
     wanted = list(keep)
-    names = [trial.name for trial in found.trials]
-    if wanted and all(isinstance(one, (bool, np.bool_)) for one in wanted):
+    names = [trial.name for trial in fit.trials]
+    if wanted and all(isinstance(entry, (bool, np.bool_)) for entry in wanted):
         if len(wanted) != len(names):
             raise FitError(f"The mask has {len(wanted)} entries for {len(names)} trials.")
         rows = np.flatnonzero(wanted)
@@ -94,13 +102,13 @@ def _rows(found: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) 
     return rows
 
 
-def numbers_felt(layout: ParameterMap, rows: Indices) -> Indices:
+def _numbers_felt(layout: ParameterMap, rows: Indices) -> Indices:
     """Places of the free numbers that some of these trials feel, in their order."""
     felt = np.unique(layout.index[rows])
     return np.asarray(felt[felt >= 0])
 
 
-def subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> ParameterMap:
+def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> ParameterMap:
     """The layout of these trials with these numbers; names, scales and priors stay."""
     moved = np.full(len(layout.free) + 1, -1)
     moved[places] = np.arange(places.size)
@@ -119,23 +127,23 @@ def subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> Param
     )
 
 
-def subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Predictor:
+def _subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Predictor:
     """A predictor of these trials, with the steps that the other has found for its differences."""
-    layout = subset_layout(predictor.layout, rows, places)
+    layout = _subset_layout(predictor.layout, rows, places)
     smaller = Predictor(layout, [predictor.data[row] for row in rows], predictor.host)
     smaller.pressure_step = predictor.pressure_step[rows].copy()
     smaller.steps = np.array([predictor.steps[predictor.layout.keys.index(key)] for key in layout.keys])
     return smaller
 
 
-def subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
+def _subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
     """The state of these trials and numbers."""
     return replace(
         state, theta=state.theta[places], trial_effects=state.trial_effects[rows], variance=state.variance[rows]
     )
 
 
-def subset_frame(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
+def _subset_frame(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
     """The frame of these trials and numbers; `layout` is theirs already."""
 
     def numbers(values: Floats) -> Floats:
@@ -159,13 +167,10 @@ def subset_frame(problem: MixedProblem, layout: ParameterMap, rows: Indices, pla
     )
 
 
-def _told(found: Fit, rows: Indices) -> FixedTerms:
+def _told(fit: Fit, rows: Indices) -> FixedTerms:
     """What the user told the fit, for these trials."""
-    told: FixedTerms = found.options.get("held", FixedTerms())
+    told: FixedTerms = fit.options.get("held", FixedTerms())
     if told.noise is None:
         return told
     rho, variance = told.noise
     return replace(told, noise=(rho, variance[rows]))
-
-
-__all__ = ["fit_subset", "numbers_felt", "subset_frame", "subset_layout", "subset_predictor", "subset_state"]

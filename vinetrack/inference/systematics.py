@@ -43,6 +43,21 @@ def systematics_of(
     """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions.
 
     `positions` tells whether smooth errors of position are among them; a fit estimates those along with its numbers.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials that were fitted.
+    solution
+        Where the iterations ended.
+    trials : sequence of TrialFit
+        In the order of the fit.
+    positions : bool
+        Whether smooth errors of position are among them; a fit estimates those along with its numbers.
+
+    Returns
+    -------
+    list of arrays, shape (n_points, n_systematics), m
     """
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
     ways = (
@@ -94,11 +109,12 @@ def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
         return [np.zeros((trial.time_s.size, 0)) for trial in trials]
     sigma_m = float(np.nanmedian(stated))
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
-    reach = max(float(np.max(one)) for one in grown)
+    reach = max(float(np.max(growth_m)) for growth_m in grown)
     waves = np.pi * np.arange(1, WAVES + 1)
-    slow = [sigma_m * np.cos(one[:, None] / reach * waves) for one in grown]
+    slow = [sigma_m * np.cos(growth_m[:, None] / reach * waves) for growth_m in grown]
     return [
-        np.column_stack([first, *_ends(one / reach, COVERED * sigma_m)]) for first, one in zip(slow, grown, strict=True)
+        np.column_stack([first, *_ends(growth_m / reach, COVERED * sigma_m)])
+        for first, growth_m in zip(slow, grown, strict=True)
     ]
 
 

@@ -16,7 +16,11 @@ LARGEST_DEVIATION_STEP = 0.3
 frames. Chosen as trust region: beyond, a linear answer says little; spreads above are bounded much earlier."""
 
 LARGEST_DEVIATION = 0.9
+"""Chosen: a pressure or B off by 90 % is a fault of the sheet, not a deviation. At half such faults hold the fit at the
+limit, at twice exp(1.8) multiplies B by six."""
+
 LARGEST_RELEASE_STEP_FRAMES = 2.0
+"""Chosen with the two above as a trust region; at half releases take more steps, at twice they overshoot."""
 
 
 def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: FitState) -> tuple[FitState, Floats]:
@@ -24,6 +28,20 @@ def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: Fit
 
     They are known so well that a step of the shared numbers leaves the valley by its curvature alone. Every trial
     takes what serves it best: where a release meets a frame, the cost has a corner at which no full step helps.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+
+    Returns
+    -------
+    state : FitState
+    costs : array, shape (n_trials,)
     """
     columns = predictor.linearise(state.theta, state.trial_effects, own_only=True)
     grams = predictor.products(columns)
@@ -46,7 +64,20 @@ def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: Fit
 
 
 def limited(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats:
-    """Own numbers after a step: the release moves by two frames at most, a deviation by 0.3."""
+    """Own numbers after a step: the release moves by two frames at most, a deviation by 0.3.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    trial_effects : array, shape (n_trials, 4)
+        Before the step.
+    step : array, shape (n_trials, 4)
+
+    Returns
+    -------
+    array, shape (n_trials, 4)
+    """
     reach = LARGEST_RELEASE_STEP_FRAMES * np.array([trial_data.frame_s for trial_data in predictor.data])
     moved = trial_effects + step
     moved[:, RELEASE] = trial_effects[:, RELEASE] + np.clip(step[:, RELEASE], -reach, reach)
@@ -57,7 +88,21 @@ def limited(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats
 
 
 def trial_costs(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
-    """Whitened sum of squares of every trial with what the priors of its own numbers add, shape (n_trials,)."""
+    """Whitened sum of squares of every trial with what the priors of its own numbers add, shape (n_trials,).
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+
+    Returns
+    -------
+    array, shape (n_trials,)
+    """
     residuals = predictor.residuals(state.theta, state.trial_effects)
     squares = [
         float(np.sum(whiten(residual, trial_data.first, state.rho, trial_data.relative_sd) ** 2)) / variance

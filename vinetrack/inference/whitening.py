@@ -23,6 +23,18 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
     """G₀, G₁, G₂ of one trial, shape (3, k, k), for columns of shape (n_points, k).
 
     `relative_sd`, shape (n_points,), is the noise of every point relative to that of the trial, see `FitTrial`.
+
+    Parameters
+    ----------
+    columns : array, shape (n_points, k)
+    first : array of bool, shape (n_points,)
+        Points that begin a stretch.
+    relative_sd : array, shape (n_points,), optional
+        Noise of every point relative to that of the trial, see `FitTrial`.
+
+    Returns
+    -------
+    array, shape (3, k, k)
     """
     if relative_sd is not None:
         columns = columns / relative_sd[:, None]
@@ -38,13 +50,36 @@ def all_products(
     first: Sequence[NDArray[np.bool_]],
     relative_sd: Sequence[Floats | None] | None = None,
 ) -> Floats:
-    """`products` of every trial, shape (n_trials, 3, k, k)."""
+    """`products` of every trial, shape (n_trials, 3, k, k).
+
+    Parameters
+    ----------
+    columns : sequence of arrays, shape (n_points, k)
+    first : sequence of arrays of bool
+    relative_sd : sequence of arrays or None, optional
+
+    Returns
+    -------
+    array, shape (n_trials, 3, k, k)
+    """
     relative = [None] * len(columns) if relative_sd is None else relative_sd
     return np.stack([products(c, f, sd) for c, f, sd in zip(columns, first, relative, strict=True)])
 
 
 def at_correlation(grams: Floats, rho: float) -> Floats:
-    """Sums of whitened products at one correlation, shape (n_trials, k, k), in units of the innovations' variance 1."""
+    """Sums of whitened products at one correlation, shape (n_trials, k, k), in units of the innovations' variance 1.
+
+    Parameters
+    ----------
+    grams : array, shape (n_trials, 3, k, k)
+        From `all_products`.
+    rho : float
+        Lag-one correlation.
+
+    Returns
+    -------
+    array, shape (n_trials, k, k)
+    """
     return np.asarray(grams[:, 0] - rho * grams[:, 1] + rho**2 * grams[:, 2])
 
 
@@ -52,11 +87,26 @@ def whiten(residual: Floats, first: NDArray[np.bool_], rho: float, relative_sd: 
     """Residuals freed of their correlation, same variance at the first point of a stretch as at the others.
 
     They have shape (n_points,), (n_points, k) or (m, n_points, k), `first` and `relative_sd` (n_points,).
+
+    Parameters
+    ----------
+    residual : array, shape (n_points,), (n_points, k) or (m, n_points, k)
+    first : array of bool, shape (n_points,)
+        Points that begin a stretch.
+    rho : float
+        Lag-one correlation.
+    relative_sd : array, shape (n_points,), optional
+        Noise of every point relative to that of the trial.
+
+    Returns
+    -------
+    array
+        Of the shape of `residual`.
     """
     if relative_sd is not None:
         residual = residual / (relative_sd if residual.ndim == 1 else relative_sd[:, None])
     white = residual.copy()
-    along, before = (np.swapaxes(one, 0, 1) if one.ndim == 3 else one for one in (white, residual))
+    along, before = (np.swapaxes(values, 0, 1) if values.ndim == 3 else values for values in (white, residual))
     follows = np.flatnonzero(~first)
     along[follows] -= rho * before[follows - 1]
     along[first] *= np.sqrt(1 - rho**2)

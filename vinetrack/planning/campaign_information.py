@@ -26,8 +26,9 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.inference.fit_data import END_FRACTION, FitTrial
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, left_to_keys, marginal
-from vinetrack.inference.optimiser import make_problem
+from vinetrack.inference.fit_problem import make_problem
+from vinetrack.inference.marginal_likelihood import left_to_keys, marginal
+from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.parameters import DAMPING, EXPONENT, FreeParameter, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import OWN, Predictor
 from vinetrack.inference.whitening import all_products

@@ -15,7 +15,8 @@ import numpy as np
 from vinetrack.core.records import Floats, Trial
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import LARGEST_SPREAD, LEAST_SPREAD, marginal, normal_equations
+from vinetrack.inference.marginal_likelihood import LARGEST_SPREAD, marginal, normal_equations
+from vinetrack.inference.mixed_effects import LEAST_SPREAD
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, FreeParameter, ParameterMap
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.planning.feasible_trials import Condition

@@ -1,0 +1,333 @@
+"""Likelihood of spreads and noise: everything that a trial has of its own, and the shared numbers, integrated out.
+
+Spreads maximise the restricted likelihood (Patterson & Thompson, Biometrika 58, 545, 1971); so does the noise, once the
+trial effects have been fitted. See `vinetrack.inference.mixed_effects` for the model.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+from vinetrack.inference.mixed_effects import (
+    LEAST_SPREAD,
+    FitState,
+    MixedProblem,
+    bounded_solve,
+    cross_products,
+    cross_products_vector,
+    put_back,
+    solve_each,
+    solve_scaled,
+    spreads,
+    trial_effect_prior,
+)
+from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.whitening import at_correlation
+
+LARGEST_SPREAD = (0.04, 0.15)
+"""Of pressure and B: four times what a batch of vines shows. Beyond, a trial would bend its own pressure and B until
+they pass for whatever the model lacks. Chosen: a batch of vines scatters by a few per cent of B and one per cent of
+pressure; at half real batches are cut short, at twice spreads soak up missing effects."""
+
+LARGEST_CORRELATION = 0.9998
+"""Nearly 1: what a wrong model leaves is slow and large, and must not count as thousands of independent points.
+Derived: a correlation time of 5000 frames, longer than any recording."""
+
+CORRELATIONS = np.concatenate(
+    [np.linspace(-0.5, 0.9, 29), [0.93, 0.95, 0.97, 0.985, 0.993, 0.997, 0.999, LARGEST_CORRELATION]]
+)
+
+LOOSE, WITHIN_LEAST = 1e-9, 1e-6
+"""Precision of a shared number freed in one trial, in units of what that trial tells of it at white noise; least part
+of the residual that stays. Derived: 1e-9 is far below any information at the correlations of the grid, far above
+rounding; a residual of which a millionth stays is a thousand times its noise, all of it disagreement."""
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """The trials with release and origin eliminated, shape (n_trials, 2 + n_keys + 1) squared: deviations, keys, rest.
+
+    The last column is what the deviations and a change of the numbers have to explain. `log_constant` is the part of
+    −2 ln L that no spread changes.
+    """
+
+    blocks: Floats
+    log_constant: float
+
+
+def marginal(grams: Floats, problem: MixedProblem, state: FitState) -> Marginal:
+    """Eliminate release and origin, and put back what the deviations explain so far.
+
+    Parameters
+    ----------
+    grams : array, shape (n_trials, 3, k, k)
+        Products of [trial effects, keys, residual], see `whitening`.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+
+    Returns
+    -------
+    Marginal
+    """
+    white = at_correlation(grams, state.rho) / state.variance[:, None, None]
+    white = put_back(white, state, -1)
+    flat = white[:, :2, :2] + problem.own_precision[:, :, None] * np.eye(2)
+    left = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_each(flat, white[:, :2, 2:])
+    log_noise = np.sum(problem.points * np.log(state.variance)) - np.sum(problem.stretches) * math.log(1 - state.rho**2)
+    log_flat = np.sum(np.linalg.slogdet(flat)[1] - np.log(problem.own_precision).sum(axis=1))
+    return Marginal(left, float(log_noise + log_flat + np.sum(problem.points) * math.log(2 * math.pi)))
+
+
+def left_to_keys(part: Marginal, problem: MixedProblem, spread: tuple[float, float]) -> tuple[Floats, Floats]:
+    """What every trial says of its keys once all it has of its own is integrated out, and what that took.
+
+    Shapes (n_trials, n_keys + 1, n_keys + 1), the last row and column the rest, and (n_trials, 2, 2).
+
+    Parameters
+    ----------
+    part
+        Release and origin eliminated.
+    problem
+        What does not change during the fit.
+    spread : (float, float)
+        Between-trial standard deviations of pressure and ln B.
+
+    Returns
+    -------
+    blocks : array, shape (n_trials, n_keys + 1, n_keys + 1)
+    inner : array, shape (n_trials, 2, 2)
+        I + S Z S of the deviations, whose determinant enters ln L.
+    """
+    root = spreads(problem, spread) * problem.feels
+    inner = np.eye(2) + root[:, :, None] * part.blocks[:, :2, :2] * root[:, None, :]
+    side = root[:, :, None] * part.blocks[:, :2, 2:]
+    return part.blocks[:, 2:, 2:] - np.swapaxes(side, 1, 2) @ np.linalg.solve(inner, side), inner
+
+
+def normal_equations(
+    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float]
+) -> tuple[Floats, Floats, float, float]:
+    """Information of the free numbers, its slope, the sum of squares and the log-determinant at these spreads.
+
+    Parameters
+    ----------
+    part
+        Release and origin eliminated.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+    spread : (float, float)
+        Between-trial standard deviations of pressure and ln B.
+
+    Returns
+    -------
+    information : array, shape (n_free, n_free)
+    slope : array, shape (n_free,)
+    square : float
+        Sum of squares at the current numbers.
+    log_det : float
+    """
+    left, inner = left_to_keys(part, problem, spread)
+    information = cross_products(left[:, :-1, :-1], problem) + np.diag(problem.prior_precision)
+    away = state.theta - problem.prior_mean
+    slope = cross_products_vector(left[:, :-1, -1], problem) - problem.prior_precision * away
+    square = float(np.sum(left[:, -1, -1]) + np.sum(problem.prior_precision * away**2))
+    return information, slope, square, float(np.sum(np.linalg.slogdet(inner)[1]))
+
+
+def deviance(
+    part: Marginal, problem: MixedProblem, state: FitState, spread: tuple[float, float], *, restricted: bool = True
+) -> float:
+    """−2 ln of the (restricted) likelihood of the spreads, the free numbers at their best for them.
+
+    Parameters
+    ----------
+    part
+        Release and origin eliminated.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+    spread : (float, float)
+        Between-trial standard deviations of pressure and ln B.
+    restricted : bool
+        Whether the fitted numbers are counted (REML).
+
+    Returns
+    -------
+    float
+    """
+    information, slope, square, log_det = normal_equations(part, problem, state, spread)
+    moves = problem.free & (np.diag(information) > 0)
+    if ((state.theta <= problem.lower) | (state.theta >= problem.upper)).any():
+        # What would rather lie beyond its bound must not be credited with what it would explain there.
+        step = bounded_solve(information, slope, problem, state.theta)
+        moves &= (step != 0) | ((state.theta > problem.lower) & (state.theta < problem.upper))
+    k = np.flatnonzero(moves)
+    total = square + log_det + part.log_constant
+    if k.size:
+        inside = information[np.ix_(k, k)]
+        total -= float(slope[k] @ solve_scaled(inside, slope[k]))
+        if restricted:
+            total += float(np.linalg.slogdet(inside)[1])
+        elif problem.random is not None and problem.random[k].any():
+            total += _groups_integrated(inside, problem.prior_precision[k], problem.random[k])
+    return total
+
+
+def _groups_integrated(information: Floats, prior_precision: Floats, random: NDArray[np.bool_]) -> float:
+    """What −2 ln L gains when the random effects w of groups of trials are integrated out: ln det(I + D M D).
+
+    With w ~ N(0, D²) and M the data's information of w, the Gaussian integral of exp(−½ wᵀ(M + D⁻²)w) / det D is
+    det(D (M + D⁻²) D)^(−½). So a hypothesis with many groups pays for each of them.
+    """
+    sd = 1 / np.sqrt(prior_precision[random])
+    return float(np.linalg.slogdet(sd[:, None] * information[np.ix_(random, random)] * sd)[1])
+
+
+def estimate_spreads(
+    part: Marginal,
+    problem: MixedProblem,
+    state: FitState,
+    estimable: tuple[bool, bool],
+    *,
+    restricted: bool = True,
+    search: bool = False,
+) -> tuple[float, float]:
+    """Spreads of pressure and B that maximise the restricted (or plain) likelihood; those not estimable stay.
+
+    `search` begins from a grid, else from where the state stands.
+
+    Parameters
+    ----------
+    part
+        Release and origin eliminated.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+    estimable : (bool, bool)
+        Which of the two are estimated.
+    restricted : bool
+        Whether the likelihood is the restricted one.
+    search : bool
+        Whether to begin from a grid.
+
+    Returns
+    -------
+    (float, float)
+        Of pressure, relative, and of ln B.
+    """
+    from scipy.optimize import minimize
+
+    which = [k for k in range(2) if estimable[k]]
+    if not which:
+        return state.spread
+
+    def at(logs: Floats) -> tuple[float, float]:
+        spread = list(state.spread)
+        for k, value in zip(which, logs, strict=True):
+            spread[k] = float(np.clip(math.exp(value), LEAST_SPREAD, LARGEST_SPREAD[k]))
+        return spread[0], spread[1]
+
+    def cost(logs: Floats) -> float:
+        return deviance(part, problem, state, at(logs), restricted=restricted)
+
+    start = np.log(np.maximum([state.spread[k] for k in which], 1e-3))
+    if search:
+        axes = np.meshgrid(*[np.log([0.001, 0.004, 0.01, 0.025, 0.06])] * len(which), indexing="ij")
+        points = np.column_stack([axis.ravel() for axis in axes])
+        start = points[int(np.argmin([cost(point) for point in points]))]
+    simplex = np.vstack([start, start + 0.4 * np.eye(len(which))])
+    minimum = minimize(
+        cost, start, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-3}
+    )
+    return at(minimum.x)
+
+
+def estimate_noise(
+    grams: Floats, problem: MixedProblem, state: FitState, rho: float | None = None, *, within: bool = False
+) -> tuple[float, Floats]:
+    """Correlation of the noise, the same for all trials, and the variance of its innovations in each, m².
+
+    Restricted likelihood of what is left once each trial's own numbers have been fitted. A trial's variance is drawn to
+    that of all as far as trials do not differ by more than chance. The correlation is `rho` where given. `within` frees
+    the shared numbers in every trial too, so that what trials disagree by does not pass for noise.
+
+    Parameters
+    ----------
+    grams : array, shape (n_trials, 3, k, k)
+        Products of [trial effects, keys, residual], see `whitening`.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+    rho : float, optional
+        Correlation, where it is known.
+    within : bool
+        Whether the shared numbers are free in every trial.
+
+    Returns
+    -------
+    rho : float
+    variance : array, shape (n_trials,), m²
+    """
+    grid = CORRELATIONS if rho is None else np.array([rho])
+    centre, precision = trial_effect_prior(problem, state)
+    stiff = precision * state.variance[:, None]
+    pull_back = stiff * (state.trial_effects - centre)
+    freed = OWN + problem.index.shape[1] if within else OWN
+    shared = 0.0 if within else np.count_nonzero(problem.free) / problem.index.shape[0]
+    if within:
+        stiff = np.concatenate([stiff, _loose(grams, freed)], axis=1)
+        pull_back = np.pad(pull_back, ((0, 0), (0, freed - OWN)))
+    scores, squares = [], []
+    for value in grid:
+        white = at_correlation(grams, float(value))
+        inner = white[:, :freed, :freed] + stiff[:, :, None] * np.eye(freed)
+        taken = np.einsum("nkk->n", solve_each(inner, white[:, :freed, :freed])) + shared
+        dof = np.maximum(problem.points - taken, 1.0)
+        pull = white[:, :freed, -1] - pull_back
+        gain = np.sum(pull * solve_each(inner, pull[:, :, None])[:, :, 0], axis=1)
+        least = WITHIN_LEAST if within else 0.2
+        square = np.maximum(white[:, -1, -1] - gain, least * white[:, -1, -1])
+        score = np.sum(dof * np.log(square / dof)) - np.sum(problem.stretches) * math.log(1 - value**2)
+        scores.append(score + np.sum(np.linalg.slogdet(inner)[1]))
+        squares.append((square, dof))
+    best = int(np.argmin(scores))
+    if rho is None:
+        return estimate_noise(grams, problem, state, _lowest(grid, np.array(scores), best), within=within)
+    return rho, _draw_together(*squares[0])
+
+
+def _loose(grams: Floats, freed: int) -> Floats:
+    """Precision that leaves the shared numbers free in every trial, shape (n_trials, n_keys): tiny beside its own."""
+    told = np.einsum("nkk->nk", grams[:, 0])[:, OWN:freed]
+    return np.asarray(np.where(told > 0, LOOSE * told, 1.0))
+
+
+def _lowest(grid: Floats, scores: Floats, best: int) -> float:
+    """Where the parabola through the best point and its neighbours is lowest."""
+    if best in (0, grid.size - 1):
+        return float(grid[best])
+    curve = np.polyfit(grid[best - 1 : best + 2] - grid[best], scores[best - 1 : best + 2], 2)
+    return float(grid[best] - curve[1] / (2 * curve[0]))
+
+
+def _draw_together(square: Floats, dof: Floats) -> Floats:
+    """Variances of the trials, drawn to the common one by as much as their differences can be chance."""
+    common = float(np.sum(square) / np.sum(dof))
+    if square.size < 2:
+        return np.full(square.size, common)
+    logs = np.log(square / dof / common)
+    beyond = float(np.average((logs - np.average(logs, weights=dof)) ** 2 - 2 / dof, weights=dof))
+    strength = 2 / beyond if beyond > 1e-6 else 1e6
+    return np.asarray((square + strength * common) / (dof + strength))
