@@ -174,7 +174,7 @@ def test_a_documented_room_breaks_no_rule(rule: Callable[[Path], list[house_rule
 
 
 def test_no_two_public_classes_share_a_name() -> None:
-    assert set(house_rules.repeated_classes(PACKAGE)) <= {"AlignedTrial", "Choice", "Course", "Plan", "Size", "View"}
+    assert not house_rules.repeated_classes(PACKAGE)
 
 
 def test_no_two_modules_share_a_name() -> None:

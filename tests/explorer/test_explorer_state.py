@@ -16,7 +16,7 @@ from explorer_campaign import DEMO, SMALL, make_experiment, make_results
 
 from vinetrack.core.records import Trial
 from vinetrack.effects import Parameter
-from vinetrack.explorer.campaign import AlignedTrial, Campaign, condition_labels
+from vinetrack.explorer.campaign import Campaign, ShownTrial, condition_labels
 from vinetrack.explorer.choice import ChoiceError, changed, chosen, first_choice, sized, slider_range
 from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.curves import errors_m, follow, overall_m
@@ -98,7 +98,7 @@ def test_a_motion_is_told_on_the_ruler_of_its_track(campaign: Campaign) -> None:
     assert math.isnan(motion.lead_position_m(np.array([99.0]))[0])
 
 
-def traced(seen: AlignedTrial) -> AlignedTrial:
+def traced(seen: ShownTrial) -> ShownTrial:
     """With a pressure measured along that is the set one all the time."""
     trace = (np.array([-1.0, 2.0]), np.full(2, seen.data.trial.pressure_Pa))
     return replace(seen, data=replace(seen.data, trace=trace))

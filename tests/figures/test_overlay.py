@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, Edge, View, compose, levels
+from vinetrack.figures.overlay import AFTER, BEFORE, TRACKED, ClipView, Edge, compose, levels
 from vinetrack.video.axis import Axis
 
 SIZE = (640, 200)
@@ -17,8 +17,8 @@ def rgb(colour: str) -> np.ndarray:
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
 
 
-def view(axis: Axis | None = None, width_px: int = 640) -> View:
-    return View("a", axis or Axis((20.0, 100.0), (620.0, 100.0)), 40.0, SIZE, 0.25, 30.0, width_px)
+def view(axis: Axis | None = None, width_px: int = 640) -> ClipView:
+    return ClipView("a", axis or Axis((20.0, 100.0), (620.0, 100.0)), 40.0, SIZE, 0.25, 30.0, width_px)
 
 
 def edges(tracked: float = 200.0, before: float = 300.0, after: float = 210.0) -> list[Edge]:
@@ -67,13 +67,13 @@ def test_a_small_recording_is_enlarged_twice_at_most() -> None:
 
 
 def test_sides_are_even_whatever_comes_in() -> None:
-    odd = View("a", Axis((20.0, 50.0), (290.0, 50.0)), 20.0, (301, 97), 0.25, 30.0, 333)
+    odd = ClipView("a", Axis((20.0, 50.0), (290.0, 50.0)), 20.0, (301, 97), 0.25, 30.0, 333)
     height, width, _ = compose(odd, np.full((97, 301), 90, np.uint8), 1, 0.0, edges(100, 120, 140)).shape
     assert (height % 2, width % 2) == (0, 0)
 
 
 def test_an_axis_down_the_picture_has_its_edges_across_it() -> None:
-    down = View("a", Axis((100.0, 10.0), (100.0, 190.0)), 40.0, (200, 200), 0.25, 30.0, 200)
+    down = ClipView("a", Axis((100.0, 10.0), (100.0, 190.0)), 40.0, (200, 200), 0.25, 30.0, 200)
     picture = compose(down, np.full((200, 200), 90, np.uint8), 1, 0.0, edges(90, 140, 60))
     rows = np.flatnonzero((picture[-200:] == rgb(TRACKED)).all(axis=2).any(axis=1))
     assert np.mean(rows) == pytest.approx(100, abs=1)
@@ -88,7 +88,7 @@ def test_the_scale_bar_has_the_length_it_names() -> None:
 
 
 def test_without_a_scale_there_is_no_bar() -> None:
-    blind = View("a", Axis((20.0, 100.0), (620.0, 100.0)), 40.0, SIZE, math.nan, 30.0, 640)
+    blind = ClipView("a", Axis((20.0, 100.0), (620.0, 100.0)), 40.0, SIZE, math.nan, 30.0, 640)
     assert not (compose(blind, grey(), 1, 0.0, [])[-SIZE[1] :] == 255).all(axis=2).any()
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class AlignedTrial:
+class ShownTrial:
     """One trial with its release and origin, which align it with the common clock and ruler of all trials.
 
     `origin_known` tells whether the vine was filmed at rest; where it was not, the origin is fitted with a model.
@@ -103,7 +103,7 @@ class Campaign:
     experiment: Experiment
     pairs: tuple[tuple[Trial, Track], ...]
     kinematics: Mapping[str, Kinematics]
-    trials: tuple[AlignedTrial, ...]
+    trials: tuple[ShownTrial, ...]
     left_out: Mapping[str, str]
     bands: Mapping[str, ReplicateBand]
     floors_m: Mapping[str, float]
@@ -154,7 +154,7 @@ class Campaign:
         """
         return [i for i, seen in enumerate(self.trials) if seen.condition == condition]
 
-    def trial(self, name: str) -> AlignedTrial:
+    def trial(self, name: str) -> ShownTrial:
         """The trial of that name; KeyError where there is none.
 
         Parameters
@@ -228,7 +228,7 @@ def _floors(results: Results) -> dict[str, float]:
     return dict(zip(table["condition"].astype(str), table["replicate_floor_m"].astype(float), strict=True))
 
 
-def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[AlignedTrial]:
+def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) -> list[ShownTrial]:
     """Trials with the release and origin that the comparison found, or else what the track alone shows."""
     starts, at_rest = initial_trial_effects(data), rest_is_seen(data)
     aligned = []
@@ -241,7 +241,7 @@ def _on_one_clock(data: list[FitTrial], compared: Mapping[str, pd.DataFrame]) ->
             origin_m = float(trial_data.lead_position_m[0] - rows["lead_position_m"].iloc[0])
         if at_rest[i]:
             origin_m = trial_data.rest_origin_m
-        aligned.append(AlignedTrial(trial_data, release_s, origin_m, bool(at_rest[i])))
+        aligned.append(ShownTrial(trial_data, release_s, origin_m, bool(at_rest[i])))
     return aligned
 
 

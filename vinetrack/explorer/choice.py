@@ -20,7 +20,7 @@ class ChoiceError(UserError, ValueError):
 
 
 @dataclass(frozen=True)
-class Size:
+class SizeControl:
     """One number of an effect that a slider moves, SI; `vine` is blank where it holds for all."""
 
     effect: str
@@ -46,7 +46,7 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Choice:
+class ModelChoice:
     """Effects in the model, in the order they were added, and the size of every number by name, in it or not.
 
     `numbers` also holds the yield pressures that a fit found, by vine; no slider moves them.
@@ -58,7 +58,7 @@ class Choice:
     def __contains__(self, effect: object) -> bool:
         return effect in self.effects
 
-    def with_effect(self, effect: str, wanted: bool = True) -> Choice:
+    def with_effect(self, effect: str, wanted: bool = True) -> ModelChoice:
         """With an effect put in (at the end) or taken out; its sizes are kept for when it comes back.
 
         Parameters
@@ -75,7 +75,7 @@ class Choice:
         kept = tuple(name for name in self.effects if name != effect)
         return replace(self, effects=(*kept, effect) if wanted else kept)
 
-    def with_size(self, name: str, value: float) -> Choice:
+    def with_size(self, name: str, value: float) -> ModelChoice:
         """With one number, SI, at another size.
 
         Parameters
@@ -90,7 +90,7 @@ class Choice:
         return replace(self, numbers={**self.numbers, name: value})
 
 
-def first_choice(campaign: Campaign) -> Choice:
+def first_choice(campaign: Campaign) -> ModelChoice:
     """The model in use at the sizes that were fitted, everything else at its default.
 
     Parameters
@@ -106,10 +106,10 @@ def first_choice(campaign: Campaign) -> Choice:
         for effect in campaign.effects.values()
         for size in sizes_of(campaign, effect, {})
     }
-    return Choice(campaign.in_use, {**numbers, **campaign.numbers})
+    return ModelChoice(campaign.in_use, {**numbers, **campaign.numbers})
 
 
-def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[Size]:
+def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[SizeControl]:
     """The sliders of an effect: one a number, or one a vine where each has its own; ranges hold the present value.
 
     Parameters
@@ -125,7 +125,7 @@ def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -
     sizes = []
     for parameter in effect.parameters:
         for vine in campaign.vines if parameter.shared == "vine" else ("",):
-            bare = Size(effect.name, parameter, vine, 0.0, 1.0)
+            bare = SizeControl(effect.name, parameter, vine, 0.0, 1.0)
             low, high = slider_range(bare.key, parameter, numbers.get(bare.name, parameter.default))
             sizes.append(replace(bare, low=low, high=high))
     return sizes
@@ -157,7 +157,7 @@ def slider_range(key: str, parameter: Parameter, value: float) -> tuple[float, f
     return max(low, parameter.bounds[0]), min(high, parameter.bounds[1]) if value < parameter.bounds[1] else value
 
 
-def sized(campaign: Campaign, choice: Choice) -> SizedModel:
+def sized(campaign: Campaign, choice: ModelChoice) -> SizedModel:
     """The model that was chosen, ready to be followed.
 
     Parameters
@@ -197,7 +197,7 @@ def can_leave(effect: str) -> bool:
     return effect not in BASE_EFFECTS
 
 
-def changed(campaign: Campaign, choice: Choice) -> tuple[list[str], list[str]]:
+def changed(campaign: Campaign, choice: ModelChoice) -> tuple[list[str], list[str]]:
     """Effects added to the model in use, and those taken out of it.
 
     Parameters
@@ -215,8 +215,8 @@ def changed(campaign: Campaign, choice: Choice) -> tuple[list[str], list[str]]:
 
 
 def chosen(
-    campaign: Campaign, start: Choice, add: Iterable[str] = (), drop: Iterable[str] = (), sizes: Iterable[str] = ()
-) -> Choice:
+    campaign: Campaign, start: ModelChoice, add: Iterable[str] = (), drop: Iterable[str] = (), sizes: Iterable[str] = ()
+) -> ModelChoice:
     """A choice put together from words, as a command line has them.
 
     Parameters
@@ -262,7 +262,7 @@ def _usable(campaign: Campaign, name: str) -> str:
     return name
 
 
-def _with_written_size(campaign: Campaign, choice: Choice, text: str) -> Choice:
+def _with_written_size(campaign: Campaign, choice: ModelChoice, text: str) -> ModelChoice:
     name, equals, written = text.partition("=")
     name = name.strip()
     effect = _usable(campaign, name.split(".")[0])

@@ -12,7 +12,7 @@ from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
     from vinetrack.explorer.campaign import Campaign
-    from vinetrack.explorer.choice import Choice
+    from vinetrack.explorer.choice import ModelChoice
 
 
 class PageError(UserError, RuntimeError):
@@ -99,7 +99,7 @@ def explore(folder: Path, experiment: Path | None, wanted: ExploreOptions, say: 
 
 
 def _without_a_page(
-    campaign: Campaign, start: Choice, choice: Choice, wanted: ExploreOptions, say: Callable[[str], None]
+    campaign: Campaign, start: ModelChoice, choice: ModelChoice, wanted: ExploreOptions, say: Callable[[str], None]
 ) -> None:
     from vinetrack.core.terminal import waiting
     from vinetrack.explorer.choice import sized
@@ -128,7 +128,7 @@ def _without_a_page(
         say(f"Saved: {save_model(campaign.experiment.folder, choice.effects)}")
 
 
-def error_lines(campaign: Campaign, choice: Choice, now: dict[str, float], before: dict[str, float]) -> list[str]:
+def error_lines(campaign: Campaign, choice: ModelChoice, now: dict[str, float], before: dict[str, float]) -> list[str]:
     """The error of every condition before and now beside what replicates differ by, aligned, with units.
 
     Parameters

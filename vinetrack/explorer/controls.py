@@ -25,7 +25,7 @@ from vinetrack.core.problems import ExperimentError, format_problems
 from vinetrack.core.tables import TableError
 from vinetrack.effects import Effect
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import Choice, Size, can_leave, sizes_of, slider_range
+from vinetrack.explorer.choice import ModelChoice, SizeControl, can_leave, sizes_of, slider_range
 from vinetrack.explorer.export import commands, exported, model_words
 from vinetrack.explorer.fitting import Fitted
 from vinetrack.explorer.look import command_block, escaped, sheet, words
@@ -52,7 +52,7 @@ input { accent-color: var(--accent); width: 1rem; height: 1rem; margin-right: .4
 class EffectRow:
     """One effect: its tick, its sliders, and words."""
 
-    def __init__(self, campaign: Campaign, effect: Effect, choice: Choice) -> None:
+    def __init__(self, campaign: Campaign, effect: Effect, choice: ModelChoice) -> None:
         self.effect, self.sizes = effect, sizes_of(campaign, effect, choice.numbers)
         unusable = campaign.unusable.get(effect.name, "")
         self.tick = Checkbox(
@@ -83,7 +83,7 @@ class EffectRow:
         return float(self.sliders[k].value) / self.sizes[k].shown[1]
 
 
-def _slider(size: Size, choice: Choice, disabled: bool) -> Slider:
+def _slider(size: SizeControl, choice: ModelChoice, disabled: bool) -> Slider:
     unit, factor = size.shown
     low, high = factor * size.low, factor * size.high
     slider = Slider(
@@ -102,7 +102,7 @@ def _slider(size: Size, choice: Choice, disabled: bool) -> Slider:
     return slider
 
 
-def _title(size: Size) -> str:
+def _title(size: SizeControl) -> str:
     what = size.vine or size.parameter.meaning
     return f"{size.parameter.symbol}, {what}" if what else size.parameter.symbol
 
@@ -117,7 +117,7 @@ class EffectPanel:
     def __init__(
         self,
         campaign: Campaign,
-        choice: Choice,
+        choice: ModelChoice,
         suspects: Sequence[str],
         ticked: Callable[[str, bool], None],
         moved: Callable[[str, str, float], None],
@@ -133,7 +133,7 @@ class EffectPanel:
             children=self._groups(choice, suspects), sizing_mode="stretch_width", name="effects", margin=0
         )
 
-    def _groups(self, choice: Choice, suspects: Sequence[str]) -> list[Column]:
+    def _groups(self, choice: ModelChoice, suspects: Sequence[str]) -> list[Column]:
         in_use = [name for name in self.rows if name in choice]
         likely = [name for name in suspects if name in self.rows and name not in in_use][:6]
         others = [name for name in self.rows if name not in in_use and name not in likely]
@@ -169,7 +169,7 @@ class EffectPanel:
 
         return heard
 
-    def show(self, choice: Choice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
+    def show(self, choice: ModelChoice, fitted: Fitted | None = None, *, sliders: bool = True) -> None:
         """Set ticks and, where wanted, sliders to a choice; beside each number what a fit found of it.
 
         Parameters
@@ -191,7 +191,7 @@ class EffectPanel:
             self._quiet = False
 
 
-def _set_slider(slider: Slider, size: Size, value: float) -> None:
+def _set_slider(slider: Slider, size: SizeControl, value: float) -> None:
     low, high = slider_range(size.key, size.parameter, value)
     low, high = (bound * size.shown[1] for bound in (min(low, size.low), max(high, size.high)))
     shown = value * size.shown[1]
@@ -201,7 +201,7 @@ def _set_slider(slider: Slider, size: Size, value: float) -> None:
         slider.value = shown
 
 
-def _say_found(div: Div, size: Size, fitted: Fitted | None) -> None:
+def _say_found(div: Div, size: SizeControl, fitted: Fitted | None) -> None:
     number = None if fitted is None else fitted.number(size.name)
     if number is None:
         div.visible = False

@@ -17,7 +17,7 @@ import numpy as np
 from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trace, Trajectory, simulate_many
-from vinetrack.explorer.campaign import AlignedTrial, Campaign
+from vinetrack.explorer.campaign import Campaign, ShownTrial
 from vinetrack.inference.left_out import TOLD_APART, told_apart
 from vinetrack.inference.parameters import YIELD_PRESSURE
 
@@ -139,19 +139,19 @@ def with_yield(trial: Trial, yield_Pa: Mapping[str, float]) -> Trial:
     return replace(trial, yield_pressure_Pa=yield_Pa[trial.name]) if trial.name in yield_Pa else trial
 
 
-def _grid(seen: AlignedTrial) -> Floats:
+def _grid(seen: ShownTrial) -> Floats:
     """Instants since release: until the end of the recording and a little on."""
     data = seen.data
     last_s = max(data.time_s[-1] - seen.release_s, 0.0) + ROOM_FRAMES * data.frame_s
     return np.linspace(0.0, last_s, GRID_POINTS)
 
 
-def _since(seen: AlignedTrial) -> Trace | None:
+def _since(seen: ShownTrial) -> Trace | None:
     trace = seen.data.trace
     return None if trace is None else (trace[0] - seen.release_s, trace[1])
 
 
-def _aligned(seen: AlignedTrial, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
+def _aligned(seen: ShownTrial, grid: Floats, moved: Trajectory, start_s: float) -> ModelCurves:
     """Newton's steps in release, and in the origin where the vine was not seen at rest."""
     data, position = seen.data, moved.observed_position_m
     speed = np.gradient(position, grid)

@@ -12,7 +12,7 @@ import numpy as np
 
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import Choice, ChoiceError, changed, sizes_of
+from vinetrack.explorer.choice import ChoiceError, ModelChoice, changed, sizes_of
 from vinetrack.explorer.curves import Curves, errors_m
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ CURVE_COLUMNS = (
 )
 
 
-def curve_table(campaign: Campaign, choice: Choice, curves: Curves, shown: Sequence[int]) -> pd.DataFrame:
+def curve_table(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int]) -> pd.DataFrame:
     """Measurement and model at every frame used, since release and from the origin; columns `CURVE_COLUMNS`.
 
     Parameters
@@ -62,7 +62,7 @@ def curve_table(campaign: Campaign, choice: Choice, curves: Curves, shown: Seque
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(CURVE_COLUMNS))
 
 
-def exported(campaign: Campaign, choice: Choice, curves: Curves, shown: Sequence[int], form: str) -> bytes:
+def exported(campaign: Campaign, choice: ModelChoice, curves: Curves, shown: Sequence[int], form: str) -> bytes:
     """The curves as `csv`, or the figure of the report as `svg`, `png` or `pdf`.
 
     Parameters
@@ -97,7 +97,7 @@ def exported(campaign: Campaign, choice: Choice, curves: Curves, shown: Sequence
 
 
 def _compared(
-    campaign: Campaign, choice: Choice, errors: Mapping[str, float], conditions: Sequence[str]
+    campaign: Campaign, choice: ModelChoice, errors: Mapping[str, float], conditions: Sequence[str]
 ) -> pd.DataFrame:
     import pandas as pd
 
@@ -115,7 +115,7 @@ def _compared(
     )
 
 
-def write_export(campaign: Campaign, choice: Choice, curves: Curves, path: Path) -> None:
+def write_export(campaign: Campaign, choice: ModelChoice, curves: Curves, path: Path) -> None:
     """Everything in one file whose ending says in which form, whole or not at all.
 
     Parameters
@@ -136,7 +136,9 @@ def write_export(campaign: Campaign, choice: Choice, curves: Curves, path: Path)
     write_bytes(path, exported(campaign, choice, curves, range(len(campaign.trials)), form))
 
 
-def commands(campaign: Campaign, start: Choice, choice: Choice, *, fitted: bool, save: bool = False) -> list[str]:
+def commands(
+    campaign: Campaign, start: ModelChoice, choice: ModelChoice, *, fitted: bool, save: bool = False
+) -> list[str]:
     """What to type for the same without the page, a line a command.
 
     Parameters
@@ -168,7 +170,7 @@ def commands(campaign: Campaign, start: Choice, choice: Choice, *, fitted: bool,
     return [" ".join(["vinetrack explore", folder, *words])]
 
 
-def _moved(campaign: Campaign, start: Choice, choice: Choice) -> dict[str, float]:
+def _moved(campaign: Campaign, start: ModelChoice, choice: ModelChoice) -> dict[str, float]:
     """Sizes of effects in the model that are not those the page opened with, by name."""
     names = [
         size.name for effect in choice.effects for size in sizes_of(campaign, campaign.effects[effect], choice.numbers)

@@ -13,7 +13,7 @@ from bokeh.models import Button, Column, ColumnDataSource, LinearColorMapper, Ra
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 
-from vinetrack.explorer.campaign import AlignedTrial, Campaign
+from vinetrack.explorer.campaign import Campaign, ShownTrial
 from vinetrack.explorer.curves import Curves
 from vinetrack.explorer.look import EARLIER_EDGE, MEASURED_EDGE, MODEL_EDGE, escaped, progress_bar, sheet, words
 from vinetrack.explorer.recording import DecodedRecording, RecordingView, view_of
@@ -176,7 +176,7 @@ class FilmPanel:
         times = self._seen().data.time_s if self._view is None else self._view.time_s
         return float(times[min(frame, times.size - 1)])
 
-    def _seen(self) -> AlignedTrial:
+    def _seen(self) -> ShownTrial:
         return self.campaign.trial(self.choose.value)
 
     def _positions(self, frame: int) -> tuple[float, float, float]:

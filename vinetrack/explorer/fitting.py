@@ -15,7 +15,7 @@ from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import Choice, first_choice, sized
+from vinetrack.explorer.choice import ModelChoice, first_choice, sized
 from vinetrack.explorer.curves import Curves, errors_m, follow
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_data import FitError
@@ -40,7 +40,7 @@ class GivenUp(Exception):  # noqa: N818 - nothing went wrong
 class Fitted:
     """A fit, the choice at its numbers, and what follows from them. `floors_m` are those of its own comparison."""
 
-    choice: Choice
+    choice: ModelChoice
     fit: Fit
     curves: Curves
     errors_m: Mapping[str, float]
@@ -61,7 +61,7 @@ class Fitted:
         return next((number for number in self.fit.numbers if number.name == name), None)
 
 
-def first_fit(campaign: Campaign, choice: Choice, watch: Watch | None = None) -> Fitted:
+def first_fit(campaign: Campaign, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
     """Fit the model in use, as the stage of the workflow does.
 
     Its likelihood is known from `fit.json`; where the first start reaches it, no others are tried.
@@ -93,7 +93,7 @@ def first_fit(campaign: Campaign, choice: Choice, watch: Watch | None = None) ->
     return _weighed(campaign, choice, result, time.perf_counter() - begun)
 
 
-def fit_choice(campaign: Campaign, before: Fit, choice: Choice, watch: Watch | None = None) -> Fitted:
+def fit_choice(campaign: Campaign, before: Fit, choice: ModelChoice, watch: Watch | None = None) -> Fitted:
     """Fit what was chosen, from where a fit ended and the sizes that were chosen for what is new.
 
     Where that ends worse than without the new effects, or does not settle, it is tried once more from their defaults.
@@ -129,7 +129,7 @@ def fit_choice(campaign: Campaign, before: Fit, choice: Choice, watch: Watch | N
     return _weighed(campaign, choice, result, time.perf_counter() - begun)
 
 
-def _weighed(campaign: Campaign, choice: Choice, result: Fit, seconds: float) -> Fitted:
+def _weighed(campaign: Campaign, choice: ModelChoice, result: Fit, seconds: float) -> Fitted:
     """The fit compared with the measurement, as `vinetrack compare` does."""
     settled = at_numbers(choice, {number.name: number.value for number in result.numbers})
     curves = follow(campaign, sized(campaign, settled))
@@ -138,7 +138,7 @@ def _weighed(campaign: Campaign, choice: Choice, result: Fit, seconds: float) ->
     return Fitted(settled, result, curves, errors_m(campaign, curves), floors, seconds)
 
 
-def at_numbers(choice: Choice, numbers: Mapping[str, float]) -> Choice:
+def at_numbers(choice: ModelChoice, numbers: Mapping[str, float]) -> ModelChoice:
     """The same effects at these sizes.
 
     Parameters
@@ -261,7 +261,7 @@ class BackgroundFit:
     `trouble` says why it got no further, blank where it did. Listeners are called from the background's thread.
     """
 
-    def __init__(self, campaign: Campaign, choice: Choice | None = None) -> None:
+    def __init__(self, campaign: Campaign, choice: ModelChoice | None = None) -> None:
         self.campaign = campaign
         self.start = first_choice(campaign)
         self.opening = choice or self.start

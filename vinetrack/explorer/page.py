@@ -11,7 +11,7 @@ from bokeh.document import Document
 from bokeh.models import Button, Column, CustomJS, Row
 
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.explorer.choice import Choice, changed, sized
+from vinetrack.explorer.choice import ModelChoice, changed, sized
 from vinetrack.explorer.controls import Chooser, EffectPanel, KeepPanel
 from vinetrack.explorer.curves import Curves, errors_m, follow
 from vinetrack.explorer.film_panel import FilmPanel
@@ -58,7 +58,7 @@ class Page:
 
     def __init__(self, ground: BackgroundFit, document: Document) -> None:
         self.ground, self.campaign, self.document = ground, ground.campaign, document
-        self.choice: Choice = ground.opening
+        self.choice: ModelChoice = ground.opening
         self.curves: Curves | None = None
         self.errors_m: Mapping[str, float] = {}
         self.last: Fitted | None = None
@@ -272,7 +272,7 @@ class Page:
             self._words_pending = True
             self.document.add_timeout_callback(self._say, WORDS_MS)
 
-    def _follow(self, choice: Choice) -> None:
+    def _follow(self, choice: ModelChoice) -> None:
         """Curves of a choice, drawn; where the model cannot be followed, that is said and the old ones stay."""
         try:
             self.curves = follow(self.campaign, sized(self.campaign, choice), self.curves)

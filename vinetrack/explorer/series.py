@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.explorer.campaign import AlignedTrial, Campaign, condition_labels
+from vinetrack.explorer.campaign import Campaign, ShownTrial, condition_labels
 from vinetrack.explorer.curves import Curves
 from vinetrack.figures.style import vine_styles
 
@@ -94,7 +94,7 @@ def measured(campaign: Campaign, shown: Sequence[int]) -> Columns:
     return columns
 
 
-def _broken(seen: AlignedTrial, rows: slice, values: Floats) -> Floats:
+def _broken(seen: ShownTrial, rows: slice, values: Floats) -> Floats:
     """Values with NaN where frames are left out, so that no line is drawn over frames that were not compared."""
     stretch = np.cumsum(seen.data.first)[rows]
     out = values.copy()

@@ -12,7 +12,7 @@ from vinetrack.core.numbers import decimals
 from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.explorer.campaign import Campaign
-from vinetrack.explorer.choice import Choice
+from vinetrack.explorer.choice import ModelChoice
 from vinetrack.explorer.curves import overall_m
 from vinetrack.explorer.export import model_words
 from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
@@ -43,7 +43,7 @@ class FittedRung:
     gained: str
 
 
-def headline(campaign: Campaign, choice: Choice, now_m: Mapping[str, float], before_m: Mapping[str, float]) -> str:
+def headline(campaign: Campaign, choice: ModelChoice, now_m: Mapping[str, float], before_m: Mapping[str, float]) -> str:
     """Return the error of the model now and as the page opened, with the replicate scatter, as a heading.
 
     Parameters

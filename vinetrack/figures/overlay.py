@@ -52,7 +52,7 @@ class Edge:
 
 
 @dataclass(frozen=True)
-class View:
+class ClipView:
     """What all frames of a clip share.
 
     `size_px` is width and height of the recording; `mm_per_px` its scale along the axis; `slowed` by how much the clip
@@ -82,7 +82,7 @@ def _even(value: float) -> int:
     return max(2 * round(value / 2), 2)
 
 
-def compose(view: View, picture: NDArray[Any], frame: int, time_ms: float, edges: list[Edge]) -> NDArray[np.uint8]:
+def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, edges: list[Edge]) -> NDArray[np.uint8]:
     """One frame of the clip, RGB, shape (height, width, 3), both even.
 
     Parameters
@@ -127,7 +127,7 @@ def _font(size_px: int, bold: bool = False) -> FreeTypeFont:
     return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/{name}", size_px)
 
 
-def _draw_edge(pen: ImageDraw, view: View, edge: Edge, frame: int, reach: float) -> None:
+def _draw_edge(pen: ImageDraw, view: ClipView, edge: Edge, frame: int, reach: float) -> None:
     """Draw across the tube where `reach` is 0, else on both sides of it as far as that."""
     along = float(edge.along_px[frame])
     if not math.isfinite(along):
@@ -143,7 +143,7 @@ def _draw_edge(pen: ImageDraw, view: View, edge: Edge, frame: int, reach: float)
         pen.line(line, fill=edge.colour, width=thick)
 
 
-def _scale_bar(pen: ImageDraw, view: View, line_px: int) -> None:
+def _scale_bar(pen: ImageDraw, view: ClipView, line_px: int) -> None:
     """A bar of a round length, about a sixth of the picture, in its lower left corner."""
     width, height = view.picture_px
     wanted_mm = width / 6 / view.zoom * view.mm_per_px
@@ -163,7 +163,7 @@ def _scale_bar(pen: ImageDraw, view: View, line_px: int) -> None:
 
 
 @lru_cache(maxsize=2)
-def _legend(view: View, names: tuple[tuple[str, str], ...], bar_px: int, line_px: int) -> Image:
+def _legend(view: ClipView, names: tuple[tuple[str, str], ...], bar_px: int, line_px: int) -> Image:
     """The part of the bar that never changes; numbers are written over it."""
     from PIL import Image, ImageDraw
 
@@ -193,7 +193,7 @@ def _shortened(text: str, room_px: float, line_px: int, bold: bool = False) -> s
     return text.rstrip() + "…"
 
 
-def _numbers(pen: ImageDraw, view: View, edges: list[Edge], frame: int, time_ms: float, line_px: int) -> None:
+def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time_ms: float, line_px: int) -> None:
     width, font = view.picture_px[0], _font(line_px)
     for i, edge in enumerate(edges):
         if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):

@@ -243,7 +243,7 @@ def _pictures(
     slowed: float,
     settings: OverlaySettings,
 ) -> Iterator[NDArray[np.uint8]]:
-    from vinetrack.figures.overlay import View, compose, levels
+    from vinetrack.figures.overlay import ClipView, compose, levels
     from vinetrack.video.axis import Axis
     from vinetrack.video.frames import inspect_recording, iterate_frames
 
@@ -257,7 +257,9 @@ def _pictures(
     mm_per_px = float(analysed["row"]["mm_per_px"] or math.nan)
     tube_px = 1e3 * trial.diameter_m / mm_per_px
     tube_px = tube_px if math.isfinite(tube_px) else 0.2 * min(recording.width, recording.height)
-    view = View(trial.name, axis, tube_px, (recording.width, recording.height), mm_per_px, slowed, settings.width_px)
+    view = ClipView(
+        trial.name, axis, tube_px, (recording.width, recording.height), mm_per_px, slowed, settings.width_px
+    )
     edges, release_s = edges_of(trial.name, results, track)
     shake_px = shake_along(line, len(track))
     edges = [replace(edge, along_px=edge.along_px + shake_px) for edge in edges]

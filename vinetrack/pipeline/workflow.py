@@ -40,7 +40,7 @@ SHARED_FILES = ("trials.csv", "experiment.yaml")
 
 
 @dataclass(frozen=True)
-class Plan:
+class WorkflowPlan:
     """One run of the workflow.
 
     `trials` are all that get files (those that failed at the sheet too, with empty ones); `filmed` those of them that
@@ -166,7 +166,7 @@ class Plan:
         return json.dumps(self.settings.model_dump(mode="json", include=chosen), sort_keys=True)
 
 
-def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
+def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     """Read the settings and the experiment's sheet.
 
     Parameters
@@ -216,7 +216,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> Plan:
         for trial in experiment.trials
         if trial.video is not None
     }
-    return Plan(
+    return WorkflowPlan(
         experiment=folder,
         results=results,
         trials=trials,
@@ -299,7 +299,7 @@ def _shown(path: Path) -> str:
     return os.path.relpath(path)
 
 
-def plan_or_stop(config: Mapping[str, Any], base: Path) -> Plan:
+def plan_or_stop(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     """`make_plan`, but what is wrong is printed in at most 20 lines and the process ends with status 1.
 
     For the Snakefile: an exception there would be printed with Snakemake's own stack.
@@ -323,7 +323,7 @@ def plan_or_stop(config: Mapping[str, Any], base: Path) -> Plan:
         raise SystemExit(1) from None
 
 
-def say_where_at_exit(plan: Plan, quiet: bool = False) -> None:
+def say_where_at_exit(plan: WorkflowPlan, quiet: bool = False) -> None:
     """Let the last line of this process say where the report is, if it is there and no older than what it is made of.
 
     Snakemake's own `onsuccess` comes before its closing lines, and not at all where nothing had to be done.
@@ -339,7 +339,7 @@ def say_where_at_exit(plan: Plan, quiet: bool = False) -> None:
         atexit.register(_say_where, plan)
 
 
-def _say_where(plan: Plan) -> None:
+def _say_where(plan: WorkflowPlan) -> None:
     path = plan.results / "report.html"
     if not path.exists():
         return

@@ -26,7 +26,7 @@ from vinetrack.inference.mixed_effects import SPREAD_COLUMNS, solve_each
 from vinetrack.inference.sensitivity import OWN
 from vinetrack.planning.feasible_trials import Condition
 from vinetrack.planning.hypothesis_predictions import Hypothesis, View
-from vinetrack.planning.simulated_tracks import Course, TrackSampling, blank
+from vinetrack.planning.simulated_tracks import GrowthCourse, TrackSampling, blank
 
 POINTS = 100
 """Times at which a condition is looked at; each stands for the frames about it. Chosen: smooth curves are summed to a
@@ -105,7 +105,7 @@ def all_sides(
     hypotheses: Sequence[Hypothesis],
     conditions: Sequence[Condition],
     cameras: Sequence[TrackSampling],
-    runs: Sequence[Course],
+    runs: Sequence[GrowthCourse],
 ) -> list[Side]:
     """Every hypothesis with what one trial of each condition would answer at its best values so far.
 
@@ -144,7 +144,7 @@ def all_sides(
     return sides
 
 
-def _times(lens: TrackSampling, run: Course) -> tuple[Floats, Floats]:
+def _times(lens: TrackSampling, run: GrowthCourse) -> tuple[Floats, Floats]:
     """Times since release at which a condition is looked at and how many frames each stands for, shape (n_times,).
 
     First the rest, last what is seen behind the end of growth (without weight where nothing is).

@@ -84,7 +84,7 @@ def _behind_end(trial_data: FitTrial) -> int:
 
 
 @dataclass(frozen=True)
-class Course:
+class GrowthCourse:
     """How a condition runs: when the first hypothesis nears the end of growth, and when the last of them has ended.
 
     `ends_s` is infinite where one of them does not end in time.
@@ -131,7 +131,7 @@ def blank(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_p
 
 def courses(
     hypotheses: Sequence[Hypothesis], conditions: Sequence[Condition], cameras: Sequence[TrackSampling]
-) -> list[Course | None]:
+) -> list[GrowthCourse | None]:
     """How every condition would run; None where it is not worth filming, or where the model is in doubt.
 
     Parameters
@@ -159,7 +159,7 @@ def courses(
         jobs = predictor.jobs(hypothesis.theta, trial_effects)
         runs.append(_followed(predictor, jobs))
     allowed = max(LEAST_SLACK, _slackest_so_far(hypotheses[-1].fit))
-    runs_or_none: list[Course | None] = []
+    runs_or_none: list[GrowthCourse | None] = []
     for i, condition in enumerate(conditions):
         mine = [trajectory for trajectory in (run[i] for run in runs) if trajectory is not None]
         if len(mine) < len(runs):
@@ -173,7 +173,7 @@ def courses(
         doubtful = condition.trial.tail_slack != "free" and slack > allowed
         ends = max(trajectory.end_time_s if trajectory.status == "ended" else math.inf for trajectory in mine)
         runs_or_none.append(
-            Course(near_s, ends) if worth and not doubtful and near_s > 8 * cameras[i].frame_s else None
+            GrowthCourse(near_s, ends) if worth and not doubtful and near_s > 8 * cameras[i].frame_s else None
         )
     return runs_or_none
 
