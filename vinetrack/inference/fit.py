@@ -25,9 +25,10 @@ from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
 from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit, TrialFit
-from vinetrack.inference.left_out import predict_trials
+from vinetrack.inference.left_out import predict_trials, prepared_pairs
 from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch, solve
 from vinetrack.inference.parameters import BetweenTerm, make_layout
+from vinetrack.inference.prediction_band import with_bands
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import POOR_FIT, led_back, solve_again, solve_from, solve_from_scratch
 from vinetrack.inference.starts import align, initial_trial_effects
@@ -257,7 +258,9 @@ def _belongs(name: str, names: Iterable[str]) -> bool:
 def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
     """What a fitted model says of trials that were not in the fit.
 
-    Each gets its own release and origin, nothing else: its deviations of pressure and B are zero.
+    Each gets its own release and origin, nothing else: its deviations of pressure and B are zero. `band_m` is by how
+    much it may lie beside that, see `vinetrack.inference.prediction_band`; of a fit to one trial it knows of no scatter
+    between trials but the usual.
 
     Parameters
     ----------
@@ -283,4 +286,5 @@ def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
     >>> [trial.name for trial in vt.predict(fit, pairs[6:])]
     ['P48_1', 'P48_2']
     """
-    return predict_trials(fitted, pairs)
+    pairs = list(pairs)
+    return with_bands(fitted, prepared_pairs(pairs), predict_trials(fitted, pairs))

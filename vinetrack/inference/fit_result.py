@@ -112,7 +112,8 @@ class TrialFit:
     """One trial under the model; arrays have shape (n_points,), at the points that were used.
 
     `whitened` are residuals freed of their correlation and of smooth errors of position, in standard deviations.
-    Deviations are relative, of the set pressure and of the vine's B.
+    Deviations are relative, of the set pressure and of the vine's B. `band_m`, of a trial that was not in the fit, is
+    the half width of the 95 % band of its position about the prediction.
     """
 
     trial: Trial
@@ -131,6 +132,14 @@ class TrialFit:
     damping_deviation: float
     damping_deviation_sigma: float
     noise_m: float
+    band_m: Floats | None = None
+
+    @property
+    def within_band(self) -> float:
+        """Part of the positions that lie within the band; NaN where there is none."""
+        if self.band_m is None:
+            return math.nan
+        return float(np.mean(np.abs(self.residual_m) <= self.band_m))
 
     @property
     def name(self) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.assemble import trial_fit
@@ -71,7 +71,7 @@ def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[T
     FitError
         If a trial cannot be used, or its vine was not in the fit and B is one per vine.
     """
-    return predict_prepared(fit, [_prepared(trial, track) for trial, track in pairs], from_rest=from_rest)
+    return predict_prepared(fit, prepared_pairs(pairs), from_rest=from_rest)
 
 
 def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = False) -> list[TrialFit]:
@@ -194,11 +194,29 @@ def rest_is_seen(data: Sequence[FitTrial]) -> NDArray[np.bool_]:
     )
 
 
-def _prepared(trial: Trial, track: Track) -> FitTrial:
-    try:
-        return prepare_trial(trial, track)
-    except FitError as error:
-        raise FitError(f"Trial {trial.name}: {error}.") from error
+def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
+    """Trials laid out for a prediction.
+
+    Parameters
+    ----------
+    pairs : trials with their tracks
+
+    Returns
+    -------
+    list of FitTrial
+
+    Raises
+    ------
+    FitError
+        If a trial cannot be used; the message names it.
+    """
+    data = []
+    for trial, track in pairs:
+        try:
+            data.append(prepare_trial(trial, track))
+        except FitError as error:
+            raise FitError(f"Trial {trial.name}: {error}.") from error
+    return data
 
 
 def _known_yield(fit: Fit, trial_data: FitTrial) -> FitTrial:

@@ -1,0 +1,315 @@
+"""How far a trial that was not in a fit may lie from its prediction: the 95 % band of its position at each time.
+
+About the prediction, with release and origin of the trial fitted to it,
+
+    e = M (X δθ + X u + Z d + S s + ε),   M = I − A (AᵀK⁻¹A)⁻¹ AᵀK⁻¹,   A = [release, origin]
+
+δθ is the error of the shared numbers, u what the numbers of a trial differ by from those (`inference.pooling`), d its
+deviations of pressure and B, s errors that replicates do not show (smooth errors of position, 30 Pa of a set pressure)
+and ε noise of covariance K, which holds what the model misses along each trial: the noise of a fit is what is left of
+it. The variance at a time is the diagonal of
+
+    M (X (C + T) Xᵀ + Z D Zᵀ + S Sᵀ) Mᵀ + K − A (AᵀK⁻¹A)⁻¹ Aᵀ + δ² ℓ²
+
+with ℓ the travel of the trial. δ is the discrepancy of the model from one trial to the next (Kennedy & O'Hagan, J. R.
+Stat. Soc. B 63, 425, 2001), taken as one standard deviation all along the way: that with which the trials of the fit,
+each left out of it in turn to first order, miss as much as their bands say (Paule & Mandel, J. Res. NBS 87, 377, 1982);
+0 where they miss less. With it a misfit that differs between trials widens the band of the next. The half width is so
+many of these standard deviations that nine positions in ten lie within, of 95 % of trials that deviate so, and of 95 %
+of the left-out trials (jackknife prediction intervals: Barber et al., Ann. Stat. 49, 486, 2021); at least Student's t.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.intervals import student
+from vinetrack.inference.mixed_effects import FitState, inverse_among, spreads
+from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.parameters import YIELD_PRESSURE, ParameterMap, make_layout
+from vinetrack.inference.pooling import pool, trial_information
+from vinetrack.inference.position_errors import position_shapes
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, Predictor
+from vinetrack.inference.systematics import PRESSURE_ERROR_PA
+from vinetrack.inference.whitening import whiten
+
+TOLD_BY_OTHERS = 1e-6
+"""Part of the information on a number that must come from other trials for one to be predicted from them. Chosen: far
+below what one of a hundred trials tells, far above rounding."""
+
+MOSTLY, HOLDS = 0.9, 0.95
+"""A trial counts as held where this part of its positions is, and a band is to hold this part of trials. Chosen: the
+few positions at which release and origin leave a band of no width are not what a band is asked for."""
+
+DRAWS = 1000
+"""Curves drawn for a simultaneous band. Chosen: its 95 % quantile is then known to 3 %."""
+
+NORMAL_95 = 1.96
+"""Derived: standard normal quantile of 0.975."""
+
+if TYPE_CHECKING:
+    from vinetrack.inference.fit_result import Fit, TrialFit
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the trials of a fit, each predicted from the others, say of the next one.
+
+    `discrepancy` is δ, a part of the travel; `reach` the half width of the band in standard deviations; `degrees` are
+    Student's; `trials` counts those that could be predicted.
+    """
+
+    discrepancy: float
+    reach: float
+    degrees: float
+    trials: int
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """The fit as predictions use it: numbers as it holds them, smooth errors of position behind them where there are.
+
+    `information` and `scores` are those of the trials, `between` is the covariance of a trial's numbers.
+    """
+
+    solution: Solution
+    information: Floats
+    scores: Floats
+    between: Floats
+
+
+def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]) -> list[TrialFit]:
+    """Predicted trials with the half width of their 95 % bands.
+
+    Parameters
+    ----------
+    fit : the fit, in which the trials were not
+    data : the trials as they were laid out for the prediction
+    predicted : in the same order
+
+    Returns
+    -------
+    list of TrialFit
+        With `band_m`, array, shape (n_points,); None where the trajectories beside the prediction cannot be followed.
+    """
+    basis = _basis(fit)
+    known = _calibrated(fit, basis)
+    banded = []
+    for item, trial in zip(data, predicted, strict=True):
+        try:
+            loadings, random = _loadings_of_new(fit, basis, item, trial)
+        except SimulationError:
+            banded.append(trial)
+            continue
+        further = (known.discrepancy * np.ptp(item.lead_position_m)) ** 2
+        sigma = np.sqrt(np.sum(loadings**2, axis=1) + random + further)
+        reach = max(known.reach, _simultaneous(loadings / sigma[:, None], known.degrees))
+        banded.append(replace(trial, band_m=reach * sigma))
+    return banded
+
+
+def _simultaneous(loadings: Floats, degrees: float) -> float:
+    """Standard deviations within which `MOSTLY` of the positions of `HOLDS` of trials lie, whichever way they deviate.
+
+    Of one way to deviate that is Student's t; of several, more, for a trial may deviate by one early and by another
+    late.
+    """
+    draw = np.random.default_rng(1)
+    scale = np.ones(DRAWS) if math.isinf(degrees) else np.sqrt(degrees / draw.chisquare(degrees, DRAWS))
+    every = loadings[:: max(len(loadings) // 60, 1)]
+    curves = np.abs(every @ draw.standard_normal((loadings.shape[1], DRAWS))) * scale
+    return float(np.quantile(np.quantile(curves, MOSTLY, axis=0), HOLDS))
+
+
+def calibration(fit: Fit) -> Calibration:
+    """What the trials of a fit, each predicted from the others, say of the next one.
+
+    Parameters
+    ----------
+    fit : the fit
+
+    Returns
+    -------
+    Calibration
+    """
+    return _calibrated(fit, _basis(fit))
+
+
+def _basis(fit: Fit) -> _Basis:
+    count = len(fit.numbers)
+    pooled = None
+    if fit.between is not None and fit.between.any():
+        pooled = pool(fit.predictor, fit.solution, count)
+    if pooled is not None:
+        return _Basis(pooled.solution, pooled.information, pooled.scores, pooled.between)
+    size = fit.solution.problem.prior_mean.size
+    return _Basis(fit.solution, *trial_information(fit.solution), np.zeros((size, size)))
+
+
+def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
+    """The discrepancy between trials and its degrees of freedom."""
+    solution, data = basis.solution, fit.predictor.data
+    pairs = [_left_out(basis, item, i, fit.noise_correlation) for i, item in enumerate(data)]
+    seen = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
+    if not seen:
+        return Calibration(0.0, NORMAL_95, math.inf, 0)
+    square = np.array([np.mean(missed**2) for _, missed, _ in seen])
+    mean_variance = np.array([np.mean(variance) for *_, variance in seen])
+    travel2 = np.array([np.ptp(data[i].lead_position_m) ** 2 for i, *_ in seen])
+    delta2 = _paule_mandel(square, mean_variance, travel2)
+    assumed = delta2 == 0.0 and not basis.between.any() and not any(solution.estimable)
+    # Spreads by restricted likelihood lose a degree of freedom for each fitted number; δ and τ lose one.
+    fitted = 1 if delta2 > 0 or basis.between.any() else int(np.count_nonzero(solution.problem.prior_precision == 0))
+    degrees = math.inf if assumed else max(float(len(seen) - fitted), 1.0)
+    reached = np.sort(
+        [
+            np.quantile(np.abs(missed) / np.sqrt(variance + delta2 * scale), MOSTLY)
+            for (_, missed, variance), scale in zip(seen, travel2, strict=True)
+        ]
+    )
+    enough = min(math.ceil(HOLDS * (len(seen) + 1)), len(seen))
+    reach = max(float(student(np.array([degrees]))[0]), float(reached[enough - 1]))
+    return Calibration(math.sqrt(delta2), reach, degrees, len(seen))
+
+
+def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
+    """The δ² at which the mean of square / (variance + δ² scale) is 1; 0 where that is less without it."""
+    from scipy.optimize import brentq
+
+    def excess(delta2: float) -> float:
+        return float(np.mean(square / (variance + delta2 * scale))) - 1
+
+    highest = float(np.max(square / scale)) * square.size
+    return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, highest))
+
+
+def _left_out(basis: _Basis, item: FitTrial, i: int, weigh: float) -> tuple[Floats, Floats] | None:
+    """What a trial of the fit misses once left out of it, m, and the variance of that, m², to first order.
+
+    None where the other trials do not tell all numbers that it feels.
+    """
+    solution = basis.solution
+    problem, state = solution.problem, solution.state
+    size = problem.prior_mean.size
+    total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
+    others = total - basis.information[i]
+    inside = (state.theta > problem.lower) & (state.theta < problem.upper)
+    free = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
+    felt = free[np.diag(basis.information[i])[free] > 0]
+    if len(basis.scores) < 2 or (np.diag(others)[felt] <= TOLD_BY_OTHERS * np.diag(total)[felt]).any():
+        return None
+    covariance = inverse_among(others, free)
+    columns, deviations = solution.columns[i], [PRESSURE, DAMPING_DEVIATION]
+    design = _design(columns, problem.index[i], size)
+    shift = covariance @ (basis.scores[i] - basis.scores.mean(axis=0))
+    missed = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
+    own = _own_loadings(_own_spreads(solution, i), columns, item)
+    loadings = np.column_stack([design @ _root(covariance + basis.between), own])
+    noise = float(state.variance[i]) / (1 - state.rho**2)
+    left, random, missed = _aligned(loadings, missed, columns[:, :2], item, weigh, state, noise)
+    return missed, np.sum(left**2, axis=1) + random
+
+
+def _design(columns: Floats, index: np.ndarray, size: int) -> Floats:
+    """What the free numbers do to positions of a trial, shape (n_points, size), from the columns of its keys."""
+    design = np.zeros((len(columns), size + 1))
+    np.add.at(design.T, index, columns[:, OWN:-1].T)
+    return design[:, :size]
+
+
+def _own_spreads(solution: Solution, i: int) -> Floats:
+    """Standard deviations of the deviations of pressure and ln B of one trial, shape (2,), 0 where it has none."""
+    return np.asarray(spreads(solution.problem, solution.state.spread)[i] * solution.problem.feels[i])
+
+
+def _own_loadings(spread: Floats, columns: Floats, item: FitTrial) -> Floats:
+    """What one standard deviation of pressure, of B and of a set pressure does to positions, shape (n_points, 3)."""
+    set_pressure = item.trace is None and spread[0] > 0 and item.trial.pressure_Pa > 0
+    misset = PRESSURE_ERROR_PA / item.trial.pressure_Pa if set_pressure else 0.0
+    moved = columns[:, [PRESSURE, DAMPING_DEVIATION, PRESSURE]]
+    return np.asarray(moved * [spread[0], spread[1], misset])
+
+
+def _loadings_of_new(fit: Fit, basis: _Basis, item: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
+    """What one standard deviation of each error does to a new trial, m, and the variance of its noise, m²."""
+    layout = make_layout(fit.model, [item], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
+    theta, places = _laid_over(fit, layout, item)
+    predictor = Predictor(layout, [item], fit.predictor.host)
+    own = np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]])
+    columns = predictor.linearise(theta, own)[0]
+    covariance = _covariance(fit, basis) + basis.between[: len(fit.numbers), : len(fit.numbers)]
+    mine = np.diag(np.where(layout.prior_precision > 0, 1 / np.maximum(layout.prior_precision, 1e-300), 0.0))
+    matched = np.flatnonzero(places >= 0)
+    mine[matched, :] = mine[:, matched] = 0.0
+    mine[np.ix_(matched, matched)] = covariance[np.ix_(places[matched], places[matched])]
+    design = _design(columns, layout.index[0], theta.size)
+    state = basis.solution.state
+    spread = np.array([item.gauge_error or state.spread[0], state.spread[1]])
+    spread *= [predictor.feels_pressure[0], predictor.feels_damping[0]]
+    shapes = position_shapes(predictor, [item.lead_position_m - own[0, ORIGIN] - columns[:, -1]])[0]
+    loadings = np.column_stack([design @ _root(mine), _own_loadings(spread, columns, item), shapes])
+    noise = float(np.mean(state.variance)) / (1 - state.rho**2)
+    return _aligned(loadings, columns[:, -1], columns[:, :2], item, fit.noise_correlation, state, noise)[:2]
+
+
+def _laid_over(fit: Fit, layout: ParameterMap, item: FitTrial) -> tuple[Floats, np.ndarray]:
+    """The numbers of the fit as a trial's own layout holds them, and their places in the fit, -1 for new ones."""
+    theta, places = layout.start, np.full(len(layout.free), -1)
+    stated = f"{item.trial.vine}, {item.trial.yield_pressure_Pa / 1e3:g} kPa"
+    for k, free in enumerate(layout.free):
+        for place, number in enumerate(fit.numbers):
+            same = number.name == free.name or (
+                number.key == free.key == YIELD_PRESSURE and number.vine in (item.trial.vine, stated)
+            )
+            if same:
+                theta[k], places[k] = free.inside(number.value), place
+    return theta, places
+
+
+def _covariance(fit: Fit, basis: _Basis) -> Floats:
+    """Covariance of the numbers as the fit holds them, with all that widens their errors."""
+    problem = basis.solution.problem
+    total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
+    count = len(fit.numbers)
+    plain = inverse_among(total, np.flatnonzero(problem.free & (np.diag(total) > 0)))[:count, :count]
+    held = fit.predictor.layout.free
+    sigma = np.array(
+        [n.sigma / (n.value if free.logarithmic else free.scale) for n, free in zip(fit.numbers, held, strict=True)]
+    )
+    own = np.sqrt(np.maximum(np.diag(plain), 1e-300))
+    wider = np.where(np.isfinite(sigma) & (np.diag(plain) > 0), np.maximum(sigma / own, 1.0), 1.0)
+    return np.asarray(plain * wider[:, None] * wider)
+
+
+def _root(square: Floats) -> Floats:
+    values, vectors = np.linalg.eigh(square)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _aligned(
+    loadings: Floats, missed: Floats, design: Floats, item: FitTrial, weigh: float, state: FitState, noise: float
+) -> tuple[Floats, Floats, Floats]:
+    """Loadings, variance of the noise at each point, and what is missed, with release and origin fitted to the trial.
+
+    `design` holds the columns of release and origin, `weigh` is the correlation of the noise with which predictions fit
+    them, `noise` the variance of a position, m².
+    """
+    white = whiten(design, item.first, weigh, item.relative_sd)
+    fixed = np.array([not item.let_in, True])
+    inverse = np.linalg.pinv(white.T @ white * np.outer(fixed, fixed), rcond=1e-10, hermitian=True)
+    both = np.column_stack([loadings, missed])
+    left = both - design @ (inverse @ (white.T @ whiten(both, item.first, weigh, item.relative_sd)))
+    random = noise * (np.ones(missed.size) if item.relative_sd is None else item.relative_sd**2)
+    if weigh == state.rho:
+        # What the alignment takes of the noise it was weighed by; a point keeps what it adds to the one before.
+        taken = noise * (1 - weigh**2) * np.einsum("nk,kl,nl->n", design, inverse, design)
+        random = np.maximum(random - taken, (1 - weigh**2) * random)
+    return left[:, :-1], random, left[:, -1]
