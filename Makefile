@@ -24,7 +24,7 @@ lint: $(STAMP)  ## style, types and the workflow's formatting
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/snakefmt --check Snakefile
+	$(BIN)/snakefmt --check Snakefile vinetrack/pipeline/Snakefile
 
 docs: $(STAMP)  ## the documentation with the Python interface as a site, build/site/tutorial.html
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-docs.lock

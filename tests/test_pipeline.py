@@ -307,6 +307,7 @@ def test_the_workflow_has_no_lints_but_the_one_about_conda() -> None:
 
 @pytest.mark.skipif(shutil.which("snakefmt", path=str(Path(sys.executable).parent)) is None, reason="needs snakefmt")
 def test_the_snakefile_is_formatted() -> None:
-    command = [str(Path(sys.executable).parent / "snakefmt"), "--check", str(ROOT / "Snakefile")]
+    files = [str(ROOT / "Snakefile"), str(ROOT / "vinetrack" / "pipeline" / "Snakefile")]
+    command = [str(Path(sys.executable).parent / "snakefmt"), "--check", *files]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -150,7 +150,7 @@ def test_what_the_commands_of_the_stages_import_is_part_of_them() -> None:
 
 
 def test_the_snakefile_asks_for_stages_that_exist_and_for_all_of_them() -> None:
-    text = (PACKAGE.parent / "Snakefile").read_text(encoding="utf-8")
+    text = (PACKAGE / "pipeline" / "Snakefile").read_text(encoding="utf-8")
     asked = {part.split('"')[1] for part in text.split("code_hash(")[1:]}
     assert asked == set(STAGES)
 

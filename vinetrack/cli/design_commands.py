@@ -14,6 +14,7 @@ from vinetrack.cli.design_options import (
     OUT,
     RIG,
     VINE,
+    Anyway,
     AtFraction,
     Damping,
     DampingError,
@@ -29,6 +30,7 @@ from vinetrack.cli.design_options import (
     column_options,
     say,
 )
+from vinetrack.cli.output import JsonFile, tell
 
 
 @column_options(
@@ -75,8 +77,9 @@ def _predict(
     ] = None,
     json: Annotated[
         Path | None,
-        typer.Option("--json", help="Write everything said, to this file.", rich_help_panel=OUT, show_default=False),
+        typer.Option("--json", help="Write everything said, to this file, - for the terminal.", rich_help_panel=OUT, show_default=False),
     ] = None,
+    anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """What a vine not yet built will do: position, speed, tension, ejection speed, with their uncertainty."""
@@ -92,6 +95,7 @@ def _predict(
             cells=cells,
             sheet=sheet,
             results=results,
+            anyway=anyway,
             effects=tuple(effects or ()),
             tail_slack=tail_slack,
             B=math.nan if B is None else B,
@@ -146,6 +150,8 @@ def _vine(
     seed: Seed = 1,
     at_fraction: AtFraction = 0.95,
     figure: FigurePath = None,
+    json_file: JsonFile = None,
+    anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """The fastest vine within burst pressure, diameter, length, and films to choose from."""
@@ -158,24 +164,24 @@ def _vine(
         asked = Asked(
             cells=cells,
             results=results,
+            anyway=anyway,
             effects=tuple(effects or ()),
             n=math.nan if n is None else n,
             n_error=n_error,
         )
-        say(
-            design_vine(
-                asked,
-                films=films,
-                diameter=diameter,
-                length=length,
-                burst_share=burst_share,
-                burst_stress_MPa=burst_stress,
-                samples=samples,
-                seed=seed,
-                at_fraction=at_fraction,
-                figure=figure,
-            )
+        lines = design_vine(
+            asked,
+            films=films,
+            diameter=diameter,
+            length=length,
+            burst_share=burst_share,
+            burst_stress_MPa=burst_stress,
+            samples=samples,
+            seed=seed,
+            at_fraction=at_fraction,
+            figure=figure,
         )
+        tell(lines, {"lines": lines}, json_file)
 
 
 @column_options(
@@ -214,6 +220,8 @@ def _reservoir(
     effects: Effects = None,
     at_fraction: AtFraction = 0.95,
     figure: FigurePath = None,
+    json_file: JsonFile = None,
+    anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """The chamber that keeps the gauge pressure within so many per cent, by the gas law in absolute pressure."""
@@ -226,11 +234,13 @@ def _reservoir(
         asked = Asked(
             cells=cells,
             results=results,
+            anyway=anyway,
             effects=tuple(effects or ()),
             B=math.nan if B is None else B,
             n=math.nan if n is None else n,
         )
-        say(design_reservoir(asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure))
+        lines = design_reservoir(asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure)
+        tell(lines, {"lines": lines}, json_file)
 
 
 @column_options(
@@ -306,6 +316,8 @@ def _campaign(
                      show_default=False),
     ] = None,
     figure: FigurePath = None,
+    json_file: JsonFile = None,
+    anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
     """Pressures, payloads and replicates that pin n and B to a wanted error, rehearsed before they are made."""
@@ -318,6 +330,7 @@ def _campaign(
         asked = Asked(
             cells=cells,
             results=results,
+            anyway=anyway,
             effects=tuple(effects or ()),
             n=math.nan if n is None else n,
             spreads=_spreads(pressure_spread, damping_spread),
@@ -339,7 +352,8 @@ def _campaign(
             check=check,
             seed=seed,
         )
-        say(design_campaign(asked, wanted, sheet=sheet, figure=figure))
+        lines = design_campaign(asked, wanted, sheet=sheet, figure=figure)
+        tell(lines, {"lines": lines}, json_file)
 
 
 def _spreads(pressure: float | None, damping: float | None) -> tuple[float, float] | None:

@@ -155,6 +155,13 @@ AtFraction = Annotated[
         "--final-at-fraction", min=0.05, max=0.99, help="y/L at which final speeds are taken.", rich_help_panel=BELIEF
     ),
 ]
+Anyway = Annotated[
+    bool,
+    typer.Option(
+        "--anyway", help="Predict from a fit whose model its diagnosis refuted; the verdict stands above.",
+        rich_help_panel=BELIEF,
+    ),
+]  # fmt: skip
 FigurePath = Annotated[
     Path | None, typer.Option("--figure", help="Draw it, to this file.", rich_help_panel=OUT, show_default=False)
 ]

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vinetrack.cli.output import JsonFile, tell
+
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
 
@@ -35,7 +37,10 @@ def register(app: typer.Typer) -> None:
 def _diagnose(
     target: Annotated[Path, typer.Argument(help="A results folder, or an experiment.", metavar="TARGET")],
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write the answer to this file, and no other.", show_default=False)
+        Path | None,
+        typer.Option(
+            "--json", help="Write the answer to this file, and no other; - for the terminal.", show_default=False
+        ),
     ] = None,
     experiment: Moved = None,
     log: LogFile = None,
@@ -61,11 +66,7 @@ def _diagnose(
                     write_diagnosis(Results(target), diagnosis)
             else:
                 diagnosis = diagnose(_tracks_only(find_experiment(target)), report=report)
-        if json_file is not None:
-            from vinetrack.core.tables import write_json
-
-            write_json(json_file, diagnosis.to_json())
-        typer.echo(str(diagnosis))
+        tell([str(diagnosis)], diagnosis.to_json(), json_file)
 
 
 def _add(
@@ -73,6 +74,7 @@ def _add(
     results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
     save: Annotated[bool, typer.Option("--save", help="Write it to `model:` of the experiment.")] = False,
     experiment: Moved = None,
+    json_file: JsonFile = None,
     log: LogFile = None,
 ) -> None:
     """Put an effect in the model, refit, and show the error before and after."""
@@ -85,13 +87,12 @@ def _add(
         read = experiment_behind(results, experiment)
         with _told() as report:
             lines = add_effect(read, results, effect, report)
-        for line in lines:
-            typer.echo(line)
         if save:
             from vinetrack.pipeline.source_experiment import save_model
 
             path = save_model(read.folder, [*read.settings.model, effect])
-            typer.echo(f"Saved to {path}; run snakemake again to have everything with it.")
+            lines.append(f"Saved to {path}; run vinetrack run, or snakemake, again to have everything with it.")
+        tell(lines, {"effect": effect, "saved": save, "lines": lines}, json_file)
 
 
 def _diagnosis(

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from vinetrack.cli.run_commands import START
+
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
 Names = Annotated[list[str] | None, typer.Option("--add", help="Put this effect in (may be given again).")]
 Drops = Annotated[list[str] | None, typer.Option("--drop", help="Take this effect out (may be given again).")]
@@ -28,7 +30,7 @@ def register(app: typer.Typer) -> None:
     app : typer.Typer
         The command line.
     """
-    app.command("explore")(_explore)
+    app.command("explore", rich_help_panel=START)(_explore)
 
 
 def _explore(

@@ -19,6 +19,8 @@ import typer
 from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.explore_commands import register as register_explore
+from vinetrack.cli.output import JsonFile, tell
+from vinetrack.cli.run_commands import register as register_run
 from vinetrack.cli.setup_commands import register as register_setup
 
 if TYPE_CHECKING:
@@ -29,7 +31,6 @@ app = typer.Typer(
     name="vinetrack",
     help="From recordings of everting vine robots to the physics that a model of them lacks.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -63,31 +64,18 @@ def _options(
     """See the commands below."""
 
 
-@app.command("check")
-def _check(experiment: ExperimentPath) -> None:
-    """Check sheet, settings, effects, tracks and recordings, in seconds; say what was understood of each recording."""
-    with _sentences(None):
-        from vinetrack.core.terminal import severity_first
-        from vinetrack.pipeline.check_stage import check_folder
-        from vinetrack.pipeline.workflow import find_experiment
-
-        checked = check_folder(find_experiment(experiment))
-        for line in checked.lines():
-            typer.echo(severity_first(line))
-        if checked.failed:
-            raise typer.Exit(1)
-        if not checked.problems:
-            typer.echo(f"{experiment}: no problems found.")
+register_setup(app)
+register_run(app)
+register_explore(app)
 
 
 @app.command("settings")
-def _settings() -> None:
+def _settings(json_file: JsonFile = None) -> None:
     """Every column of the sheet and every key of the settings, with unit, default, bounds and meaning."""
     with _sentences(None):
-        from vinetrack.experiment.reference import reference_lines
+        from vinetrack.experiment.reference import reference_content, reference_lines
 
-        for line in reference_lines():
-            typer.echo(line)
+        tell(reference_lines(), reference_content(), json_file)
 
 
 @app.command("effects")
@@ -99,25 +87,26 @@ def _effects(
     figure: Annotated[
         Path | None, typer.Option("--figure", help="Draw what NAME does, to this file.", show_default=False)
     ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """The catalogue of effects, with formulas, parameters and units; or one explained."""
     with _sentences(None):
-        from vinetrack.pipeline.effects_stage import describe_effects
+        from vinetrack.pipeline.effects_stage import describe_effects, effects_content
         from vinetrack.pipeline.workflow import find_experiment
 
         folder = None if experiment is None else find_experiment(experiment)
-        for line in describe_effects(name, folder, figure):
-            typer.echo(line)
+        tell(describe_effects(name, folder, figure), effects_content(name, folder), json_file)
 
 
 @app.command("compare")
-def _compare(results: ResultsPath) -> None:
+def _compare(results: ResultsPath, json_file: JsonFile = None) -> None:
     """The model against the measurement of every condition, beside what repeated trials differ by."""
     with _sentences(None):
         from vinetrack.pipeline.model_stage import comparison_lines
+        from vinetrack.results.folder_layout import Results, read_result
 
-        for line in comparison_lines(results):
-            typer.echo(line)
+        lines = comparison_lines(results)
+        tell(lines, read_result(Results(results).comparison).to_dict("records"), json_file)
 
 
 @app.command("overlay")
@@ -130,6 +119,7 @@ def _overlay(
     seconds: Annotated[
         float | None, typer.Option("--seconds", min=0.5, help="About how long it plays.", show_default=False)
     ] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """The recording of one trial, slowed down, with the tracked edge and the models' edges drawn."""
     with _sentences(None):
@@ -137,7 +127,7 @@ def _overlay(
 
         with _busy(f"drawing over {trial}", None):
             path = overlay_one(results, trial, experiment, seconds)
-        typer.echo(f"Clip: {path}")
+        tell([f"Clip: {path}"], {"clip": path}, json_file)
 
 
 @app.command("overlays", rich_help_panel="Stages of the workflow")
@@ -156,8 +146,6 @@ def _overlays(
             typer.echo(f"  {line}")
 
 
-register_explore(app)
-register_setup(app)
 register_diagnose(app)
 register_design(app)
 

@@ -432,7 +432,17 @@ def write_json(path: Path, content: Any) -> None:
     path : the file.
     content : mappings, lists, numbers, text, arrays and paths.
     """
-    write_text(path, json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(path, json_text(content) + "\n")
+
+
+def json_text(content: Any) -> str:
+    """Content as JSON; see `write_json`.
+
+    Parameters
+    ----------
+    content : mappings, lists, numbers, text, arrays and paths.
+    """
+    return json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def _plain(content: Any) -> Any:

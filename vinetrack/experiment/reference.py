@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
@@ -147,3 +147,13 @@ def _parts(annotation: Any) -> tuple[Any, ...]:
 
 def _literals(annotation: Any) -> tuple[Any, ...]:
     return get_args(annotation) if get_origin(annotation) is Literal else ()
+
+
+def reference_content() -> dict[str, list[dict[str, str]]]:
+    """Columns and keys for a program: `columns`, `experiment` and `run`, each a list of entries."""
+    groups = {
+        "columns": column_entries(),
+        "experiment": list(setting_entries(ExperimentSettings)),
+        "run": list(setting_entries(RunSettings)),
+    }
+    return {name: [asdict(entry) for entry in entries] for name, entries in groups.items()}

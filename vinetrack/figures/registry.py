@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-CAPTIONS = "vinetrack/report/captions"
-"""Folder of the captions, from the folder of the Snakefile."""
+CAPTIONS = Path(__file__).parents[1] / "report" / "captions"
+"""Folder of the captions; Snakemake would look for a relative one beside the file of the rule."""
 
 _CATEGORIES = {"damping": "Experiment", "model": "Experiment", "trials": "Trials", "paper": "Beside the paper"}
 """Category in Snakemake's report of each section of the page; all other sections are of the diagnosis."""
@@ -48,8 +49,8 @@ class RegisteredFigure:
 
     @property
     def caption_file(self) -> str:
-        """The file of the caption, from the folder of the Snakefile."""
-        return f"{CAPTIONS}/{self.name}.rst"
+        """The file of the caption."""
+        return (CAPTIONS / f"{self.name}.rst").as_posix()
 
 
 _ALL = (

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem
 
@@ -142,3 +143,33 @@ def _write_picture(effect: Effect, path: Path) -> None:
     fig = draw_effect(effect.name, size_words(effect), reference_words(effect), effect_motion(effect))
     form = path.suffix.lower()[1:]
     write_bytes(path, render(fig, [form])[form])
+
+
+def effects_content(name: str | None, experiment: Path | None) -> list[dict[str, Any]]:
+    """All effects, or the one named, for a program; see `describe_effects`.
+
+    Parameters
+    ----------
+    name : str or None
+        Name of an effect.
+    experiment : Path or None
+        Folder whose own effects are listed too.
+
+    Returns
+    -------
+    list of dict, one an effect
+    """
+    from vinetrack.effects import catalogue, find_effect
+
+    user_effects = {} if experiment is None else effects_of(experiment)
+    effects = {**catalogue(), **user_effects}.values() if name is None else [find_effect(name, user_effects)]
+    return [
+        {
+            "name": effect.name,
+            "kind": effect.kind,
+            "text": effect.text,
+            "parameters": [asdict(parameter) for parameter in effect.parameters],
+            "own": effect.name in user_effects,
+        }
+        for effect in effects
+    ]

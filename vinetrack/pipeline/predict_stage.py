@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.numbers import number
-from vinetrack.core.tables import write_csv, write_json
+from vinetrack.core.tables import json_text, write_csv, write_json
 from vinetrack.pipeline.prediction_inputs import (
     Asked,
     Ground,
@@ -97,7 +97,10 @@ def predict_conditions(
         write_csv(csv, pd.concat([prediction.sight.curve for prediction in predictions], ignore_index=True))
         lines.append(f"Curves: {csv}")
     if json is not None:
-        write_json(json, [_entry(prediction) for prediction in predictions])
+        entries = [_entry(prediction) for prediction in predictions]
+        if str(json) == "-":
+            return [json_text(entries)]
+        write_json(json, entries)
         lines.append(f"Everything: {json}")
     return lines
 

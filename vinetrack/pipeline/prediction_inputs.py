@@ -41,6 +41,7 @@ class Asked:
     cells: Mapping[str, str] = field(default_factory=dict)
     sheet: Path | None = None
     results: Path | None = None
+    anyway: bool = False
     effects: tuple[str, ...] = ()
     tail_slack: str | None = None
     B: float = math.nan

@@ -38,6 +38,12 @@ PAPER_TABLES = (
 
 SHARED_FILES = ("trials.csv", "experiment.yaml")
 
+SNAKEFILE = PACKAGE / "pipeline" / "Snakefile"
+"""The rules, in the package: `vinetrack run` runs them from anywhere, the Snakefile of a checkout includes them."""
+
+CLAIM = "experiment.json"
+"""File of a results folder that names its experiment from the beginning of a run; `provenance.json` comes last."""
+
 
 @dataclass(frozen=True)
 class WorkflowPlan:
@@ -188,6 +194,8 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.settings import run_settings
 
+    # Beside the Snakefile of a checkout lies `data`; the rules of the package are two folders further down.
+    base = base if (base / "data").is_dir() else PACKAGE.parent
     paths = {key: str(config[key]) for key in ("experiment", "results") if config.get(key) is not None}
     settings = run_settings({**config, **paths})
     folder = Path(settings.experiment)
@@ -198,6 +206,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
     _refuse_braces(folder, results)
+    refuse_shared_results(results, folder)
     trials = tuple(name for name in experiment.names if name not in experiment.left_out)
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
     present = (path for path in files if path is not None and (is_virtual or path.exists()))
@@ -239,6 +248,43 @@ def _find_nature(folder: Path, base: Path) -> Path | None:
         if folder.exists() and shipped.exists() and folder.samefile(shipped):
             return nature
     return None
+
+
+def refuse_shared_results(results: Path, experiment: Path) -> None:
+    """Refuse a results folder that holds another experiment's.
+
+    Parameters
+    ----------
+    results : the folder, which need not exist.
+    experiment : whose results are to go there.
+
+    Raises
+    ------
+    ExperimentError
+        If what is there was made from another experiment that still exists, naming both.
+    """
+    for name in ("provenance.json", CLAIM):
+        try:
+            made_from = Path(str(json.loads((results / name).read_text(encoding="utf-8"))["experiment"]))
+        except (OSError, ValueError, KeyError, TypeError):
+            continue
+        if made_from.is_dir() and experiment.is_dir() and not made_from.samefile(experiment):
+            message = f"holds the results of {made_from}, not of {experiment.absolute()}"
+            remedy = "name another folder (vinetrack run --results DIR, snakemake --config results=DIR), or rename one"
+            raise ExperimentError([Problem(message=message, file=str(results), remedy=remedy)])
+
+
+def claim_results(results: Path, experiment: Path) -> None:
+    """Write down whose results a folder holds, before the first of them.
+
+    Parameters
+    ----------
+    results : the folder, made where it does not exist.
+    experiment : whose they are.
+    """
+    from vinetrack.core.tables import write_json
+
+    write_json(results / CLAIM, {"experiment": experiment.absolute().as_posix()})
 
 
 def _has_brace(path: Path) -> bool:

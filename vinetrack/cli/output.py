@@ -1,0 +1,46 @@
+"""What commands print: lines for a person, or with `--json` the same for a program."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+JsonFile = Annotated[
+    Path | None,
+    typer.Option("--json", metavar="FILE", help="Write it as JSON to this file, - for the terminal.",
+                 show_default=False),
+]  # fmt: skip
+
+
+def as_json(json_file: Path | None) -> bool:
+    """Whether JSON goes to the terminal in place of lines.
+
+    Parameters
+    ----------
+    json_file : of the option `--json`.
+    """
+    return json_file is not None and str(json_file) == "-"
+
+
+def tell(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
+    """Print lines, or `content` as JSON; into a file beside the lines, or in their place on the terminal.
+
+    Parameters
+    ----------
+    lines : for a person.
+    content : the same for a program: mappings, lists, numbers, text and paths.
+    json_file : of the option `--json`; None for lines alone.
+    """
+    from vinetrack.core.tables import json_text, write_json
+    from vinetrack.core.terminal import severity_first
+
+    if json_file is not None and as_json(json_file):
+        typer.echo(json_text(content))
+        return
+    for line in lines:
+        typer.echo(severity_first(line))
+    if json_file is not None:
+        write_json(json_file, content)

@@ -1,0 +1,79 @@
+"""The commands that a new user needs first: check an experiment, run it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from vinetrack.cli.output import JsonFile, as_json, tell
+
+START = "Start here"
+"""Panel of the help with the commands that one needs; it stands first."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        The command line.
+    """
+    app.command("check", rich_help_panel=START)(_check)
+    app.command("run", rich_help_panel=START)(_run)
+
+
+def _check(
+    experiment: Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")],
+    json_file: JsonFile = None,
+) -> None:
+    """Check sheet, settings, effects, tracks and recordings, in seconds; say what was understood of each recording."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(None):
+        from vinetrack.pipeline.check_stage import check_folder
+        from vinetrack.pipeline.workflow import find_experiment
+
+        checked = check_folder(find_experiment(experiment))
+        lines = checked.lines()
+        tell(lines if checked.problems else [*lines, f"{experiment}: no problems found."], checked.to_json(), json_file)
+        if checked.failed:
+            raise typer.Exit(1)
+
+
+def _run(
+    folder: Annotated[
+        Path, typer.Argument(help="The experiment's folder; by default this one.", metavar="[FOLDER]")
+    ] = Path(),
+    cores: Annotated[int, typer.Option("--cores", min=1, help="Processor cores to use.")] = 2,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            "--results", metavar="DIR", show_default=False,
+            help="Results go to DIR/NAME of the experiment; by default to results/NAME beside it.",
+        ),
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:  # fmt: skip
+    """Run everything: recordings to tracks, damping law, model, diagnosis and report; the verdict comes last."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(None):
+        from vinetrack.pipeline.run_stage import check_first, run_chain, run_lines, run_paths
+        from vinetrack.results.folder_layout import Results, read_json
+
+        def say(line: str) -> None:
+            """A line of progress: to the terminal, or beside it where JSON goes there."""
+            typer.echo(line, err=as_json(json_file))
+
+        paths = run_paths(folder, results)
+        check_first(paths.experiment, say)
+        run_chain(paths, cores, say)
+        content: dict[str, Any] = {
+            "results": paths.results,
+            "report": Results(paths.results).report,
+            "diagnosis": read_json(Results(paths.results).diagnosis),
+        }
+        tell(run_lines(paths.results), content, json_file)
