@@ -30,7 +30,7 @@ from vinetrack.cli.design_options import (
     column_options,
     say,
 )
-from vinetrack.cli.output import JsonFile, tell
+from vinetrack.cli.output import MORE, JsonFile, tell
 
 
 @column_options(
@@ -77,7 +77,8 @@ def _predict(
     ] = None,
     json: Annotated[
         Path | None,
-        typer.Option("--json", help="Write everything said, to this file, - for the terminal.", rich_help_panel=OUT, show_default=False),
+        typer.Option("--json", help="Write everything said, to this file, - for the terminal.",
+                     rich_help_panel=OUT, show_default=False),
     ] = None,
     anyway: Anyway = False,
     log: LogPath = None,
@@ -394,5 +395,5 @@ def register(app: typer.Typer) -> None:
     app : typer.Typer
         The command line.
     """
-    app.command("predict", cls=RenamedOptions)(_predict)
-    app.add_typer(design_app)
+    app.command("predict", cls=RenamedOptions, rich_help_panel=MORE)(_predict)
+    app.add_typer(design_app, rich_help_panel=MORE)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from vinetrack.cli.output import JsonFile, tell
+from vinetrack.cli.output import MORE, JsonFile, tell
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -29,8 +29,8 @@ def register(app: typer.Typer) -> None:
     app : typer.Typer
         The command line.
     """
-    app.command("diagnose")(_diagnose)
-    app.command("add")(_add)
+    app.command("diagnose", rich_help_panel=MORE)(_diagnose)
+    app.command("add", rich_help_panel=MORE)(_add)
     app.command("diagnosis", rich_help_panel="Stages of the workflow")(_diagnosis)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinetrack.cli.run_commands import START
+from vinetrack.cli.output import START
 
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
 Names = Annotated[list[str] | None, typer.Option("--add", help="Put this effect in (may be given again).")]

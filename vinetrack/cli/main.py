@@ -19,7 +19,7 @@ import typer
 from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.explore_commands import register as register_explore
-from vinetrack.cli.output import JsonFile, tell
+from vinetrack.cli.output import MORE, JsonFile, tell
 from vinetrack.cli.run_commands import register as register_run
 from vinetrack.cli.setup_commands import register as register_setup
 
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="vinetrack",
-    help="From recordings of everting vine robots to the physics that a model of them lacks.",
+    help="From recordings of everting vine robots to the physics that a model of them lacks.\n\n"
+    "Three commands do most: vinetrack check FOLDER, vinetrack run FOLDER, vinetrack explore RESULTS.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -69,7 +70,7 @@ register_run(app)
 register_explore(app)
 
 
-@app.command("settings")
+@app.command("settings", rich_help_panel=MORE)
 def _settings(json_file: JsonFile = None) -> None:
     """Every column of the sheet and every key of the settings, with unit, default, bounds and meaning."""
     with _sentences(None):
@@ -78,7 +79,7 @@ def _settings(json_file: JsonFile = None) -> None:
         tell(reference_lines(), reference_content(), json_file)
 
 
-@app.command("effects")
+@app.command("effects", rich_help_panel=MORE)
 def _effects(
     name: Annotated[str | None, typer.Argument(help="Explain this one.", metavar="NAME", show_default=False)] = None,
     experiment: Annotated[
@@ -98,7 +99,7 @@ def _effects(
         tell(describe_effects(name, folder, figure), effects_content(name, folder), json_file)
 
 
-@app.command("compare")
+@app.command("compare", rich_help_panel=MORE)
 def _compare(results: ResultsPath, json_file: JsonFile = None) -> None:
     """The model against the measurement of every condition, beside what repeated trials differ by."""
     with _sentences(None):
@@ -109,7 +110,7 @@ def _compare(results: ResultsPath, json_file: JsonFile = None) -> None:
         tell(lines, read_result(Results(results).comparison).to_dict("records"), json_file)
 
 
-@app.command("overlay")
+@app.command("overlay", rich_help_panel=MORE)
 def _overlay(
     results: ResultsPath,
     trial: Annotated[str, typer.Argument(help="Name of the trial.", metavar="TRIAL")],

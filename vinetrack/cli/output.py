@@ -8,6 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+START, MORE = "Start here", "More"
+"""Panels of the help: the commands that one needs stand first."""
+
 JsonFile = Annotated[
     Path | None,
     typer.Option("--json", metavar="FILE", help="Write it as JSON to this file, - for the terminal.",

@@ -7,10 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vinetrack.cli.output import JsonFile, as_json, tell
-
-START = "Start here"
-"""Panel of the help with the commands that one needs; it stands first."""
+from vinetrack.cli.output import START, JsonFile, as_json, tell
 
 
 def register(app: typer.Typer) -> None:

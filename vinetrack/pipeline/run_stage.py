@@ -7,12 +7,21 @@ import re
 import subprocess
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 from vinetrack.core.problems import ExperimentError, UserError
-from vinetrack.pipeline.workflow import SNAKEFILE, claim_results, find_experiment, refuse_shared_results
+from vinetrack.core.terminal import Progress, progress
+from vinetrack.pipeline.workflow import (
+    PACKAGE,
+    SNAKEFILE,
+    claim_results,
+    find_experiment,
+    find_nature,
+    refuse_shared_results,
+)
 
 Say = Callable[[str], None]
 
@@ -21,14 +30,14 @@ _STEPS = re.compile(r"^(\d+) of (\d+) steps")
 _FAILED = re.compile(r"^Error in rule (\w+)")
 _STAGE_LOG = re.compile(r"^\s+log: (\S.*\.log)")
 _NOISE = re.compile(
-    r"^(\[|\s|$|Finished jobid|\d+ of \d+ steps|Select jobs|Execute \d|Using |Config file|Assuming|Building|Provided|Rules "
-    r"claiming|Job stats|job  |-----|total  |Error in rule|Complete log|Elapsed|Shutting down|Exiting because|Removing "
-    r"output|Nothing to be done|Report: |RuleException|CalledProcessError|Trying to restart|At least one job)"
+    r"^(\[|\s|$|Finished jobid|\d+ of \d+ steps|Select jobs|Execute \d|Using |Config file|Assuming|Building|Provided|"
+    r"Rules claiming|Job stats|job  |-----|total  |Error in rule|Complete log|Elapsed|Shutting down|Exiting|"
+    r"Removing output|Nothing to be done|Report: |RuleException|CalledProcessError|Trying to restart|At least one job)"
 )
 """Lines of Snakemake about itself; format of version 9. What stages print is what is left."""
 
 LAST_WORDS = 12
-"""Chosen: lines of stages that are kept to explain a failure; a refused sheet takes up to 20, and a stage's sentence 1."""
+"""Chosen: lines of stages that are kept to explain a failure; a stage that stops says why in one to three."""
 
 STAGE_WORDS = {
     "laboratory": "recordings of the virtual laboratory made",
@@ -99,6 +108,8 @@ def check_first(experiment: Path, say: Say) -> None:
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.pipeline.check_stage import check_folder
 
+    if find_nature(experiment, PACKAGE.parent):
+        return  # The virtual laboratory makes the recordings of the demonstration in the run itself.
     checked = check_folder(experiment)
     errors = [problem for problem in checked.problems if problem.severity == "error"]
     read = read_experiment(experiment)
@@ -137,25 +148,25 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, encoding="utf-8", errors="replace"
         ) as process:
             assert process.stdout is not None
-            failed, words = _follow(_kept(process.stdout, kept.write), say)
+            failed, words = _follow(_kept(process.stdout, kept), say)
         if process.returncode:
             raise RunError(_why(failed, words, log))
 
 
-def _kept(lines: Iterator[str] | object, write: Callable[[str], object]) -> Iterator[str]:
-    for line in lines:  # type: ignore[attr-defined]
-        write(line)
-        yield str(line).rstrip("\n")
+def _kept(lines: Iterable[str], file: TextIO) -> Iterator[str]:
+    """The lines without their ends, each written to the file before it is handed on."""
+    for line in lines:
+        file.write(line)
+        yield line.rstrip("\n")
 
 
 def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
     """Show how a run gets on; the stages that failed with their logs, and the last lines that stages printed."""
-    from vinetrack.core.terminal import progress
-
     failed: dict[str, str] = {}
     words: deque[str] = deque(maxlen=LAST_WORDS)
     done: Counter[str] = Counter()
-    shown, rule, bar = sys.stderr.isatty(), "", None
+    shown, rule = sys.stderr.isatty(), ""
+    bar: Progress[int] | None = None
     for line in lines:
         if match := _FINISHED.match(line):
             rule = match[1]

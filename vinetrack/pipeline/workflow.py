@@ -199,9 +199,9 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     paths = {key: str(config[key]) for key in ("experiment", "results") if config.get(key) is not None}
     settings = run_settings({**config, **paths})
     folder = Path(settings.experiment)
-    if not folder.exists() and _find_nature(base / folder, base):
+    if not folder.exists() and find_nature(base / folder, base):
         folder = base / folder
-    nature = _find_nature(folder, base)
+    nature = find_nature(folder, base)
     is_virtual = nature is not None
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
@@ -238,10 +238,15 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     )
 
 
-def _find_nature(folder: Path, base: Path) -> Path | None:
+def find_nature(folder: Path, base: Path) -> Path | None:
     """What is true in an experiment that is shipped with a sheet alone; None for a folder of anybody's own.
 
     The virtual laboratory has a file for each folder of `data/` that it makes, by the same name.
+
+    Parameters
+    ----------
+    folder : of an experiment.
+    base : the checkout in which `data/` may lie.
     """
     for nature in sorted((PACKAGE / "laboratory").glob("*.yaml")):
         shipped = base / "data" / nature.stem
