@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="vinetrack",
     help="From recordings of everting vine robots to the physics that a model of them lacks.\n\n"
-    "Three commands do most: vinetrack check FOLDER, vinetrack run FOLDER, vinetrack explore RESULTS.",
+    "Three commands do most: vinetrack setup FOLDER, vinetrack run FOLDER, vinetrack explore RESULTS.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

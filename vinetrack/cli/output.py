@@ -25,7 +25,9 @@ def as_json(json_file: Path | None) -> bool:
     ----------
     json_file : of the option `--json`.
     """
-    return json_file is not None and str(json_file) == "-"
+    from vinetrack.core.tables import STANDARD_OUTPUT
+
+    return json_file == STANDARD_OUTPUT
 
 
 def tell(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
@@ -37,13 +39,10 @@ def tell(lines: Iterable[str], content: Any, json_file: Path | None) -> None:
     content : the same for a program: mappings, lists, numbers, text and paths.
     json_file : of the option `--json`; None for lines alone.
     """
-    from vinetrack.core.tables import json_text, write_json
+    from vinetrack.core.tables import write_json
     from vinetrack.core.terminal import severity_first
 
-    if json_file is not None and as_json(json_file):
-        typer.echo(json_text(content))
-        return
-    for line in lines:
+    for line in () if as_json(json_file) else lines:
         typer.echo(severity_first(line))
     if json_file is not None:
         write_json(json_file, content)

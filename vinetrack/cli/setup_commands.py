@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from vinetrack.cli.output import START
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to the command line.
@@ -15,7 +17,7 @@ def register(app: typer.Typer) -> None:
     ----------
     app : the command line.
     """
-    app.command(name="setup")(setup)
+    app.command(name="setup", rich_help_panel=START)(setup)
 
 
 def setup(

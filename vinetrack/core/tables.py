@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
 LARGEST_TABLE_BYTES = 200_000_000
 """Beyond this a file is no table: probably a recording named in the wrong column. Chosen: an hour of positions at 1000
-frames a second takes 150 MB. At half such a file is refused, at twice a recording takes memory before it is
-refused."""
+frames a second takes 150 MB. At half such a file is refused, at twice a recording takes memory first."""
+
+STANDARD_OUTPUT = Path("-")  # convention of commands: a file of this name is the terminal
 
 _NUMBER = re.compile(r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 _GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}", re.ASCII)
@@ -429,20 +430,11 @@ def write_json(path: Path, content: Any) -> None:
 
     Parameters
     ----------
-    path : the file.
+    path : the file; STANDARD_OUTPUT prints it.
     content : mappings, lists, numbers, text, arrays and paths.
     """
-    write_text(path, json_text(content) + "\n")
-
-
-def json_text(content: Any) -> str:
-    """Content as JSON; see `write_json`.
-
-    Parameters
-    ----------
-    content : mappings, lists, numbers, text, arrays and paths.
-    """
-    return json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_plain(content), indent=2, ensure_ascii=False, allow_nan=False)
+    print(text) if path == STANDARD_OUTPUT else write_text(path, text + "\n")
 
 
 def _plain(content: Any) -> Any:

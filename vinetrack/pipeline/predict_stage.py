@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.numbers import number
-from vinetrack.core.tables import json_text, write_csv, write_json
+from vinetrack.core.tables import STANDARD_OUTPUT, write_csv, write_json
 from vinetrack.pipeline.prediction_inputs import (
     Asked,
     Ground,
@@ -97,12 +97,9 @@ def predict_conditions(
         write_csv(csv, pd.concat([prediction.sight.curve for prediction in predictions], ignore_index=True))
         lines.append(f"Curves: {csv}")
     if json is not None:
-        entries = [_entry(prediction) for prediction in predictions]
-        if str(json) == "-":
-            return [json_text(entries)]
-        write_json(json, entries)
+        write_json(json, [_entry(prediction) for prediction in predictions])
         lines.append(f"Everything: {json}")
-    return lines
+    return [] if json == STANDARD_OUTPUT else lines
 
 
 def _predict_all(ground: Ground, samples: int, seed: int, at_fraction: float) -> list[ConditionPrediction]:
