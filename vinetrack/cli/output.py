@@ -24,6 +24,10 @@ def as_json(json_file: Path | None) -> bool:
     Parameters
     ----------
     json_file : of the option `--json`.
+
+    Returns
+    -------
+    bool
     """
     from vinetrack.core.tables import STANDARD_OUTPUT
 

@@ -247,6 +247,10 @@ def find_nature(folder: Path, base: Path) -> Path | None:
     ----------
     folder : of an experiment.
     base : the checkout in which `data/` may lie.
+
+    Returns
+    -------
+    nature : the file of what is true.
     """
     for nature in sorted((PACKAGE / "laboratory").glob("*.yaml")):
         shipped = base / "data" / nature.stem
