@@ -193,13 +193,15 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
 
 
 def _why(failed: dict[str, str], words: list[str], log: Path) -> str:
-    """Which stage stopped a run and what it said."""
-    said = [line for line in words if line.strip()]
+    """Which stage stopped a run and what it sentences."""
+    sentences = [line for line in words if line.strip()]
     if not failed:
-        return "\n".join([*said, f"The run stopped; everything it printed is in {log}."])
+        return "\n".join([*sentences, f"The run stopped; everything it printed is in {log}."])
     stages = ", ".join(failed)
     logs = ", ".join(path for path in failed.values() if path) or str(log)
-    return "\n".join([*said[-3:], f"The run stopped in {stages}; its log is {logs}, everything printed is in {log}."])
+    return "\n".join(
+        [*sentences[-3:], f"The run stopped in {stages}; its log is {logs}, everything printed is in {log}."]
+    )
 
 
 def run_lines(results: Path) -> list[str]:
