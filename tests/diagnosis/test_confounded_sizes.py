@@ -59,12 +59,12 @@ def by_effect(after: MisfitTests) -> dict[str, Confounder]:
 
 def test_levers_say_how_far_a_refit_with_the_other_effect_moves_the_size(after: MisfitTests) -> None:
     place = after.of("air_drag")[0]
-    k = next(k for k, number in enumerate(after.found.numbers) if number.key == INLET)
-    lever = float(levers_of(after.found, after.sums)[k, place])
+    k = next(k for k, number in enumerate(after.fit.numbers) if number.key == INLET)
+    lever = float(levers_of(after.fit, after.sums)[k, place])
     drag = 0.2
-    model = (after.found.model + vt.effects.air_drag).with_values({DRAG: drag})
+    model = (after.fit.model + vt.effects.air_drag).with_values({DRAG: drag})
     with_drag = fit(model, both_act(), fixed=[DRAG], profile=False)
-    fell = after.found[INLET].value - with_drag[INLET].value
+    fell = after.fit[INLET].value - with_drag[INLET].value
     # First order in C_D; spreads and noise are estimated anew in the refit.
     assert fell == pytest.approx(lever * drag, rel=0.1)
 
@@ -75,7 +75,7 @@ def test_what_nobody_can_exclude_is_named_and_the_wider_interval_holds_the_truth
     # Linear damping takes the same sign of the force, fold inertia the other: found in refits with either held.
     linear, fold = by_effect["linear_damping"], by_effect["fold_inertia"]
     assert linear.value < linear.number.value < fold.value
-    number = after.found[INLET]
+    number = after.fit[INLET]
     for one in by_effect.values():
         assert one.low_95 <= number.low < TRUE_INLET < number.high <= one.high_95
     text = confounders_in_words(tuple(by_effect.values()))

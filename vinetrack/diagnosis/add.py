@@ -27,6 +27,23 @@ def add(
 ) -> tuple[Fit, Fit, pd.DataFrame]:
     """The model in use fitted without and with an effect, and the ladder of both.
 
+    Parameters
+    ----------
+    experiment
+        Sheet and settings; the user's effects are read from its folder.
+    tracks : mapping
+        Tracks by name of trial.
+    name : str
+        Name of the effect.
+    report : callable
+        Called with a sentence at each step.
+
+    Returns
+    -------
+    before, after : Fit
+    table : DataFrame
+        The ladder of both.
+
     Raises
     ------
     EffectError

@@ -47,7 +47,7 @@ class Difference:
     p: float = 1.0
 
 
-def chance_of_gain(found: Fit, one: Difference, gain: float) -> float:
+def chance_of_gain(fit: Fit, difference: Difference, gain: float) -> float:
     """Chance of such a gain where trials do not differ.
 
     Of fixed coefficients by the F test with as many degrees of freedom as trials leave, LR = N ln(1 + q F / dof):
@@ -56,9 +56,9 @@ def chance_of_gain(found: Fit, one: Difference, gain: float) -> float:
 
     Parameters
     ----------
-    found
+    fit
         The fit without the difference.
-    one
+    difference
         The difference.
     gain
         Fall of −2 ln L.
@@ -72,16 +72,16 @@ def chance_of_gain(found: Fit, one: Difference, gain: float) -> float:
 
     if gain <= 0:
         return 1.0
-    if any(math.isfinite(term.prior_sd) for term in one.terms):
+    if any(math.isfinite(term.prior_sd) for term in difference.terms):
         return min(1.0, math.exp(-0.5 * gain))
-    trials = len(found.trials)
-    vines = len({trial.trial.vine for trial in found.trials})
-    extra = vines - 1 if one.name == N_BY_VINE else len(one.terms)
-    spare = max(trials - int(np.count_nonzero(found.predictor.layout.prior_precision == 0)) - extra, 1)
+    trials = len(fit.trials)
+    vines = len({trial.trial.vine for trial in fit.trials})
+    extra = vines - 1 if difference.name == N_BY_VINE else len(difference.terms)
+    spare = max(trials - int(np.count_nonzero(fit.predictor.layout.prior_precision == 0)) - extra, 1)
     return float(fisher.sf(math.expm1(min(gain / trials, 500.0)) * spare / extra, extra, spare))
 
 
-def linear_gain(found: Fit, base: Solution, one: Difference, spread: tuple[float, float] | None = None) -> float:
+def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[float, float] | None = None) -> float:
     """Fall of −2 ln L with a difference, from the sensitivities of the fit: no trajectory is simulated.
 
     The deviation of a trial is a column of the linear mixed model already, so the columns of the coefficients are
@@ -89,11 +89,11 @@ def linear_gain(found: Fit, base: Solution, one: Difference, spread: tuple[float
 
     Parameters
     ----------
-    found
+    fit
         The fit without the difference.
     base
         Its solution, smooth errors of position among its numbers where there are any.
-    one
+    difference
         The difference.
     spread
         Standard deviations of pressure and B from trial to trial; None to estimate them anew.
@@ -103,7 +103,7 @@ def linear_gain(found: Fit, base: Solution, one: Difference, spread: tuple[float
     float
         Fall of −2 ln L.
     """
-    grams, problem, state = _widened(found, base, one)
+    grams, problem, state = _widened(fit, base, difference)
     before = marginal(base.grams, base.problem, base.state)
     part = marginal(grams, problem, state)
     if spread is None:
@@ -115,13 +115,13 @@ def linear_gain(found: Fit, base: Solution, one: Difference, spread: tuple[float
     return plain - deviance(part, problem, state, new, restricted=False)
 
 
-def _widened(fit: Fit, base: Solution, one: Difference) -> tuple[Floats, MixedProblem, FitState]:
+def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, MixedProblem, FitState]:
     """Cross products, problem and state of a solution with the coefficients of a difference added, all zero."""
     old, state = fit.predictor.layout, base.state
     data, options = fit.predictor.data, fit.options
     layout = make_layout(
         old.model, data, fixed=options["fixed"], free=options["free"],
-        shared={**options["shared"], **one.shared}, between=(*old.between, *one.terms),
+        shared={**options["shared"], **difference.shared}, between=(*old.between, *difference.terms),
     )  # fmt: skip
     problem = make_problem(Predictor(layout, data, fit.predictor.host), state.trial_effects)
     problem = replace(problem, own_centre=base.problem.own_centre)

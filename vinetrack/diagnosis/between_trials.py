@@ -58,7 +58,9 @@ PLAUSIBLE_DRIFT = 0.05
 """Change of ln B a trial that is still believed. Chosen: a tube whose B rises by 5 % a trial is done for after ten."""
 
 FEWEST_TRIALS = 6
-"""Trials from which a drift or a change is asked for: below, any order of a few pressures is like any other."""
+"""Trials from which a drift or a change is asked for: below, any order of a few pressures is like any other. Chosen:
+with six, one order in 360 is the strict one, either way. At half chance orders pass for drifts, at twice small
+campaigns are never asked."""
 
 OUT_OF_REACH = 40.0
 """How far in −2 ln L the linear estimate may stay behind the best hypothesis and still be fitted. Chosen: well above
@@ -72,6 +74,8 @@ SPREAD_OVER_CONDITIONS = 0.5
 random order gives (1 on average). Chosen: replicates in adjacent places give under 0.1, random order 0.6 to 1.3."""
 
 FIRST_ITERATIONS, MORE_ITERATIONS = 14, 30
+"""Iterations of the fit of a difference: at first, and in all. Chosen for time; a fit that has not settled by then says
+so."""
 
 
 @dataclass(frozen=True)
@@ -93,12 +97,12 @@ class BetweenRatio(LikelihoodRatio):
         return tuple(number for number in self.fit.numbers if number.name not in keys)
 
 
-def differences(found: Fit) -> list[Difference]:
+def differences(fit: Fit) -> list[Difference]:
     """The hypotheses that trials differ which these data allow, each with its linear estimate.
 
     Parameters
     ----------
-    found
+    fit
         The fit that is questioned.
 
     Returns
@@ -106,16 +110,16 @@ def differences(found: Fit) -> list[Difference]:
     list
         Of the forms of a hypothesis (B, pressure, both) the one that gains most.
     """
-    if DAMPING not in found.predictor.layout.keys:
+    if DAMPING not in fit.predictor.layout.keys:
         return []
-    trials = [trial.trial for trial in found.trials]
-    smooth = smooth_errors(found.predictor, found.solution, found.options.get("held"))
-    base = smooth.solution if smooth else found.solution
+    trials = [trial.trial for trial in fit.trials]
+    smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
+    base = smooth.solution if smooth else fit.solution
     best: dict[str, Difference] = {}
-    for one in (*_law(found, trials), *_drifts(trials), *_groups(trials), *_changes(found, base, trials)):
-        estimated = _estimated(found, base, one)
-        if estimated is not None and (one.name not in best or estimated.gain > best[one.name].gain):
-            best[one.name] = estimated
+    for difference in (*_law(fit, trials), *_drifts(trials), *_groups(trials), *_changes(fit, base, trials)):
+        estimated = _estimated(fit, base, difference)
+        if estimated is not None and (difference.name not in best or estimated.gain > best[difference.name].gain):
+            best[difference.name] = estimated
     return list(best.values())
 
 
@@ -124,53 +128,84 @@ def called(among: Sequence[Difference], level: float) -> list[Difference]:
 
     One that random order or replicates keep apart from the conditions is a random deviation of the trials, which the
     fit allows for. `level` is the chance of a false alarm of them all (Bonferroni).
+
+    Parameters
+    ----------
+    among : sequence of Difference
+        Those that were estimated.
+    level : float
+        Chance of a false alarm of them all.
+
+    Returns
+    -------
+    list of Difference
     """
-    return [one for one in among if one.stated and one.confounded and one.p < level / len(among)]
+    return [
+        difference
+        for difference in among
+        if difference.stated and difference.confounded and difference.p < level / len(among)
+    ]
 
 
 def between_fits(
-    found: Fit, among: Sequence[Difference], best: float, report: Callable[[str], None]
+    before: Fit, among: Sequence[Difference], best: float, report: Callable[[str], None]
 ) -> list[LikelihoodRatio]:
-    """Fits of the differences whose estimate comes near the `best` Δχ² of the effects."""
+    """Fits of the differences whose estimate comes near the `best` Δχ² of the effects.
+
+    Parameters
+    ----------
+    before
+        The fit that is questioned.
+    among : sequence of Difference
+        Those that were estimated.
+    best : float
+        Largest Δχ² of the effects.
+    report : callable
+        Called with a sentence at each fit.
+
+    Returns
+    -------
+    list of LikelihoodRatio
+    """
     fitted: list[LikelihoodRatio] = []
-    for one in among:
-        if one.gain < LEAST_GAIN or one.gain < best - max(OUT_OF_REACH, 0.3 * best):
+    for difference in among:
+        if difference.gain < LEAST_GAIN or difference.gain < best - max(OUT_OF_REACH, 0.3 * best):
             continue
-        report(f"fitting {one.name}")
-        fit = _fitted(found, one)
+        report(f"fitting {difference.name}")
+        fit = _fitted(before, difference)
         if fit is None:
             continue
-        ratio = likelihood_ratio(found, (effect_of(one),), fit)
-        fitted.append(BetweenRatio(**{**vars(ratio), "difference": one, **_without_scatter(one, ratio)}))
+        ratio = likelihood_ratio(before, (_effect_of(difference),), fit)
+        fitted.append(BetweenRatio(**{**vars(ratio), "difference": difference, **_without_scatter(difference, ratio)}))
     return fitted
 
 
-def _without_scatter(one: Difference, ratio: LikelihoodRatio) -> dict[str, float]:
+def _without_scatter(difference: Difference, ratio: LikelihoodRatio) -> dict[str, float]:
     """Significance and inflation of random effects of groups, which the scatter of trials cannot widen.
 
     A coefficient that only the few trials of its group feel has a robust error that says nothing.
     """
-    if not any(math.isfinite(term.prior_sd) for term in one.terms):
+    if not any(math.isfinite(term.prior_sd) for term in difference.terms):
         return {}
     return {"sigma": math.copysign(math.sqrt(abs(ratio.delta_chi2)), ratio.delta_chi2), "inflation": 1.0}
 
 
-def effect_of(one: Difference) -> Effect:
+def _effect_of(difference: Difference) -> Effect:
     """A stand-in for the effect that the tables of candidates and the answer set show."""
     drift = (Parameter("B", "dlnB", "1/trial", 0.0, plausible=(-PLAUSIBLE_DRIFT, PLAUSIBLE_DRIFT)),)
-    keys = [term.key for term in one.terms] or list(one.shared)
+    keys = [term.key for term in difference.terms] or list(difference.shared)
     parameters = tuple(Parameter(key.split(".")[1], key, "", 0.0) for key in keys)
     return Effect(
-        name=one.name,
+        name=difference.name,
         kind=BETWEEN_TRIALS,
-        summary=BETWEEN_SUMMARIES[one.name],
-        text=BETWEEN_SUMMARIES[one.name],
-        parameters=drift if one.name == ORDER_DRIFT else parameters,
+        summary=BETWEEN_SUMMARIES[difference.name],
+        text=BETWEEN_SUMMARIES[difference.name],
+        parameters=drift if difference.name == ORDER_DRIFT else parameters,
         functions={},
         needs=(),
         easily_taken_for=(),
         worked=(),
-        path=Path(one.name),
+        path=Path(difference.name),
     )
 
 
@@ -207,17 +242,17 @@ def _drifts(trials: Sequence[Trial]) -> list[Difference]:
 
 def _groups(trials: Sequence[Trial]) -> list[Difference]:
     """Specimens and days that the sheet states."""
-    found: list[Difference] = []
+    differences_found: list[Difference] = []
     if all(trial.specimen for trial in trials):
         tubes = tuple(_tube(trial) for trial in trials)
         # A vine of which there is one tube has a B of its own already.
         several = {vine for vine in (t.vine for t in trials) if len({_tube(t) for t in trials if t.vine == vine}) > 1}
         groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
-        found += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
+        differences_found += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
     if all(trial.day for trial in trials):
         days = tuple(f"day {trial.day}" for trial in trials)
-        found += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, stated=True)
-    return found
+        differences_found += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, stated=True)
+    return differences_found
 
 
 def _forms(
@@ -232,7 +267,7 @@ def _forms(
     groups = tuple(groups)
     in_B = BetweenTerm(f"{name}.B", "ΔlnB", "", False, groups, np.ones(len(groups)), B_sd, B_sd)
     in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, pressure_sd_Pa, pressure_sd_Pa)
-    member = np.array([[group == one for one in dict.fromkeys(groups) if one] for group in groups], dtype=float)
+    member = np.array([[group == label for label in dict.fromkeys(groups) if label] for group in groups], dtype=float)
     apart = confounded(member, trials)
     return [
         Difference(name, terms, stated=stated, confounded=apart)
@@ -260,7 +295,7 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
             gain = linear_gain(fit, base, form, spread=base.state.spread)
             ways.append((gain, way))
         if ways:
-            groups = max(ways, key=lambda one: one[0])[1]
+            groups = max(ways, key=lambda candidate_way: candidate_way[0])[1]
     conditions = [trial.condition for trial in trials]
     changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
     if _in_turn(ranks, conditions):
@@ -271,7 +306,7 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
 def _in_turn(ranks: Floats, conditions: Sequence[str]) -> bool:
     """Whether the replicates of every condition were made one after the other."""
     ordered = [conditions[i] for i in np.argsort(ranks)]
-    changes = sum(one != other for one, other in itertools.pairwise(ordered))
+    changes = sum(before != after for before, after in itertools.pairwise(ordered))
     return 1 < len(set(conditions)) == changes + 1 < len(conditions)
 
 
@@ -280,6 +315,15 @@ def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
 
     The mean square within conditions over that within vines: 1 on average where trials are in random order. Without
     replicates nothing tells them apart.
+
+    Parameters
+    ----------
+    regressors : array, shape (n_trials, k)
+    trials : sequence of Trial
+
+    Returns
+    -------
+    bool
     """
     within, inner = _square_within(regressors, [trial.condition for trial in trials])
     whole, outer = _square_within(regressors, [trial.vine for trial in trials])
@@ -297,17 +341,17 @@ def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
     return total, len(groups) - len(names)
 
 
-def _estimated(fit: Fit, base: Solution, one: Difference) -> Difference | None:
+def _estimated(fit: Fit, base: Solution, difference: Difference) -> Difference | None:
     """The difference with its linear estimate; None where it cannot be laid out."""
-    gain = linear_gain(fit, base, one)
-    return replace(one, gain=gain, p=chance_of_gain(fit, one, gain)) if math.isfinite(gain) else None
+    gain = linear_gain(fit, base, difference)
+    return replace(difference, gain=gain, p=chance_of_gain(fit, difference, gain)) if math.isfinite(gain) else None
 
 
-def _fitted(found: Fit, one: Difference) -> Fit | None:
+def _fitted(before: Fit, difference: Difference) -> Fit | None:
     """The difference fitted; None where it cannot be followed."""
-    between = (*found.predictor.layout.between, *one.terms)
+    between = (*before.predictor.layout.between, *difference.terms)
     try:
-        fit = refit(found, between=between, shared=one.shared, most_iterations=FIRST_ITERATIONS, thorough=False)
+        fit = refit(before, between=between, shared=difference.shared, most_iterations=FIRST_ITERATIONS, thorough=False)
         return fit if fit.converged else refit(fit, most_iterations=MORE_ITERATIONS, thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
@@ -316,7 +360,21 @@ def _fitted(found: Fit, one: Difference) -> Fit | None:
 def between_candidates(
     tried: Sequence[LikelihoodRatio], answer: Sequence[str], aside: Mapping[str, str]
 ) -> list[Candidate]:
-    """Rows of the ranking of candidates for the differences that were fitted."""
+    """Rows of the ranking of candidates for the differences that were fitted.
+
+    Parameters
+    ----------
+    tried : sequence of LikelihoodRatio
+        Hypotheses that were fitted.
+    answer : sequence of str
+        Names in the answer set.
+    aside : mapping
+        Why those set aside were, by name.
+
+    Returns
+    -------
+    list of Candidate
+    """
     return [
         Candidate(
             hypothesis.names[0],

@@ -40,7 +40,11 @@ part of the best promise worth a subset fit. Chosen: √16 is four standard devi
 err by; 0.95 leaves a tenth of the information (1 − 0.95²)."""
 
 ALIKE = 0.95
+"""See above; chosen."""
+
 SHARE_WORTH_A_CLIMB = 0.2
+"""See above; chosen. At half more climbs cost time, at twice an effect whose linear promise errs is missed."""
+
 FEWEST_CLIMBED, LOUDEST = 5, 4
 """The most promising and those with the largest scores: what is left of a fit far off may show in either way alone.
 Chosen for time: 5 and 4 of about 20 candidates."""
@@ -54,6 +58,8 @@ MOST_FITTED = 7
 """Full fits at most, and starts of each. Chosen for time."""
 
 STARTS_EACH = 3
+"""Chosen for time, see above."""
+
 SURELY = 6.0
 """Standard deviations from nothing beyond which a number is there. Chosen: six standard errors, beyond doubt even with
 errors half as large as they should be."""
@@ -77,7 +83,7 @@ class CandidateFits:
     most_fitted: int = MOST_FITTED
 
     def __post_init__(self) -> None:
-        self.slope = SubsetFitter(self.questions.found)
+        self.slope = SubsetFitter(self.questions.fit)
         self.goal = math.inf
         self.base = -math.inf
 
@@ -94,7 +100,17 @@ class CandidateFits:
         return sorted(names, key=lambda name: -self.questions.promise(name))
 
     def after(self, fit: Fit) -> MisfitTests:
-        """What one of its fits leaves, asked once."""
+        """What one of its fits leaves, asked once.
+
+        Parameters
+        ----------
+        fit
+            One of the hypotheses' fits.
+
+        Returns
+        -------
+        MisfitTests
+        """
         for known, tests in self.tested:
             if known is fit:
                 return tests
@@ -107,11 +123,20 @@ class CandidateFits:
 
         With `all_of_them` every candidate is fitted to one trial of every condition, and to all trials unless that
         leaves it out of reach of the best.
+
+        Parameters
+        ----------
+        all_of_them : bool
+            Fit every candidate to one trial of each condition.
+
+        Returns
+        -------
+        list of LikelihoodRatio
         """
         if self.weak:
             return self._fit_weak(all_of_them=all_of_them)
         self._climb_all(self.names if all_of_them else self._worth_a_climb())
-        leaders = sorted(self.climbs.values(), key=lambda one: (one.hopeless, one.deviance))
+        leaders = sorted(self.climbs.values(), key=lambda subset_fit: (subset_fit.hopeless, subset_fit.deviance))
         if not leaders:
             return []
         best = leaders[0]
@@ -125,7 +150,7 @@ class CandidateFits:
             for leader in leaders
             if leader.deviance - best.deviance < (ALIKE_REACH * reach if leader in alike else reach)
         ]
-        chosen = [one for one in near if not one.hopeless] or near
+        chosen = [subset_fit for subset_fit in near if not subset_fit.hopeless] or near
         for climb in chosen if all_of_them else chosen[: self.most_fitted]:
             self._fit(climb)
         self._fit_what_is_contained()
@@ -133,7 +158,7 @@ class CandidateFits:
 
     def _fit_what_is_contained(self) -> None:
         """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
-        found = self.questions.found
+        base_fit = self.questions.fit
         best = max((fitted_one.fit.log_likelihood for fitted_one in self.fitted.values()), default=0.0)
         for fitted_one in list(self.fitted.values()):
             # The simpler is in the larger one, and can be no better.
@@ -141,8 +166,8 @@ class CandidateFits:
             if behind or any(known is fitted_one.fit for known in self.simplified):
                 continue
             self.simplified.append(fitted_one.fit)
-            for both, fit in simpler_forms(found, fitted_one, self.questions.effects):
-                simpler = likelihood_ratio(found, both, fit)
+            for both, fit in _simpler_forms(base_fit, fitted_one, self.questions.effects):
+                simpler = likelihood_ratio(base_fit, both, fit)
                 known = self.fitted.get(simpler.label)
                 if known is None or simpler.delta_chi2 > max(known.delta_chi2, WORSE):
                     self.fitted[simpler.label] = simpler
@@ -170,12 +195,12 @@ class CandidateFits:
             places = self.questions.of(name)[:STARTS_EACH]
             sizes = self.questions.gains[1]
             starts = starts_of((self.questions.answers.shapes[i], float(sizes[i])) for i in places)
-            found = best_subset_fit(self.slope, starts, self.goal)
-            if found is None:
+            climb = best_subset_fit(self.slope, starts, self.goal)
+            if climb is None:
                 self.silent.add(name)
                 continue
-            self.goal = min(self.goal, found.deviance)
-            self.climbs[name] = found
+            self.goal = min(self.goal, climb.deviance)
+            self.climbs[name] = climb
 
     def _fit_weak(self, *, all_of_them: bool) -> list[LikelihoodRatio]:
         names = self.names
@@ -216,21 +241,21 @@ class CandidateFits:
             return
         self.report(f"fitting {name}")
         best = max((fitted_one.fit.log_likelihood for fitted_one in self.fitted.values()), default=-math.inf)
-        found = self._from_climb(climb, best)
+        hypothesis = self._from_climb(climb, best)
         promised = self.base - climb.deviance if math.isfinite(climb.deviance) else 0.0
-        if found is not None and found.delta_chi2 < max(WORSE, PART_KEPT * promised):
+        if hypothesis is not None and hypothesis.delta_chi2 < max(WORSE, PART_KEPT * promised):
             # The smaller model is in this one, and part of the trials gained more: it was led astray by its start.
             smallest = SubsetFit(climb.effects, math.nan, self._smallest(climb.effects))
             others = (self._from_climb(climb, best, afresh=True), self._from_climb(smallest, best))
-            found = max((one for one in (found, *others) if one is not None), key=_gain)
-        if found is None or found.delta_chi2 < WORSE:
+            hypothesis = max((known for known in (hypothesis, *others) if known is not None), key=_gain)
+        if hypothesis is None or hypothesis.delta_chi2 < WORSE:
             self.silent.add(name)
-        elif name not in self.fitted or found.delta_chi2 > self.fitted[name].delta_chi2:
-            self.fitted[name] = found
+        elif name not in self.fitted or hypothesis.delta_chi2 > self.fitted[name].delta_chi2:
+            self.fitted[name] = hypothesis
 
     def _from_climb(self, climb: SubsetFit, best: float, *, afresh: bool = False) -> LikelihoodRatio | None:
-        fit = full_fit(self.questions.found, climb, best, afresh=afresh)
-        return None if fit is None else likelihood_ratio(self.questions.found, climb.effects, fit)
+        fit = full_fit(self.questions.fit, climb, best, afresh=afresh)
+        return None if fit is None else likelihood_ratio(self.questions.fit, climb.effects, fit)
 
 
 def _gain(hypothesis: LikelihoodRatio) -> float:
@@ -240,44 +265,61 @@ def _gain(hypothesis: LikelihoodRatio) -> float:
 def pairs(
     before: Fit, firsts: Sequence[LikelihoodRatio], effects: Sequence[Effect], report: Report
 ) -> list[LikelihoodRatio]:
-    """Fits of two effects together: to each of the best single ones, those that promise to mend what it leaves."""
-    found: dict[frozenset[str], LikelihoodRatio] = {}
+    """Fits of two effects together: to each of the best single ones, those that promise to mend what it leaves.
+
+    Parameters
+    ----------
+    before
+        The fit that is questioned.
+    firsts : sequence of LikelihoodRatio
+        Fits of single effects.
+    effects : sequence of Effect
+        Candidates for the second.
+    report : callable
+        Called with a sentence at each fit.
+
+    Returns
+    -------
+    list of LikelihoodRatio
+        Most likely first.
+    """
+    fitted_pairs: dict[frozenset[str], LikelihoodRatio] = {}
     top = max((first.delta_chi2 for first in firsts), default=0.0)
     for first in [first for first in firsts if first.delta_chi2 >= SHARE_OF_BEST * top][:FIRSTS]:
         later = misfit_tests(first.fit, effects, LATER_LEVEL)
         search = CandidateFits(later, report, most_fitted=PARTNERS)
         search.singles()
-        ranked = sorted(search.fitted.values(), key=lambda one: -one.fit.log_likelihood)
+        ranked = sorted(search.fitted.values(), key=lambda pair: -pair.fit.log_likelihood)
         for second in ranked[:PARTNERS]:
             names = frozenset((*first.names, *second.names))
             both = likelihood_ratio(before, (*first.effects, *second.effects), second.fit)
-            if names not in found or both.fit.log_likelihood > found[names].fit.log_likelihood:
-                found[names] = both
-    for one in sorted(found.values(), key=lambda one: -one.fit.log_likelihood)[:PARTNERS]:
-        for effects_both, fit in simpler_forms(before, one, effects):
+            if names not in fitted_pairs or both.fit.log_likelihood > fitted_pairs[names].fit.log_likelihood:
+                fitted_pairs[names] = both
+    for pair in sorted(fitted_pairs.values(), key=lambda pair: -pair.fit.log_likelihood)[:PARTNERS]:
+        for effects_both, fit in _simpler_forms(before, pair, effects):
             names = frozenset(effect.name for effect in effects_both)
-            if names not in found or fit.log_likelihood > found[names].fit.log_likelihood:
-                found[names] = likelihood_ratio(before, effects_both, fit)
-    return sorted(found.values(), key=lambda one: -one.fit.log_likelihood)
+            if names not in fitted_pairs or fit.log_likelihood > fitted_pairs[names].fit.log_likelihood:
+                fitted_pairs[names] = likelihood_ratio(before, effects_both, fit)
+    return sorted(fitted_pairs.values(), key=lambda pair: -pair.fit.log_likelihood)
 
 
-def simpler_forms(
-    before: Fit, one: LikelihoodRatio, effects: Sequence[Effect]
+def _simpler_forms(
+    before: Fit, pair: LikelihoodRatio, effects: Sequence[Effect]
 ) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
     """A hypothesis with one of its effects in the simpler form that it contains, fitted from where it ended."""
-    for held in one.effects:
+    for held in pair.effects:
         for simpler in effects:
-            if simpler.name not in held.replaces or simpler.name in one.names or _needs_more(one.fit, held, simpler):
+            if simpler.name not in held.replaces or simpler.name in pair.names or _needs_more(pair.fit, held, simpler):
                 continue
-            both = tuple(simpler if effect is held else effect for effect in one.effects)
+            both = tuple(simpler if effect is held else effect for effect in pair.effects)
             model = before.model
             for effect in both:
                 model = model + effect
-            values = one.fit.model.values
+            values = pair.fit.model.values
             sizes = {f"{simpler.name}.{p.name}": values.get(f"{held.name}.{p.name}") for p in simpler.parameters}
             start = {key: size for key, size in sizes.items() if size is not None}
             with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
-                yield both, refit(one.fit, model, start=start, thorough=False)
+                yield both, refit(pair.fit, model, start=start, thorough=False)
 
 
 def _needs_more(fit: Fit, held: Effect, simpler: Effect) -> bool:

@@ -46,21 +46,21 @@ OF_A_TUBE = {
 
 @dataclass(frozen=True)
 class CandidateShape:
-    """One way to try an effect: its first parameter is the size, the others are held at `rest`.
+    """One way to try an effect: its first parameter is the size, the others are held at `other_values`.
 
     `step` is how much of the size is put in to see what it does; a `whole` one is a size in itself, because small
     sizes of this effect do something else or nothing.
     """
 
     effect: Effect
-    rest: tuple[float, ...]
+    other_values: tuple[float, ...]
     step: float
     whole: bool = False
 
     @property
     def values(self) -> tuple[float, ...]:
         """Parameters of the effect with the step put in."""
-        return (self.size.zero + self.step, *self.rest) if self.effect.parameters else ()
+        return (self.size.zero + self.step, *self.other_values) if self.effect.parameters else ()
 
     @property
     def size(self) -> Parameter:
@@ -72,6 +72,19 @@ def candidates_of(
     model: Model, wanted: Iterable[str] | None, user_effects: Mapping[str, Effect] | None = None
 ) -> tuple[Effect, ...]:
     """Effects to question: those `wanted` (default the catalogue) and the user's own, less what is in the model.
+
+    Parameters
+    ----------
+    model
+        The model that is questioned.
+    wanted : iterable of str or None
+        Names of effects; the catalogue where None.
+    user_effects : mapping, optional
+        Effects of the user by name.
+
+    Returns
+    -------
+    tuple of Effect
 
     Raises
     ------
@@ -86,8 +99,20 @@ def candidates_of(
 
 
 def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
-    """Candidates that the sheet lets act, and for the others the reason why not, by name."""
-    found, reasons = [], {}
+    """Candidates that the sheet lets act, and for the others the reason why not, by name.
+
+    Parameters
+    ----------
+    candidates : sequence of Effect
+    data : sequence of FitTrial
+
+    Returns
+    -------
+    able : tuple of Effect
+    reasons : dict
+        By name of the others.
+    """
+    able, reasons = [], {}
     no_tube = all(trial_data.trial.travel_ratio == 1 for trial_data in data)
     for effect in candidates:
         if no_tube and (absent := [column for column in effect.needs if column in OF_A_TUBE]):
@@ -110,8 +135,8 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
             blank = " and ".join(f"`{column}`" for column in effect.needs)
             reasons[effect.name] = f"it needs {blank}, which the sheet leaves blank for some trials"
             continue
-        found.append(effect)
-    return tuple(found), reasons
+        able.append(effect)
+    return tuple(able), reasons
 
 
 @lru_cache(maxsize=1)
@@ -121,41 +146,83 @@ def probe() -> Effect:
 
 
 def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
-    """One model that holds all that may be asked for, so that one compiled form serves every hypothesis."""
+    """One model that holds all that may be asked for, so that one compiled form serves every hypothesis.
+
+    Parameters
+    ----------
+    model
+        The model that is questioned.
+    candidates : iterable of Effect
+
+    Returns
+    -------
+    Model
+    """
     held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
     return Model(tuple(held[name] for name in held))
 
 
 def shapes_of(effect: Effect) -> list[CandidateShape]:
-    """The ways in which an effect is tried: every combination of two or three plausible values of what shapes it."""
+    """The ways in which an effect is tried: every combination of two or three plausible values of what shapes it.
+
+    Parameters
+    ----------
+    effect
+
+    Returns
+    -------
+    list of CandidateShape
+    """
     if not effect.parameters:
         return [CandidateShape(effect, (), 1.0, whole=True)]
     size, *others = effect.parameters
-    combinations = list(itertools.product(*(typical_values(parameter) for parameter in others)))
-    shapes = [CandidateShape(effect, rest, first_step(size)) for rest in combinations]
+    combinations = list(itertools.product(*(_typical_values(parameter) for parameter in others)))
+    shapes = [CandidateShape(effect, values, _first_step(size)) for values in combinations]
     if others or effect.finite:
-        middle = [rest for k, rest in enumerate(combinations) if k == len(combinations) // 2]
+        middle = [values for k, values in enumerate(combinations) if k == len(combinations) // 2]
         shapes += whole_shapes(effect, middle)
     return shapes
 
 
-def whole_shapes(effect: Effect, rests: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
-    """An effect at finite sizes of its plausible range."""
+def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = ((),)) -> list[CandidateShape]:
+    """An effect at finite sizes of its plausible range.
+
+    Parameters
+    ----------
+    effect
+    other_values : sequence of tuple of float
+        Values of the parameters behind the first, SI; several are tried.
+
+    Returns
+    -------
+    list of CandidateShape
+    """
     low, high = plausible_range(effect.parameters[0])
     largest = high if abs(high) >= abs(low) else low
     zero = effect.parameters[0].zero
     parts = LADDER if "rest_force" in effect.functions else AMPLITUDES
-    return [CandidateShape(effect, rest, part * (largest - zero), whole=True) for rest in rests for part in parts]
+    return [
+        CandidateShape(effect, values, part * (largest - zero), whole=True) for values in other_values for part in parts
+    ]
 
 
-def first_step(size: Parameter) -> float:
+def _first_step(size: Parameter) -> float:
     """A size small against what is plausible."""
     low, high = plausible_range(size)
     return 0.01 * max(abs(high - size.zero), abs(low - size.zero))
 
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
-    """What an experimenter would believe; where the effect does not say, a factor of three about its default."""
+    """What an experimenter would believe; where the effect does not say, a factor of three about its default.
+
+    Parameters
+    ----------
+    parameter
+
+    Returns
+    -------
+    low, high : float, SI
+    """
     if parameter.plausible is not None:
         return parameter.plausible
     low, high = parameter.bounds
@@ -163,7 +230,7 @@ def plausible_range(parameter: Parameter) -> tuple[float, float]:
     return max(low, parameter.zero - reach), min(high, parameter.zero + reach)
 
 
-def typical_values(parameter: Parameter) -> tuple[float, ...]:
+def _typical_values(parameter: Parameter) -> tuple[float, ...]:
     """Three values that span what is plausible, two where that is narrow."""
     low, high = plausible_range(parameter)
     if low > 0 and high / low > WIDE_RANGE:
@@ -177,6 +244,20 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
     """Whether a value lies in the plausible range, or no further outside than `reach` of its errors.
 
     `widened` is how many times further from zero it may lie.
+
+    Parameters
+    ----------
+    parameter
+    value, sigma : float, SI
+        Size and its standard error.
+    reach : float
+        Standard errors by which a value may lie outside.
+    widened : float
+        How many times further from zero it may lie.
+
+    Returns
+    -------
+    bool
     """
     if parameter.plausible is None or value == parameter.zero:
         return True

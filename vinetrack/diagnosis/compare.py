@@ -83,7 +83,17 @@ class Comparison:
     trials: tuple[TrialFit, ...]
 
     def plot(self, name: str = "model_comparison") -> Figure:
-        """Return a figure of the report: `model_comparison` or `model_residuals`."""
+        """Return a figure of the report: `model_comparison` or `model_residuals`.
+
+        Parameters
+        ----------
+        name : str
+            Name of the figure.
+
+        Returns
+        -------
+        Figure
+        """
         return plot(self, name)
 
     def __repr__(self) -> str:
@@ -94,7 +104,7 @@ class Comparison:
 
 
 def compare(
-    found: Fit,
+    fit: Fit,
     experiment: Experiment | Path | str | Pairs,
     *,
     tracks: Mapping[str, Track] | None = None,
@@ -105,14 +115,20 @@ def compare(
 
     Parameters
     ----------
+    fit
+        The fitted model.
     experiment
         An experiment or its folder, or pairs of trial and track; trials that the fit did not use are passed over.
-    tracks
+    tracks : mapping, optional
         Tracks by name of trial, where the experiment brings recordings.
-    kinematics
+    kinematics : mapping, optional
         By name of trial, where they are known already; else they are estimated from the tracks.
-    final_at_fraction
+    final_at_fraction : float
         Fraction of the length at which the final speed is taken; where less was seen, the same fraction of that.
+
+    Returns
+    -------
+    Comparison
 
     Raises
     ------
@@ -123,18 +139,18 @@ def compare(
     """
     import pandas as pd
 
-    fitted = {trial.name for trial in found.trials}
+    fitted = {trial.name for trial in fit.trials}
     chosen = [(trial, track) for trial, track in pairs_of(experiment, tracks)[0] if trial.name in fitted]
-    predicted = predict_trials(found, chosen, from_rest=True)
+    predicted = predict_trials(fit, chosen, from_rest=True)
     measured = {trial.name: track for trial, track in chosen}
-    errors = final_speed_errors(found, predicted, measured, kinematics or {}, final_at_fraction)
+    errors = _final_speed_errors(fit, predicted, measured, kinematics or {}, final_at_fraction)
     rows, trajectories = [], {}
     for condition in dict.fromkeys(trial.trial.condition for trial in predicted):
         members = [trial for trial in predicted if trial.trial.condition == condition]
         together = replicates_of(members)
         rows.append(
             {
-                "model": "+".join(found.model.names),
+                "model": "+".join(fit.model.names),
                 "condition": condition,
                 **position_errors(members, together),
                 "rms_final_velocity_m_s": _rms([errors[trial.name] for trial in members]),
@@ -145,7 +161,20 @@ def compare(
 
 
 def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[str, float]:
-    """Errors of position of one condition while it moves: every trial counts alike, however many frames it has."""
+    """Errors of position of one condition while it moves: every trial counts alike, however many frames it has.
+
+    Parameters
+    ----------
+    trials : sequence of TrialFit
+        Of one condition, as predicted.
+    together
+        The same trials on one clock.
+
+    Returns
+    -------
+    dict of float
+        Columns of `comparison.csv`: m, s and ratios.
+    """
     squares = [float(np.mean(trial.residual_m[first_that_counts(trial) :] ** 2)) for trial in trials]
     rms_m = math.sqrt(float(np.mean(squares)))
     floor_m = together.alignment.floor_m
@@ -174,7 +203,7 @@ def _worst(together: Replicates) -> tuple[float, float]:
     return float(time_s[worst]), float((together.model_m[moving] + misfit_m)[worst])
 
 
-def final_speed_errors(
+def _final_speed_errors(
     fit: Fit,
     predicted: Sequence[TrialFit],
     tracks: Mapping[str, Track],
@@ -198,8 +227,8 @@ def final_speed_errors(
         length_m = trial.trial.length_m
         place_m = at_fraction * (min(length_m, seen_m) if math.isfinite(length_m) else seen_m)
         measured = lead_velocity_at(travel_m, known.lead_velocity_m_s, place_m)
-        said = lead_velocity_at(run.observed_position_m, np.gradient(run.observed_position_m, time_s), place_m)
-        errors[trial.name] = (said if math.isfinite(said) else 0.0) - measured
+        by_model = lead_velocity_at(run.observed_position_m, np.gradient(run.observed_position_m, time_s), place_m)
+        errors[trial.name] = (by_model if math.isfinite(by_model) else 0.0) - measured
     return errors
 
 
@@ -214,6 +243,17 @@ def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.Dat
     """One condition's trials and the model, since release and from the origin, columns `TRAJECTORY_COLUMNS`.
 
     `replicates_mean_m` is the mean of the replicates then, `replicates_sigma_m` their standard deviation.
+
+    Parameters
+    ----------
+    trials : sequence of TrialFit
+        Of one condition, as predicted.
+    together
+        The same trials on one clock.
+
+    Returns
+    -------
+    DataFrame
     """
     import pandas as pd
 

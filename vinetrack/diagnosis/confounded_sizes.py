@@ -88,19 +88,19 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
     tuple of Confounder
         For each size those that could move it by more than its own standard error, the largest first.
     """
-    if after.lost or not after.answers.shapes:
+    if after.poorly_fitted or not after.answers.shapes:
         return ()
-    levers = levers_of(after.found, after.sums)
+    levers = levers_of(after.fit, after.sums)
     chosen = []
-    for k, number in enumerate(after.found.numbers):
+    for k, number in enumerate(after.fit.numbers):
         if number.key.split(".")[0] in added and math.isfinite(number.sigma) and number.sigma > 0:
-            likely = [one for one in _of_number(after, number, levers[k]) if _is_worth_saying(one)]
-            chosen += sorted(likely, key=lambda one: -abs(one.value - number.value))[:MOST_LISTED]
+            likely = [confounder for confounder in _of_number(after, number, levers[k]) if _is_worth_saying(confounder)]
+            chosen += sorted(likely, key=lambda confounder: -abs(confounder.value - number.value))[:MOST_LISTED]
     return tuple(chosen)
 
 
-def _is_worth_saying(one: Confounder) -> bool:
-    return abs(one.value - one.number.value) > WORTH_SAYING * one.number.sigma
+def _is_worth_saying(confounder: Confounder) -> bool:
+    return abs(confounder.value - confounder.number.value) > WORTH_SAYING * confounder.number.sigma
 
 
 def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confounder]:
@@ -111,9 +111,9 @@ def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confou
         if kinds.get(name) != "physical":
             continue
         each = [_in_shape(after, number, place, float(lever[place])) for place in after.of(name)]
-        known = [one for one in each if one is not None]
+        known = [confounder for confounder in each if confounder is not None]
         if known:
-            confounders.append(max(known, key=lambda one: abs(one.value - number.value)))
+            confounders.append(max(known, key=lambda confounder: abs(confounder.value - number.value)))
     return confounders
 
 
@@ -142,7 +142,9 @@ def _in_shape(after: MisfitTests, number: Number, place: int, lever: float) -> C
 def _bounds(after: MisfitTests, number: Number) -> tuple[float, float]:
     """What physics allows of a number, SI."""
     effect, _, name = number.key.partition(".")
-    parameters = next(one for one in after.found.model if one.name == effect).parameters
+    parameters = next(
+        effect_of_model for effect_of_model in after.fit.model if effect_of_model.name == effect
+    ).parameters
     return next(parameter.bounds for parameter in parameters if parameter.name == name)
 
 

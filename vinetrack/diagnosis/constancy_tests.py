@@ -32,15 +32,42 @@ class Against:
     logarithmic: bool
 
     def level(self, trial: Trial) -> float:
-        """The nominal value of a trial, SI."""
+        """The nominal value of a trial, SI.
+
+        Parameters
+        ----------
+        trial
+
+        Returns
+        -------
+        float, SI
+        """
         return float(getattr(trial, self.column))
 
     def along(self, levels: Floats) -> Floats:
-        """The coordinate a drift is a straight line in."""
+        """The coordinate a drift is a straight line in.
+
+        Parameters
+        ----------
+        levels : array, shape (n_trials,), SI
+
+        Returns
+        -------
+        array, shape (n_trials,)
+        """
         return np.log(levels) if self.logarithmic and np.all(levels > 0) else levels
 
     def shown(self, level: float) -> str:
-        """A level with its unit."""
+        """A level with its unit.
+
+        Parameters
+        ----------
+        level : float, SI
+
+        Returns
+        -------
+        str
+        """
         return f"{level * self.factor:.3g} {self.unit}"
 
 
@@ -67,7 +94,23 @@ class Sums:
 
 
 def sums_of(estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDArray[np.bool_]) -> Sums | None:
-    """Deviations about the mean of each vine (or of all), and the scatter of replicates; None without any to tell."""
+    """Deviations about the mean of each vine (or of all), and the scatter of replicates; None without any to tell.
+
+    Parameters
+    ----------
+    estimates
+        Values of one parameter by trial.
+    x : array, shape (n_trials,)
+        Coordinate of a drift.
+    levels : array, shape (n_trials,)
+        Values that make the groups.
+    chosen : array of bool, shape (n_trials,)
+        Trials that are tested.
+
+    Returns
+    -------
+    Sums or None
+    """
     conditions = np.array([trial.condition for trial in estimates.trials])
     blocks = (
         np.array([trial.vine for trial in estimates.trials])
@@ -106,7 +149,17 @@ def sums_of(estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDA
 
 
 def constancy(sums: Sums) -> tuple[float, float]:
-    """How likely chance is to make groups differ so much, and that as a normal deviate."""
+    """How likely chance is to make groups differ so much, and that as a normal deviate.
+
+    Parameters
+    ----------
+    sums
+        From `sums_of`.
+
+    Returns
+    -------
+    p, z : float
+    """
     from scipy.stats import f as fisher
 
     if sums.groups < 1:
@@ -116,7 +169,17 @@ def constancy(sums: Sums) -> tuple[float, float]:
 
 
 def as_deviate(p: float) -> float:
-    """The normal deviate that is two-sided as unlikely as `p`."""
+    """The normal deviate that is two-sided as unlikely as `p`.
+
+    Parameters
+    ----------
+    p : float
+        Two-sided p-value.
+
+    Returns
+    -------
+    float
+    """
     from scipy.stats import norm
 
     return float(norm.isf(max(p, 1e-300) / 2))

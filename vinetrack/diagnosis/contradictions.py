@@ -43,8 +43,8 @@ def displacement_m(before: Fit, after: Fit) -> float:
         its own, m.
     """
     moved = [
-        float(np.max(np.abs(one.predicted_position_m - other.predicted_position_m)))
-        for one, other in zip(before.trials, after.trials, strict=True)
+        float(np.max(np.abs(trial.predicted_position_m - later.predicted_position_m)))
+        for trial, later in zip(before.trials, after.trials, strict=True)
     ]
     return float(np.sqrt(np.mean(np.square(moved))))
 

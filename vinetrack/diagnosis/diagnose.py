@@ -83,19 +83,24 @@ def diagnose(
     source
         A fit, whose model is questioned; or an experiment, its folder, or pairs of trial and track, to which the model
         is fitted first.
-    model
+    model : Model, optional
         The model to question, by default the one the experiment names, else the base model.
-    tracks
+    tracks : mapping, optional
         Tracks by name of trial, where the experiment brings recordings.
-    candidates, own
-        Names of the effects to question, by default those the experiment names, else the whole catalogue; and the
-        user's own effects by name.
-    limits
+    candidates : iterable of str, optional
+        Names of the effects to question, by default those the experiment names, else the whole catalogue.
+    user_effects : mapping, optional
+        Effects of the user by name.
+    limits : Limits, optional
         Within which limits further trials can be made.
-    ladder, advice
+    ladder, advice : bool
         Whether errors before and after are worked out, and what to do next.
-    report
-        Told in a few words what is being done.
+    report : callable
+        Called with a few words at each step.
+
+    Returns
+    -------
+    Diagnosis
 
     Raises
     ------
@@ -109,7 +114,7 @@ def diagnose(
     wild = ""
     if isinstance(source, Fit):
         questioned = candidates_of(source.model, candidates, user_effects)
-        found, dropped = _with_host(source, questioned), _dropped_in_fit(source)
+        fit, dropped = _with_host(source, questioned), _dropped_in_fit(source)
     else:
         settings = _settings(source)
         if settings is not None:
@@ -123,11 +128,11 @@ def diagnose(
         pairs, dropped = _frames_put_right(pairs)
         wild = listed_wild_points({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
-        found = fit_model(model, pairs, host=host_for(model, questioned), profile=False, thorough=False)
-        found = replace(found, left_out={**left_out, **found.left_out})
-    effects, blind = testable(questioned, found.predictor.data)
-    findings = select_effects(found, effects, report)
-    result = _conclude(found, findings, blind)
+        fit = fit_model(model, pairs, host=host_for(model, questioned), profile=False, thorough=False)
+        fit = replace(fit, left_out={**left_out, **fit.left_out})
+    effects, blind = testable(questioned, fit.predictor.data)
+    findings = select_effects(fit, effects, report)
+    result = _conclude(fit, findings, blind)
     if dropped:
         result = _artefact_first(result, dropped)
     if wild:
@@ -136,8 +141,8 @@ def diagnose(
         result = _with_ladder(result, report)
     if ladder and result.final_verdict == ADEQUATE:
         report("what speaks against it")
-        doubts = contradictions(result.fits, result.effects, result.ladder)
-        result = replace(result, notes=(*result.notes, *(f"Against this verdict: {doubt}" for doubt in doubts)))
+        objections = contradictions(result.fits, result.effects, result.ladder)
+        result = replace(result, notes=(*result.notes, *(f"Against this verdict: {doubt}" for doubt in objections)))
     if advice:
         result = _with_advice(result, limits, report)
     return result
@@ -159,14 +164,14 @@ def _settings(
     return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
 
 
-def _with_host(found: Fit, questioned: Sequence[Effect]) -> Fit:
+def _with_host(fit: Fit, questioned: Sequence[Effect]) -> Fit:
     """A fit whose trajectories come from a kernel that holds all candidates."""
-    host = host_for(found.model, questioned)
-    predictor = Predictor(found.predictor.layout, found.predictor.data, host)
+    host = host_for(fit.model, questioned)
+    predictor = Predictor(fit.predictor.layout, fit.predictor.data, host)
     # Copies: the predictor adapts its steps in place, and the caller's fit must stay as it is.
-    predictor.steps = found.predictor.steps.copy()
-    predictor.pressure_step = found.predictor.pressure_step.copy()
-    return replace(found, predictor=predictor)
+    predictor.steps = fit.predictor.steps.copy()
+    predictor.pressure_step = fit.predictor.pressure_step.copy()
+    return replace(fit, predictor=predictor)
 
 
 def _frames_put_right(pairs: Iterable[tuple[Trial, Track]]) -> tuple[list[tuple[Trial, Track]], list[str]]:
@@ -183,12 +188,12 @@ def _frames_put_right(pairs: Iterable[tuple[Trial, Track]]) -> tuple[list[tuple[
     return right, dropped
 
 
-def _dropped_in_fit(found: Fit) -> list[str]:
+def _dropped_in_fit(fit: Fit) -> list[str]:
     """Trials of a fit from which frames are missing that nobody has put right."""
     from vinetrack.tracks.frame_timing import correct_frames
 
     dropped = []
-    for trial_data in found.predictor.data:
+    for trial_data in fit.predictor.data:
         blank = np.full(trial_data.time_s.size, "", dtype=object)
         track = Track(
             time_s=trial_data.time_s,
@@ -211,10 +216,10 @@ def _conclude(fit: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, s
         effect = finding.answer[0]
         added.append(effect)
     for after in findings[1:]:
-        fits.append(after.questions.found)
-    explanation = " ".join(one.explanation for one in rounds)
+        fits.append(after.questions.fit)
+    explanation = " ".join(step.explanation for step in rounds)
     lacking = [name for name, why in blind.items() if "`" in why]
-    if lacking and any(one.verdict == UNEXPLAINED for one in rounds):
+    if lacking and any(step.verdict == UNEXPLAINED for step in rounds):
         explanation += f" Not tried, because the sheet does not say what they need: {joined(lacking)}."
     return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits))
 
@@ -223,14 +228,14 @@ def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
     questions = finding.questions
     names, cosines = _cosines(questions)
     return Round(
-        model=questions.found.model.names,
+        model=questions.fit.model.names,
         verdict=finding.verdict,
         answer_set=finding.answer,
         ranking=tuple(_ranking(finding, blind)),
         explanation=explain(finding),
         cosine_names=names,
         cosines=cosines,
-        fit=questions.found,
+        fit=questions.fit,
         fits={
             hypothesis.names[-1]: hypothesis.fit
             for hypothesis in finding.kept
@@ -260,22 +265,22 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
             continue
         z, place = questions.best_z(effect.name)
         if effect.name in singles:
-            one = singles[effect.name]
+            single = singles[effect.name]
             rows.append(
                 Candidate(
                     effect.name,
                     effect.kind,
                     REFITTED,
-                    one.delta_chi2,
-                    one.sigma,
-                    one.numbers,
-                    one.plausible,
+                    single.delta_chi2,
+                    single.sigma,
+                    single.numbers,
+                    single.plausible,
                     effect.name in finding.answer,
-                    aside.get(effect.name, one.reason),
+                    aside.get(effect.name, single.reason),
                     largest,
-                    one.others if effect.name in finding.answer else (),
+                    single.others if effect.name in finding.answer else (),
                     weights[effect.name],
-                    tuple(one for one in finding.confounded if one.number.key.split(".")[0] == effect.name),
+                    tuple(single for single in finding.confounded if single.number.key.split(".")[0] == effect.name),
                 )
             )
         elif finding.verdict == ADEQUATE and not shows and z < questions.threshold:
@@ -291,14 +296,12 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     _predicted(questions, effect, place),
                     in_answer_set=effect.name in finding.answer,
                     reason=_holds(effect, finding) or _behind(finding, effect.name),
-                    largest={} if questions.lost else largest,
+                    largest={} if questions.poorly_fitted else largest,
                 )
             )
     rows += between_candidates(finding.tried, finding.answer, aside)
     rows += [
-        Candidate(name, "", NOT_TESTABLE, reason=why)
-        for name, why in blind.items()
-        if name not in questions.found.model
+        Candidate(name, "", NOT_TESTABLE, reason=why) for name, why in blind.items() if name not in questions.fit.model
     ]
     order = {REFITTED: 0, SCREENED: 1, NOT_TESTABLE: 2}
     return sorted(rows, key=lambda row: (not row.in_answer_set, order[row.status], -_known(row.delta_chi2)))
@@ -316,7 +319,7 @@ def _promised(finding: SelectionStep, name: str, z: float) -> float:
     """Fall of −2 ln L that the sensitivities promise; of an adequate model, what the score says."""
     if finding.verdict == ADEQUATE:
         return z**2
-    return math.nan if finding.questions.lost else finding.questions.promise(name)
+    return math.nan if finding.questions.poorly_fitted else finding.questions.promise(name)
 
 
 def _holds(effect: Effect, finding: SelectionStep) -> str:
@@ -340,7 +343,7 @@ def _known(value: float) -> float:
 
 def _predicted(questions: MisfitTests, effect: Effect, place: int) -> tuple[Number, ...]:
     """The size that the sensitivities predict, with its error; nothing where the model is too far off for that."""
-    if place < 0 or not effect.parameters or questions.lost:
+    if place < 0 or not effect.parameters or questions.poorly_fitted:
         return ()
     size, sigma = float(questions.scores.size[place]), float(questions.scores.sigma[place])
     parameter = questions.answers.shapes[place].size

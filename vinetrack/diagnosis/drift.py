@@ -110,8 +110,14 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
 
     Parameters
     ----------
-    scatter
+    fit
+        The fit that is questioned.
+    scatter : Scatter, optional
         What replicates differ by, where it is known already.
+
+    Returns
+    -------
+    Drift
 
     Raises
     ------
@@ -124,7 +130,7 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
     scatter = scatter or replicate_scatter(fit, courses_of(fit)[0])
     tests = list(_tests(fit, scatter, notes))
     level = 1 - (1 - FALSE_ALARMS) ** (1 / max(len(tests), 1))
-    tests.sort(key=lambda one: one.p)
+    tests.sort(key=lambda tested: tested.p)
     rows = [{**test.row, "significant": bool(test.p < level)} for test in tests]
     groups = [group for test in tests for group in test.groups]
     return Drift(
@@ -327,9 +333,9 @@ def _vine_row(
     low, high = ordered[0], ordered[-1]
     shown, factor = display_unit(unit)
     ends = " and ".join(
-        f"{float(str(one['value'])) * factor:.3g} ± {float(str(one['sigma'])) * factor:.1g} {shown}".rstrip()
-        + f" ({one['vine']})"
-        for one in (low, high)
+        f"{float(str(end['value'])) * factor:.3g} ± {float(str(end['sigma'])) * factor:.1g} {shown}".rstrip()
+        + f" ({end['vine']})"
+        for end in (low, high)
     )
     return {
         "parameter": key,
@@ -356,7 +362,7 @@ def _between_vines(fit: Fit, scatter: Scatter) -> Iterator[ConstancyTest]:
     parts = list(_alone(fit, scatter)) if shared else []
     for key in shared:
         estimates = [(vine, alone[key], len(alone.trials)) for vine, alone in parts]
-        estimates = [one for one in estimates if math.isfinite(one[1].sigma) and one[1].sigma > 0]
+        estimates = [estimate for estimate in estimates if math.isfinite(estimate[1].sigma) and estimate[1].sigma > 0]
         if len(estimates) > 1:
             yield _apart(fit[key], estimates)
 
@@ -387,8 +393,8 @@ def _apart(common: Number, estimates: Sequence[tuple[str, Number, int]]) -> Cons
     value, sigma = (np.array([getattr(number, name) for _, number, _ in estimates]) for name in ("value", "sigma"))
     mean = float(np.average(value, weights=1 / sigma**2))
     p = float(chi_square.sf(float(np.sum((value - mean) ** 2 / sigma**2)), len(estimates) - 1))
-    groups = [_alone_group(*one, common.value) for one in estimates]
-    count = sum(one[2] for one in estimates)
+    groups = [_alone_group(*estimate, common.value) for estimate in estimates]
+    count = sum(estimate[2] for estimate in estimates)
     row = _vine_row(common.key, common.symbol, common.unit, groups, as_deviate(p), math.inf, count)
     return ConstancyTest(row, p, groups)
 

@@ -46,6 +46,19 @@ class _Halves:
 def along_growth(fit: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> Iterator[ConstancyTest]:
     """Rows of B against the growth, for every vine and for all; `values` are those of B.
 
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    laid
+        Its model aligned with its trials.
+    values
+        Values of B by trial.
+
+    Yields
+    ------
+    ConstancyTest
+
     Raises
     ------
     SimulationError
@@ -75,7 +88,7 @@ def _halves(fit: Fit, laid: AlignedTrial, trial_effects: Floats) -> _Halves:
         * float(np.max(np.interp(trial_data.time_s - trial_effects[i, RELEASE], motion.time_s, motion.lead_position_m)))
         for i, (trial_data, motion) in enumerate(zip(data, motions, strict=True))
     ]
-    pushes = [_pushes(*one) for one in zip(motions, middles, strict=True)]
+    pushes = [_pushes(*pair) for pair in zip(motions, middles, strict=True)]
     deviation = np.full((len(data), 2), math.nan)
     for i, answers in enumerate(push_sensitivities(fit, trial_effects, motions, pushes)):
         others = columns[i][:, [RELEASE]] if held[i] else columns[i][:, [RELEASE, ORIGIN]]
@@ -175,9 +188,19 @@ def _groups(fit: Fit, halves: _Halves, vine: str, chosen: np.ndarray) -> list[di
     return rows
 
 
-def against_the_sheet(found: Fit) -> Iterator[ConstancyTest]:
-    """Rows of yield pressures that the fit moved, beside the error that the sheet gives them."""
-    for number, free in zip(found.numbers, found.predictor.layout.free, strict=True):
+def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
+    """Rows of yield pressures that the fit moved, beside the error that the sheet gives them.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+
+    Yields
+    ------
+    ConstancyTest
+    """
+    for number, free in zip(fit.numbers, fit.predictor.layout.free, strict=True):
         if number.key != YIELD_PRESSURE or not math.isfinite(free.prior_sd):
             continue
         away = number.value - free.start
@@ -197,7 +220,7 @@ def against_the_sheet(found: Fit) -> Iterator[ConstancyTest]:
             "z": z,
             "z_constancy": z,
             "dof": math.inf,
-            "n_trials": sum(trial.trial.vine == number.vine.split(",")[0] for trial in found.trials),
+            "n_trials": sum(trial.trial.vine == number.vine.split(",")[0] for trial in fit.trials),
             "sentence": (
                 f"{number.symbol} of {number.vine} is pulled from the {free.start / 1e3:.2f} ±"
                 f" {free.prior_sd / 1e3:.2f} kPa of the sheet to {number.value / 1e3:.2f} kPa ({z:.1f} σ)."

@@ -51,18 +51,29 @@ class EffectSensitivities:
 
 
 def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSensitivities:
-    """Ask every shape; those that do nothing by a small step are tried at finite sizes before they count as silent."""
+    """Ask every shape; those that do nothing by a small step are tried at finite sizes before they count as silent.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    shapes : sequence of CandidateShape
+
+    Returns
+    -------
+    EffectSensitivities
+    """
     plain = [trial.predicted_position_m - trial.origin_m for trial in fit.trials]
     kept: list[tuple[CandidateShape, list[Floats]]] = []
     heard: set[str] = set()
     names = dict.fromkeys(shape.effect.name for shape in shapes)
     for name in names:
         of_effect = [shape for shape in shapes if shape.effect.name == name]
-        answered = [one for shape in of_effect if (one := _answer(fit, shape, plain)) is not None]
+        answered = [answer for shape in of_effect if (answer := _answer(fit, shape, plain)) is not None]
         if not answered and any(shape.effect.parameters for shape in of_effect):
-            rest = of_effect[0].rest
-            finite = whole_shapes(of_effect[0].effect, [rest])
-            answered = [one for shape in finite if (one := _answer(fit, shape, plain)) is not None]
+            values = of_effect[0].other_values
+            finite = whole_shapes(of_effect[0].effect, [values])
+            answered = [answer for shape in finite if (answer := _answer(fit, shape, plain)) is not None]
         kept += answered
         heard |= {name} if answered else set()
     columns = tuple(
@@ -81,7 +92,7 @@ def _answer(fit: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> tuple[C
         response = _response(fit, change)
         if shape.whole:
             speaks = response > SILENT_RESPONSE and not _holds_back(plain, change)
-            return (shape, [one / shape.step for one in change]) if speaks else None
+            return (shape, [moved / shape.step for moved in change]) if speaks else None
         if response <= SILENT_RESPONSE * 1e-3:
             return None
         if not LEAST_RESPONSE < response < LARGEST_RESPONSE:
@@ -93,20 +104,21 @@ def _answer(fit: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> tuple[C
             response = _response(fit, change)
     except SimulationError:
         return None
-    return (shape, [one / shape.step for one in change]) if response > SILENT_RESPONSE else None
+    return (shape, [moved / shape.step for moved in change]) if response > SILENT_RESPONSE else None
 
 
 def _holds_back(plain: Sequence[Floats], change: Sequence[Floats]) -> bool:
     """Whether some vine hardly starts any more, although it was seen to grow: no such size can hide."""
     return any(
-        float(np.max(before + one)) < STARTS * float(np.max(before)) for before, one in zip(plain, change, strict=True)
+        float(np.max(before + moved)) < STARTS * float(np.max(before))
+        for before, moved in zip(plain, change, strict=True)
     )
 
 
 def _response(fit: Fit, change: Sequence[Floats]) -> float:
     """Largest answer, as part of a trial's travel; infinite where one cannot be followed."""
     spans = [max(float(np.ptp(trial.lead_position_m)), 1e-9) for trial in fit.trials]
-    parts = [float(np.max(np.abs(one))) / span for one, span in zip(change, spans, strict=True)]
+    parts = [float(np.max(np.abs(moved))) / span for moved, span in zip(change, spans, strict=True)]
     worst = max(parts, default=0.0)
     return worst if math.isfinite(worst) else math.inf
 

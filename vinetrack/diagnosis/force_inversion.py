@@ -114,7 +114,19 @@ class ForceFit:
         return np.asarray(inverse * scale[:, None] * scale)
 
     def gains(self, answers: Sequence[Floats], columns: Sequence[int]) -> list[Gain]:
-        """What each of several forces explains alone; `columns` counts the columns of each among the answers."""
+        """What each of several forces explains alone; `columns` counts the columns of each among the answers.
+
+        Parameters
+        ----------
+        answers : sequence of arrays, shape (n_points, n_columns), m
+            What the forces do to the positions of each trial, side by side.
+        columns : sequence of int
+            Columns of each force.
+
+        Returns
+        -------
+        list of Gain
+        """
         blocks = self._blocks(answers)
         square, cross, total = self._spread(blocks)
         inverse = self._inverse(square)
@@ -151,18 +163,36 @@ class ForceFit:
         return np.asarray(left[:, forces] - np.einsum("nkl,nk->nl", levers, left[:, :k]))
 
     def together(self, answers: Sequence[Floats]) -> Gain:
-        """What forces explain all together, the same in every trial."""
+        """What forces explain all together, the same in every trial.
+
+        Parameters
+        ----------
+        answers : sequence of arrays, shape (n_points, n_columns), m
+
+        Returns
+        -------
+        Gain
+        """
         return self.gains(answers, [answers[0].shape[1]])[0]
 
     def by_condition(self, answers: Sequence[Floats]) -> Gain:
-        """What forces explain all together, each condition with amplitudes of its own."""
+        """What forces explain all together, each condition with amplitudes of its own.
+
+        Parameters
+        ----------
+        answers : sequence of arrays, shape (n_points, n_columns), m
+
+        Returns
+        -------
+        Gain
+        """
         names = list(dict.fromkeys(self.conditions))
         count = answers[0].shape[1]
         wide = []
-        for condition, one in zip(self.conditions, answers, strict=True):
-            block = np.zeros((len(one), count * len(names)))
+        for condition, answer in zip(self.conditions, answers, strict=True):
+            block = np.zeros((len(answer), count * len(names)))
             k = names.index(condition) * count
-            block[:, k : k + count] = one
+            block[:, k : k + count] = answer
             wide.append(block)
         return self.together(wide)
 
@@ -177,6 +207,21 @@ class ForceFit:
         """How badly forces of so many numbers do beside the `most` that any explained: smaller is better.
 
         What not even that explains is no noise but counts as if it were, once for every independent piece.
+
+        Source: Schwarz, Annals of Statistics 6, 461 (1978), with the misfit scaled by what nothing explains.
+
+        Parameters
+        ----------
+        chi2 : float
+            What the forces explain.
+        numbers : int
+            Numbers that they have.
+        most : float
+            The most that any explained.
+
+        Returns
+        -------
+        float
         """
         pieces = PER_TRIAL * len(self.data)
         beyond = max(self.chi2 - most - self.points, 0.0)
@@ -186,6 +231,18 @@ class ForceFit:
         """A smooth force in every condition, the model's numbers moved by `numbers`: coefficients and covariance.
 
         As smooth as generalised cross-validation finds best, the same in all conditions.
+
+        Parameters
+        ----------
+        answers : sequence of arrays, shape (n_points, n_columns), m
+            Of a spline's pieces.
+        numbers : array, shape (n_free,)
+            How far the model's numbers moved, scaled.
+
+        Returns
+        -------
+        dict of (coefficients, covariance)
+            By condition; shapes (n_columns,) and (n_columns, n_columns), N.
         """
         blocks = self._blocks(answers)
         k = self.problem.index.shape[1]
@@ -194,9 +251,9 @@ class ForceFit:
         place = np.array([names.index(condition) for condition in self.conditions])
         count = answers[0].shape[1]
         square, slope = np.zeros((len(names), count, count)), np.zeros((len(names), count))
-        rest = blocks[:, k:, -1] - np.einsum("nlk,nk->nl", blocks[:, k:, :k], moved)
+        left = blocks[:, k:, -1] - np.einsum("nlk,nk->nl", blocks[:, k:, :k], moved)
         np.add.at(square, place, blocks[:, k:-1, k:-1])
-        np.add.at(slope, place, rest[:, :-1])
+        np.add.at(slope, place, left[:, :-1])
         bend = np.diff(np.eye(count), 2, axis=0)
         unit = float(np.mean(np.einsum("nkk->n", square))) / count
         rough = unit * (bend.T @ bend + 1e-6 * np.eye(count))
@@ -205,12 +262,14 @@ class ForceFit:
         whole = float(np.sum(slope * np.linalg.solve(square + 1e-9 * rough, slope[:, :, None])[:, :, 0]))
         for strength in SMOOTHNESS:
             inverse = np.linalg.inv(square + strength * rough)
-            found = np.einsum("nkl,nl->nk", inverse, slope)
-            missed = whole - float(np.sum(2 * found * slope) - np.einsum("nk,nkl,nl->", found, square, found))
+            coefficients = np.einsum("nkl,nl->nk", inverse, slope)
+            missed = whole - float(
+                np.sum(2 * coefficients * slope) - np.einsum("nk,nkl,nl->", coefficients, square, coefficients)
+            )
             freedom = float(np.einsum("nkl,nlk->", inverse, square))
             score = (missed + pieces) / max(pieces - freedom, 1.0) ** 2
             if best is None or score < best[0]:
-                best = score, found, inverse
+                best = score, coefficients, inverse
         assert best is not None
         spare = max(self.points - count * len(names), 1.0)
         noise = max(1.0, (self.chi2 - whole) / spare) if not numbers.any() else 1.0

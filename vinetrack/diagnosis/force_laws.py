@@ -79,27 +79,79 @@ class Law:
         return ("low", "high") if self.kind == "patch" else ("scale",) * self.shapes
 
     def size_of(self, name: str) -> float:
-        """How much of a change of one of them is a large one."""
+        """How much of a change of one of them is a large one.
+
+        Parameters
+        ----------
+        name : str
+            One of `shape_names`.
+
+        Returns
+        -------
+        float
+        """
         return self.high - self.low if self.kind == "patch" else float(getattr(self, name))
 
     def shifted(self, name: str, by: float) -> Law:
-        """The law with one of them changed."""
+        """The law with one of them changed.
+
+        Parameters
+        ----------
+        name : str
+            One of `shape_names`.
+        by : float
+            Added to it.
+
+        Returns
+        -------
+        Law
+        """
         return replace(self, **{name: getattr(self, name) + by})
 
     def kept_inside(self, growth_m: float) -> Law:
-        """A patch no further beyond the growth than it is rounded."""
+        """A patch no further beyond the growth than it is rounded.
+
+        Parameters
+        ----------
+        growth_m : float
+            Growth of the longest trial, m.
+
+        Returns
+        -------
+        Law
+        """
         if self.kind != "patch":
             return self
         room = EDGE * (self.high - self.low)
         return replace(self, low=max(self.low, -room), high=min(self.high, growth_m + room))
 
     def along(self, motion: FittedMotion) -> Floats:
-        """The force of amplitude 1 along a motion, N, shape (n_times, columns)."""
+        """The force of amplitude 1 along a motion, N, shape (n_times, columns).
+
+        Parameters
+        ----------
+        motion
+
+        Returns
+        -------
+        array, shape (n_times, n_columns), N
+        """
         size = (motion.trial.area_m2 / self.by_area if self.by_area else 1.0) / self.largest
         return size * _EXPRESSIONS[self.kind](self, motion)
 
     def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
-        """What it looks like, with its size."""
+        """What it looks like, with its size.
+
+        Parameters
+        ----------
+        amplitude_N : sequence of float, N
+        sigma_N : float, N
+            Standard error of the amplitude.
+
+        Returns
+        -------
+        str
+        """
         if self.kind == "periodic":
             size = f"with an amplitude of {_sized(math.hypot(*amplitude_N), sigma_N)}"
         else:
@@ -183,7 +235,16 @@ class _Reach:
 
 
 def coarse_laws(motions: Sequence[FittedMotion]) -> list[Law]:
-    """The grid of all laws; where vines differ in width, each also in proportion to the cross-section."""
+    """The grid of all laws; where vines differ in width, each also in proportion to the cross-section.
+
+    Parameters
+    ----------
+    motions : sequence of FittedMotion
+
+    Returns
+    -------
+    list of Law
+    """
     reach = _reach(motions)
     plain = ["constant", "position", "speed", "speed_squared", "pressure", "time"]
     laws = [Law(kind) for kind in plain]
@@ -204,7 +265,18 @@ def coarse_laws(motions: Sequence[FittedMotion]) -> list[Law]:
 
 
 def finer_laws(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
-    """Laws around the best of the grid: its place, width, period or range moved by less than a step of the grid."""
+    """Laws around the best of the grid: its place, width, period or range moved by less than a step of the grid.
+
+    Parameters
+    ----------
+    law
+        The best of the grid.
+    motions : sequence of FittedMotion
+
+    Returns
+    -------
+    list of Law
+    """
     if law.kind == "patch":
         centre, width = (law.low + law.high) / 2, law.high - law.low
         step = _reach(motions).growth_m / PLACES
@@ -222,7 +294,7 @@ def finer_laws(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
         ]
     else:
         return []
-    return _scaled([_by_area(one, law.by_area) if law.by_area else one for one in near], motions)
+    return _scaled([_by_area(near_law, law.by_area) if law.by_area else near_law for near_law in near], motions)
 
 
 def _patch_at(centre: float, width: float) -> Law:
@@ -235,19 +307,19 @@ def _by_area(law: Law, mean_area: float) -> Law:
 
 def _scaled(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
     """The laws with the largest force that they reach along the motions as their unit."""
-    found = []
+    scaled = []
     for law in laws:
         everywhere = [np.abs(law.along(motion)) for motion in motions]
-        largest = max(float(one.max()) for one in everywhere)
-        seen = max(float(one[_grown(motion)].max()) for one, motion in zip(everywhere, motions, strict=True))
+        largest = max(float(course.max()) for course in everywhere)
+        seen = max(float(course[_grown(motion)].max()) for course, motion in zip(everywhere, motions, strict=True))
         if law.columns > 1:
             largest = 1.0
         elif law.kind in _OF_SPEED:
             largest = seen
         elif law.kind == "patch" and seen < 0.5 * largest:
             continue
-        found.append(Law(law.kind, law.columns, law.shapes, law.low, law.high, law.scale, law.by_area, largest or 1.0))
-    return found
+        scaled.append(Law(law.kind, law.columns, law.shapes, law.low, law.high, law.scale, law.by_area, largest or 1.0))
+    return scaled
 
 
 def _grown(motion: FittedMotion) -> NDArray[np.bool_]:

@@ -96,21 +96,33 @@ class _Normal:
 
 
 def refine(
-    found: Fit, fit: ForceFit, motions: Sequence[FittedMotion], law: Law, gain: Gain, *, thorough: bool = False
+    model_fit: Fit, fit: ForceFit, motions: Sequence[FittedMotion], law: Law, gain: Gain, *, thorough: bool = False
 ) -> Refined | None:
     """Fit a law in full, begun from its linear fit; None where it cannot be followed.
 
     Parameters
     ----------
-    motions
+    model_fit
+        The fit that lacks the force.
+    fit
+        Its linear answers to forces.
+    motions : sequence of FittedMotion
         The fitted motions that `gain` belongs to.
-    thorough
+    law
+        Form of the force.
+    gain
+        Its linear fit.
+    thorough : bool
         Whether to search once more with care where the quick way leads nowhere.
+
+    Returns
+    -------
+    Refined or None
     """
     start = _Place(fit.state.theta, fit.trial_effects, law, 0.0 * gain.amplitude, list(motions))
-    best = _searched(found, fit, start, 0.0)
+    best = _searched(model_fit, fit, start, 0.0)
     if thorough and (best is None or best[1].cost > MENDED * fit.chi2):
-        best = _searched(found, fit, start, FIRST_DAMPING)
+        best = _searched(model_fit, fit, start, FIRST_DAMPING)
     if best is None:
         return None
     place, normal = best
@@ -128,15 +140,15 @@ def refine(
     )
 
 
-def _searched(found: Fit, fit: ForceFit, start: _Place, damping: float) -> tuple[_Place, _Normal] | None:
+def _searched(model_fit: Fit, fit: ForceFit, start: _Place, damping: float) -> tuple[_Place, _Normal] | None:
     """The best place on the way down from `start`; without damping the first steps may lead up."""
     best: tuple[_Place, _Normal] | None = None
     place, bare = start, 0 if damping else BARE
     for turn in range(STEPS):
         try:
             with np.errstate(all="raise", under="ignore"):
-                place = _as_driven(found, place)
-                normal = _normal(found, fit, place)
+                place = _as_driven(model_fit, place)
+                normal = _normal(model_fit, fit, place)
         except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
             break
         before = best
@@ -164,7 +176,7 @@ def _force(place: _Place, motion: FittedMotion) -> Floats:
 def _as_driven(fit: Fit, place: _Place) -> _Place:
     """The motions of these numbers and this force, corrected from those of the place before."""
     jobs = fit.predictor.jobs(place.theta, place.trial_effects)
-    motions = [with_derivatives(_with_numbers(fit, *one)) for one in zip(place.motions, jobs, strict=True)]
+    motions = [with_derivatives(_with_numbers(fit, *pair)) for pair in zip(place.motions, jobs, strict=True)]
     return replace(place, motions=pushed(motions, lambda motion: _force(place, motion), ROUNDS))
 
 
@@ -175,17 +187,17 @@ def _with_numbers(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
     return replace(motion, model=fit.model.with_values(values), trial=trial)
 
 
-def _normal(found: Fit, fit: ForceFit, place: _Place) -> _Normal:
+def _normal(model_fit: Fit, fit: ForceFit, place: _Place) -> _Normal:
     """Normal equations of all unknowns at a place."""
     theta, trial_effects, q, s = place.theta, place.trial_effects, place.amplitude.size, len(place.law.shape_names)
     p, n = theta.size, trial_effects.shape[0]
-    columns = push_sensitivities(found, trial_effects, place.motions, _pushes(found, place))
+    columns = push_sensitivities(model_fit, trial_effects, place.motions, _pushes(model_fit, place))
     centre, precision = trial_effect_prior(fit.problem, fit.state)
     size = p + q + s + n * OWN
     square, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     cost = float(np.sum(precision * (trial_effects - centre) ** 2))
     cost += float(np.sum(fit.problem.prior_precision * (theta - fit.problem.prior_mean) ** 2))
-    for i, trial_data in enumerate(found.predictor.data):
+    for i, trial_data in enumerate(model_fit.predictor.data):
         position, velocity = _seen(place.motions[i], trial_data.time_s - trial_effects[i, RELEASE])
         left = trial_data.lead_position_m - trial_effects[i, ORIGIN] - position
         answers = columns[i]
@@ -261,8 +273,10 @@ def _pushes(fit: Fit, place: _Place) -> list[Floats]:
                 varied.append(_with(job, k, job.row[k] * factor if number.logarithmic else job.row[k] + change))
         felt = [fit.predictor.feels_pressure[i], fit.predictor.feels_damping[i], *[True] * len(layout.keys)]
         changes = [
-            (_acceleration(fit, motion, one) - motion.free) / SMALL if feels and one is not job else 0.0 * motion.free
-            for one, feels in zip(varied, felt, strict=True)
+            (_acceleration(fit, motion, moved) - motion.free) / SMALL
+            if feels and moved is not job
+            else 0.0 * motion.free
+            for moved, feels in zip(varied, felt, strict=True)
         ]
         pushes.append(np.column_stack([*changes, _law_pushes(place, motion)]))
     return pushes

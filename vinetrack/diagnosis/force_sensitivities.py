@@ -81,6 +81,18 @@ class FittedMotion:
 def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> list[FittedMotion]:
     """The fitted motions with these numbers of the trials' own, shape (n_trials, 4), and other numbers of the model.
 
+    Parameters
+    ----------
+    fit
+        The fit whose model is followed.
+    trial_effects : array, shape (n_trials, 4)
+    theta : array, shape (n_free,), optional
+        Numbers of the model, scaled; those of the fit where None.
+
+    Returns
+    -------
+    list of FittedMotion
+
     Raises
     ------
     SimulationError
@@ -101,11 +113,21 @@ def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> 
     runs = simulate_many(
         fit.model, trials, grids, traces=traces, parameters=np.array([job.row for job in jobs]), host=predictor.host
     )
-    return [_motion(fit.model, *one) for one in zip(trials, jobs, runs, traces, strict=True)]
+    return [_motion(fit.model, *run) for run in zip(trials, jobs, runs, traces, strict=True)]
 
 
 def as_it_was(trial: Trial, job: Job) -> Trial:
-    """The trial with the pressures of its job."""
+    """The trial with the pressures of its job.
+
+    Parameters
+    ----------
+    trial
+    job
+
+    Returns
+    -------
+    Trial
+    """
     yield_Pa = trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
     return replace(trial, pressure_Pa=trial.pressure_Pa * (1 + job.pressure_deviation), yield_pressure_Pa=yield_Pa)
 
@@ -121,12 +143,21 @@ def _motion(model: Model, trial: Trial, job: Job, run: Trajectory, trace: tuple[
                   nothing, nothing, nothing, nothing, nothing, _seen(run),
                   run.observed_position_m - run.lead_position_m,
                   run.end_time_s if run.status == "ended" else math.inf)  # fmt: skip
-    found = with_derivatives(bare)
-    return replace(found, actual=found.free)
+    motion = with_derivatives(bare)
+    return replace(motion, actual=motion.free)
 
 
 def with_derivatives(motion: FittedMotion) -> FittedMotion:
-    """The motion with what the model says along it."""
+    """The motion with what the model says along it.
+
+    Parameters
+    ----------
+    motion
+
+    Returns
+    -------
+    FittedMotion
+    """
     y, v = motion.lead_position_m, motion.lead_velocity_m_s
     step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
     plain, further, faster = (
@@ -164,8 +195,17 @@ def force_sensitivities(
 
     Parameters
     ----------
-    force
+    fit
+        The fit whose model is followed.
+    trial_effects : array, shape (n_trials, 4)
+    motions : sequence of FittedMotion
+        One a trial.
+    force : callable
         Gives the forces along a motion, N, shape (STEPS + 1, n_forces).
+
+    Returns
+    -------
+    list of arrays, shape (n_points, n_forces), m
     """
     return push_sensitivities(
         fit, trial_effects, motions, [force(motion) / motion.mass_kg[:, None] for motion in motions]
@@ -175,15 +215,30 @@ def force_sensitivities(
 def push_sensitivities(
     fit: Fit, trial_effects: Floats, motions: Sequence[FittedMotion], pushes: Sequence[Floats]
 ) -> list[Floats]:
-    """As `force_sensitivities`, for further accelerations of the tail, m/s², shape (STEPS + 1, n) for each trial."""
+    """As `force_sensitivities`, for further accelerations of the tail, m/s², shape (STEPS + 1, n) for each trial.
+
+    Parameters
+    ----------
+    fit
+        The fit whose model is followed.
+    trial_effects : array, shape (n_trials, 4)
+    motions : sequence of FittedMotion
+        One a trial.
+    pushes : sequence of arrays, shape (STEPS + 1, n), m/s²
+        Further accelerations of the tail.
+
+    Returns
+    -------
+    list of arrays, shape (n_points, n), m
+    """
     moved, _ = _followed(motions, np.array(pushes))
     return [
         _at(
             trial_data.time_s - trial_effects[i, RELEASE],
             motion,
-            one * motion.seen[:, None] / motion.trial.travel_ratio,
+            answer * motion.seen[:, None] / motion.trial.travel_ratio,
         )
-        for i, (trial_data, motion, one) in enumerate(zip(fit.predictor.data, motions, moved, strict=True))
+        for i, (trial_data, motion, answer) in enumerate(zip(fit.predictor.data, motions, moved, strict=True))
     ]
 
 
@@ -192,11 +247,23 @@ def pushed(motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floa
 
     Every round leaves about a tenth of the error of the one before; the motions are corrected to those of their models,
     if they are not that.
+
+    Parameters
+    ----------
+    motions : sequence of FittedMotion
+    force : callable
+        Force along a motion, N, shape (STEPS + 1,).
+    rounds : int
+        Corrections.
+
+    Returns
+    -------
+    list of FittedMotion
     """
     for _ in range(rounds):
         lacks = np.array([motion.free + force(motion) / motion.mass_kg - motion.actual for motion in motions])
         moved, sped = (answer[:, :, 0] for answer in _followed(motions, lacks[:, :, None]))
-        motions = [_moved(*one) for one in zip(motions, lacks, moved, sped, strict=True)]
+        motions = [_moved(*step) for step in zip(motions, lacks, moved, sped, strict=True)]
     return list(motions)
 
 
@@ -233,7 +300,7 @@ def _followed(motions: Sequence[FittedMotion], push: Floats) -> tuple[Floats, Fl
     moved, sped = np.zeros_like(push), np.zeros_like(push)
     for i in range(STEPS):
         h = (time_s[:, i + 1] - time_s[:, i])[:, None]
-        inside = [(1 - STAGE) * one[:, i] + STAGE * one[:, i + 1] for one in (k, c, push)]
+        inside = [(1 - STAGE) * course[:, i] + STAGE * course[:, i + 1] for course in (k, c, push)]
         _, _, dx, dv = _stage(x, v, STAGE * h, *inside)
         x, v = x + (1 - STAGE) * h * dx, v + (1 - STAGE) * h * dv
         x, v, _, _ = _stage(x, v, STAGE * h, k[:, i + 1], c[:, i + 1], push[:, i + 1])

@@ -103,16 +103,16 @@ def ladder(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
     import pandas as pd
 
     rows, notes = [], []
-    for found, name in zip(fits, added, strict=True):
-        row, said = ladder_row(found, name)
+    for fit, name in zip(fits, added, strict=True):
+        row, remarks = _ladder_row(fit, name)
         rows.append(row)
-        notes += [note for note in said if note not in notes]
+        notes += [note for note in remarks if note not in notes]
     table = pd.DataFrame(rows, columns=list(LADDER_COLUMNS))
     table.attrs["notes"] = notes
     return table
 
 
-def ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
+def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
     """The row of one model, and sentences about what could not be predicted."""
     inside, outside, highest = in_sample(fit), left_out(fit), highest_pressure(fit)
     floor_m, floor_sigma_m = inside.floor
@@ -130,27 +130,64 @@ def ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]]
 
 
 def excess(rms_m: float, floor_m: float) -> float:
-    """√(rms² − floor²), 0 where the error is below the floor; NaN where there is no floor."""
+    """√(rms² − floor²), 0 where the error is below the floor; NaN where there is no floor.
+
+    Parameters
+    ----------
+    rms_m, floor_m : float, m
+        Error and what replicates differ by.
+
+    Returns
+    -------
+    float, m
+    """
     return math.sqrt(max(rms_m**2 - floor_m**2, 0.0)) if math.isfinite(rms_m + floor_m) else math.nan
 
 
 def in_sample(fit: Fit) -> Errors:
-    """Predictions of the trials that the model was fitted to."""
+    """Predictions of the trials that the model was fitted to.
+
+    Parameters
+    ----------
+    fit
+
+    Returns
+    -------
+    Errors
+    """
     return Errors(tuple(predict_prepared(fit, fit.predictor.data, from_rest=True)), {})
 
 
 def left_out(fit: Fit) -> Errors:
-    """Predictions of every condition by the model fitted to all the others."""
+    """Predictions of every condition by the model fitted to all the others.
+
+    Parameters
+    ----------
+    fit
+
+    Returns
+    -------
+    Errors
+    """
     conditions = dict.fromkeys(trial.trial.condition for trial in fit.trials)
     parts = [_without(fit, [trial.trial.condition == condition for trial in fit.trials]) for condition in conditions]
     return _together(parts)
 
 
 def highest_pressure(fit: Fit) -> Errors:
-    """Predictions of each vine's highest pressure by the model fitted to all lower ones."""
+    """Predictions of each vine's highest pressure by the model fitted to all lower ones.
+
+    Parameters
+    ----------
+    fit
+
+    Returns
+    -------
+    Errors
+    """
     highest: dict[str, float] = {}
-    for one in fit.trials:
-        trial = one.trial
+    for trial_fit in fit.trials:
+        trial = trial_fit.trial
         highest[trial.vine] = max(highest.get(trial.vine, -math.inf), trial.pressure_Pa)
     return _without(fit, [trial.trial.pressure_Pa >= highest[trial.trial.vine] for trial in fit.trials])
 
@@ -159,7 +196,7 @@ def _without(fit: Fit, gone: Sequence[bool]) -> Errors:
     """Predictions of the trials that are `gone` by the model fitted to the rest."""
     data = [trial_data for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
-        rest = fit_subset(
+        others = fit_subset(
             fit,
             [not out for out in gone],
             hold_spreads=True,
@@ -168,16 +205,16 @@ def _without(fit: Fit, gone: Sequence[bool]) -> Errors:
         )
     except FitError as error:
         return Errors((), {trial_data.trial.name: str(error) for trial_data in data})
-    alone = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in rest.trials}
+    alone = {trial_data.trial.vine for trial_data in data} - {trial.trial.vine for trial in others.trials}
     alone = {vine for vine in alone if _has_numbers_of_its_own(fit, vine)}
     known = [trial_data for trial_data in data if trial_data.trial.vine not in alone]
-    lost = {
+    left = {
         trial_data.trial.name: f"no other condition of the vine {trial_data.trial.vine} says what its numbers are"
         for trial_data in data
         if trial_data.trial.vine in alone
     }
-    predicted = predict_prepared(rest, known, from_rest=True) if known else []
-    return Errors(tuple(predicted), lost)
+    predicted = predict_prepared(others, known, from_rest=True) if known else []
+    return Errors(tuple(predicted), left)
 
 
 def _has_numbers_of_its_own(fit: Fit, vine: str) -> bool:
@@ -202,12 +239,24 @@ def _notes(what: str, errors: Errors) -> list[str]:
 
 
 def moved(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
-    """How the numbers moved along the ladder: a row a number of each model, columns `MOVED_COLUMNS`, SI."""
+    """How the numbers moved along the ladder: a row a number of each model, columns `MOVED_COLUMNS`, SI.
+
+    Parameters
+    ----------
+    fits : sequence of Fit
+        One a step of the ladder.
+    added : sequence of str
+        What each step added; blank for the first.
+
+    Returns
+    -------
+    DataFrame
+    """
     import pandas as pd
 
     rows = [
         (
-            "+".join(found.model.names),
+            "+".join(fit.model.names),
             name,
             number.key,
             number.vine,
@@ -218,7 +267,7 @@ def moved(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
             number.low,
             number.high,
         )
-        for found, name in zip(fits, added, strict=True)
-        for number in found.numbers
+        for fit, name in zip(fits, added, strict=True)
+        for number in fit.numbers
     ]
     return pd.DataFrame(rows, columns=list(MOVED_COLUMNS))

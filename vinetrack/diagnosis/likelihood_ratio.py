@@ -83,12 +83,26 @@ class LikelihoodRatio:
 
 
 def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> LikelihoodRatio:
-    """Hold a refit against the fit without the effects."""
+    """Hold a refit against the fit without the effects.
+
+    Parameters
+    ----------
+    before
+        The fit without the effects.
+    effects : sequence of Effect
+        Those that were added.
+    after
+        The fit with them.
+
+    Returns
+    -------
+    LikelihoodRatio
+    """
     fall = 2 * (after.log_likelihood - before.log_likelihood)
     ratio = _robust_ratio(after, [effect.name for effect in effects])
-    plausible, reason = belief(effects, after)
+    plausible, reason = plausibility(effects, after)
     parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
-    nothing = compatible_with_nothing(effects, after)
+    nothing = _compatible_with_nothing(effects, after)
     return LikelihoodRatio(
         effects=tuple(effects),
         fit=after,
@@ -96,14 +110,14 @@ def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> Like
         sigma=math.copysign(math.sqrt(abs(fall)), fall) / ratio,
         plausible=plausible,
         reason=nothing or reason,
-        credible=not nothing and belief(effects, after, CREDIBLE)[0],
+        credible=not nothing and plausibility(effects, after, CREDIBLE)[0],
         inflation=min(ratio**2, MOST_INFLATION),
         surprise=prior_surprise(after, parameters),
         log_evidence=log_evidence(after, parameters),
     )
 
 
-def compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
+def _compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
     """That a size is smaller than its own error, in words; blank where none is.
 
     Such a fit is better by the shape that its other numbers give it, not by an effect of which anything is known.
@@ -119,8 +133,23 @@ def compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
     return ""
 
 
-def belief(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:
-    """Whether an experimenter would believe the sizes, and why not; `widened` stretches what is plausible."""
+def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:
+    """Whether the fitted sizes are plausible, and why not.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+    after
+        The fit with them.
+    widened : float
+        Factor by which plausible ranges are stretched.
+
+    Returns
+    -------
+    plausible : bool
+    reason : str
+        Blank where they are.
+    """
     for effect in effects:
         for parameter in effect.parameters:
             for number in after.numbers:
@@ -146,7 +175,7 @@ def _robust_ratio(after: Fit, names: Sequence[str]) -> float:
     return max([1.0, *(float(robust[k] / plain[k]) for k in mine)])
 
 
-def distance(fit: Fit, other: Fit) -> float:
+def _distance(fit: Fit, other: Fit) -> float:
     """Squared distance of what two fits predict, in units of the noise of the first, its correlation counted."""
     rho = fit.noise_correlation
     total = 0.0
@@ -159,7 +188,7 @@ def distance(fit: Fit, other: Fit) -> float:
     return total
 
 
-def complexity(hypothesis: LikelihoodRatio) -> int:
+def _complexity(hypothesis: LikelihoodRatio) -> int:
     """Parameters that its effects bring."""
     return sum(len(effect.parameters) for effect in hypothesis.effects)
 
@@ -170,34 +199,50 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     Excluded is what is worse by 9 than the best, in −2 ln L as far as the scatter of trials bears it out plus what its
     sizes lie beyond the plausible (`prior_surprise`). Set aside are those that hold a simpler one as a limit and are no
     better by 9 than it, and those that need a size beyond belief where another does not.
+
+    Parameters
+    ----------
+    hypotheses : sequence of LikelihoodRatio
+        At least one.
+
+    Returns
+    -------
+    kept : list of LikelihoodRatio
+    aside : dict
+        Reason by label.
     """
-    highest = max(hypotheses, key=lambda one: one.fit.log_likelihood)
+    highest = max(hypotheses, key=lambda ratio: ratio.fit.log_likelihood)
     likely = [
-        hypothese
-        for hypothese in hypotheses
-        if 2 * (highest.fit.log_likelihood - hypothese.fit.log_likelihood) <= ANSWER_SET * highest.inflation
+        hypothesis
+        for hypothesis in hypotheses
+        if 2 * (highest.fit.log_likelihood - hypothesis.fit.log_likelihood) <= ANSWER_SET * highest.inflation
     ]
-    likely.sort(key=lambda one: -one.fit.log_likelihood)
+    likely.sort(key=lambda ratio: -ratio.fit.log_likelihood)
 
     def misfit(hypothesis: LikelihoodRatio) -> float:
         return -2 * hypothesis.fit.log_likelihood / highest.inflation + hypothesis.surprise
 
-    lowest = min(misfit(one) for one in likely)
-    near = [one for one in likely if misfit(one) - lowest <= ANSWER_SET]
-    aside = {one.label: one.reason or "its size lies beyond what is plausible" for one in likely if one not in near}
+    lowest = min(misfit(ratio) for ratio in likely)
+    near = [ratio for ratio in likely if misfit(ratio) - lowest <= ANSWER_SET]
+    aside = {
+        ratio.label: ratio.reason or "its size lies beyond what is plausible" for ratio in likely if ratio not in near
+    }
     kept = []
-    for one in near:
+    for ratio in near:
         simpler = [
             other
             for other in near
-            if 2 * (one.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET
-            and complexity(other) < complexity(one)
-            and (_contains(one, other) or (_comparable(one, other) and distance(other.fit, one.fit) < LIMIT_DISTANCE))
+            if 2 * (ratio.fit.log_likelihood - other.fit.log_likelihood) <= ANSWER_SET
+            and _complexity(other) < _complexity(ratio)
+            and (
+                _contains(ratio, other)
+                or (_comparable(ratio, other) and _distance(other.fit, ratio.fit) < LIMIT_DISTANCE)
+            )
         ]
         if simpler:
-            aside[one.label] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
+            aside[ratio.label] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
         else:
-            kept.append(one)
+            kept.append(ratio)
     believed = [hypothesis for hypothesis in kept if hypothesis.credible]
     if believed and len(believed) < len(kept):
         aside |= {hypothesis.label: hypothesis.reason for hypothesis in kept if not hypothesis.credible}
@@ -210,22 +255,30 @@ def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
 
     With the deviation of B and pressure that every trial has, all hypotheses about levels of trials predict one curve.
     """
-    return all(one.effects[-1].kind != BETWEEN_TRIALS for one in (hypothesis, other))
+    return all(ratio.effects[-1].kind != BETWEEN_TRIALS for ratio in (hypothesis, other))
 
 
 def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
     """Posterior weights of hypotheses by label; they add up to 1 over these.
 
     The likelihood counts as far as the scatter of trials bears it out: ln L over the best one's inflation.
+
+    Parameters
+    ----------
+    hypotheses : sequence of LikelihoodRatio
+
+    Returns
+    -------
+    dict of float
     """
     if not hypotheses:
         return {}
-    inflation = max(hypotheses, key=lambda one: one.fit.log_likelihood).inflation
+    inflation = max(hypotheses, key=lambda hypothesis: hypothesis.fit.log_likelihood).inflation
     tempered = [
-        hypothese.log_evidence - hypothese.fit.log_likelihood + hypothese.fit.log_likelihood / inflation
-        for hypothese in hypotheses
+        hypothesis.log_evidence - hypothesis.fit.log_likelihood + hypothesis.fit.log_likelihood / inflation
+        for hypothesis in hypotheses
     ]
-    return dict(zip((hypothese.label for hypothese in hypotheses), posterior_weights(tempered), strict=True))
+    return dict(zip((hypothesis.label for hypothesis in hypotheses), posterior_weights(tempered), strict=True))
 
 
 def _contains(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:

@@ -95,6 +95,15 @@ class Failure:
 def locate(fit: Fit) -> Failure:
     """Find where a fitted model fails.
 
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+
+    Returns
+    -------
+    Failure
+
     Raises
     ------
     FitError
@@ -224,19 +233,19 @@ def _where(table: pd.DataFrame, fails: bool) -> list[str]:
         else "without replicates"
     )
     ahead = "ahead of" if worst["worst_residual_m"] > 0 else "behind"
-    found = [
+    places = [
         f"The model fails most at {_named(worst, table)}: root mean square {_mm(worst['rms_m'])} {beside}; there the"
         f" vine is {_off(worst)} {ahead} the model"
         f" ({worst['z']:.1f} σ in all)."
     ]
     where = "every condition" if len(failing) == len(table) else f"{len(failing)} of {len(table)} conditions"
-    found.append(f"It fails in {where} beyond what replicates explain.")
-    return found + _trend(table)
+    places.append(f"It fails in {where} beyond what replicates explain.")
+    return places + _trend(table)
 
 
 def _trend(table: pd.DataFrame) -> list[str]:
     """Whether it fails more and more towards one end of the pressures (or payloads)."""
-    found = []
+    trends = []
     for column, words, low, high in (
         ("pressure_Pa", "pressure", "lower", "higher"),
         ("payload_kg", "payload", "smaller", "larger"),
@@ -248,10 +257,10 @@ def _trend(table: pd.DataFrame) -> list[str]:
             continue
         ranks = [np.corrcoef(np.arange(step.size), np.argsort(np.argsort(step)))[0, 1] for step in steps]
         if all(rank > 0.75 for rank in ranks):
-            found.append(f"The {high} the {words}, the more it fails.")
+            trends.append(f"The {high} the {words}, the more it fails.")
         elif all(rank < -0.75 for rank in ranks):
-            found.append(f"The {low} the {words}, the more it fails.")
-    return found
+            trends.append(f"The {low} the {words}, the more it fails.")
+    return trends
 
 
 def _named(row: pd.Series, table: pd.DataFrame) -> str:

@@ -63,7 +63,7 @@ ONE_SIDED_95 = 1.645
 class MisfitTests:
     """What a fit leaves, held against every candidate. Arrays have shape (n_shapes,), see `EffectSensitivities`."""
 
-    found: Fit
+    fit: Fit
     effects: tuple[Effect, ...]
     answers: EffectSensitivities
     sums: Products
@@ -112,12 +112,12 @@ class MisfitTests:
     @cached_property
     def hidden(self) -> float:
         """Chance of what trials take upon themselves, or lets pass for noise."""
-        return min(conditions_apart(self.found), noisier_in_motion(self.found))
+        return min(conditions_apart(self.fit), noisier_in_motion(self.fit))
 
     @property
     def suspect(self) -> bool:
         """Whether a fit that passes is worth a search all the same: it may have bent everything until it fits."""
-        return self.found.chi2_per_dof > SUSPECT or self.hidden < SUSPECT_CHANCE
+        return self.fit.chi2_per_dof > SUSPECT or self.hidden < SUSPECT_CHANCE
 
     @cached_property
     def whispers(self) -> bool:
@@ -133,17 +133,17 @@ class MisfitTests:
     @property
     def far_off(self) -> bool:
         """Whether the fit misses more than any noise could."""
-        return self.found.chi2_per_dof > FAR_OFF
+        return self.fit.chi2_per_dof > FAR_OFF
 
     @property
     def off(self) -> bool:
         """Whether it misses more than noise, and more of the growth than a tracker's slow errors amount to."""
-        return self.far_off and missed_fraction(self.found.predictor, self.found.solution) > self._allowed
+        return self.far_off and missed_fraction(self.fit.predictor, self.fit.solution) > self._allowed
 
     @property
     def _allowed(self) -> float:
         """The part that may be missed: less where neither the tracks nor a gauge have slow errors to own up to."""
-        data = self.found.predictor.data
+        data = self.fit.predictor.data
         smooth = float(
             np.median([trial_data.position_systematic_m / np.ptp(trial_data.lead_position_m) for trial_data in data])
         )
@@ -151,46 +151,98 @@ class MisfitTests:
         return max(OFF if slow else OFF_OTHERWISE, smooth)
 
     @property
-    def lost(self) -> bool:
+    def poorly_fitted(self) -> bool:
         """Whether it misses so much of the growth besides that no tracker's slow errors explain it either."""
-        return is_poor_fit(self.found.predictor, self.found.solution)
+        return is_poor_fit(self.fit.predictor, self.fit.solution)
 
     @cached_property
     def gains(self) -> tuple[Floats, Floats]:
         """Fall of −2 ln L that each shape promises, and the size it is promised for."""
         if self.far_off:
-            return linear_gains(self.found, self.sums, track_correlation(self.found.predictor.data))
+            return linear_gains(self.fit, self.sums, track_correlation(self.fit.predictor.data))
         signs, size = np.array(self.signs), self.scores.size
         right = (signs == 0) | (size * signs > 0)
         return np.where(right, self.scores.score * size, 0.0), size
 
     def of(self, name: str) -> list[int]:
-        """Places of an effect's shapes, the most promising first."""
+        """Places of an effect's shapes, the most promising first.
+
+        Parameters
+        ----------
+        name : str
+            Name of an effect.
+
+        Returns
+        -------
+        list of int
+        """
         gains = self.gains[0]
         places = [i for i, effect in enumerate(self.answers.effects) if effect == name]
         return sorted(places, key=lambda i: -gains[i])
 
     def promise(self, name: str) -> float:
-        """The largest fall of −2 ln L that any shape of an effect promises."""
+        """The largest fall of −2 ln L that any shape of an effect promises.
+
+        Parameters
+        ----------
+        name : str
+            Name of an effect.
+
+        Returns
+        -------
+        float
+        """
         places = self.of(name)
         return float(self.gains[0][places[0]]) if places else 0.0
 
     def best_z(self, name: str) -> tuple[float, int]:
-        """Largest z of an effect and the place of its shape; 0 and −1 where it is silent."""
+        """Largest z of an effect and the place of its shape; 0 and −1 where it is silent.
+
+        Parameters
+        ----------
+        name : str
+            Name of an effect.
+
+        Returns
+        -------
+        z : float
+        place : int
+        """
         places = [i for i, effect in enumerate(self.answers.effects) if effect == name]
         if not places:
             return 0.0, -1
         place = max(places, key=lambda i: self.possible[i])
         return float(self.possible[place]), place
 
-    def cosine(self, one: str, other: str) -> float:
-        """Largest |cosine| between shapes of two effects."""
-        a = [i for i, effect in enumerate(self.answers.effects) if effect == one]
-        b = [i for i, effect in enumerate(self.answers.effects) if effect == other]
+    def cosine(self, first: str, second: str) -> float:
+        """Largest |cosine| between shapes of two effects.
+
+        Parameters
+        ----------
+        first, second : str
+            Names of effects.
+
+        Returns
+        -------
+        float
+        """
+        a = [i for i, effect in enumerate(self.answers.effects) if effect == first]
+        b = [i for i, effect in enumerate(self.answers.effects) if effect == second]
         return float(np.max(np.abs(self.scores.cosines[np.ix_(a, b)]), initial=0.0))
 
     def largest(self, effect: Effect) -> tuple[dict[str, float], bool]:
-        """The largest sizes that could hide, one-sided 95 %, and whether a plausible one would show at all."""
+        """The largest sizes that could hide, one-sided 95 %, and whether a plausible one would show at all.
+
+        Parameters
+        ----------
+        effect
+
+        Returns
+        -------
+        limits : dict of float
+            By `effect.parameter`, SI; blank where the effect is silent.
+        testable : bool
+        """
         places = [i for i, name in enumerate(self.answers.effects) if name == effect.name]
         if not places or not effect.parameters:
             return {}, bool(places)
@@ -209,11 +261,25 @@ class MisfitTests:
         return {key: parameter.zero + math.copysign(abs(size) + ONE_SIDED_95 * sigma, size)}, True
 
 
-def misfit_tests(found: Fit, effects: Sequence[Effect], level: float) -> MisfitTests:
-    """Question a fit about these effects."""
-    effects = tuple(effect for effect in effects if effect.name not in found.model)
+def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTests:
+    """Question a fit about these effects.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    effects : sequence of Effect
+        Candidates; those of the model are passed over.
+    level : float
+        Chance of a false alarm of all tests.
+
+    Returns
+    -------
+    MisfitTests
+    """
+    effects = tuple(effect for effect in effects if effect.name not in fit.model)
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect)]
-    answers = effect_sensitivities(found, shapes)
-    doubts = systematics_of(found.predictor, found.solution, found.trials)
-    sums = products_of(found, answers, doubts)
-    return MisfitTests(found, effects, answers, sums, scores_of(found, sums), structure_of(found, doubts), level)
+    answers = effect_sensitivities(fit, shapes)
+    systematics = systematics_of(fit.predictor, fit.solution, fit.trials)
+    sums = products_of(fit, answers, systematics)
+    return MisfitTests(fit, effects, answers, sums, scores_of(fit, sums), structure_of(fit, systematics), level)

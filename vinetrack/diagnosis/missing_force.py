@@ -111,8 +111,17 @@ class MissingForce:
         }
 
 
-def missing_force(found: Fit) -> MissingForce:
+def missing_force(model_fit: Fit) -> MissingForce:
     """Find the force that a fit lacks.
+
+    Parameters
+    ----------
+    model_fit
+        The fit that is questioned.
+
+    Returns
+    -------
+    MissingForce
 
     Raises
     ------
@@ -120,22 +129,22 @@ def missing_force(found: Fit) -> MissingForce:
         If the model cannot be followed.
     """
     try:
-        scatter = replicate_scatter(found, courses_of(found)[0])
-        begins = [found.solution.state.trial_effects, lay(found).trial_effects]
-        looks = [_look(found, ForceFit(found, trial_effects, scatter)) for trial_effects in begins]
+        scatter = replicate_scatter(model_fit, courses_of(model_fit)[0])
+        begins = [model_fit.solution.state.trial_effects, lay(model_fit).trial_effects]
+        looks = [_look(model_fit, ForceFit(model_fit, trial_effects, scatter)) for trial_effects in begins]
     except SimulationError as error:
         raise FitError(f"The model cannot be followed: {error}") from error
     # All is linear about where the trials' own numbers are: the better place leaves less that no force explains.
-    look = min(looks, key=lambda one: one.fit.chi2 - one.everything.chi2)
+    look = min(looks, key=lambda tried: tried.fit.chi2 - tried.everything.chi2)
     fit, motions, everything = look.fit, look.motions, look.everything
 
     def answers(laws: Sequence[Law]) -> list[Floats]:
         return force_sensitivities(
-            found, fit.trial_effects, motions, lambda m: np.column_stack([law.along(m) for law in laws])
+            model_fit, fit.trial_effects, motions, lambda m: np.column_stack([law.along(m) for law in laws])
         )
 
-    ranked = _in_full(found, fit, motions, _ranked(fit, answers, motions, everything))
-    families = _families(found, fit, motions)
+    ranked = _in_full(model_fit, fit, motions, _ranked(fit, answers, motions, everything))
+    families = _families(model_fit, fit, motions)
     whole = max([1e-300, everything.beyond, *families.values(), *(hypothesis.gain.beyond for hypothesis in ranked)])
     laws = [replace(hypothesis, explained=hypothesis.gain.beyond / whole) for hypothesis in ranked]
     depends = {name: beyond / whole for name, beyond in families.items()}
@@ -161,13 +170,13 @@ class _Look:
     everything: Gain
 
 
-def _look(found: Fit, fit: ForceFit) -> _Look:
-    motions = motions_of(found, fit.trial_effects)
+def _look(model_fit: Fit, fit: ForceFit) -> _Look:
+    motions = motions_of(model_fit, fit.trial_effects)
     longest = {motion.trial.condition: 0.0 for motion in motions}
     for motion in motions:
         longest[motion.trial.condition] = max(longest[motion.trial.condition], float(motion.lead_position_m.max()))
     pieces = force_sensitivities(
-        found, fit.trial_effects, motions, lambda m: pieces_of(m.lead_position_m / longest[m.trial.condition])
+        model_fit, fit.trial_effects, motions, lambda m: _pieces_of(m.lead_position_m / longest[m.trial.condition])
     )
     return _Look(fit, motions, longest, pieces, fit.by_condition(pieces))
 
@@ -190,11 +199,23 @@ class _Judged:
 
 
 def curves(at: Floats, count: int) -> Floats:
-    """Cubic B-splines on 0 to 1, shape (n, count), evenly wide."""
+    """Cubic B-splines on 0 to 1, shape (n, count), evenly wide.
+
+    Parameters
+    ----------
+    at : array, shape (n,)
+        Places from 0 to 1.
+    count : int
+        Number of splines.
+
+    Returns
+    -------
+    array, shape (n, count)
+    """
     return _splines(at, np.linspace(0.0, 1.0, count - 2))
 
 
-def pieces_of(at: Floats) -> Floats:
+def _pieces_of(at: Floats) -> Floats:
     """The smooth pieces of a force along the growth, shape (n, PIECES): narrower at the start, where speed rises."""
     return _splines(at, np.concatenate([[0.0, *EARLY], np.linspace(0.0, 1.0, PIECES - 2 - len(EARLY))[1:]]))
 
@@ -210,40 +231,46 @@ def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[FittedMotion], ev
     """The best law of each kind, best first."""
 
     def gains(laws: Sequence[Law]) -> list[tuple[Law, Gain]]:
-        found = zip(laws, fit.gains(answers(laws), [law.columns for law in laws]), strict=True)
-        return [(law, gain) for law, gain in found if gain.terms or law.kind == "constant"]
+        judged_laws = zip(laws, fit.gains(answers(laws), [law.columns for law in laws]), strict=True)
+        return [(law, gain) for law, gain in judged_laws if gain.terms or law.kind == "constant"]
 
-    found, largest = gains(coarse_laws(motions)), _largest_N(motions)
-    most = max(everything.chi2, *(gain.chi2 for _, gain in found))
-    finer = [law for one in _best_of_kinds(_judged(fit, found, most, largest)) for law in finer_laws(one.law, motions)]
-    found += gains(finer)
-    most = max(most, *(gain.chi2 for _, gain in found))
-    return sorted(_best_of_kinds(_judged(fit, found, most, largest)), key=lambda one: (not one.seen, one.bic))
+    judged_laws, largest = gains(coarse_laws(motions)), _largest_N(motions)
+    most = max(everything.chi2, *(gain.chi2 for _, gain in judged_laws))
+    finer = [
+        law
+        for judged in _best_of_kinds(_judged(fit, judged_laws, most, largest))
+        for law in finer_laws(judged.law, motions)
+    ]
+    judged_laws += gains(finer)
+    most = max(most, *(gain.chi2 for _, gain in judged_laws))
+    return sorted(
+        _best_of_kinds(_judged(fit, judged_laws, most, largest)), key=lambda judged: (not judged.seen, judged.bic)
+    )
 
 
-def _in_full(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion], laws: list[_Judged]) -> list[_Judged]:
+def _in_full(model_fit: Fit, fit: ForceFit, motions: Sequence[FittedMotion], laws: list[_Judged]) -> list[_Judged]:
     """The laws, the best fitted in full where that leaves hardly more than their linear fit promised.
 
     Where the linear fit of the best leaves but noise, its rivals' will do.
     """
     rough = fit.chi2 - laws[0].gain.chi2 > ROUGH * fit.points
     gains = [law.gain for law in laws]
-    for k, one in enumerate(laws[: IN_FULL if rough else 1]):
-        if not one.seen or one.gain.chi2 < WORTH * fit.chi2:
+    for k, judged_law in enumerate(laws[: IN_FULL if rough else 1]):
+        if not judged_law.seen or judged_law.gain.chi2 < WORTH * fit.chi2:
             continue
-        full = refine(found, fit, motions, one.law, one.gain, thorough=k == 0)
-        if full is not None and full.chi2 < max(AS_PROMISED * (fit.chi2 - one.gain.chi2), fit.points):
-            gains[k] = Gain(fit.chi2 - full.chi2, full.amplitude, full.sigma, full.numbers, one.gain.terms)
-            laws = [*laws[:k], replace(one, law=full.law), *laws[k + 1 :]]
+        full = refine(model_fit, fit, motions, judged_law.law, judged_law.gain, thorough=k == 0)
+        if full is not None and full.chi2 < max(AS_PROMISED * (fit.chi2 - judged_law.gain.chi2), fit.points):
+            gains[k] = Gain(fit.chi2 - full.chi2, full.amplitude, full.sigma, full.numbers, judged_law.gain.terms)
+            laws = [*laws[:k], replace(judged_law, law=full.law), *laws[k + 1 :]]
     most = max(gain.chi2 for gain in gains)
     judged = _judged(fit, list(zip((law.law for law in laws), gains, strict=True)), most, _largest_N(motions))
-    return sorted(judged, key=lambda one: (not one.seen, one.bic))
+    return sorted(judged, key=lambda ranked: (not ranked.seen, ranked.bic))
 
 
-def _judged(fit: ForceFit, found: Sequence[tuple[Law, Gain]], most: float, largest_N: float) -> list[_Judged]:
+def _judged(fit: ForceFit, laws_and_gains: Sequence[tuple[Law, Gain]], most: float, largest_N: float) -> list[_Judged]:
     return [
         _Judged(law, gain, fit.bic(gain.chi2, law.columns + law.shapes, most), largest_N=largest_N)
-        for law, gain in found
+        for law, gain in laws_and_gains
     ]
 
 
@@ -257,16 +284,16 @@ def _largest_N(motions: Sequence[FittedMotion]) -> float:
     return BEYOND_DRIVE * max(sizes)
 
 
-def _best_of_kinds(found: Sequence[_Judged]) -> list[_Judged]:
+def _best_of_kinds(judged: Sequence[_Judged]) -> list[_Judged]:
     best: dict[str, _Judged] = {}
-    for one in found:
-        before = best.get(one.law.kind)
-        if before is None or (not one.seen, one.bic) < (not before.seen, before.bic):
-            best[one.law.kind] = one
+    for law in judged:
+        before = best.get(law.law.kind)
+        if before is None or (not law.seen, law.bic) < (not before.seen, before.bic):
+            best[law.law.kind] = law
     return list(best.values())
 
 
-def _families(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion]) -> dict[str, float]:
+def _families(model_fit: Fit, fit: ForceFit, motions: Sequence[FittedMotion]) -> dict[str, float]:
     """By how much χ² falls with a smooth force that hangs on one thing alone; or one constant a condition."""
     along = {
         "growth": lambda m: m.lead_position_m,
@@ -277,13 +304,13 @@ def _families(found: Fit, fit: ForceFit, motions: Sequence[FittedMotion]) -> dic
     for name, count in FAMILIES.items():
         top = max(float(along[name](motion).max()) for motion in motions)
         answers = force_sensitivities(
-            found,
+            model_fit,
             fit.trial_effects,
             motions,
             lambda m, a=along[name], t=top, n=count: curves(a(m) / t, n),  # type: ignore[misc]
         )
         explained[name] = fit.together(answers).beyond
-    constant = force_sensitivities(found, fit.trial_effects, motions, lambda m: np.ones((m.time_s.size, 1)))
+    constant = force_sensitivities(model_fit, fit.trial_effects, motions, lambda m: np.ones((m.time_s.size, 1)))
     explained["condition"] = fit.by_condition(constant).beyond
     return explained
 
@@ -298,7 +325,7 @@ def _table(
     for condition, (coefficients, covariance) in drawn.items():
         motion = next(m for m in motions if m.trial.condition == condition)
         at = np.linspace(0.04, 0.96, DRAWN) * motion.lead_position_m.max()
-        shape = pieces_of(at / longest[condition])
+        shape = _pieces_of(at / longest[condition])
         sigma = np.sqrt(np.einsum("nk,kl,nl->n", shape, covariance, shape))
         told = sigma < UNTOLD * np.median(sigma)
         at, force, sigma = at[told], (shape @ coefficients)[told], sigma[told]
@@ -310,7 +337,7 @@ def _table(
             "pressure_Pa": np.interp(when, motion.time_s, motion.pressure_Pa),
         }
         for against, values in axes.items():
-            rows += [(against, *one, condition) for one in zip(values, force, sigma, strict=True)]
+            rows += [(against, *row, condition) for row in zip(values, force, sigma, strict=True)]
     table = pd.DataFrame(rows, columns=list(FORCE_COLUMNS))
     means = [_mean(part) for _, part in table.groupby("against", sort=False)]
     return pd.concat([table, *means], ignore_index=True)
@@ -375,20 +402,20 @@ def _sentence(laws: Sequence[_Judged], depends: Mapping[str, float], mended: flo
     if not best.seen:
         return "No further force on the tail can be told from how single trials differ."
     if best.explained < LIKE:
-        name, part = max(depends.items(), key=lambda one: one[1])
+        name, part = max(depends.items(), key=lambda part: part[1])
         whole = {
             "growth": "where the tip is",
             "speed": "the speed",
             "time": "the time",
             "condition": "the condition, and not on what happens in a trial",
         }
-        found = (
+        sentence = (
             f"What is missing looks like none of the simple laws: the best, {words},"
             f" explains {best.explained:.0%} of it."
         )
         if part >= LIKE:
-            found += f" It hangs on {whole[name]}: a force of that alone explains {part:.0%}."
-        return found
+            sentence += f" It hangs on {whole[name]}: a force of that alone explains {part:.0%}."
+        return sentence
     # What not even a free force mends is the error of small forces where the force is none: laws are told apart less.
     nearly = EQUALLY + float(np.nan_to_num(1 - mended))
     others = [
@@ -396,8 +423,8 @@ def _sentence(laws: Sequence[_Judged], depends: Mapping[str, float], mended: flo
         for law in laws[1:]
         if law.seen and law.explained > best.explained - nearly and law.law.shapes <= best.law.shapes
     ]
-    said = f"What is missing looks like {words}; that explains {best.explained:.0%} of what any force could."
+    sentence = f"What is missing looks like {words}; that explains {best.explained:.0%} of what any force could."
     if others:
         listed = "; ".join(other.law.words(other.gain.amplitude.tolist(), other.gain.sigma) for other in others[:2])
-        said += f" These data would nearly as well have: {listed}."
-    return said
+        sentence += f" These data would nearly as well have: {listed}."
+    return sentence

@@ -37,6 +37,9 @@ CLIMB_SPREADS = (0.01, 0.03)
 the optimiser; for time."""
 
 FIRST_ITERATIONS, MORE_ITERATIONS = 4, 10
+"""Iterations of a subset fit from each start, and of the best of them each further time. Chosen for time: a start that
+leads anywhere has shown it after four steps."""
+
 MOST_CLIMBED = 14
 """Trials of a climb: one of every condition, no more than this. Chosen for time."""
 
@@ -87,23 +90,39 @@ class SubsetFitter:
     """Climbs from one fit, all on the same trials, so that their deviances can be held against each other."""
 
     def __init__(self, fit: Fit) -> None:
-        self.found = fit
-        self.chosen = one_of_each(fit.predictor.data)
+        self.fit = fit
+        self.chosen = _one_of_each(fit.predictor.data)
         self.data = [fit.predictor.data[i] for i in self.chosen]
         self.correlation = track_correlation(self.data)
 
     def climb(
         self, effects: Sequence[Effect], start: Mapping[str, Value], *, iterations: int, align_first: bool = True
     ) -> SubsetFit | None:
-        """Fit with these effects added from `start`; None where the start cannot be followed."""
-        model = self.found.model
+        """Fit with these effects added from `start`; None where the start cannot be followed.
+
+        Parameters
+        ----------
+        effects : sequence of Effect
+            Added to the model.
+        start : mapping
+            Values of parameters, SI.
+        iterations : int
+            Steps at most.
+        align_first : bool
+            Whether releases are looked for first.
+
+        Returns
+        -------
+        SubsetFit or None
+        """
+        model = self.fit.model
         for effect in effects:
             model = model + effect
-        fitted = self.found.model.values
+        fitted = self.fit.model.values
         model = model.with_values({**fitted, **start})
         layout = make_layout(model, self.data, fixed=self._fixed(model.parameter_names), shared={})
-        predictor = Predictor(layout, self.data, self.found.predictor.host)
-        trial_effects = self.found.solution.state.trial_effects[self.chosen].copy()
+        predictor = Predictor(layout, self.data, self.fit.predictor.host)
+        trial_effects = self.fit.solution.state.trial_effects[self.chosen].copy()
         trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
         held = FixedTerms(spread=CLIMB_SPREADS, correlation=self.correlation)
         try:
@@ -125,26 +144,26 @@ class SubsetFitter:
         return math.inf if climb is None else climb.deviance
 
     def _fixed(self, names: Iterable[str]) -> tuple[str, ...]:
-        held = self.found.options["fixed"]
+        held = self.fit.options["fixed"]
         return tuple(name for name in held if name in names or any(name == full.split(".")[1] for full in names))
 
 
 def _values(layout: ParameterMap, theta: Floats) -> dict[str, Value]:
     """Parameters by name, those of single vines as mappings; yield pressures have priors and find their way."""
-    found: dict[str, Value] = {}
+    values: dict[str, Value] = {}
     for number, value in zip(layout.free, layout.values(theta), strict=True):
         if number.key == YIELD_PRESSURE:
             continue
         if number.vine:
-            former = found.get(number.key, {})
+            former = values.get(number.key, {})
             assert isinstance(former, dict)
-            found[number.key] = {**former, number.vine: float(value)}
+            values[number.key] = {**former, number.vine: float(value)}
         else:
-            found[number.key] = float(value)
-    return found
+            values[number.key] = float(value)
+    return values
 
 
-def one_of_each(data: Sequence[FitTrial]) -> list[int]:
+def _one_of_each(data: Sequence[FitTrial]) -> list[int]:
     """Places of one trial of every condition, the one with the most points; spread evenly where there are too many."""
     places = one_of_each_condition(data)
     if len(places) <= MOST_CLIMBED:
@@ -156,7 +175,19 @@ def one_of_each(data: Sequence[FitTrial]) -> list[int]:
 
 
 def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
-    """Values of an effect's parameters to begin from: the predicted size brought inside what is possible."""
+    """Values of an effect's parameters to begin from: the predicted size brought inside what is possible.
+
+    Parameters
+    ----------
+    shape
+    size : float, SI
+        Predicted size, from the parameter's zero.
+
+    Returns
+    -------
+    dict
+        By `effect.parameter`, SI.
+    """
     effect = shape.effect
     if not effect.parameters:
         return {}
@@ -170,23 +201,36 @@ def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
         size = float(np.clip(size, -reach, reach))
     if parameter.sign * size < 0 or size == 0:
         size = parameter.sign * abs(shape.step) or shape.step
-    values = (float(np.clip(parameter.zero + size, low, high)), *shape.rest)
-    return {f"{effect.name}.{one.name}": value for one, value in zip(effect.parameters, values, strict=True)}
+    values = (float(np.clip(parameter.zero + size, low, high)), *shape.other_values)
+    return {f"{effect.name}.{known.name}": value for known, value in zip(effect.parameters, values, strict=True)}
 
 
 def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -> SubsetFit | None:
     """The best of several starts of one hypothesis: each a few steps, the best of them on to the end.
 
     One that stays far above `goal`, the best deviance of any hypothesis so far, is not followed further.
+
+    Parameters
+    ----------
+    slope
+        Fits to one trial of every condition.
+    starts : sequence of Start
+        Of one hypothesis.
+    goal : float
+        Best deviance of any hypothesis so far.
+
+    Returns
+    -------
+    SubsetFit or None
     """
     first = [
-        one
+        subset_fit
         for effects, start in starts
-        if (one := slope.climb(effects, start, iterations=FIRST_ITERATIONS)) is not None
+        if (subset_fit := slope.climb(effects, start, iterations=FIRST_ITERATIONS)) is not None
     ]
     if not first:
         return None
-    best = min(first, key=lambda one: one.deviance)
+    best = min(first, key=lambda subset_fit: subset_fit.deviance)
     points = sum(trial_data.time_s.size for trial_data in slope.data)
     if best.deviance - goal > HOPELESS * points:
         return best
@@ -198,17 +242,32 @@ def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -
     return best
 
 
-def full_fit(found: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: bool = False) -> Fit | None:
+def full_fit(before: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: bool = False) -> Fit | None:
     """The hypothesis fitted to all trials from where its climb ended; None where it cannot be followed.
 
     `afresh` begins with nothing of what the fit had bent to do without it. One whose ln L is still far below the `best`
     after the first iterations is left unsettled.
+
+    Parameters
+    ----------
+    before
+        The fit without the effects.
+    climb
+        Where the subset fit ended.
+    best : float
+        Largest ln L of any hypothesis so far.
+    afresh : bool
+        Begin with releases, deviations and noise as the tracks show them.
+
+    Returns
+    -------
+    Fit or None
     """
-    model = found.model
+    model = before.model
     for effect in climb.effects:
         model = model + effect
     try:
-        fit = refit(found, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False, afresh=afresh)
+        fit = refit(before, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False, afresh=afresh)
         if fit.noise_correlation > SLOW_NOISE and is_poor_fit(fit.predictor, fit.solution):
             # Noise that wanders as it likes makes anything likely.
             return None
@@ -219,23 +278,43 @@ def full_fit(found: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: b
         return None
 
 
-def from_other_starts(found: Fit) -> Fit:
-    """The same model fitted from where climbs from several exponents end, if that is better; else the fit itself."""
-    if EXPONENT not in found.model.parameter_names or EXPONENT in found.options["fixed"]:
-        return found
-    slope = SubsetFitter(found)
+def from_other_starts(fit: Fit) -> Fit:
+    """The same model fitted from where climbs from several exponents end, if that is better; else the fit itself.
+
+    Parameters
+    ----------
+    fit
+
+    Returns
+    -------
+    Fit
+    """
+    if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
+        return fit
+    slope = SubsetFitter(fit)
     points = sum(trial_data.time_s.size for trial_data in slope.data)
     starts: list[Start] = [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
     return _from(slope, starts, slope.here(), LOWER_PER_POINT * points)
 
 
-def without(found: Fit, other: Fit) -> Fit:
+def without(fit: Fit, other: Fit) -> Fit:
     """The model of a fit begun from the numbers of another fit, which holds it, if that is better; else the fit.
 
     It is fitted where a climb from there makes up for half of what the other fit is better by.
+
+    Parameters
+    ----------
+    fit
+        The fit without the effect.
+    other
+        A fit whose model holds that of `fit`.
+
+    Returns
+    -------
+    Fit
     """
-    slope, names = SubsetFitter(found), set(found.model.parameter_names)
-    added = [effect for effect in other.model if effect.name not in found.model]
+    slope, names = SubsetFitter(fit), set(fit.model.parameter_names)
+    added = [effect for effect in other.model if effect.name not in fit.model]
     here, there = slope.here(), slope.climb(added, other.model.values, iterations=1)
     lower = math.inf if there is None else max(LOWER, 0.5 * (here - there.deviance))
     return _from(slope, [((), {key: value for key, value in other.model.values.items() if key in names})], here, lower)
@@ -243,16 +322,26 @@ def without(found: Fit, other: Fit) -> Fit:
 
 def _from(slope: SubsetFitter, starts: Sequence[Start], here: float, lower: float) -> Fit:
     """The model of a fit begun elsewhere, where a climb from there ends lower than `here` by this."""
-    found = slope.found
+    fit = slope.fit
     climb = best_subset_fit(slope, starts, here)
     if climb is None or climb.deviance > here - lower:
-        return found
-    other = full_fit(found, climb, found.log_likelihood)
-    return other if other is not None and other.log_likelihood > found.log_likelihood else found
+        return fit
+    other = full_fit(fit, climb, fit.log_likelihood)
+    return other if other is not None and other.log_likelihood > fit.log_likelihood else fit
 
 
 def starts_of(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
-    """Starts of one effect from its shapes and the sizes predicted for them."""
+    """Starts of one effect from its shapes and the sizes predicted for them.
+
+    Parameters
+    ----------
+    shapes : iterable of (CandidateShape, float)
+        Shapes of one effect with their predicted sizes, SI.
+
+    Returns
+    -------
+    list of Start
+    """
     seen: set[tuple[float, ...]] = set()
     starts: list[Start] = []
     for shape, size in shapes:

@@ -56,6 +56,7 @@ GAIN = 1.01
 """Gain in separation for which a trial is exchanged, and new vines tried at most. Chosen for time."""
 
 MOST_VINES_TRIED = 2
+"""Chosen for time, see above."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class NextExperiment:
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it; what is not known is null."""
-        found: dict[str, Any] = _without_nan(
+        content: dict[str, Any] = _without_nan(
             {
                 "text": self.text,
                 "trials": [dict(trial) for trial in self.trials],
@@ -96,14 +97,14 @@ class NextExperiment:
                 "calibration": self.calibration,
             }
         )
-        return found
+        return content
 
 
 def _without_nan(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_nan(one) for key, one in value.items()}
+        return {key: _without_nan(part) for key, part in value.items()}
     if isinstance(value, list):
-        return [_without_nan(one) for one in value]
+        return [_without_nan(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -132,12 +133,16 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
 
     Parameters
     ----------
-    tied
+    tied : sequence of Fit
         Fits of two hypotheses or more to the same trials, most likely first; of more than five the first five count.
-    limits
+    limits : Limits, optional
         Within what further trials can be made; what it leaves open follows the trials so far.
-    seed
+    seed : int
         Of the random numbers of the simulated trials.
+
+    Returns
+    -------
+    NextExperiment
 
     Raises
     ------
@@ -148,7 +153,7 @@ def next_experiment(tied: Sequence[Fit], limits: Limits | None = None, *, seed: 
     limits = limits or Limits()
     _judge(tied)
     tied = list(tied)[:MOST_HYPOTHESES]
-    names = hypothesis_names(tied)
+    names = _hypothesis_names(tied)
     if only_measurement(tied):
         advice = calibration_for(list(itertools.combinations(tied, 2)))
         faults = [name for name in names if name != NOTHING]
@@ -171,7 +176,7 @@ def _judge(tied: Sequence[Fit]) -> None:
         raise FitError("The fits to tell apart are not of the same trials: fit all of them to one set.")
 
 
-def hypothesis_names(tied: Sequence[Fit]) -> list[str]:
+def _hypothesis_names(tied: Sequence[Fit]) -> list[str]:
     """Each hypothesis by the effects that not all of them have, numbered where that is not enough."""
     common = set.intersection(*(set(fit.model.names) for fit in tied))
     names = [" + ".join(name for name in fit.model.names if name not in common) or NOTHING for fit in tied]
@@ -184,9 +189,11 @@ def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[B
     every = conditions(data, limits)
     if not every:
         return Bench((), (), ()), []
-    cameras = [camera_of(data, one.like) for one in every]
+    cameras = [camera_of(data, condition.like) for condition in every]
     runs = courses([carry(fit, name, every) for fit, name in zip(tied, names, strict=True)], every, cameras)
-    kept = [(one, lens, run) for one, lens, run in zip(every, cameras, runs, strict=True) if run is not None]
+    kept = [
+        (condition, lens, run) for condition, lens, run in zip(every, cameras, runs, strict=True) if run is not None
+    ]
     if not kept:
         return Bench((), (), ()), []
     chosen, lenses, ways = (list(column) for column in zip(*kept, strict=True))
@@ -202,16 +209,16 @@ def _options(bench: Bench, sides: list[Side], limits: Limits, seed: int) -> list
 
     One effort beyond what is enough is looked at, to have something to compare with.
     """
-    found: list[_Option] = []
+    options: list[_Option] = []
     before = -math.inf
     for allowed in _by_effort(bench, sides, limits.trials):
-        if any(option.weakest >= ENOUGH for option in found[:-1]):
+        if any(option.weakest >= ENOUGH for option in options[:-1]):
             break
         design, foretold = best_design(sides, allowed, limits.trials)
         if foretold > GAIN * before:
             before = foretold
-            found.append(_Option(tuple(design.tolist()), expected(bench, design.tolist(), [0], seed)))
-    return found
+            options.append(_Option(tuple(design.tolist()), expected(bench, design.tolist(), [0], seed)))
+    return options
 
 
 def _by_effort(bench: Bench, sides: list[Side], trials: int) -> Iterator[NDArray[np.int_]]:
@@ -244,14 +251,14 @@ def _choice(options: Sequence[_Option]) -> _Option:
 def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperiment:
     best = _choice(options)
     best = _Option(best.design, np.concatenate([best.rises, expected(bench, best.design, [1], seed)]))
-    names = [hypothese.name for hypothese in bench.hypotheses]
+    names = [hypothesis.name for hypothesis in bench.hypotheses]
     to_expect = _by_pair(best.between)
     worth_it = max(to_expect.values()) >= SEPARATES
     draws = max(DRAWS_OBSERVED.get(len(names), 1) - (min(to_expect.values()) > PLAIN), 1)
     checked = _checked(observed(bench, best.design, range(draws), seed)) if worth_it else {}
     left = [place for place, sigma in to_expect.items() if min(sigma, checked.get(place, (sigma,))[0]) < SEPARATES]
     worth_it = worth_it and len(left) < len(to_expect)
-    fits = [hypothese.fit for hypothese in bench.hypotheses]
+    fits = [hypothesis.fit for hypothesis in bench.hypotheses]
     advice = calibration_for([(fits[a], fits[b]) for a, b in left or _measured(fits)])
     sigmas = {_pair(names, place): sigma for place, sigma in to_expect.items()}
     seen = {_pair(names, place): both for place, both in checked.items()}
@@ -278,7 +285,7 @@ def _conclude(bench: Bench, options: Sequence[_Option], seed: int) -> NextExperi
                 "trials": [dict(entry) for entry in entries(bench.conditions, option.design)],
                 "separation_sigma": {_pair(names, p): s for p, s in _by_pair(option.between).items()},
             }
-            for option in sorted(options, key=lambda one: -one.worth)
+            for option in sorted(options, key=lambda ranked: -ranked.worth)
             if option.design != best.design
         ),
         calibration=advice or None,
@@ -295,14 +302,14 @@ def _measured(fits: Sequence[Fit]) -> list[tuple[int, int]]:
 def _checked(rises: Floats) -> dict[tuple[int, int], tuple[float, float]]:
     """Mean and standard deviation of the separations observed, by pair, of the direction that separates less."""
     sigma = np.sqrt(np.maximum(rises, 0.0))
-    found = {}
+    checked = {}
     for a, b in itertools.combinations(range(rises.shape[1]), 2):
-        ways = [one[np.isfinite(one)] for one in (sigma[:, a, b], sigma[:, b, a])]
+        ways = [draws[np.isfinite(draws)] for draws in (sigma[:, a, b], sigma[:, b, a])]
         ways = [way for way in ways if way.size]
         if ways:
-            least = min(ways, key=lambda one: float(np.mean(one)))
-            found[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
-    return found
+            least = min(ways, key=lambda draws: float(np.mean(draws)))
+            checked[(a, b)] = (float(np.mean(least)), float(np.std(least, ddof=1)) if least.size > 1 else math.nan)
+    return checked
 
 
 def _pair(names: Sequence[str], place: tuple[int, int]) -> str:

@@ -47,22 +47,26 @@ STEP = 1e-3
 Derived: 1000 times the integrator's error."""
 
 
-def payload_curves(found: Fit, final_at_fraction: float) -> pd.DataFrame:
+def payload_curves(fit: Fit, final_at_fraction: float) -> pd.DataFrame:
     """Final speed of the leading edge along payload, columns `CURVE_COLUMNS`; empty where payloads do not vary.
 
     Parameters
     ----------
-    found
+    fit
         A fit; its trials say which vines, pressures and payloads there are.
-    final_at_fraction
+    final_at_fraction : float
         Fraction of the length at which the speed is taken.
+
+    Returns
+    -------
+    DataFrame
     """
     import pandas as pd
 
     rows: list[tuple[object, ...]] = []
-    for trials, lasts_s in _families(found):
+    for trials, lasts_s in _families(fit):
         at_m = final_at_fraction * trials[0].length_m
-        speed, sigma = speeds_with_error(found, trials, at_m, lasts_s)
+        speed, sigma = speeds_with_error(fit, trials, at_m, lasts_s)
         for trial, v, s in zip(trials, speed, sigma, strict=True):
             rows.append((trial.vine, trial.pressure_Pa / 1e3, 1e3 * trial.payload_kg, 1e3 * at_m, v, s))
     return pd.DataFrame(rows, columns=list(CURVE_COLUMNS))
@@ -78,11 +82,11 @@ def _families(fit: Fit) -> list[tuple[list[Trial], float]]:
             alike.setdefault(_but_for_payload(trial), []).append((trial.payload_kg, lasts_s, trial))
     families = []
     for seen in alike.values():
-        payloads_kg = [one[0] for one in seen]
+        payloads_kg = [load[0] for load in seen]
         low, high = min(payloads_kg), max(payloads_kg)
         if high > low:
             trials = [replace(seen[0][2], payload_kg=float(kg)) for kg in np.linspace(low, high, PAYLOADS)]
-            families.append((trials, LASTS * max(one[1] for one in seen)))
+            families.append((trials, LASTS * max(load[1] for load in seen)))
     return families
 
 
@@ -97,6 +101,26 @@ def speeds_with_error(fit: Fit, trials: Sequence[Trial], at_m: float, lasts_s: f
     """Speed of the leading edge at `at_m` of growth and its standard error, m/s, shape (n_trials,) each.
 
     Trials of one vine. A motion that does not get there has speed 0.
+
+    Parameters
+    ----------
+    fit
+        A fit.
+    trials : sequence of Trial
+        Of one vine.
+    at_m : float
+        Growth at which the speed is taken, m.
+    lasts_s : float
+        Growth is followed for so long, s.
+
+    Returns
+    -------
+    speed, sigma : arrays, shape (n_trials,), m/s
+
+    Raises
+    ------
+    ValueError
+        If the speeds do not depend smoothly on the fitted numbers.
     """
     vine = trials[0].vine
     instants = _around_arrival(fit, trials, at_m, lasts_s)

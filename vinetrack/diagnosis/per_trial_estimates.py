@@ -67,6 +67,14 @@ class AlignedTrial:
 def lay(fit: Fit) -> AlignedTrial:
     """Lay the model on the trials that it was fitted to.
 
+    Parameters
+    ----------
+    fit
+
+    Returns
+    -------
+    AlignedTrial
+
     Raises
     ------
     FitError
@@ -81,6 +89,18 @@ def lay(fit: Fit) -> AlignedTrial:
 
 def per_trial_estimates(fit: Fit, key: str, laid: AlignedTrial) -> PerTrialEstimates:
     """Find the best value of `key` for every trial: least squares of position, its release free.
+
+    Parameters
+    ----------
+    fit
+    key : str
+        Name of a parameter, `effect.parameter`.
+    laid
+        The model aligned with its trials, from `lay`.
+
+    Returns
+    -------
+    PerTrialEstimates
 
     Raises
     ------
@@ -97,7 +117,7 @@ def per_trial_estimates(fit: Fit, key: str, laid: AlignedTrial) -> PerTrialEstim
     projected = [np.zeros(0)] * base.size
     for _ in range(STEPS):
         moved, trial_effects, projected = _improved(predictor, trial_effects, column, base, moved, scale, logarithmic)
-    felt = np.array([float(np.sum(one**2)) for one in projected])
+    felt = np.array([float(np.sum(answer**2)) for answer in projected])
     known = felt > 1e-12 * np.array(
         [np.ptp(trial_data.lead_position_m) ** 2 * trial_data.time_s.size for trial_data in predictor.data]
     )
@@ -178,7 +198,17 @@ def _improved(
 
 
 def without(answer: Floats, others: Floats) -> Floats:
-    """What of an answer no sum of the others makes, shape (n_points,)."""
+    """What of an answer no sum of the others makes, shape (n_points,).
+
+    Parameters
+    ----------
+    answer : array, shape (n_points,)
+    others : array, shape (n_points, n)
+
+    Returns
+    -------
+    array, shape (n_points,)
+    """
     return np.asarray(answer - others @ np.linalg.lstsq(others, answer, rcond=1e-9)[0])
 
 

@@ -24,6 +24,8 @@ FIRST_GUESS = (0.01, 0.03, 0.2)
 """Start, least and largest values of the search: pressure, ln B, rest. Chosen."""
 
 LEAST, LARGEST = (1e-5, 1e-5, 1e-3), (0.2, 0.5, 3.0)
+"""Chosen: from exact to worse than any rig; the search never ends there where replicates tell anything."""
+
 LEAST_SPREAD = (0.005, 0.015)
 """Of pressure and B, for whoever needs both: replicates tell their sum much better than either. Chosen: half of a
 usual scatter."""
@@ -55,13 +57,13 @@ class Scatter:
 
     pressure: float
     damping: float
-    rest: float
+    residual: float
     dof: int
 
     @property
     def variances(self) -> Floats:
         """Their squares, shape (3,)."""
-        return np.array([self.pressure, self.damping, self.rest]) ** 2
+        return np.array([self.pressure, self.damping, self.residual]) ** 2
 
 
 def scatter_sensitivities(laid: AlignedTrial) -> list[Floats]:
@@ -69,9 +71,18 @@ def scatter_sensitivities(laid: AlignedTrial) -> list[Floats]:
 
     Where growth has ended in the model nothing answers any more, but the vine may still grow: there the answers stay
     what they were.
+
+    Parameters
+    ----------
+    laid
+        The model aligned with its trials.
+
+    Returns
+    -------
+    list of arrays, shape (n_points, 2), m
     """
     held = rest_is_seen(laid.predictor.data)
-    found = []
+    answers = []
     for i, columns in enumerate(laid.columns):
         moving = np.flatnonzero(columns[:, RELEASE] != 0)
         kept = columns.copy()
@@ -80,12 +91,24 @@ def scatter_sensitivities(laid: AlignedTrial) -> list[Floats]:
                 moving[-1], [RELEASE, PRESSURE, DAMPING_DEVIATION]
             ]
         others = kept[:, [RELEASE]] if held[i] else kept[:, [RELEASE, ORIGIN]]
-        found.append(np.column_stack([without(kept[:, k], others) for k in (PRESSURE, DAMPING_DEVIATION)]))
-    return found
+        answers.append(np.column_stack([without(kept[:, k], others) for k in (PRESSURE, DAMPING_DEVIATION)]))
+    return answers
 
 
 def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
-    """The three numbers that make the differences between replicates most likely; a group is a condition."""
+    """The three numbers that make the differences between replicates most likely; a group is a condition.
+
+    Parameters
+    ----------
+    fit
+        Its between-trial standard deviations stand in where there are no replicates.
+    groups : sequence of Stretches
+        One a condition.
+
+    Returns
+    -------
+    Scatter
+    """
     from scipy.optimize import minimize
 
     dof = sum(len(group.means_m) - 1 for group in groups)
@@ -108,19 +131,29 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
         return total
 
     best = minimize(cost, np.log(FIRST_GUESS), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.01})
-    pressure, damping, rest = np.exp(np.clip(best.x, np.log(LEAST), np.log(LARGEST))).tolist()
-    return Scatter(pressure, damping, rest, dof)
+    pressure, damping, residual = np.exp(np.clip(best.x, np.log(LEAST), np.log(LARGEST))).tolist()
+    return Scatter(pressure, damping, residual, dof)
 
 
 def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
-    """Covariance of the means of one trial's stretches, shape (n_stretches, n_stretches), m²."""
+    """Covariance of the means of one trial's stretches, shape (n_stretches, n_stretches), m².
+
+    Parameters
+    ----------
+    scatter
+    group
+
+    Returns
+    -------
+    array, shape (n_stretches, n_stretches), m²
+    """
     return _covariance(group, scatter.variances)
 
 
 def _covariance(group: Stretches, variances: Floats) -> Floats:
     shared = (group.answers * variances[:2]) @ group.answers.T
-    rest = variances[2] * float(np.trace(shared)) / len(shared)
-    return np.asarray(shared + group.noise_m2 + (rest + EXACT_M**2) * np.eye(len(shared)))
+    residual = variances[2] * float(np.trace(shared)) / len(shared)
+    return np.asarray(shared + group.noise_m2 + (residual + EXACT_M**2) * np.eye(len(shared)))
 
 
 def unlikely(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) -> float:
@@ -128,6 +161,21 @@ def unlikely(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) ->
 
     The sum of squares of the means in their own errors, for what Satterthwaite's approximation leaves of degrees of
     freedom: stretches err together. The scatter is itself known from `dof` replicates.
+
+    Parameters
+    ----------
+    mean : array, shape (n_stretches,), m
+        Means over the trials of a condition.
+    covariance : array, shape (n_stretches, n_stretches), m²
+        Of one trial.
+    trials : int
+        Number of trials.
+    scatter
+        Its degrees of freedom count.
+
+    Returns
+    -------
+    float
     """
     from scipy.stats import chi2, norm
     from scipy.stats import f as fisher

@@ -48,8 +48,12 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
 
     Parameters
     ----------
-    trials
+    trials : sequence of TrialFit
         Trials of one condition as a model predicts them, see `vinetrack.inference.fit.predict`.
+
+    Returns
+    -------
+    Replicates
     """
     longest = max(trials, key=lambda trial: trial.time_s[-1] - trial.release_s)
     frame_s = min(float(np.median(np.diff(trial.time_s))) for trial in trials)
@@ -68,7 +72,16 @@ def replicates_of(trials: Sequence[TrialFit]) -> Replicates:
 
 
 def first_that_counts(trial: TrialFit) -> int:
-    """The frame where the first of model and measurement begins to move: rest would only dilute an error."""
+    """The frame where the first of model and measurement begins to move: rest would only dilute an error.
+
+    Parameters
+    ----------
+    trial
+
+    Returns
+    -------
+    int
+    """
     released = int(np.searchsorted(trial.time_s, trial.release_s))
     # A pressure that is only let in moves nothing yet.
     moved = np.flatnonzero(trial.predicted_position_m > trial.origin_m)

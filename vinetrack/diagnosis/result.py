@@ -91,7 +91,7 @@ class Candidate:
             "reason": self.reason,
             "largest": dict(self.largest),
             "posterior_weight": self.posterior_weight,
-            "confounded_by": [one.to_json() for one in self.confounded_by],
+            "confounded_by": [confounder.to_json() for confounder in self.confounded_by],
             "along": [number.to_json() for number in self.along],
         }
 
@@ -113,12 +113,12 @@ class Candidate:
             status=str(entry.get("status") or ""),
             delta_chi2=or_nan(entry.get("delta_chi2")),
             sigma=or_nan(entry.get("sigma")),
-            numbers=tuple(Number.from_json(one) for one in entry.get("numbers") or ()),
+            numbers=tuple(Number.from_json(number) for number in entry.get("numbers") or ()),
             plausible=bool(entry.get("plausible", True)),
             in_answer_set=bool(entry.get("in_answer_set")),
             reason=str(entry.get("reason") or ""),
             largest={str(name): or_nan(value) for name, value in (entry.get("largest") or {}).items()},
-            along=tuple(Number.from_json(one) for one in entry.get("along") or ()),
+            along=tuple(Number.from_json(number) for number in entry.get("along") or ()),
             posterior_weight=or_nan(entry.get("posterior_weight")),
         )
 
@@ -170,7 +170,7 @@ class Round:
             model=tuple(entry.get("model") or ()),
             verdict=str(entry["verdict"]),
             answer_set=tuple(entry.get("answer_set") or ()),
-            ranking=tuple(Candidate.from_json(one) for one in entry.get("ranking") or ()),
+            ranking=tuple(Candidate.from_json(candidate) for candidate in entry.get("ranking") or ()),
             explanation=str(entry.get("explanation") or ""),
             cosine_names=tuple(cosines.get("effects") or ()),
             cosines=tuple(tuple(or_nan(value) for value in row) for row in cosines.get("matrix") or ()),
@@ -273,7 +273,7 @@ class Diagnosis:
             "answer_set": list(self.answer_set),
             "explanation": self.explanation,
             "final_verdict": self.final_verdict or None,
-            "rounds": [one.to_json() for one in self.rounds],
+            "rounds": [step.to_json() for step in self.rounds],
             "parameters": [number.to_json() for number in self.parameters],
             "cosines": first.get("cosines", {}),
             "where": list(self.where),
@@ -300,7 +300,7 @@ class Diagnosis:
         """
         rounds = content.get("rounds") or ([{"verdict": content["verdict"]}] if content.get("verdict") else [])
         return cls(
-            rounds=tuple(Round.from_json(one) for one in rounds),
+            rounds=tuple(Round.from_json(stored) for stored in rounds),
             effects=tuple(content.get("effects") or ()),
             explanation=str(content.get("explanation") or ""),
             ladder=ladder,
@@ -309,12 +309,24 @@ class Diagnosis:
             next_experiment=content.get("next_experiment"),
             missing_force=content.get("missing_force"),
             notes=tuple(str(note) for note in content.get("notes") or ()),
-            stored_parameters=tuple(Number.from_json(one) for one in content.get("parameters") or ()),
+            stored_parameters=tuple(Number.from_json(stored) for stored in content.get("parameters") or ()),
             refused=str(content.get("refused") or ""),
         )
 
     def plot(self, name: str = "", **options: Any) -> Figure:
-        """Return a figure of the report: `ladder` (the default), `before_after`, `where`, `candidates`, …, by name."""
+        """Return a figure of the report: `ladder` (the default), `before_after`, `where`, `candidates`, …, by name.
+
+        Parameters
+        ----------
+        name : str
+            Name of the figure.
+        **options
+            Passed on to the drawing.
+
+        Returns
+        -------
+        Figure
+        """
         return plot(self, name, **options)
 
     def __repr__(self) -> str:

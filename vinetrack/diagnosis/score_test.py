@@ -107,21 +107,35 @@ class Scores:
         return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
 
 
-def products_of(fit: Fit, answers: EffectSensitivities, doubts: Sequence[Floats]) -> Products:
-    """All sums of products that the tests need; `doubts` are those of `doubts_of`."""
+def products_of(fit: Fit, answers: EffectSensitivities, systematics: Sequence[Floats]) -> Products:
+    """All sums of products that the tests need; `systematics` are those of `doubts_of`.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    answers
+        How positions answer to the candidates.
+    systematics : sequence of arrays, shape (n_points, n_systematics), m
+        From `vinetrack.inference.systematics`.
+
+    Returns
+    -------
+    Products
+    """
     columns = fit.solution.columns
     grams = np.stack(
         [
-            products(np.column_stack([trial_effects, more, doubt]), trial_data.first, trial_data.relative_sd)
-            for trial_effects, more, doubt, trial_data in zip(
-                columns, answers.columns, doubts, fit.predictor.data, strict=True
+            products(np.column_stack([trial_effects, more, systematic]), trial_data.first, trial_data.relative_sd)
+            for trial_effects, more, systematic, trial_data in zip(
+                columns, answers.columns, systematics, fit.predictor.data, strict=True
             )
         ]
     )
-    return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes), doubts[0].shape[1])
+    return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes), systematics[0].shape[1])
 
 
-def _projected(found: Fit, sums: Products, state: FitState) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.intp]]:
+def _projected(fit: Fit, sums: Products, state: FitState) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.intp]]:
     """Project shapes and residual on the free numbers of a fit, trial effects eliminated.
 
     Returns
@@ -135,7 +149,7 @@ def _projected(found: Fit, sums: Products, state: FitState) -> tuple[Floats, Flo
     moving : indices
         Of the free numbers that can give way.
     """
-    problem = found.solution.problem
+    problem = fit.solution.problem
     blocks = trial_effects_eliminated(sums.grams, sums.n_keys, problem, state)
     p, size = sums.n_keys, problem.prior_mean.size
     asked = sums.n_shapes + sums.n_doubts
@@ -147,17 +161,17 @@ def _projected(found: Fit, sums: Products, state: FitState) -> tuple[Floats, Flo
     cross = np.zeros((size + 1, asked))
     np.add.at(cross, problem.index, blocks[:, X, C])
     cross = cross[:size]
-    moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(found))
+    moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(fit))
     inverse = inverse_among(square, moving)
     return blocks, cross, inverse @ cross, inverse @ slope, moving
 
 
-def levers_of(found: Fit, sums: Products) -> Floats:
+def levers_of(fit: Fit, sums: Products) -> Floats:
     """How far each number of a fit falls for each unit of another effect's size, by linear algebra.
 
     Parameters
     ----------
-    found
+    fit
         The fit.
     sums
         Its products with the shapes.
@@ -167,22 +181,36 @@ def levers_of(found: Fit, sums: Products) -> Floats:
     ndarray, shape (n_numbers, n_shapes)
         I_θθ⁻¹ I_θs with systematic errors integrated out, in units of the number over those of the size.
     """
-    lever = _projected(found, sums, found.solution.state)[2]
-    lever = lever @ _systematics_turn(scores_with_systematics(found, sums).information, sums.n_shapes)
-    free = found.predictor.layout.free
+    lever = _projected(fit, sums, fit.solution.state)[2]
+    lever = lever @ _systematics_turn(_scores_with_systematics(fit, sums).information, sums.n_shapes)
+    free = fit.predictor.layout.free
     slopes = [
         number.value if parameter.logarithmic else parameter.scale
-        for parameter, number in zip(free, found.numbers, strict=True)
+        for parameter, number in zip(free, fit.numbers, strict=True)
     ]
     return np.asarray(lever[: len(free)] * np.array(slopes)[:, None])
 
 
-def scores_of(found: Fit, sums: Products, state: FitState | None = None) -> Scores:
-    """Scores at a fit, or with the noise and spreads of another `state`."""
-    return _systematics_aside(scores_with_systematics(found, sums, state), sums.n_shapes)
+def scores_of(fit: Fit, sums: Products, state: FitState | None = None) -> Scores:
+    """Scores at a fit, or with the noise and spreads of another `state`.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    sums
+        From `products_of`.
+    state : FitState, optional
+        Noise and spreads in place of the fit's.
+
+    Returns
+    -------
+    Scores
+    """
+    return _systematics_aside(_scores_with_systematics(fit, sums, state), sums.n_shapes)
 
 
-def scores_with_systematics(fit: Fit, sums: Products, state: FitState | None = None) -> Scores:
+def _scores_with_systematics(fit: Fit, sums: Products, state: FitState | None = None) -> Scores:
     """Scores of the shapes and, behind them, of the systematic errors, none integrated out."""
     problem, state = fit.solution.problem, state or fit.solution.state
     blocks, cross, lever, step, moving = _projected(fit, sums, state)
@@ -237,30 +265,43 @@ def _pressed(fit: Fit) -> NDArray[np.bool_]:
     return np.array([math.isfinite(number.bound) for number in fit.numbers], dtype=bool)
 
 
-def linear_gains(found: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
+def linear_gains(fit: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
     """How far −2 ln L would fall with each shape, and at which size, if everything were linear.
 
     The noise is as correlated as in the tracks, of whatever size is left: where a model is far off, the noise of its
     fit has taken in what it misses, and says nothing of what is missing.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    sums
+        From `products_of`.
+    rho : float
+        Lag-one correlation of the tracks' noise.
+
+    Returns
+    -------
+    fall, size : arrays, shape (n_shapes,)
     """
-    state = found.solution.state
-    points = found.solution.problem.points
+    state = fit.solution.state
+    points = fit.solution.problem.points
     total = points.sum()
     variance = state.variance
     for _ in range(4):
         trial_state = FitState(state.theta, state.trial_effects, (0.01, 0.03), rho, variance)
-        scores = scores_of(found, sums, trial_state)
-        rest = _rest(found, sums, trial_state)
-        variance = np.full_like(variance, float(np.mean(variance)) * max(rest / total, 1e-6))
+        scores = scores_of(fit, sums, trial_state)
+        left_over = _rest(fit, sums, trial_state)
+        variance = np.full_like(variance, float(np.mean(variance)) * max(left_over / total, 1e-6))
     diagonal = np.maximum(np.diag(scores.information), 1e-300)
     fall = np.where(np.diag(scores.information) > 0, scores.score**2 / diagonal, 0.0)
-    left = np.maximum(rest - fall, 1e-3 * rest)
-    return np.asarray(total * np.log(rest / left)), scores.size
+    left = np.maximum(left_over - fall, 1e-3 * left_over)
+    return np.asarray(total * np.log(left_over / left)), scores.size
 
 
-def _rest(found: Fit, sums: Products, state: FitState) -> float:
+def _rest(fit: Fit, sums: Products, state: FitState) -> float:
     """Sum of squares that the fit's own numbers leave, with the priors' part."""
-    problem = found.solution.problem
+    problem = fit.solution.problem
     blocks = trial_effects_eliminated(sums.grams, sums.n_keys, problem, state)
     p = sums.n_keys
     square = cross_products(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
@@ -271,7 +312,7 @@ def _rest(found: Fit, sums: Products, state: FitState) -> float:
     return max(float(whole - step @ slope), 1e-9 * float(whole))
 
 
-def probe_shapes(fit: Fit) -> list[CandidateShape]:
+def _probe_shapes(fit: Fit) -> list[CandidateShape]:
     """Bumps of force along the growth, over speed and over time, with and without a factor P."""
     longest_s = max(float(trial.time_s[-1] - trial.release_s) for trial in fit.trials)
     fastest = max(
@@ -308,18 +349,29 @@ class Structure:
     loudest: float = 1.0
 
 
-def structure_of(found: Fit, doubts: Sequence[Floats]) -> Structure:
+def structure_of(fit: Fit, systematics: Sequence[Floats]) -> Structure:
     """Whether anything that a smooth force could explain is left beside a fit.
 
     All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    systematics : sequence of arrays, shape (n_points, n_systematics), m
+        From `vinetrack.inference.systematics`.
+
+    Returns
+    -------
+    Structure
     """
     from scipy.stats import f as fisher
     from scipy.stats import norm, t
 
-    answers = effect_sensitivities(found, probe_shapes(found))
+    answers = effect_sensitivities(fit, _probe_shapes(fit))
     if not answers.shapes:
         return Structure(0.0, 0, 1.0, 0.0)
-    scores = scores_of(found, products_of(found, answers, doubts))
+    scores = scores_of(fit, products_of(fit, answers, systematics))
     root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
     live = np.diag(scores.information) > 0
     information = (scores.information / root[:, None] / root)[np.ix_(live, live)]
@@ -346,6 +398,21 @@ def family_threshold(cosines: Floats, signs: Sequence[int], level: float, draws:
     """The z that the largest of correlated scores exceeds with this probability where nothing is missing.
 
     Candidates are correlated and some have one sign only: sixteen may act like four.
+
+    Parameters
+    ----------
+    cosines : array, shape (n, n)
+        Correlations of the scores.
+    signs : sequence of int
+        Sign of each candidate, 0 where it may have either.
+    level : float
+        Chance of a false alarm of them all.
+    draws : int
+        Monte Carlo draws; 40 000 give the 95 % quantile to 0.01.
+
+    Returns
+    -------
+    float
     """
     count = len(signs)
     if not count:

@@ -67,19 +67,34 @@ class SelectionStep:
     confounded: tuple[Confounder, ...] = ()
 
 
-def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[SelectionStep]:
+def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[SelectionStep]:
     """The findings of all rounds, the first about the fit itself.
 
     A fit may have ended in a local minimum, from which any effect seems to help. So one that is far off is begun again
     elsewhere before it is questioned, and again from where the best hypothesis ended: if it then does better without
     the effect, all is asked again of that, twice at most.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    effects : sequence of Effect
+        Candidates.
+    report : callable
+        Called with a sentence at each step.
+    again : int
+        How often it has been begun again.
+
+    Returns
+    -------
+    list of SelectionStep
     """
-    if found.chi2_per_dof > FAR_OFF and not again:
+    if fit.chi2_per_dof > FAR_OFF and not again:
         report("fitting the model from other starts")
-        found = from_other_starts(found)
+        fit = from_other_starts(fit)
     report("questioning the model")
-    questions = misfit_tests(found, effects, FIRST_LEVEL)
-    among = differences(found)
+    questions = misfit_tests(fit, effects, FIRST_LEVEL)
+    among = differences(fit)
     differ = bool(called(among, FIRST_LEVEL))
     if not questions.something and not questions.suspect and not differ:
         return [SelectionStep(ADEQUATE, questions)]
@@ -87,13 +102,13 @@ def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, aga
         return slack
     search = CandidateFits(questions, report)
     tried = search.singles()
-    between = between_fits(found, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
+    between = between_fits(fit, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
     tried += between
-    if not questions.something and not differ and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
+    if not questions.something and not differ and (not tried or _best_of(tried).sigma < SUSPECT_SIGMAS):
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
-    if tried and again < MOST_AGAIN and best_of(tried) not in between:
-        rival = without(found, best_of(tried).fit)
-        if rival.log_likelihood > found.log_likelihood + NO_BETTER:
+    if tried and again < MOST_AGAIN and _best_of(tried) not in between:
+        rival = without(fit, _best_of(tried).fit)
+        if rival.log_likelihood > fit.log_likelihood + NO_BETTER:
             return select_effects(rival, effects, report, again=again + 1)
     alone = None if questions.far_off else _alone(questions, search, tried)
     if alone is not None:
@@ -107,7 +122,7 @@ def select_effects(found: Fit, effects: Sequence[Effect], report: Report, *, aga
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
     tried = [hypothesis for hypothesis in tried if hypothesis not in between]
     believed = [hypothesis for hypothesis in tried if hypothesis.credible]
-    if not believed or best_of(believed).sigma < questions.threshold:
+    if not believed or _best_of(believed).sigma < questions.threshold:
         # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
         loud = questions.possible.max(initial=0.0) > questions.threshold + LOUD
         fails = questions.fails or questions.off or loud
@@ -122,7 +137,7 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
 
     It is asked first: a tail cannot push, and the rule brings no number that could make up for something else.
     """
-    slack = slack_fit(questions.found)
+    slack = slack_fit(questions.fit)
     if slack is None or slack.sigma < questions.threshold:
         return None
     report("letting the tail go slack")
@@ -134,9 +149,9 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
     return [first, SelectionStep(ADEQUATE, after)]
 
 
-def best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:
+def _best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:
     """The hypothesis with the highest likelihood."""
-    return max(tried, key=lambda one: one.fit.log_likelihood)
+    return max(tried, key=lambda hypothesis: hypothesis.fit.log_likelihood)
 
 
 def _alone(
@@ -145,14 +160,14 @@ def _alone(
     """Findings where one effect mends everything; None where none does."""
     if not tried:
         return None
-    best = best_of(tried)
+    best = _best_of(tried)
     if best.sigma < questions.threshold:
         return None
     kept, aside, after = _mending(tried, search)
     if after is None:
         return None
     verdict = verdict_of(kept)
-    if verdict == MISSING and is_within_position_errors(questions.found, kept[0].fit):
+    if verdict == MISSING and is_within_position_errors(questions.fit, kept[0].fit):
         return [
             SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search, note=_too_small(kept[0], questions))
         ]
@@ -170,7 +185,7 @@ def _alone(
 
 
 def _too_small(best: LikelihoodRatio, questions: MisfitTests) -> str:
-    moved_mm = 1e3 * displacement_m(questions.found, best.fit)
+    moved_mm = 1e3 * displacement_m(questions.fit, best.fit)
     return (
         f"{best.label} would improve the fit by {best.sigma:.1f} σ, but it moves positions by only {moved_mm:.2g} mm, "
         "less than their systematic errors, and does not lower the error on left-out conditions; it is not counted"
@@ -186,25 +201,26 @@ def _mending(
     something, those next to it are asked, as far as misjudged noise could have put them behind.
     """
     kept, aside = answer_set(hypotheses)
-    best = max(hypothese.fit.log_likelihood for hypothese in hypotheses)
+    best = max(hypothesis.fit.log_likelihood for hypothesis in hypotheses)
     behind = sorted(
-        (hypothese for hypothese in hypotheses if hypothese not in kept), key=lambda one: -one.fit.log_likelihood
+        (hypothesis for hypothesis in hypotheses if hypothesis not in kept),
+        key=lambda hypothesis: -hypothesis.fit.log_likelihood,
     )
     next_to_it = [
-        one
-        for one in behind
-        if one.label not in aside and 2 * (best - one.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
+        hypothesis
+        for hypothesis in behind
+        if hypothesis.label not in aside and 2 * (best - hypothesis.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
     ]
     for group in (kept, next_to_it):
         mending: list[LikelihoodRatio] = []
         after: MisfitTests | None = None
-        for one in group:
-            asked = search.after(one.fit) if one.credible else None
+        for hypothesis in group:
+            asked = search.after(hypothesis.fit) if hypothesis.credible else None
             # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
-            if asked is None or asked.something or (len(one.effects) > 1 and asked.whispers):
-                aside[one.label] = one.reason if asked is None else "something is left once it is added"
-            elif not mending or one in answer_set([*mending, one])[0]:
-                mending.append(one)
+            if asked is None or asked.something or (len(hypothesis.effects) > 1 and asked.whispers):
+                aside[hypothesis.label] = hypothesis.reason if asked is None else "something is left once it is added"
+            elif not mending or hypothesis in answer_set([*mending, hypothesis])[0]:
+                mending.append(hypothesis)
                 after = after or asked
         if mending:
             return mending, aside, after
@@ -215,6 +231,15 @@ def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
     """What an answer set amounts to; of each hypothesis the last effect counts.
 
     Where nothing in it is physics that is missing, the measurement or the trials are at fault.
+
+    Parameters
+    ----------
+    kept : sequence of LikelihoodRatio
+        The answer set.
+
+    Returns
+    -------
+    str
     """
     if all(hypothesis.effects[-1].kind in NOT_PHYSICAL for hypothesis in kept):
         return ARTEFACT
@@ -229,8 +254,8 @@ def _together(
     report: Report,
 ) -> list[SelectionStep]:
     """Findings where two effects together mend what none does alone; else nothing known does."""
-    ranked = sorted(tried, key=lambda one: -one.fit.log_likelihood)
-    both = pairs(questions.found, ranked, effects, report)
+    ranked = sorted(tried, key=lambda single: -single.fit.log_likelihood)
+    both = pairs(questions.fit, ranked, effects, report)
     nothing = [
         SelectionStep(UNEXPLAINED, questions, tried=(*ranked, *both), search=search, aside=_why_not(ranked, both))
     ]
@@ -278,7 +303,7 @@ def _in_order(
         return [first]
     base = by_name.get(first_name)
     later = misfit_tests(base.fit if base else turned[0].fit, questions.effects, LATER_LEVEL)
-    seconds = tuple(likelihood_ratio(later.found, one.effects[1:], one.fit) for one in turned)
+    seconds = tuple(likelihood_ratio(later.fit, pair.effects[1:], pair.fit) for pair in turned)
     second_verdict = verdict_of(seconds)
     names = tuple(second.names[0] for second in seconds)
     confounded = confounders_of(after, kept[0].names) if second_verdict == MISSING else ()
@@ -300,6 +325,6 @@ def _turned(hypothesis: LikelihoodRatio, first: str) -> LikelihoodRatio:
 
 def _why_not(ranked: Sequence[LikelihoodRatio], both: Sequence[LikelihoodRatio]) -> tuple[tuple[str, str], ...]:
     return tuple(
-        (one.label, one.reason if not one.credible else "something is left once it is added")
-        for one in (*ranked[:1], *both[:1])
+        (hypothesis.label, hypothesis.reason if not hypothesis.credible else "something is left once it is added")
+        for hypothesis in (*ranked[:1], *both[:1])
     )

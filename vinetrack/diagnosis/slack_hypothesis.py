@@ -42,7 +42,16 @@ of it their errors ask for a fit in vain, at twice a push of 4 % of the drive go
 
 
 def pushes(fit: Fit) -> bool:
-    """Whether the fitted model has the tail of some trial push, where the trial does not let it go slack."""
+    """Whether the fitted model has the tail of some trial push, where the trial does not let it go slack.
+
+    Parameters
+    ----------
+    fit
+
+    Returns
+    -------
+    bool
+    """
     return any(_pushes(fit, trial) for trial in fit.trials)
 
 
@@ -68,16 +77,26 @@ def _pushes(fit: Fit, trial: TrialFit) -> bool:
     return bool(np.any(tension_N < -PUSHES * terms.pressure_Pa * terms.area_m2 / ratio))
 
 
-def slack_fit(found: Fit) -> LikelihoodRatio | None:
-    """The model refitted with tails that may go slack; None where no tail pushes or the fit does not get through."""
-    if not pushes(found):
+def slack_fit(fit: Fit) -> LikelihoodRatio | None:
+    """The model refitted with tails that may go slack; None where no tail pushes or the fit does not get through.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+
+    Returns
+    -------
+    LikelihoodRatio or None
+    """
+    if not pushes(fit):
         return None
     data = [
-        replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in found.predictor.data
+        replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
     ]
-    predictor = Predictor(found.predictor.layout, data, found.predictor.host)
+    predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
     try:
-        after = refit(replace(found, predictor=predictor), thorough=False)
+        after = refit(replace(fit, predictor=predictor), thorough=False)
     except (FitError, SimulationError, np.linalg.LinAlgError):
         return None
-    return likelihood_ratio(found, (TAIL_SLACK,), after)
+    return likelihood_ratio(fit, (TAIL_SLACK,), after)

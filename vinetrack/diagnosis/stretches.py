@@ -49,27 +49,55 @@ class Course:
     rest_m2: float
 
 
-def courses_of(found: Fit) -> tuple[list[Course], tuple[TrialFit, ...]]:
+def courses_of(fit: Fit) -> tuple[list[Course], tuple[TrialFit, ...]]:
     """Every trial of a fit as a course, and as predicted with a release and an origin of its own.
+
+    Parameters
+    ----------
+    fit
+
+    Returns
+    -------
+    courses : list of Course
+    predicted : tuple of TrialFit
 
     Raises
     ------
     FitError
         If the model cannot be followed.
     """
-    predicted = in_sample(found).trials
-    answers = scatter_sensitivities(lay(found))
-    return [_course(*one) for one in zip(predicted, answers, found.predictor.data, strict=True)], predicted
+    predicted = in_sample(fit).trials
+    answers = scatter_sensitivities(lay(fit))
+    return [_course(*members) for members in zip(predicted, answers, fit.predictor.data, strict=True)], predicted
 
 
 def by_condition(courses: Sequence[Course]) -> dict[str, list[Course]]:
-    """Courses by name of condition, in order."""
+    """Courses by name of condition, in order.
+
+    Parameters
+    ----------
+    courses : sequence of Course
+
+    Returns
+    -------
+    dict of list of Course
+    """
     names = dict.fromkeys(course.trial.condition for course in courses)
     return {name: [course for course in courses if course.trial.condition == name] for name in names}
 
 
 def replicate_scatter(fit: Fit, courses: Sequence[Course]) -> Scatter:
-    """How much replicates scatter, from stretches of time that all of a condition were filmed in."""
+    """How much replicates scatter, from stretches of time that all of a condition were filmed in.
+
+    Parameters
+    ----------
+    fit
+    courses : sequence of Course
+
+    Returns
+    -------
+    Scatter
+    """
     groups = by_condition(courses).values()
     return find_scatter(fit, [stretches_of(members, "time_s", common_edges(members)) for members in groups])
 
@@ -91,7 +119,17 @@ def _course(trial: TrialFit, answers: Floats, trial_data: FitTrial) -> Course:
 
 
 def common_edges(members: Sequence[Course]) -> Floats:
-    """Edges of stretches of time that every replicate was filmed in."""
+    """Edges of stretches of time that every replicate was filmed in.
+
+    Parameters
+    ----------
+    members : sequence of Course
+        Of one condition.
+
+    Returns
+    -------
+    array, shape (n_stretches + 1,), s
+    """
     begin = max(float(member.time_s[0]) for member in members)
     end = min(float(member.time_s[-1]) for member in members)
     frames = min(int(np.count_nonzero((member.time_s >= begin) & (member.time_s <= end))) for member in members)
@@ -100,7 +138,20 @@ def common_edges(members: Sequence[Course]) -> Floats:
 
 
 def means_of(course: Course, along: str, edges: Floats) -> tuple[Floats, Floats]:
-    """Means of [residual, answers] in each stretch, shape (n_stretches, 3), NaN where no frame is; and the frames."""
+    """Means of [residual, answers] in each stretch, shape (n_stretches, 3), NaN where no frame is; and the frames.
+
+    Parameters
+    ----------
+    course
+    along : str
+        Attribute of the course that the edges belong to.
+    edges : array, shape (n_stretches + 1,)
+
+    Returns
+    -------
+    means : array, shape (n_stretches, 3), m
+    frames : array, shape (n_stretches,)
+    """
     values, at = np.column_stack([course.residual_m, course.answers]), getattr(course, along)
     place = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, edges.size - 2)
     inside = (at >= edges[0]) & (at <= edges[-1])
@@ -111,11 +162,24 @@ def means_of(course: Course, along: str, edges: Floats) -> tuple[Floats, Floats]
 
 
 def stretches_of(members: Sequence[Course], along: str, edges: Floats) -> Stretches:
-    """The stretches that all of the members have frames in."""
+    """The stretches that all of the members have frames in.
+
+    Parameters
+    ----------
+    members : sequence of Course
+        Of one condition.
+    along : str
+        Attribute of the courses that the edges belong to.
+    edges : array, shape (n_stretches + 1,)
+
+    Returns
+    -------
+    Stretches
+    """
     parts = [means_of(member, along, edges) for member in members]
     both = np.array([means for means, _ in parts])
     reached = np.isfinite(both).all(axis=(0, 2))
-    noise = np.mean([_noise(one, count[reached]) for one, (_, count) in zip(members, parts, strict=True)], axis=0)
+    noise = np.mean([_noise(course, count[reached]) for course, (_, count) in zip(members, parts, strict=True)], axis=0)
     return Stretches(both[:, reached, 0], both[:, reached, 1:].mean(axis=0), noise)
 
 
@@ -125,7 +189,19 @@ def _noise(course: Course, count: Floats) -> Floats:
 
 
 def variances_of(course: Course, part: tuple[Floats, Floats], scatter: Scatter) -> Floats:
-    """Variances of the means of one trial's stretches, shape (n_stretches,)."""
+    """Variances of the means of one trial's stretches, shape (n_stretches,).
+
+    Parameters
+    ----------
+    course
+    part : (means, frames)
+        From `means_of`.
+    scatter
+
+    Returns
+    -------
+    array, shape (n_stretches,), m²
+    """
     means, count = part
     alone = Stretches(means[None, :, 0], np.nan_to_num(means[:, 1:]), _noise(course, count))
     return np.diag(stretch_covariance(scatter, alone))

@@ -27,7 +27,7 @@ EXPECTED = 4.0
 the edge of the range."""
 
 
-def prior_of(parameter: Parameter) -> tuple[float, float]:
+def _prior_of(parameter: Parameter) -> tuple[float, float]:
     """Mean and standard deviation of the prior that a plausible range stands for, in the parameter's unit."""
     low, high = plausible_range(parameter)
     return 0.5 * (low + high), 0.25 * (high - low)
@@ -38,8 +38,14 @@ def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
 
     Parameters
     ----------
-    parameters
+    fit
+        The fit with the effects.
+    parameters : mapping
         Those of the effects that a hypothesis adds, by `effect.parameter`.
+
+    Returns
+    -------
+    float
 
     Notes
     -----
@@ -51,7 +57,7 @@ def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
         parameter = parameters.get(number.key)
         if parameter is None or not math.isfinite(number.sigma) or number.value == parameter.zero:
             continue
-        mean, sd = prior_of(parameter)
+        mean, sd = _prior_of(parameter)
         variance = number.sigma**2 + sd**2
         if variance > 0:
             total += max((number.value - mean) ** 2 / variance - EXPECTED, 0.0)
@@ -62,12 +68,23 @@ def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
     """Logarithm of the marginal likelihood Z of a hypothesis, up to a constant that all about the same trials share.
 
     Numbers that no trajectory answers to, or whose error is open, keep their prior: they cost nothing.
+
+    Parameters
+    ----------
+    fit
+        The fit with the effects.
+    parameters : mapping
+        Those of the effects that a hypothesis adds, by `effect.parameter`.
+
+    Returns
+    -------
+    float
     """
     places, means, sds = [], [], []
     for k, number in enumerate(fit.numbers):
         parameter = parameters.get(number.key)
         if parameter is not None and math.isfinite(number.sigma) and number.sigma > 0:
-            mean, sd = prior_of(parameter)
+            mean, sd = _prior_of(parameter)
             if sd > 0:
                 places.append(k)
                 means.append(mean)
@@ -88,9 +105,18 @@ def _log_det(matrix: Floats) -> float:
 
 
 def posterior_weights(log_evidences: Sequence[float]) -> list[float]:
-    """Posterior probabilities of hypotheses that were equally likely beforehand; they add up to 1."""
+    """Posterior probabilities of hypotheses that were equally likely beforehand; they add up to 1.
+
+    Parameters
+    ----------
+    log_evidences : sequence of float
+
+    Returns
+    -------
+    list of float
+    """
     if not log_evidences:
         return []
     values = np.array(log_evidences)
     weights = np.exp(values - values.max())
-    return [float(one) for one in weights / weights.sum()]
+    return [float(weight) for weight in weights / weights.sum()]

@@ -70,8 +70,8 @@ def explain(finding: SelectionStep) -> str:
     str
     """
     questions = finding.questions
-    model = " + ".join(questions.found.model.names)
-    count = len(questions.found.trials)
+    model = " + ".join(questions.fit.model.names)
+    count = len(questions.fit.trials)
     trials = f"{count} trial{'s' if count != 1 else ''}"
     if finding.verdict == ADEQUATE:
         return _adequate(finding, model, trials)
@@ -171,7 +171,7 @@ def _weights(kept: Sequence[LikelihoodRatio]) -> str:
 
 def _with_the_fault(finding: SelectionStep) -> str:
     """Sizes of effects added before, fitted together with the fault: without it they are biased by it."""
-    fit, best = finding.questions.found, finding.kept[0]
+    fit, best = finding.questions.fit, finding.kept[0]
     added = [number for number in best.others if number.key.split(".")[0] not in base_model()]
     before = {number.name: number for number in fit.numbers}
     moved = [number for number in added if number.name in before and math.isfinite(number.sigma)]
@@ -190,7 +190,7 @@ def _hypotheses(kept: Sequence[LikelihoodRatio]) -> str:
 
 
 def _remedies(finding: SelectionStep) -> str:
-    return remedies_in_words(finding.kept, [trial.trial for trial in finding.questions.found.trials])
+    return remedies_in_words(finding.kept, [trial.trial for trial in finding.questions.fit.trials])
 
 
 def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
