@@ -103,13 +103,13 @@ def with_bands(fit: Fit, data: Sequence[FitTrial], predicted: Sequence[TrialFit]
     basis = _basis(fit)
     known = _calibrated(fit, basis)
     banded = []
-    for item, trial in zip(data, predicted, strict=True):
+    for trial_data, trial in zip(data, predicted, strict=True):
         try:
-            loadings, random = _loadings_of_new(fit, basis, item, trial)
+            loadings, random = _loadings_of_new(fit, basis, trial_data, trial)
         except SimulationError:
             banded.append(trial)
             continue
-        further = (known.discrepancy * np.ptp(item.lead_position_m)) ** 2
+        further = (known.discrepancy * np.ptp(trial_data.lead_position_m)) ** 2
         sigma = np.sqrt(np.sum(loadings**2, axis=1) + random + further)
         reach = max(known.reach, _simultaneous(loadings / sigma[:, None], known.degrees))
         banded.append(replace(trial, band_m=reach * sigma))
@@ -157,7 +157,7 @@ def _basis(fit: Fit) -> _Basis:
 def _calibrated(fit: Fit, basis: _Basis) -> Calibration:
     """The discrepancy between trials and its degrees of freedom."""
     solution, data = basis.solution, fit.predictor.data
-    pairs = [_left_out(basis, item, i, fit.noise_correlation) for i, item in enumerate(data)]
+    pairs = [_left_out(basis, trial_data, i, fit.noise_correlation) for i, trial_data in enumerate(data)]
     seen = [(i, *pair) for i, pair in enumerate(pairs) if pair is not None]
     if not seen:
         return Calibration(0.0, NORMAL_95, math.inf, 0)
@@ -191,7 +191,7 @@ def _paule_mandel(square: Floats, variance: Floats, scale: Floats) -> float:
     return 0.0 if excess(0.0) <= 0 else float(brentq(excess, 0.0, highest))
 
 
-def _left_out(basis: _Basis, item: FitTrial, i: int, weigh: float) -> tuple[Floats, Floats] | None:
+def _left_out(basis: _Basis, trial_data: FitTrial, i: int, weigh: float) -> tuple[Floats, Floats] | None:
     """What a trial of the fit misses once left out of it, m, and the variance of that, m², to first order.
 
     None where the other trials do not tell all numbers that it feels.
@@ -211,10 +211,10 @@ def _left_out(basis: _Basis, item: FitTrial, i: int, weigh: float) -> tuple[Floa
     design = _design(columns, problem.index[i], size)
     shift = covariance @ (basis.scores[i] - basis.scores.mean(axis=0))
     missed = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
-    own = _own_loadings(_own_spreads(solution, i), columns, item)
-    loadings = np.column_stack([design @ _root(covariance + basis.between), own])
+    trial_effects = _own_loadings(_own_spreads(solution, i), columns, trial_data)
+    loadings = np.column_stack([design @ _root(covariance + basis.between), trial_effects])
     noise = float(state.variance[i]) / (1 - state.rho**2)
-    left, random, missed = _aligned(loadings, missed, columns[:, :2], item, weigh, state, noise)
+    left, random, missed = _aligned(loadings, missed, columns[:, :2], trial_data, weigh, state, noise)
     return missed, np.sum(left**2, axis=1) + random
 
 
@@ -230,21 +230,21 @@ def _own_spreads(solution: Solution, i: int) -> Floats:
     return np.asarray(spreads(solution.problem, solution.state.spread)[i] * solution.problem.feels[i])
 
 
-def _own_loadings(spread: Floats, columns: Floats, item: FitTrial) -> Floats:
+def _own_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -> Floats:
     """What one standard deviation of pressure, of B and of a set pressure does to positions, shape (n_points, 3)."""
-    set_pressure = item.trace is None and spread[0] > 0 and item.trial.pressure_Pa > 0
-    misset = PRESSURE_ERROR_PA / item.trial.pressure_Pa if set_pressure else 0.0
+    set_pressure = trial_data.trace is None and spread[0] > 0 and trial_data.trial.pressure_Pa > 0
+    misset = PRESSURE_ERROR_PA / trial_data.trial.pressure_Pa if set_pressure else 0.0
     moved = columns[:, [PRESSURE, DAMPING_DEVIATION, PRESSURE]]
     return np.asarray(moved * [spread[0], spread[1], misset])
 
 
-def _loadings_of_new(fit: Fit, basis: _Basis, item: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
+def _loadings_of_new(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
     """What one standard deviation of each error does to a new trial, m, and the variance of its noise, m²."""
-    layout = make_layout(fit.model, [item], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
-    theta, places = _laid_over(fit, layout, item)
-    predictor = Predictor(layout, [item], fit.predictor.host)
-    own = np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]])
-    columns = predictor.linearise(theta, own)[0]
+    layout = make_layout(fit.model, [trial_data], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
+    theta, places = _laid_over(fit, layout, trial_data)
+    predictor = Predictor(layout, [trial_data], fit.predictor.host)
+    trial_effects = np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]])
+    columns = predictor.linearise(theta, trial_effects)[0]
     covariance = _covariance(fit, basis) + basis.between[: len(fit.numbers), : len(fit.numbers)]
     mine = np.diag(np.where(layout.prior_precision > 0, 1 / np.maximum(layout.prior_precision, 1e-300), 0.0))
     matched = np.flatnonzero(places >= 0)
@@ -252,22 +252,22 @@ def _loadings_of_new(fit: Fit, basis: _Basis, item: FitTrial, trial: TrialFit) -
     mine[np.ix_(matched, matched)] = covariance[np.ix_(places[matched], places[matched])]
     design = _design(columns, layout.index[0], theta.size)
     state = basis.solution.state
-    spread = np.array([item.gauge_error or state.spread[0], state.spread[1]])
+    spread = np.array([trial_data.gauge_error or state.spread[0], state.spread[1]])
     spread *= [predictor.feels_pressure[0], predictor.feels_damping[0]]
-    shapes = position_shapes(predictor, [item.lead_position_m - own[0, ORIGIN] - columns[:, -1]])[0]
-    loadings = np.column_stack([design @ _root(mine), _own_loadings(spread, columns, item), shapes])
+    shapes = position_shapes(predictor, [trial_data.lead_position_m - trial_effects[0, ORIGIN] - columns[:, -1]])[0]
+    loadings = np.column_stack([design @ _root(mine), _own_loadings(spread, columns, trial_data), shapes])
     noise = float(np.mean(state.variance)) / (1 - state.rho**2)
-    return _aligned(loadings, columns[:, -1], columns[:, :2], item, fit.noise_correlation, state, noise)[:2]
+    return _aligned(loadings, columns[:, -1], columns[:, :2], trial_data, fit.noise_correlation, state, noise)[:2]
 
 
-def _laid_over(fit: Fit, layout: ParameterMap, item: FitTrial) -> tuple[Floats, np.ndarray]:
+def _laid_over(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
     """The numbers of the fit as a trial's own layout holds them, and their places in the fit, -1 for new ones."""
     theta, places = layout.start, np.full(len(layout.free), -1)
-    stated = f"{item.trial.vine}, {item.trial.yield_pressure_Pa / 1e3:g} kPa"
+    stated = f"{trial_data.trial.vine}, {trial_data.trial.yield_pressure_Pa / 1e3:g} kPa"
     for k, free in enumerate(layout.free):
         for place, number in enumerate(fit.numbers):
             same = number.name == free.name or (
-                number.key == free.key == YIELD_PRESSURE and number.vine in (item.trial.vine, stated)
+                number.key == free.key == YIELD_PRESSURE and number.vine in (trial_data.trial.vine, stated)
             )
             if same:
                 theta[k], places[k] = free.inside(number.value), place
@@ -284,8 +284,8 @@ def _covariance(fit: Fit, basis: _Basis) -> Floats:
     sigma = np.array(
         [n.sigma / (n.value if free.logarithmic else free.scale) for n, free in zip(fit.numbers, held, strict=True)]
     )
-    own = np.sqrt(np.maximum(np.diag(plain), 1e-300))
-    wider = np.where(np.isfinite(sigma) & (np.diag(plain) > 0), np.maximum(sigma / own, 1.0), 1.0)
+    trial_effects = np.sqrt(np.maximum(np.diag(plain), 1e-300))
+    wider = np.where(np.isfinite(sigma) & (np.diag(plain) > 0), np.maximum(sigma / trial_effects, 1.0), 1.0)
     return np.asarray(plain * wider[:, None] * wider)
 
 
@@ -295,19 +295,19 @@ def _root(square: Floats) -> Floats:
 
 
 def _aligned(
-    loadings: Floats, missed: Floats, design: Floats, item: FitTrial, weigh: float, state: FitState, noise: float
+    loadings: Floats, missed: Floats, design: Floats, trial_data: FitTrial, weigh: float, state: FitState, noise: float
 ) -> tuple[Floats, Floats, Floats]:
     """Loadings, variance of the noise at each point, and what is missed, with release and origin fitted to the trial.
 
     `design` holds the columns of release and origin, `weigh` is the correlation of the noise with which predictions fit
     them, `noise` the variance of a position, m².
     """
-    white = whiten(design, item.first, weigh, item.relative_sd)
-    fixed = np.array([not item.let_in, True])
+    white = whiten(design, trial_data.first, weigh, trial_data.relative_sd)
+    fixed = np.array([not trial_data.let_in, True])
     inverse = np.linalg.pinv(white.T @ white * np.outer(fixed, fixed), rcond=1e-10, hermitian=True)
     both = np.column_stack([loadings, missed])
-    left = both - design @ (inverse @ (white.T @ whiten(both, item.first, weigh, item.relative_sd)))
-    random = noise * (np.ones(missed.size) if item.relative_sd is None else item.relative_sd**2)
+    left = both - design @ (inverse @ (white.T @ whiten(both, trial_data.first, weigh, trial_data.relative_sd)))
+    random = noise * (np.ones(missed.size) if trial_data.relative_sd is None else trial_data.relative_sd**2)
     if weigh == state.rho:
         # What the alignment takes of the noise it was weighed by; a point keeps what it adds to the one before.
         taken = noise * (1 - weigh**2) * np.einsum("nk,kl,nl->n", design, inverse, design)
