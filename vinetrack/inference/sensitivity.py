@@ -94,7 +94,7 @@ class Predictor:
         ----------
         jobs : sequence of Job
         times_s : sequence of arrays, optional
-            Instants since the recording began, s, one array a job.
+            Instants on the clock of the recording, s, one array a job.
 
         Returns
         -------

@@ -137,7 +137,7 @@ def courses(
     Parameters
     ----------
     hypotheses
-        Carried to the conditions; that last is the one whose slack decides.
+        Carried to the conditions; the slack of the last one decides.
     conditions
         Trials that could be made.
     cameras
