@@ -88,7 +88,7 @@ def _predict(
 
     with _sentences(log):
         from vinetrack.pipeline.predict_stage import predict_conditions
-        from vinetrack.pipeline.prediction_inputs import Asked
+        from vinetrack.pipeline.prediction_inputs import Asked, fit_heading
 
         if tail_slack not in (None, "taut", "free"):
             raise typer.BadParameter(f"{tail_slack!r} is neither taut nor free", param_hint="--tail-slack")
@@ -104,11 +104,11 @@ def _predict(
             n=math.nan if n is None else n,
             n_error=n_error,
         )
-        say(
-            predict_conditions(
-                asked, samples=samples, seed=seed, at_fraction=at_fraction, figure=figure, csv=csv, json=json
-            )
+        heading = fit_heading(asked)
+        lines = predict_conditions(
+            asked, samples=samples, seed=seed, at_fraction=at_fraction, figure=figure, csv=csv, json=json
         )
+        say([*heading, *lines] if lines else [])
 
 
 @column_options(
@@ -160,7 +160,7 @@ def _vine(
 
     with _sentences(log):
         from vinetrack.pipeline.design_stage import design_vine
-        from vinetrack.pipeline.prediction_inputs import Asked
+        from vinetrack.pipeline.prediction_inputs import Asked, fit_heading
 
         asked = Asked(
             cells=cells,
@@ -170,7 +170,7 @@ def _vine(
             n=math.nan if n is None else n,
             n_error=n_error,
         )
-        lines = design_vine(
+        lines = fit_heading(asked) + design_vine(
             asked,
             films=films,
             diameter=diameter,
@@ -230,7 +230,7 @@ def _reservoir(
 
     with _sentences(log):
         from vinetrack.pipeline.design_stage import design_reservoir
-        from vinetrack.pipeline.prediction_inputs import Asked
+        from vinetrack.pipeline.prediction_inputs import Asked, fit_heading
 
         asked = Asked(
             cells=cells,
@@ -240,7 +240,10 @@ def _reservoir(
             B=math.nan if B is None else B,
             n=math.nan if n is None else n,
         )
-        lines = design_reservoir(asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure)
+        lines = fit_heading(asked)
+        lines += design_reservoir(
+            asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure
+        )
         tell(lines, {"lines": lines}, json_file)
 
 
@@ -326,7 +329,7 @@ def _campaign(
 
     with _sentences(log):
         from vinetrack.pipeline.campaign_stage import Wanted, design_campaign
-        from vinetrack.pipeline.prediction_inputs import Asked
+        from vinetrack.pipeline.prediction_inputs import Asked, fit_heading
 
         asked = Asked(
             cells=cells,
@@ -353,7 +356,7 @@ def _campaign(
             check=check,
             seed=seed,
         )
-        lines = design_campaign(asked, wanted, sheet=sheet, figure=figure)
+        lines = fit_heading(asked) + design_campaign(asked, wanted, sheet=sheet, figure=figure)
         tell(lines, {"lines": lines}, json_file)
 
 

@@ -148,6 +148,10 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
         write_csv(folder / name, table)
     numbers = moved(diagnosis.fits, ("", *diagnosis.effects)) if len(diagnosis.fits) > 1 else empty_table(MOVED_COLUMNS)
     write_csv(folder / "moved.csv", numbers)
+    if len(diagnosis.fits) > 1:
+        from vinetrack.inference.fit_summary import summary_of
+
+        write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]).items():
         path = results.predictions(name)
         path.parent.mkdir(parents=True, exist_ok=True)

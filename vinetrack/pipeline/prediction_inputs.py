@@ -15,6 +15,7 @@ from vinetrack.core.tables import write_bytes
 from vinetrack.core.units import PREDICTION_UNITS, display_unit
 from vinetrack.experiment.planned import PlannedTrials, planned_sheet, planned_trial
 from vinetrack.experiment.schema import option
+from vinetrack.pipeline.fit_for_prediction import choose_fit
 from vinetrack.results.folder_layout import Results, ResultsError, read_json
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ NEVER = "never"
 class Asked:
     """What stands on the command line. `cells` are texts by column of the sheet, those that were given.
 
-    `B_error` and `spreads` are relative. NaN and None where nothing is said.
+    `B_error` and `spreads` are relative. NaN and None where nothing is said. `anyway` allows a fit whose model was
+    refuted.
     """
 
     cells: Mapping[str, str] = field(default_factory=dict)
@@ -97,7 +99,7 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
         planned = replace(
             planned, trials=tuple(replace(trial, tail_slack=asked.tail_slack) for trial in planned.trials)
         )
-    fit, user_effects = (None, _own(planned)) if asked.results is None else _read_fit(asked.results)
+    fit, user_effects = (None, _own(planned)) if asked.results is None else _read_fit(asked.results, asked.anyway)
     sizes = [read_sizes(text, user_effects) for text in asked.effects]
     stated = StatedValues(
         B=asked.B,
@@ -129,13 +131,29 @@ def _own(planned: PlannedTrials) -> Mapping[str, Effect]:
     return effects_of(planned.folder) if planned.folder is not None and planned.settings.effects else {}
 
 
-def _read_fit(results: Path) -> tuple[FitNumbers, Mapping[str, Effect]]:
-    """The fit of a results folder, and the own effects of the experiment that it belongs to.
+def fit_heading(asked: Asked) -> list[str]:
+    """What must stand above everything predicted from a fit: the verdict on its model.
+
+    Parameters
+    ----------
+    asked
+        Numbers, sheet, fit and effects of the command line.
+
+    Returns
+    -------
+    list of str
+        Empty without a fit, and where its model is adequate.
+    """
+    return [] if asked.results is None else list(choose_fit(asked.results, asked.anyway).heading)
+
+
+def _read_fit(results: Path, anyway: bool) -> tuple[FitNumbers, Mapping[str, Effect]]:
+    """The fit of a results folder to predict from, and the own effects of the experiment that it belongs to.
 
     Raises
     ------
     ResultsError
-        If the folder holds no fit, or an effect of it can no longer be found.
+        If the folder holds no fit, its model was refuted, or an effect of it can no longer be found.
     """
     from vinetrack.effects import catalogue
     from vinetrack.inference.fit_data import FitError
@@ -144,7 +162,7 @@ def _read_fit(results: Path) -> tuple[FitNumbers, Mapping[str, Effect]]:
 
     paths = Results(results)
     try:
-        fit = fit_numbers(read_json(paths.fit), results.as_posix())
+        fit = fit_numbers(choose_fit(results, anyway).content, results.as_posix())
     except FitError as error:
         raise ResultsError(str(error)) from None
     lacking = [name for name in fit.model if name not in catalogue()]

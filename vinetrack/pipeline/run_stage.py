@@ -193,7 +193,7 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
 
 
 def _why(failed: dict[str, str], words: list[str], log: Path) -> str:
-    """Which stage stopped a run and what it sentences."""
+    """Which stage stopped a run and what it printed."""
     sentences = [line for line in words if line.strip()]
     if not failed:
         return "\n".join([*sentences, f"The run stopped; everything it printed is in {log}."])

@@ -223,6 +223,11 @@ class Results:
         """
         return self.folder / "diagnosis" / name
 
+    @property
+    def final_fit(self) -> Path:
+        """The fit of the model with every effect that the diagnosis added; only where it added any."""
+        return self.folder / "diagnosis" / "final_fit.json"
+
     def predictions(self, trial: str) -> Path:
         """Return the file of one trial and what the models before and after give for it.
 
