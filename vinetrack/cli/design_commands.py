@@ -241,9 +241,7 @@ def _reservoir(
             n=math.nan if n is None else n,
         )
         lines = fit_heading(asked)
-        lines += design_reservoir(
-            asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure
-        )
+        lines += design_reservoir(asked, within_percent=within, supply_s=supply, at_fraction=at_fraction, figure=figure)
         tell(lines, {"lines": lines}, json_file)
 
 
