@@ -181,7 +181,7 @@ def levers_of(fit: Fit, sums: Products) -> Floats:
     ndarray, shape (n_numbers, n_shapes)
         I_θθ⁻¹ I_θs with systematic errors integrated out, in units of the number over those of the size.
     """
-    lever = _projected(fit, sums, fit.solution.state)[2]
+    lever = _projected(fit, sums, fit.state)[2]
     lever = lever @ _systematics_turn(_scores_with_systematics(fit, sums).information, sums.n_shapes)
     free = fit.predictor.layout.free
     slopes = [
@@ -212,7 +212,7 @@ def scores_of(fit: Fit, sums: Products, state: FitState | None = None) -> Scores
 
 def _scores_with_systematics(fit: Fit, sums: Products, state: FitState | None = None) -> Scores:
     """Scores of the shapes and, behind them, of the systematic errors, none integrated out."""
-    problem, state = fit.solution.problem, state or fit.solution.state
+    problem, state = fit.solution.problem, state or fit.state
     blocks, cross, lever, step, moving = _projected(fit, sums, state)
     index, asked, p = problem.index, sums.n_shapes + sums.n_doubts, sums.n_keys
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)

@@ -21,7 +21,7 @@ from vinetrack.inference.mixed_effects import trial_effect_prior
 from vinetrack.inference.optimiser import Solution, chi2_per_dof
 from vinetrack.inference.parameters import YIELD_PRESSURE, FreeParameter, ParameterMap
 from vinetrack.inference.pooling import Pooled, pool
-from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.position_errors import SmoothErrors, smooth_errors
 from vinetrack.inference.robust_covariance import few_trials, widened_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.whitening import at_correlation, whiten
@@ -83,26 +83,27 @@ def assemble(
     if pooled is not None:
         wide, by_noise = pooled.solution, replace(by_noise, covariance=_with_unknown(pooled.covariance, by_noise))
     if smooth is not None:
-        trials = tuple(replace(trial, whitened=white) for trial, white in zip(trials, smooth.whitened, strict=True))
+        trials = _beside_smooth_errors(trials, smooth)
     known = widened_covariance(predictor, solution, trials, by_noise, wide if smooth else None, pooled)
-    by_noise, known = (among_first(trial, len(layout.free)) for trial in (by_noise, known))
+    by_noise, known = (among_first(each, len(layout.free)) for each in (by_noise, known))
     numbers = _numbers(predictor, solution, wide.state.theta, by_noise, known, profile=profile)
     between = _outside(layout, numbers, _between(pooled, len(numbers)))
     chi2 = chi2_per_dof(predictor, solution)
     weights = np.array([trial_data.time_s.size for trial_data in predictor.data], dtype=float)
-    variance = float(np.average(state.variance, weights=weights)) / (1 - state.rho**2)
+    beside = smooth.solution.state if smooth else state
+    variance = float(np.average(beside.variance, weights=weights)) / (1 - beside.rho**2)
     felt = [bool(solution.problem.feels[:, k].any()) for k in range(2)]
     return Fit(
         model=_fitted_model(layout, numbers),
         numbers=numbers,
         covariance=_outside(layout, numbers, known.covariance),
         spreads={
-            name: BetweenTrialSpread(state.spread[k], solution.estimable[k])
+            name: BetweenTrialSpread(beside.spread[k], solution.estimable[k])
             for k, name in enumerate(SPREAD_NAMES)
             if felt[k]
         },
         noise_m=math.sqrt(variance),
-        noise_correlation=state.rho,
+        noise_correlation=beside.rho,
         chi2_per_dof=chi2,
         log_likelihood=plain + smooth.gain if smooth else plain,
         trials=trials,
@@ -118,6 +119,21 @@ def assemble(
         solution=solution,
         options=options,
         between=between,
+        smooth=smooth.solution.state if smooth else None,
+    )
+
+
+def _beside_smooth_errors(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
+    """Trials with deviations and residuals as they are beside smooth errors of position: a lens deviates no tube."""
+    own = smooth.solution.state.own
+    return tuple(
+        replace(
+            trial,
+            whitened=white,
+            pressure_deviation=float(values[PRESSURE]),
+            damping_deviation=math.expm1(values[DAMPING_DEVIATION]),
+        )
+        for trial, white, values in zip(trials, smooth.whitened, own, strict=True)
     )
 
 

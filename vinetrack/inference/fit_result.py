@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from vinetrack.inference.mixed_effects import FitState
     from vinetrack.inference.optimiser import Solution
     from vinetrack.inference.sensitivity import Predictor
 
@@ -208,7 +209,8 @@ class Fit(NumberTable):
     what hypotheses are compared by. `left_out` gives trials that could not be used, and why; `pairs`
     are the trials with their tracks, empty for a fit to part of another fit's trials. `between`, of the shape
     of `covariance`, is by how much the numbers of a trial differ from the shared ones, beyond its deviations of
-    pressure and B (`vinetrack.inference.pooling`): all zeros where the trials agree, or are many.
+    pressure and B (`vinetrack.inference.pooling`): all zeros where the trials agree, or are many. `smooth` is the
+    state of the solution with smooth errors of position beside it, None where positions have none.
     """
 
     model: Model
@@ -229,6 +231,19 @@ class Fit(NumberTable):
     options: Mapping[str, Any]
     pairs: tuple[tuple[Trial, Track], ...] = ()
     between: Floats | None = None
+    smooth: FitState | None = None
+
+    @property
+    def state(self) -> FitState:
+        """Numbers of the solution with noise and spreads as they are beside smooth errors of position.
+
+        A solution is iterated without smooth errors. What a lens bends then passes for deviations of single trials, and
+        spreads and noise take it up.
+        """
+        state, smooth = self.solution.state, self.smooth
+        if smooth is None:
+            return state
+        return replace(state, spread=smooth.spread, rho=smooth.rho, variance=smooth.variance)
 
     def trial(self, name: str) -> TrialFit:
         """The trial of that name; KeyError where there is none.
