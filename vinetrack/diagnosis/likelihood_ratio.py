@@ -123,7 +123,8 @@ def _compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
     Such a fit is better by the shape that its other numbers give it, not by an effect of which anything is known.
     """
     for effect in effects:
-        for parameter in effect.parameters[:1]:
+        # Differences between groups are contrasts: each group's own may be uncertain where their differences are not.
+        for parameter in () if effect.kind == BETWEEN_TRIALS else effect.parameters[:1]:
             for number in after.numbers:
                 known = number.key == f"{effect.name}.{parameter.name}" and math.isfinite(number.sigma)
                 if known and 0 < abs(number.value - parameter.zero) < LEAST_SIGMAS * number.sigma:
