@@ -125,7 +125,7 @@ def assemble(
 
 def _beside_smooth_errors(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
     """Trials with deviations and residuals as they are beside smooth errors of position: a lens deviates no tube."""
-    own = smooth.solution.state.own
+    effects = smooth.solution.state.trial_effects
     return tuple(
         replace(
             trial,
@@ -133,7 +133,7 @@ def _beside_smooth_errors(trials: Sequence[TrialFit], smooth: SmoothErrors) -> t
             pressure_deviation=float(values[PRESSURE]),
             damping_deviation=math.expm1(values[DAMPING_DEVIATION]),
         )
-        for trial, white, values in zip(trials, smooth.whitened, own, strict=True)
+        for trial, white, values in zip(trials, smooth.whitened, effects, strict=True)
     )
 
 
