@@ -33,8 +33,8 @@ class FitState:
     """Where a fit stands.
 
     `theta`, shape (n_free,), scaled; `trial_effects`, shape (n_trials, 4), see `vinetrack.inference.sensitivity`;
-    `spread` the relative standard deviations of pressure and B from trial to trial; `rho` the lag-one correlation of the noise and
-    `variance`, shape (n_trials,), that of its innovations, m².
+    `spread` the relative standard deviations of pressure and B from trial to trial; `rho` the lag-one correlation of
+    the noise and `variance`, shape (n_trials,), that of its innovations, m².
     """
 
     theta: Floats
