@@ -37,6 +37,7 @@ def fit() -> FitSummary:
         warnings=("b",),
         left_out={"c": "never moves"},
         trials={"t": TrialEstimates(*(0.1 * i for i in range(8)))},
+        between=np.array([[0.04, 0.0], [0.0, 0.0]]),
     )
 
 
@@ -47,6 +48,7 @@ def test_a_fit_comes_back_as_it_was_written(tmp_path: Path) -> None:
     write_json(tmp_path / "again.json", back.to_json())
     assert (tmp_path / "again.json").read_text() == results.fit.read_text()
     assert back["B"].value == 6.4
+    assert back.between[0, 0] == 0.04
     assert back.fitted_values == {"eversion_damping.B": {"v": 6.4}, "yield_pressure.P_y": 3000.0}
     assert back.trial_table()["release_sigma_s"].tolist() == [0.1]
     assert str(back) == str(fit())

@@ -119,6 +119,12 @@ def test_a_fit_to_few_trials_is_believed_no_more_than_its_own_intervals_say() ->
     assert np.std(draws[N]) == pytest.approx(0.01 * 2.776 / 1.960, rel=0.02)
 
 
+def test_the_next_trial_differs_from_the_shared_numbers_as_trials_of_the_fit_do() -> None:
+    content = fitted(between_trials=[[0.0, 0.0, 0.0], [0.0, 9e-4, 0.0], [0.0, 0.0, 0.0]])
+    draws = predictive_inputs(vine_of_the_fit(), None, fit_numbers(content, "a")).draw(20_000, seed=4)
+    assert np.std(draws[N]) == pytest.approx(math.hypot(0.01, 0.03), rel=0.03)
+
+
 def test_spreads_from_trial_to_trial_are_those_of_the_fit_with_the_doubt_of_few_trials() -> None:
     """Scale σ of Student's t with 13 trials less 3 numbers: its standard deviation is σ √(10/8)."""
     content = fitted(trials={str(k): {} for k in range(13)})

@@ -58,6 +58,7 @@ class FitSummary(NumberTable):
     left_out: Mapping[str, str] = field(default_factory=dict)
     trials: Mapping[str, TrialEstimates] = field(default_factory=dict)
     refused: str = ""
+    between: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def fitted_values(self) -> dict[str, float | dict[str, float]]:
@@ -87,6 +88,7 @@ class FitSummary(NumberTable):
         return content | {
             "numbers": [number.to_json() for number in self.numbers],
             "covariance": self.covariance,
+            "between_trials": self.between,
             "spreads": {name: asdict(spread) for name, spread in self.spreads.items()},
             "noise_m": self.noise_m,
             "noise_correlation": self.noise_correlation,
@@ -112,7 +114,10 @@ class FitSummary(NumberTable):
         FitSummary
         """
         numbers = tuple(Number.from_json(entry) for entry in content.get("numbers") or ())
-        matrix = [[or_nan(cell) for cell in row] for row in content.get("covariance") or ()]
+        matrix, between = (
+            [[or_nan(cell) for cell in row] for row in content.get(key) or ()]
+            for key in ("covariance", "between_trials")
+        )
         keys = [entry.name for entry in fields(TrialEstimates)]
         return cls(
             names=tuple(content["model"]),
@@ -135,6 +140,7 @@ class FitSummary(NumberTable):
                 for name, estimates in (content.get("trials") or {}).items()
             },
             refused=str(content.get("refused") or ""),
+            between=np.array(between, dtype=float) if between else np.empty((0, 0)),
         )
 
     def __repr__(self) -> str:
@@ -183,4 +189,5 @@ def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequenc
         warnings=tuple(warnings),
         left_out=fit.left_out,
         trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},
+        between=np.zeros_like(fit.covariance) if fit.between is None else fit.between,
     )

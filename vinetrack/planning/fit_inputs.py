@@ -34,10 +34,10 @@ _VINE = re.compile(r"([\d.]+)mm-([\d.]+)um(?:-([\d.]+)mm)?")
 class FitNumbers:
     """The numbers of a fit; `keys` and `vines` name them, `log` marks those held as logarithms.
 
-    `mean`, `covariance` are those of the numbers as held; numbers that the fit left open have a variance of 0 and
-    stand in `open`. The covariance is stretched so that its normal 95 % are the fit's own, which take Student's t.
-    `spreads` are those of pressure and B from trial to trial, relative, and `spread_dof` their degrees of freedom,
-    infinite where they were told to the fit.
+    `mean`, `covariance` are those of the numbers of the next trial as held, what trials differ by included; numbers
+    that the fit left open have a variance of 0 and stand in `open`. The covariance is stretched so that its normal 95 %
+    are the fit's own, which take Student's t. `spreads` are those of pressure and B from trial to trial, relative, and
+    `spread_dof` their degrees of freedom, infinite where they were told to the fit.
     """
 
     source: str
@@ -132,7 +132,11 @@ def fit_numbers(content: Mapping[str, Any], source: str) -> FitNumbers:
     stretch = np.array(
         [_stretch(number, bool(is_log)) for number, is_log in zip(numbers, log, strict=True)], dtype=float
     )
+    between = np.array([[_number(cell) for cell in row] for row in content.get("between_trials") or ()], dtype=float)
     known = np.isfinite(np.diag(covariance))
+    if between.shape == covariance.shape:
+        # What is predicted is a trial, whose numbers differ from the shared ones.
+        covariance = covariance + np.nan_to_num(between)
     spare = float(max(len(content["trials"]) - len(numbers), FEWEST_TO_SPARE))
     held = np.where(known, slopes * stretch, 0.0)
     return FitNumbers(
@@ -179,6 +183,7 @@ def numbers_of(fit: Fit) -> FitNumbers:
         "model": fit.model.names,
         "numbers": [number.to_json() for number in fit.numbers],
         "covariance": fit.covariance,
+        "between_trials": None if fit.between is None else fit.between.tolist(),
         "spreads": {
             name: {"value": spread.value, "estimated": spread.estimated} for name, spread in fit.spreads.items()
         },
