@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.diagnosis.replicate_alignment import align_replicates
-from vinetrack.diagnosis.replicates import first_that_counts
+from vinetrack.diagnosis.replicates import align_replicates, first_that_counts
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_prepared

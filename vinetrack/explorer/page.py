@@ -11,7 +11,7 @@ from bokeh.document import Document
 from bokeh.models import Button, Column, CustomJS, Row
 
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.explorer.choice import ModelChoice, changed, sized
+from vinetrack.explorer.choice import ModelChoice, sized
 from vinetrack.explorer.controls import Chooser, EffectPanel, KeepPanel
 from vinetrack.explorer.curves import Curves, errors_m, follow
 from vinetrack.explorer.film_panel import FilmPanel
@@ -344,10 +344,6 @@ class Page:
     def is_fitted(self) -> bool:
         """Whether the sizes are those of a fit."""
         return not self._touched
-
-    def is_changed(self) -> bool:
-        """Whether other effects are chosen than those in use."""
-        return changed(self.campaign, self.choice) != ([], [])
 
     def close(self) -> None:
         """Nobody looks any more."""

@@ -13,9 +13,8 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_problem import estimable, floor, track_correlation
 from vinetrack.inference.marginal_likelihood import estimate_noise, estimate_spreads, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_step, shared_penalty
-from vinetrack.inference.release_search import search_releases
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.trial_effects import follow_trial_effects, limited, trial_costs
+from vinetrack.inference.trial_effects import follow_trial_effects, limited, search_releases, trial_costs
 from vinetrack.inference.whitening import at_correlation
 
 MOST_ITERATIONS = 60

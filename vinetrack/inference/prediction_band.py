@@ -37,6 +37,7 @@ from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.pooling import pool, trial_information
 from vinetrack.inference.position_errors import position_shapes
+from vinetrack.inference.robust_covariance import root_of
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, Predictor
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA
 from vinetrack.inference.whitening import whiten
@@ -211,8 +212,8 @@ def _left_out(basis: _Basis, trial_data: FitTrial, i: int, weigh: float) -> tupl
     design = _design(columns, problem.index[i], size)
     shift = covariance @ (basis.scores[i] - basis.scores.mean(axis=0))
     missed = columns[:, -1] + columns[:, deviations] @ state.trial_effects[i, deviations] + design @ shift
-    trial_effects = _own_loadings(_own_spreads(solution, i), columns, trial_data)
-    loadings = np.column_stack([design @ _root(covariance + basis.between), trial_effects])
+    own_loadings = _own_loadings(_own_spreads(solution, i), columns, trial_data)
+    loadings = np.column_stack([design @ root_of(covariance + basis.between), own_loadings])
     noise = float(state.variance[i]) / (1 - state.rho**2)
     left, random, missed = _aligned(loadings, missed, columns[:, :2], trial_data, weigh, state, noise)
     return missed, np.sum(left**2, axis=1) + random
@@ -255,7 +256,7 @@ def _loadings_of_new(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: Trial
     spread = np.array([trial_data.gauge_error or state.spread[0], state.spread[1]])
     spread *= [predictor.feels_pressure[0], predictor.feels_damping[0]]
     shapes = position_shapes(predictor, [trial_data.lead_position_m - trial_effects[0, ORIGIN] - columns[:, -1]])[0]
-    loadings = np.column_stack([design @ _root(mine), _own_loadings(spread, columns, trial_data), shapes])
+    loadings = np.column_stack([design @ root_of(mine), _own_loadings(spread, columns, trial_data), shapes])
     noise = float(np.mean(state.variance)) / (1 - state.rho**2)
     return _aligned(loadings, columns[:, -1], columns[:, :2], trial_data, fit.noise_correlation, state, noise)[:2]
 
@@ -284,14 +285,9 @@ def _covariance(fit: Fit, basis: _Basis) -> Floats:
     sigma = np.array(
         [n.sigma / (n.value if free.logarithmic else free.scale) for n, free in zip(fit.numbers, held, strict=True)]
     )
-    trial_effects = np.sqrt(np.maximum(np.diag(plain), 1e-300))
-    wider = np.where(np.isfinite(sigma) & (np.diag(plain) > 0), np.maximum(sigma / trial_effects, 1.0), 1.0)
+    by_noise = np.sqrt(np.maximum(np.diag(plain), 1e-300))
+    wider = np.where(np.isfinite(sigma) & (np.diag(plain) > 0), np.maximum(sigma / by_noise, 1.0), 1.0)
     return np.asarray(plain * wider[:, None] * wider)
-
-
-def _root(square: Floats) -> Floats:
-    values, vectors = np.linalg.eigh(square)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _aligned(

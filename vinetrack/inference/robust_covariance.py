@@ -171,7 +171,7 @@ def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: 
     live = np.flatnonzero(np.diag(plain) > 0)
     if not live.size or len(scores) < 2:
         return variance, degrees
-    root = _root(plain[np.ix_(live, live)])
+    root = root_of(plain[np.ix_(live, live)])
     score = (scores - scores.mean(axis=0))[:, live] @ root
     shares, mended = [], []
     constant = root.T @ np.diag(solution.problem.prior_precision[live]) @ root
@@ -194,8 +194,18 @@ def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: 
     return variance, degrees
 
 
-def _root(square: Floats) -> Floats:
-    """A matrix whose product with its own transpose is a symmetric positive one."""
+def root_of(square: Floats) -> Floats:
+    """A matrix whose product with its own transpose is a symmetric positive one.
+
+    Parameters
+    ----------
+    square : array, shape (n, n)
+        Symmetric, no eigenvalue below zero but by rounding.
+
+    Returns
+    -------
+    array, shape (n, n)
+    """
     values, vectors = np.linalg.eigh(square)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 

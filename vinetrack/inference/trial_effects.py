@@ -1,15 +1,37 @@
-"""What each trial has of its own, release, origin and deviations, brought to its best while all else stays."""
+"""Effects of single trials, release, origin and deviations, brought to their best; releases looked for elsewhere.
+
+The release, the origin and the deviations of a trial trade against each other, so that its misfit has a minimum in more
+than one place: by far where no frame shows it at rest, and where a vine begins so slowly that its first frames hardly
+differ from rest. A trajectory depends on the time since release alone, so one simulation, shifted, tells the misfit of
+every release.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effect_penalty, trial_effect_step
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, RELEASE, Predictor
-from vinetrack.inference.whitening import whiten
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.mixed_effects import (
+    FitState,
+    MixedProblem,
+    trial_effect_penalty,
+    trial_effect_prior,
+    trial_effect_step,
+)
+from vinetrack.inference.sensitivity import (
+    DAMPING_DEVIATION,
+    ORIGIN,
+    OWN,
+    PRESSURE,
+    RELEASE,
+    Job,
+    Predictor,
+)
+from vinetrack.inference.whitening import at_correlation, whiten
 
 LARGEST_DEVIATION_STEP = 0.3
 """Largest step and largest size of a trial's deviation of pressure and ln B, and the largest step of its release,
@@ -109,3 +131,171 @@ def trial_costs(predictor: Predictor, problem: MixedProblem, state: FitState) ->
         for trial_data, residual, variance in zip(predictor.data, residuals, state.variance, strict=True)
     ]
     return np.array(squares) + trial_effect_penalty(problem, state)
+
+
+RELEASES = 60
+"""Releases tried for a trial seen only in motion. Chosen for time; the best is improved by Newton steps afterwards."""
+
+NEAR_FRAMES = np.concatenate([np.arange(-14.0, 15.0), [-0.6, -0.3, -0.12, -0.05, 0.05, 0.12, 0.3, 0.6]])
+"""Where else the release of a trial may be that was seen at rest, from where it is held to be. Close by, it may lie on
+the other side of a frame at which the edge jumps. Chosen: slow starts seen at rest were off by up to nine frames;
+fractions resolve a frame."""
+
+GRID_POINTS = 600
+"""Points of the grid on which a trajectory is shifted. Derived: linear interpolation then errs by less than 1e-6 of
+the travel."""
+
+WORTH_MOVING = 0.5
+"""Fall of a trial's −2 ln L for which its release jumps to another minimum. Derived: 0.5 of −2 ln L is 0.7 standard
+errors; less is left to the next step."""
+
+HARDLY_MISSED = 30.0
+"""Times the variance of its noise by which a trial may be missed for its release to be looked for. Chosen for time: a
+trial missed by more is not helped by its release alone."""
+
+IMPROVED = 3
+"""Steps in which a trial settles at another release before it is held against where it was. Chosen: Newton steps of
+four numbers settle in two or three."""
+
+STEPS = np.array([-np.inf, -0.3, -0.3]), np.array([np.inf, 0.3, 0.3])
+"""Least and largest change of origin and deviations."""
+
+DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
+"""Steps of pressure and ln B for differences. Derived: 1 % moves a trajectory ten thousand times the integrator's
+error and bends it by 1e-4."""
+
+
+def search_releases(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
+    """The state with likelier releases; None if none is.
+
+    Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than noise:
+    another release would make up for something else.
+
+    Parameters
+    ----------
+    predictor
+        Of the trials to fit.
+    problem
+        What does not change during the fit.
+    state
+        Where the fit stands.
+
+    Returns
+    -------
+    FitState or None
+    """
+    missed = trial_costs(predictor, problem, state) * state.variance / (1 - state.rho**2) / problem.points
+    places = [
+        i
+        for i, trial_data in enumerate(predictor.data)
+        if trial_data.trace is None and (not trial_data.shows_rest or missed[i] < HARDLY_MISSED * trial_data.noise_m**2)
+    ]
+    if not places:
+        return None
+    plain = predictor.jobs(state.theta, state.trial_effects)
+    releases = [_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
+    answers = _answers(predictor, [plain[i] for i in places], releases)
+    trial_effects = state.trial_effects.copy()
+    claimed = False
+    for i, tried_s, answer in zip(places, releases, answers, strict=True):
+        there, gain = _best(predictor.data[i], i, problem, state, tried_s, *answer)
+        if gain > WORTH_MOVING:
+            trial_effects[i], claimed = there, True
+    kept = _borne_out(predictor, problem, state, replace(state, trial_effects=trial_effects)) if claimed else state
+    return None if np.array_equal(kept.trial_effects, state.trial_effects) else kept
+
+
+def _borne_out(predictor: Predictor, problem: MixedProblem, state: FitState, tried: FitState) -> FitState:
+    """Of both states the own numbers that fit a trial better, once those tried have settled: lines are not straight."""
+    for _ in range(IMPROVED):
+        tried = follow_trial_effects(predictor, problem, tried)[0]
+    better = _levels(predictor, problem, tried) < _levels(predictor, problem, state) - WORTH_MOVING
+    return replace(state, trial_effects=np.where(better[:, None], tried.trial_effects, state.trial_effects))
+
+
+def _levels(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
+    """−2 ln L of every trial with its own numbers integrated out about where they stand, shape (n_trials,)."""
+    columns = predictor.linearise(state.theta, state.trial_effects, own_only=True)
+    white = at_correlation(predictor.products(columns), state.rho)
+    square = white[:, :OWN, :OWN] / state.variance[:, None, None]
+    precision = trial_effect_prior(problem, state)[1]
+    log_volume = np.linalg.slogdet(square + precision[:, :, None] * np.eye(OWN))[1]
+    return np.asarray(trial_costs(predictor, problem, state) + log_volume)
+
+
+def _best(
+    trial_data: FitTrial,
+    i: int,
+    problem: MixedProblem,
+    state: FitState,
+    releases: Floats,
+    times: Floats,
+    plain: Floats,
+    answers: Floats,
+) -> tuple[Floats, float]:
+    """The own numbers of one trial at its likeliest release, and the fall of −2 ln L from the last of the releases."""
+    trial_effects = state.trial_effects[i]
+    centre, precision = (part[i] for part in trial_effect_prior(problem, state))
+    since = np.clip(trial_data.time_s - releases[:, None], 0.0, times[-1])
+    moved = [np.interp(since, times, values) for values in (*answers, plain)]
+    moved[-1] = trial_data.lead_position_m - trial_effects[ORIGIN] - moved[-1]
+    white = whiten(np.stack(moved, axis=-1), trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(
+        state.variance[i]
+    )
+    tried = np.tile(trial_effects, (releases.size, 1))
+    tried[:, RELEASE] = releases
+    square = np.swapaxes(white, 1, 2) @ white
+    inner = square[:, :-1, :-1] + np.diag(precision)
+    slope = (square[:, :-1, -1] - precision * (tried - centre))[:, ORIGIN:]
+    step = np.clip(np.linalg.solve(inner[:, ORIGIN:, ORIGIN:], slope[..., None])[..., 0], *STEPS)
+    tried[:, ORIGIN:] += step
+    left = white[..., -1] - np.einsum("rnk,rk->rn", white[..., 1:-1], step)
+    levels = np.sum(left**2, axis=1) + np.sum(precision * (tried - centre) ** 2, axis=1) + np.linalg.slogdet(inner)[1]
+    k = int(np.argmin(levels))
+    return tried[k], float(levels[-1] - levels[k])
+
+
+def _releases(trial_data: FitTrial, release_s: float) -> Floats:
+    """Where the release of a trial may be, s, shape (n,); the last is where it is held to be."""
+    if trial_data.shows_rest:
+        return np.append(release_s + trial_data.frame_s * NEAR_FRAMES, release_s)
+    duration_s = float(trial_data.time_s[-1] - trial_data.time_s[0])
+    return np.append(trial_data.time_s[0] - np.geomspace(0.1 * trial_data.frame_s, duration_s, RELEASES), release_s)
+
+
+def _answers(
+    predictor: Predictor, plain: Sequence[Job], releases: Sequence[Floats]
+) -> list[tuple[Floats, Floats, Floats]]:
+    """Of every trial other instants since release, shape (n,), positions there, and how they answer to its own numbers.
+
+    Answers have shape (4, n), zero where it does not feel one.
+    """
+    jobs: list[Job] = []
+    moves: list[tuple[int, float]] = []
+    grids: list[Floats] = []
+    for job, tried_s in zip(plain, releases, strict=True):
+        i, released = job.trial, replace(job, release_s=0.0)
+        ways = [((-1, 0.0), released)]
+        if predictor.feels_pressure[i]:
+            deviation = job.pressure_deviation + PRESSURE_STEP
+            ways.append(((PRESSURE, PRESSURE_STEP), replace(released, pressure_deviation=deviation)))
+        if predictor.feels_damping[i]:
+            row = job.row.copy()
+            row[predictor.damping_column] *= np.exp(DAMPING_STEP)
+            ways.append(((DAMPING_DEVIATION, DAMPING_STEP), replace(released, row=row)))
+        longest_s = float(predictor.data[i].time_s[-1] - tried_s.min())
+        for move, varied in ways:
+            moves.append(move)
+            jobs.append(varied)
+            grids.append(longest_s * np.linspace(0.0, 1.0, GRID_POINTS) ** 1.5)
+    answers_found: list[tuple[Floats, Floats, Floats]] = []
+    for (place, step), times, moved in zip(moves, grids, predictor.run(jobs, times_s=grids), strict=True):
+        y = moved.observed_position_m
+        if place < 0:
+            answers = np.zeros((OWN, times.size))
+            answers[RELEASE] = -np.gradient(y, times)
+            answers[ORIGIN] = 1.0
+            answers_found.append((times, y, answers))
+        else:
+            answers_found[-1][2][place] = (y - answers_found[-1][1]) / step
+    return answers_found

@@ -9,8 +9,7 @@ import pytest
 
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.compare import position_errors
-from vinetrack.diagnosis.replicate_alignment import align_replicates
-from vinetrack.diagnosis.replicates import replicates_of
+from vinetrack.diagnosis.replicates import align_replicates, replicates_of
 from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
