@@ -152,14 +152,20 @@ def _weighed(solution: Solution, shared: int) -> Pooled:
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
     live = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
     root = _typical_root(inverse_among(total, live), information, shared)
+    values, vectors = np.linalg.eigh(information)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     prior = np.diag(problem.prior_precision)
     offset = state.theta - problem.prior_mean
 
     def weighed(tau2: float) -> tuple[Floats, Floats, float]:
         inner = np.eye(size) + tau2 * root.T @ information @ root
         less = tau2 * root @ np.linalg.solve(inner, np.broadcast_to(root.T, inner.shape))
-        weight = information - information @ less @ information
-        score = scores - np.einsum("nij,nj->ni", information @ less, scores)
+        # (J⁻¹ + τ²M)⁻¹ as ZᵀZ: J − J(…)J would lose every digit of a number that trials disagree on.
+        across = np.swapaxes(half, 1, 2) @ root
+        lower = np.linalg.cholesky(np.eye(size) + tau2 * across @ np.swapaxes(across, 1, 2))
+        narrow = np.linalg.solve(lower, np.swapaxes(half, 1, 2))
+        weight = np.swapaxes(narrow, 1, 2) @ narrow
+        score = np.linalg.solve(np.eye(size) + tau2 * information @ root @ root.T, scores[..., None])[..., 0]
         inside_all = (weight.sum(axis=0) + prior)[np.ix_(live, live)]
         slope = (score.sum(axis=0) - problem.prior_precision * offset)[live]
         scale = 1 / np.sqrt(np.diag(inside_all))
