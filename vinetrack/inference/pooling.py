@@ -164,8 +164,9 @@ def _weighed(solution: Solution, shared: int) -> Pooled:
         across = np.swapaxes(half, 1, 2) @ root
         lower = np.linalg.cholesky(np.eye(size) + tau2 * across @ np.swapaxes(across, 1, 2))
         narrow = np.linalg.solve(lower, np.swapaxes(half, 1, 2))
-        weight = np.swapaxes(narrow, 1, 2) @ narrow
-        score = np.linalg.solve(np.eye(size) + tau2 * information @ root @ root.T, scores[..., None])[..., 0]
+        weight = np.asarray(np.swapaxes(narrow, 1, 2) @ narrow, dtype=float)
+        turned = np.linalg.solve(np.eye(size) + tau2 * information @ root @ root.T, scores[..., None])
+        score = np.asarray(turned[..., 0], dtype=float)
         inside_all = (weight.sum(axis=0) + prior)[np.ix_(live, live)]
         slope = (score.sum(axis=0) - problem.prior_precision * offset)[live]
         scale = 1 / np.sqrt(np.diag(inside_all))
