@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 from vinetrack.core.records import Trial
-from vinetrack.experiment.reference import column_entries, reference_lines, setting_entries
+from vinetrack.experiment.reference import (
+    column_entries,
+    picture_entries,
+    reference_content,
+    reference_lines,
+    reference_page,
+    setting_entries,
+)
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.experiment.settings import ExperimentSettings, RunSettings
 
@@ -44,3 +52,22 @@ def test_the_lines_name_units_and_bounds() -> None:
     assert "litres" in line
     assert "above 0 to 10000" in line
     assert "Volume of the pressure chamber." in line
+
+
+def test_the_page_of_the_docs_is_current() -> None:
+    page = Path(__file__).parents[2] / "docs" / "settings.md"
+    assert page.read_text(encoding="utf-8") == reference_page(), "vinetrack settings --page docs/settings.md"
+
+
+def test_every_number_of_a_trial_says_how_one_measures_it() -> None:
+    measured = {entry.name: entry.measured for entry in column_entries()}
+    numbers = {name for name, column in COLUMNS.items() if column.kind == "number" and name != "order"}
+    assert not {name for name in numbers if not measured[name]}
+    assert "until the tip starts to move" in measured["yield_pressure_kPa"]
+
+
+def test_keys_of_every_calibration_and_of_the_axis_are_listed() -> None:
+    names = {entry.name for entry in picture_entries()}
+    assert {"calibration.squares (kind: charuco)", "calibration.length_mm (kind: two_points)", "axis.width_mm"} <= names
+    assert all(entry.meaning for entry in picture_entries())
+    assert set(reference_content()) == {"columns", "experiment", "picture", "run"}

@@ -256,3 +256,11 @@ def test_a_wrong_run_setting_is_named(values: dict[str, Any], column: str) -> No
 def test_a_run_setting_nearly_right_suggests_the_nearest() -> None:
     with pytest.raises(ExperimentError, match="did you mean seed"):
         run_settings({"damping": {"sead": 1}})
+
+
+def test_an_unknown_key_shows_the_nearest_three(tmp_path: Path) -> None:
+    with pytest.raises(ExperimentError) as refused:
+        read(tmp_path, "mm_px: 3\n")
+    (problem,) = refused.value.problems
+    assert problem.remedy.startswith("did you mean mm_per_px? (or ")
+    assert problem.remedy.count(",") == 1

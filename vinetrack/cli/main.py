@@ -71,11 +71,21 @@ register_explore(app)
 
 
 @app.command("settings", rich_help_panel=MORE)
-def _settings(json_file: JsonFile = None) -> None:
+def _settings(
+    json_file: JsonFile = None,
+    page: Annotated[
+        Path | None,
+        typer.Option("--page", metavar="FILE", help="Write them as a page of docs.", show_default=False),
+    ] = None,
+) -> None:
     """Every column of the sheet and every key of the settings, with unit, default, bounds and meaning."""
     with _sentences(None):
-        from vinetrack.experiment.reference import reference_content, reference_lines
+        from vinetrack.core.tables import write_text
+        from vinetrack.experiment.reference import reference_content, reference_lines, reference_page
 
+        if page is not None:
+            write_text(page, reference_page())
+            return
         tell(reference_lines(), reference_content(), json_file)
 
 

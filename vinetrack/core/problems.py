@@ -5,8 +5,12 @@ Reading an experiment collects every problem before it gives up, so that a sheet
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+COMES_CLOSE = 0.6
+"""Chosen: part of the letters that two names share from which one may be a slip for the other; difflib's default."""
 
 LONGEST_VALUE = 60
 """Of a value quoted in a message; chosen: half a line, as a paragraph pasted in a cell would hide the message."""
@@ -87,6 +91,30 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     errors = sum(problem.severity == "error" for problem in remaining)
     more = f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"
     return [*(str(problem) for problem in ordered[: limit - 1]), more]
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """What an unknown name may have meant: the nearest three of those that are known.
+
+    Parameters
+    ----------
+    name : as it was written.
+    known : names that would have been right.
+
+    Returns
+    -------
+    a question where one comes close, else a list; blank where nothing is known.
+
+    >>> did_you_mean("presure", ["pressure", "payload", "trial", "preview"])
+    'did you mean pressure? (or preview, payload)'
+    """
+    nearest = difflib.get_close_matches(name, list(known), 3, 0.0)
+    if not nearest:
+        return ""
+    if difflib.SequenceMatcher(None, nearest[0], name).ratio() < COMES_CLOSE:
+        return f"the nearest are {', '.join(nearest)}; vinetrack settings lists all"
+    others = f" (or {', '.join(nearest[1:])})" if len(nearest) > 1 else ""
+    return f"did you mean {nearest[0]}?{others}"
 
 
 def _shorten(text: str) -> str:

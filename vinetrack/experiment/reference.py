@@ -16,7 +16,15 @@ from pydantic.fields import FieldInfo
 from vinetrack.core.terminal import table
 from vinetrack.core.units import UNITS, split_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
-from vinetrack.experiment.settings import ExperimentSettings, RunSettings
+from vinetrack.experiment.settings import (
+    AxisSettings,
+    Charuco,
+    Checkerboard,
+    ExperimentSettings,
+    MmPerPx,
+    RunSettings,
+    TwoPoints,
+)
 
 _BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
@@ -33,15 +41,52 @@ _KIND_ALLOWED = {
 """What a column may hold that is no number within bounds."""
 
 
+_PICTURE_MODELS = (
+    ("calibration", "charuco", Charuco),
+    ("calibration", "checkerboard", Checkerboard),
+    ("calibration", "two_points", TwoPoints),
+    ("calibration", "mm_per_px", MmPerPx),
+    ("axis", "", AxisSettings),
+)
+"""Groups of keys about the picture: the key of the group, its kind, and what reads it."""
+
+_PICTURE_MEANINGS = {
+    "image": ("Picture or clip of the target, in the plane of growth.", "Film it with the settings of the trials."),
+    "squares": ("Squares across and down.", "Count them."),
+    "square_mm": ("Side of a square.", "Calliper over ten printed squares, divided by ten: printers scale."),
+    "marker_mm": ("Side of a marker inside its square.", "Calliper."),
+    "dictionary": ("Markers of the board, as OpenCV names them.", "The program that printed the board says it."),
+    "from_px": ("First point, x to the right and y down from the upper left corner.", "Any picture viewer shows it."),
+    "to_px": ("Second point.", "Any picture viewer shows it."),
+    "length_mm": ("Distance between the two points.", "Two marks of a ruler in the plane of growth."),
+    "mm_per_px": ("Scale of the picture.", "Length of a ruler in the plane of growth over its pixels."),
+    "width_mm": ("How wide a strip along the axis is looked at.", "About the diameter of the vine."),
+}
+"""Meaning of each of those keys, and how one comes by it."""
+
+_PAGE_HEAD = """# Every column and key
+
+Made from the declarations that read them: `vinetrack settings` prints the same, `vinetrack settings --json -` for a
+program, and `vinetrack settings --page docs/settings.md` makes this page. A column may be in another unit by its name
+(`pressure_psi`, `diameter_in`, …), and so may a key of `experiment.yaml`: it is converted, and `check` says so. A
+blank cell stands for the default; a blank `growth_angle_deg` means straight down.
+"""
+"""Beginning of the page."""
+
+
 @dataclass(frozen=True)
 class Entry:
-    """A column or key: its unit, default and what is allowed, blank where there is none, and what it means."""
+    """A column or key: its unit, default and what is allowed, blank where there is none, and what it means.
+
+    `measured` is how one comes by it.
+    """
 
     name: str
     unit: str
     default: str
     allowed: str
     meaning: str
+    measured: str = ""
 
 
 def column_entries() -> list[Entry]:
@@ -52,7 +97,8 @@ def column_entries() -> list[Entry]:
             unit=column.unit,
             default=column.default,
             allowed=_KIND_ALLOWED.get(column.kind) or column.allowed.removesuffix(column.unit).rstrip(),
-            meaning=f"{column.meaning} {column.measured}".rstrip(),
+            meaning=column.meaning,
+            measured=column.measured,
         )
         for column in COLUMNS.values()
     ]
@@ -93,18 +139,52 @@ def setting_entries(model: type[BaseModel], prefix: str = "") -> Iterator[Entry]
             yield from setting_entries(type(field.default), f"{name}.")
 
 
+def picture_entries() -> list[Entry]:
+    """Keys of `calibration`, by its kind, and of `axis`."""
+    entries = []
+    for prefix, kind, model in _PICTURE_MODELS:
+        for name, field in model.model_fields.items():
+            if name != "kind":
+                meaning = _PICTURE_MEANINGS[name]
+                unit = UNITS[split_unit(name)[1]].text if name.endswith("_mm") else "px" if name.endswith("_px") else ""
+                of_kind = f" (kind: {kind})" if kind else ""
+                default = "required" if field.is_required() else "by the motion"
+                entries.append(Entry(f"{prefix}.{name}{of_kind}", unit, default, _allowed(field), *meaning))
+    return entries
+
+
+def _groups() -> tuple[tuple[str, list[Entry]], ...]:
+    """Title and entries of each part of the reference."""
+    one_each = ", ".join(name for name, column in COLUMNS.items() if not column.shared)
+    return (
+        (f"Columns of trials.csv; all but {one_each} may stand in experiment.yaml for all", column_entries()),
+        ("Keys of experiment.yaml", list(setting_entries(ExperimentSettings))),
+        ("Keys of calibration and axis in experiment.yaml", picture_entries()),
+        ("Keys of config/config.yaml, also --config key=value of snakemake", list(setting_entries(RunSettings))),
+    )
+
+
+def reference_page() -> str:
+    """The reference as the page `docs/settings.md`."""
+    parts = [_PAGE_HEAD]
+    for title, entries in _groups():
+        heading, _, rest = title.partition("; ")
+        parts += [f"## {heading}", ""]
+        parts += [f"{rest[0].upper()}{rest[1:]}.", ""] if rest else []
+        parts += ["| name | unit | default | allowed | meaning | how one measures it |", "|---|---|---|---|---|---|"]
+        for e in entries:
+            cells = (f"`{e.name}`", e.unit, e.default, e.allowed, e.meaning, e.measured)
+            parts.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        parts.append("")
+    return "\n".join(parts)
+
+
 def reference_lines() -> list[str]:
     """Columns and keys, a line each, aligned; for the terminal."""
     head = ("name", "unit", "default", "allowed", "meaning")
-    one_each = ", ".join(name for name, column in COLUMNS.items() if not column.shared)
-    groups = (
-        (f"Columns of trials.csv; all but {one_each} may stand in experiment.yaml for all", column_entries()),
-        ("Keys of experiment.yaml", list(setting_entries(ExperimentSettings))),
-        ("Keys of config/config.yaml, also --config key=value of snakemake", list(setting_entries(RunSettings))),
-    )
     lines: list[str] = []
-    for title, entries in groups:
-        rows = [(entry.name, entry.unit, entry.default, entry.allowed, entry.meaning) for entry in entries]
+    for title, entries in _groups():
+        rows = [(e.name, e.unit, e.default, e.allowed, f"{e.meaning} {e.measured}".rstrip()) for e in entries]
         lines += ["", title, *table(rows, head, indent="  ", align="<<<<<")]
     lines += [
         "",
@@ -154,6 +234,7 @@ def reference_content() -> dict[str, list[dict[str, str]]]:
     groups = {
         "columns": column_entries(),
         "experiment": list(setting_entries(ExperimentSettings)),
+        "picture": picture_entries(),
         "run": list(setting_entries(RunSettings)),
     }
     return {name: [asdict(entry) for entry in entries] for name, entries in groups.items()}

@@ -46,6 +46,7 @@ COLUMNS: dict[str, Column] = {
             field="pressure_trace",
             kind="path",
             meaning="A CSV with time_s, pressure_kPa: the gauge pressure measured during the trial.",
+            measured="A gauge at the chamber, logged on the clock of the recording.",
         ),
         Column(
             name="capture_fps",
@@ -55,7 +56,7 @@ COLUMNS: dict[str, Column] = {
             high=1e7,
             usual=(60, math.inf),
             unusual_hint="write the rate of capture, not that of playback",
-            meaning="Frames a second at capture.",
+            meaning="Frames a second at capture; never the rate at which the file plays.",
             measured="The camera's setting; the file's own rate is that of playback.",
             default="required with a video, but for DNG frames",
         ),
@@ -148,7 +149,7 @@ COLUMNS: dict[str, Column] = {
             high=1000,
             slips=("Pa", "mbar"),
             meaning="Yield pressure: the least gauge pressure at which the vine grows.",
-            measured="Pressure raised slowly until the tip starts to move.",
+            measured="Raise the pressure slowly from zero until the tip starts to move; the mean gauge of five starts.",
             default="required",
         ),
         Column(
@@ -158,7 +159,7 @@ COLUMNS: dict[str, Column] = {
             high=1000,
             slips=("Pa", "mbar"),
             meaning="Standard error of the yield pressure.",
-            measured="Standard deviation over repeated starts.",
+            measured="Standard deviation over those starts, over the root of their number.",
             default="0.2 kPa",
         ),
         Column(
@@ -213,6 +214,7 @@ COLUMNS: dict[str, Column] = {
             field="bends",
             kind="bends",
             meaning="Bends of the path: start_mm:arc_mm:radius_mm, several joined by ;.",
+            measured="Drawing of the guide, or a string laid along it.",
             default="none",
         ),
         Column(
@@ -233,6 +235,7 @@ COLUMNS: dict[str, Column] = {
             high=1000,
             unit_key="mm",
             meaning="Scale of the picture; overrides the calibration.",
+            measured="Length of a ruler in the plane of growth over its pixels.",
         ),
         Column(
             name="compare_sizes",

@@ -6,7 +6,6 @@ in step. An unknown key, a key written twice and a value that is not allowed are
 
 from __future__ import annotations
 
-import difflib
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -23,7 +22,7 @@ from pydantic import (
 )
 
 from vinetrack.core.constants import BASE_EFFECTS
-from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
 from vinetrack.core.records import Bend
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
 from vinetrack.experiment.cells import read_limit, read_range, read_value, steps_between
@@ -389,8 +388,7 @@ def _as_problem(model: type[BaseModel], document: YamlDocument, file: str, detai
     value = detail["input"] if isinstance(detail["input"], str | int | float | bool) else None
     shown = None if value is None else str(value)
     if detail["type"] == "extra_forbidden":
-        nearest = difflib.get_close_matches(str(location[-1]), _keys_beside(model, document.content, location), 1, 0.6)
-        remedy = f"did you mean {nearest[0]}?" if nearest else "remove it, or see the documentation for the keys"
+        remedy = did_you_mean(str(location[-1]), _keys_beside(model, document.content, location)) or "remove it"
         return Problem(message="is no setting", file=file, line=line, column=key, remedy=remedy)
     if detail["type"] == "missing":
         return Problem(message="is missing", file=file, line=line, column=key, remedy="add it")

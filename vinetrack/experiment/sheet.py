@@ -5,14 +5,13 @@ Nothing here opens a recording; `vinetrack.experiment.folder` joins rows, settin
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vinetrack.core.problems import Problem
+from vinetrack.core.problems import Problem, did_you_mean
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Trial
 from vinetrack.core.tables import Table, TableError, safe_join
 from vinetrack.experiment.cells import CellError, oddity, read_cell
@@ -126,8 +125,7 @@ def unknown_columns(table: Table, file: str) -> list[Problem]:
     problems = []
     for name in table.columns:
         if name not in COLUMNS:
-            nearest = difflib.get_close_matches(name, [c for c in COLUMNS if c not in table.columns], 1, 0.6)
-            remedy = f"did you mean {nearest[0]}?" if nearest else ""
+            remedy = did_you_mean(name, [column for column in COLUMNS if column not in table.columns])
             message = "is no column of a trial sheet and is ignored"
             place: dict[str, Any] = {"file": file, "line": 1, "column": name}
             problems.append(Problem(message=message, severity="warning", remedy=remedy, **place))
