@@ -168,9 +168,9 @@ def reference_page() -> str:
     """The reference as the page `docs/settings.md`."""
     parts = [_PAGE_HEAD]
     for title, entries in _groups():
-        heading, _, rest = title.partition("; ")
+        heading, _, shared = title.partition("; ")
         parts += [f"## {heading}", ""]
-        parts += [f"{rest[0].upper()}{rest[1:]}.", ""] if rest else []
+        parts += [f"{shared[0].upper()}{shared[1:]}.", ""] if shared else []
         parts += ["| name | unit | default | allowed | meaning | how one measures it |", "|---|---|---|---|---|---|"]
         for e in entries:
             cells = (f"`{e.name}`", e.unit, e.default, e.allowed, e.meaning, e.measured)
