@@ -131,7 +131,7 @@ def test_the_band_is_that_of_the_replicates() -> None:
 def true_model() -> Comparison:
     """Two vines, four pressures, four replicates that scatter; the model is the one they were grown with."""
     pairs, _ = small_campaign(seed=11, replicates=4)
-    return compare(vt.fit(vt.base_model(), pairs, profile=False), pairs)
+    return vt.compare(vt.fit(vt.base_model(), pairs, profile=False))
 
 
 def test_a_model_that_lacks_nothing_stands_at_the_floor(true_model: Comparison) -> None:
@@ -139,10 +139,6 @@ def test_a_model_that_lacks_nothing_stands_at_the_floor(true_model: Comparison) 
     together = np.sqrt(np.mean(table["rms_position_m"] ** 2) / np.mean(table["replicate_floor_m"] ** 2))
     assert 0.8 < together < 1.25
     assert table["ratio"].max() < 2.0
-
-
-def test_it_stands_at_the_front_door() -> None:
-    assert vt.compare is compare
 
 
 def test_the_table_has_a_row_a_condition_and_the_columns_of_the_file(true_model: Comparison) -> None:
