@@ -25,9 +25,8 @@ def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -
     ----------
     text : YAML.
     key : a key of the first level.
-    value
-        A number, text, yes or no, a list of them, a mapping of them, or None, which leaves the key blank. Of a mapping
-        that has a line for each key, only lines whose value differs change.
+    value : a number, text, yes or no, a list of them, a mapping of them, or None, which leaves the key blank. Of a
+        mapping that has a line for each key, only lines whose value differs change.
     file : its name, for messages.
 
     Returns

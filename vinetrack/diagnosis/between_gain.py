@@ -56,12 +56,9 @@ def chance_of_gain(fit: Fit, difference: Difference, gain: float) -> float:
 
     Parameters
     ----------
-    fit
-        The fit without the difference.
-    difference
-        The difference.
-    gain
-        Fall of −2 ln L.
+    fit : the fit without the difference.
+    difference : the difference.
+    gain : fall of −2 ln L.
 
     Returns
     -------
@@ -89,14 +86,10 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
 
     Parameters
     ----------
-    fit
-        The fit without the difference.
-    base
-        Its solution, smooth errors of position among its numbers where there are any.
-    difference
-        The difference.
-    spread
-        Standard deviations of pressure and B from trial to trial; None to estimate them anew.
+    fit : the fit without the difference.
+    base : its solution, smooth errors of position among its numbers where there are any.
+    difference : the difference.
+    spread : standard deviations of pressure and B from trial to trial; None to estimate them anew.
 
     Returns
     -------

@@ -104,8 +104,7 @@ class CandidateFits:
 
         Parameters
         ----------
-        fit
-            One of the hypotheses' fits.
+        fit : one of the hypotheses' fits.
 
         Returns
         -------
@@ -269,8 +268,7 @@ def pairs(
 
     Parameters
     ----------
-    before
-        The fit that is questioned.
+    before : the fit that is questioned.
     firsts : sequence of LikelihoodRatio
         Fits of single effects.
     effects : sequence of Effect

@@ -115,10 +115,9 @@ def compare(
 
     Parameters
     ----------
-    fit
-        The fitted model.
-    experiment
-        An experiment or its folder, or pairs of trial and track; trials that the fit did not use are passed over.
+    fit : the fitted model.
+    experiment : an experiment or its folder, or pairs of trial and track; trials that the fit did not use are passed
+        over.
     tracks : mapping, optional
         Tracks by name of trial, where the experiment brings recordings.
     kinematics : mapping, optional
@@ -167,8 +166,7 @@ def position_errors(trials: Sequence[TrialFit], together: Replicates) -> dict[st
     ----------
     trials : sequence of TrialFit
         Of one condition, as predicted.
-    together
-        The same trials on one clock.
+    together : the same trials on one clock.
 
     Returns
     -------
@@ -248,8 +246,7 @@ def trajectory_table(trials: Sequence[TrialFit], together: Replicates) -> pd.Dat
     ----------
     trials : sequence of TrialFit
         Of one condition, as predicted.
-    together
-        The same trials on one clock.
+    together : the same trials on one clock.
 
     Returns
     -------

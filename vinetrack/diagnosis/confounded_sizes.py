@@ -78,10 +78,8 @@ def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder
 
     Parameters
     ----------
-    after
-        The fit with the effects in, held against all other candidates.
-    added
-        Names of the effects whose sizes are asked about.
+    after : the fit with the effects in, held against all other candidates.
+    added : names of the effects whose sizes are asked about.
 
     Returns
     -------
@@ -161,12 +159,9 @@ def size_not_excluded(
 
     Parameters
     ----------
-    estimate, sigma
-        One-step estimate of the size, from the value without effect, and its standard error, SI.
-    parameter
-        The size: plausible range and sign.
-    upwards
-        Which limit is asked for where physics allows both signs.
+    estimate, sigma : one-step estimate of the size, from the value without effect, and its standard error, SI.
+    parameter : the size: plausible range and sign.
+    upwards : which limit is asked for where physics allows both signs.
 
     Returns
     -------

@@ -98,8 +98,7 @@ def sums_of(estimates: PerTrialEstimates, x: Floats, levels: Floats, chosen: NDA
 
     Parameters
     ----------
-    estimates
-        Values of one parameter by trial.
+    estimates : values of one parameter by trial.
     x : array, shape (n_trials,)
         Coordinate of a drift.
     levels : array, shape (n_trials,)
@@ -153,8 +152,7 @@ def constancy(sums: Sums) -> tuple[float, float]:
 
     Parameters
     ----------
-    sums
-        From `sums_of`.
+    sums : from `sums_of`.
 
     Returns
     -------

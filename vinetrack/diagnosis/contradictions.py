@@ -33,8 +33,7 @@ def displacement_m(before: Fit, after: Fit) -> float:
 
     Parameters
     ----------
-    before, after
-        Fits to the same trials without and with the effect.
+    before, after : fits to the same trials without and with the effect.
 
     Returns
     -------
@@ -56,8 +55,7 @@ def is_within_position_errors(before: Fit, after: Fit) -> bool:
 
     Parameters
     ----------
-    before, after
-        Fits to the same trials without and with the effect.
+    before, after : fits to the same trials without and with the effect.
 
     Returns
     -------
@@ -78,12 +76,9 @@ def contradictions(fits: Sequence[Fit], added: Sequence[str], ladder: pd.DataFra
 
     Parameters
     ----------
-    fits
-        The first model and every one after it.
-    added
-        The effects added, in order.
-    ladder
-        Table of errors with a row a model, see `vinetrack.diagnosis.ladder`; None where it was not made.
+    fits : the first model and every one after it.
+    added : the effects added, in order.
+    ladder : table of errors with a row a model, see `vinetrack.diagnosis.ladder`; None where it was not made.
 
     Returns
     -------

@@ -110,8 +110,7 @@ def drift(fit: Fit, scatter: Scatter | None = None) -> Drift:
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
+    fit : the fit that is questioned.
     scatter : Scatter, optional
         What replicates differ by, where it is known already.
 

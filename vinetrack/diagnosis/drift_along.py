@@ -48,12 +48,9 @@ def along_growth(fit: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> Ite
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
-    laid
-        Its model aligned with its trials.
-    values
-        Values of B by trial.
+    fit : the fit that is questioned.
+    laid : its model aligned with its trials.
+    values : values of B by trial.
 
     Yields
     ------
@@ -193,8 +190,7 @@ def against_the_sheet(fit: Fit) -> Iterator[ConstancyTest]:
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
+    fit : the fit that is questioned.
 
     Yields
     ------

@@ -55,8 +55,7 @@ def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSe
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
+    fit : the fit that is questioned.
     shapes : sequence of CandidateShape
 
     Returns

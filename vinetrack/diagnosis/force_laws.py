@@ -269,8 +269,7 @@ def finer_laws(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
 
     Parameters
     ----------
-    law
-        The best of the grid.
+    law : the best of the grid.
     motions : sequence of FittedMotion
 
     Returns

@@ -102,16 +102,12 @@ def refine(
 
     Parameters
     ----------
-    model_fit
-        The fit that lacks the force.
-    fit
-        Its linear answers to forces.
+    model_fit : the fit that lacks the force.
+    fit : its linear answers to forces.
     motions : sequence of FittedMotion
         The fitted motions that `gain` belongs to.
-    law
-        Form of the force.
-    gain
-        Its linear fit.
+    law : form of the force.
+    gain : its linear fit.
     thorough : bool
         Whether to search once more with care where the quick way leads nowhere.
 

@@ -83,8 +83,7 @@ def motions_of(fit: Fit, trial_effects: Floats, theta: Floats | None = None) -> 
 
     Parameters
     ----------
-    fit
-        The fit whose model is followed.
+    fit : the fit whose model is followed.
     trial_effects : array, shape (n_trials, 4)
     theta : array, shape (n_free,), optional
         Numbers of the model, scaled; those of the fit where None.
@@ -195,8 +194,7 @@ def force_sensitivities(
 
     Parameters
     ----------
-    fit
-        The fit whose model is followed.
+    fit : the fit whose model is followed.
     trial_effects : array, shape (n_trials, 4)
     motions : sequence of FittedMotion
         One a trial.
@@ -219,8 +217,7 @@ def push_sensitivities(
 
     Parameters
     ----------
-    fit
-        The fit whose model is followed.
+    fit : the fit whose model is followed.
     trial_effects : array, shape (n_trials, 4)
     motions : sequence of FittedMotion
         One a trial.

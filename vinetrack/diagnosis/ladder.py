@@ -84,10 +84,8 @@ def ladder(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
 
     Parameters
     ----------
-    fits
-        Fits of the models in order, all to the same trials.
-    added
-        What each added to the one before; blank for the first.
+    fits : fits of the models in order, all to the same trials.
+    added : what each added to the one before; blank for the first.
 
     Returns
     -------

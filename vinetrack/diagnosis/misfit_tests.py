@@ -266,8 +266,7 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTes
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
+    fit : the fit that is questioned.
     effects : sequence of Effect
         Candidates; those of the model are passed over.
     level : float

@@ -116,8 +116,7 @@ def missing_force(model_fit: Fit) -> MissingForce:
 
     Parameters
     ----------
-    model_fit
-        The fit that is questioned.
+    model_fit : the fit that is questioned.
 
     Returns
     -------

@@ -52,8 +52,7 @@ def payload_curves(fit: Fit, final_at_fraction: float) -> pd.DataFrame:
 
     Parameters
     ----------
-    fit
-        A fit; its trials say which vines, pressures and payloads there are.
+    fit : a fit; its trials say which vines, pressures and payloads there are.
     final_at_fraction : float
         Fraction of the length at which the speed is taken.
 
@@ -104,8 +103,7 @@ def speeds_with_error(fit: Fit, trials: Sequence[Trial], at_m: float, lasts_s: f
 
     Parameters
     ----------
-    fit
-        A fit.
+    fit : a fit.
     trials : sequence of Trial
         Of one vine.
     at_m : float

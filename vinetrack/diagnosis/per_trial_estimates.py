@@ -95,8 +95,7 @@ def per_trial_estimates(fit: Fit, key: str, laid: AlignedTrial) -> PerTrialEstim
     fit
     key : str
         Name of a parameter, `effect.parameter`.
-    laid
-        The model aligned with its trials, from `lay`.
+    laid : the model aligned with its trials, from `lay`.
 
     Returns
     -------

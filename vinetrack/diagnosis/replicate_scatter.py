@@ -74,8 +74,7 @@ def scatter_sensitivities(laid: AlignedTrial) -> list[Floats]:
 
     Parameters
     ----------
-    laid
-        The model aligned with its trials.
+    laid : the model aligned with its trials.
 
     Returns
     -------
@@ -100,8 +99,7 @@ def find_scatter(fit: Fit, groups: Sequence[Stretches]) -> Scatter:
 
     Parameters
     ----------
-    fit
-        Its between-trial standard deviations stand in where there are no replicates.
+    fit : its between-trial standard deviations stand in where there are no replicates.
     groups : sequence of Stretches
         One a condition.
 
@@ -170,8 +168,7 @@ def unlikely(mean: Floats, covariance: Floats, trials: int, scatter: Scatter) ->
         Of one trial.
     trials : int
         Number of trials.
-    scatter
-        Its degrees of freedom count.
+    scatter : its degrees of freedom count.
 
     Returns
     -------

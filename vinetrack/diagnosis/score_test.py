@@ -112,10 +112,8 @@ def products_of(fit: Fit, answers: EffectSensitivities, systematics: Sequence[Fl
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
-    answers
-        How positions answer to the candidates.
+    fit : the fit that is questioned.
+    answers : how positions answer to the candidates.
     systematics : sequence of arrays, shape (n_points, n_systematics), m
         From `vinetrack.inference.systematics`.
 
@@ -171,10 +169,8 @@ def levers_of(fit: Fit, sums: Products) -> Floats:
 
     Parameters
     ----------
-    fit
-        The fit.
-    sums
-        Its products with the shapes.
+    fit : the fit.
+    sums : its products with the shapes.
 
     Returns
     -------
@@ -196,10 +192,8 @@ def scores_of(fit: Fit, sums: Products, state: FitState | None = None) -> Scores
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
-    sums
-        From `products_of`.
+    fit : the fit that is questioned.
+    sums : from `products_of`.
     state : FitState, optional
         Noise and spreads in place of the fit's.
 
@@ -273,10 +267,8 @@ def linear_gains(fit: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
-    sums
-        From `products_of`.
+    fit : the fit that is questioned.
+    sums : from `products_of`.
     rho : float
         Lag-one correlation of the tracks' noise.
 
@@ -356,8 +348,7 @@ def structure_of(fit: Fit, systematics: Sequence[Floats]) -> Structure:
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
+    fit : the fit that is questioned.
     systematics : sequence of arrays, shape (n_points, n_systematics), m
         From `vinetrack.inference.systematics`.
 

@@ -82,8 +82,7 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
 
     Parameters
     ----------
-    fit
-        The fit that is questioned.
+    fit : the fit that is questioned.
 
     Returns
     -------

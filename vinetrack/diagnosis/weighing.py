@@ -38,8 +38,7 @@ def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
 
     Parameters
     ----------
-    fit
-        The fit with the effects.
+    fit : the fit with the effects.
     parameters : mapping
         Those of the effects that a hypothesis adds, by `effect.parameter`.
 
@@ -71,8 +70,7 @@ def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
 
     Parameters
     ----------
-    fit
-        The fit with the effects.
+    fit : the fit with the effects.
     parameters : mapping
         Those of the effects that a hypothesis adds, by `effect.parameter`.
 

@@ -175,8 +175,7 @@ def read_campaign(folder: Path, experiment: Experiment, user_effects: Mapping[st
     ----------
     folder : of the results.
     experiment : whose results they are.
-    user_effects
-        The user's own effects, see `vinetrack.pipeline.effects_stage.effects_of`.
+    user_effects : the user's own effects, see `vinetrack.pipeline.effects_stage.effects_of`.
 
     Returns
     -------

@@ -223,10 +223,8 @@ def chosen(
     ----------
     campaign : what is explored.
     start : the choice that is changed.
-    add, drop
-        Names of effects.
-    sizes
-        `effect.parameter=value` or `effect.parameter[vine]=value`, SI; the effect is put in.
+    add, drop : names of effects.
+    sizes : `effect.parameter=value` or `effect.parameter[vine]=value`, SI; the effect is put in.
 
     Returns
     -------

@@ -92,8 +92,7 @@ def follow(campaign: Campaign, sized: SizedModel, before: Curves | None = None) 
 
     Parameters
     ----------
-    before
-        Curves whose releases the alignment starts from; by default those of the comparison.
+    before : curves whose releases the alignment starts from; by default those of the comparison.
     campaign : the trials.
     sized : model, sizes and yield pressures.
 

@@ -143,10 +143,8 @@ def commands(
 
     Parameters
     ----------
-    start
-        The choice the page opened with.
-    fitted
-        Whether the sizes are those of a fit: else they are said one by one.
+    start : the choice the page opened with.
+    fitted : whether the sizes are those of a fit: else they are said one by one.
     campaign : as `read_campaign` returns it.
     choice : effects and sizes.
     save : whether the model is to be saved.

@@ -62,10 +62,8 @@ def fit(
 
     Parameters
     ----------
-    model
-        Sum of effects; its values are those of numbers that are held.
-    experiment
-        An experiment or its folder, or pairs of trial and track.
+    model : sum of effects; its values are those of numbers that are held.
+    experiment : an experiment or its folder, or pairs of trial and track.
     tracks : mapping, optional
         Tracks by name of trial, where the experiment brings recordings.
     fixed, free : iterable of str
@@ -172,8 +170,7 @@ def refit(
 
     Parameters
     ----------
-    before
-        The fit whose data, numbers and trial effects are taken over.
+    before : the fit whose data, numbers and trial effects are taken over.
     model : Model, optional
         The other model; its values are those of the fit where it has the same parameters.
     fixed, free : iterable of str, optional
@@ -264,8 +261,7 @@ def predict(fitted: Fit, pairs: Pairs) -> list[TrialFit]:
 
     Parameters
     ----------
-    fitted
-        A fit.
+    fitted : a fit.
     pairs : iterable of (Trial, Track)
         Trials to predict.
 

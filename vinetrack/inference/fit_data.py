@@ -197,10 +197,8 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
 
     Parameters
     ----------
-    trial
-        Row of the sheet.
-    track
-        Its positions.
+    trial : row of the sheet.
+    track : its positions.
 
     Returns
     -------
@@ -343,8 +341,7 @@ def pairs_of(
 
     Parameters
     ----------
-    experiment
-        An experiment, the path of its folder, or pairs of trial and track.
+    experiment : an experiment, the path of its folder, or pairs of trial and track.
     tracks : mapping, optional
         Tracks by name of trial, for recordings that were tracked before; else they are read from the experiment.
 

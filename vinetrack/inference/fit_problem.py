@@ -38,8 +38,7 @@ def make_problem(predictor: Predictor, trial_effects: Floats) -> MixedProblem:
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
+    predictor : of the trials to fit.
     trial_effects : array, shape (n_trials, 4)
         First guess of releases and origins.
 
@@ -145,8 +144,7 @@ def estimable(problem: MixedProblem) -> tuple[bool, bool]:
 
     Parameters
     ----------
-    problem
-        What does not change during the fit.
+    problem : what does not change during the fit.
 
     Returns
     -------

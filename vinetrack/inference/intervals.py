@@ -56,8 +56,7 @@ def among_first(known: Precision, count: int) -> Precision:
 
     Parameters
     ----------
-    known
-        Covariance of all numbers.
+    known : covariance of all numbers.
     count : int
         How many are kept.
 
@@ -73,8 +72,7 @@ def precision(solution: Solution) -> Precision:
 
     Parameters
     ----------
-    solution
-        Where the iterations ended.
+    solution : where the iterations ended.
 
     Returns
     -------
@@ -116,8 +114,7 @@ def degrees_of_freedom(solution: Solution) -> Floats:
 
     Parameters
     ----------
-    solution
-        Where the iterations ended.
+    solution : where the iterations ended.
 
     Returns
     -------
@@ -194,8 +191,7 @@ def near_bound(solution: Solution, sigma: Floats) -> np.ndarray:
 
     Parameters
     ----------
-    solution
-        Where the iterations ended.
+    solution : where the iterations ended.
     sigma : array, shape (n_free,)
         Standard errors, scaled.
 
@@ -218,10 +214,8 @@ def profile_interval(
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
     place : int
         Place of the number among the free ones.
     sigma : float

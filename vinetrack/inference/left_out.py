@@ -55,8 +55,7 @@ def predict_trials(fit: Fit, pairs: Pairs, *, from_rest: bool = False) -> list[T
 
     Parameters
     ----------
-    fit
-        A fit.
+    fit : a fit.
     pairs : iterable of (Trial, Track)
         Trials to predict.
     from_rest : bool
@@ -79,8 +78,7 @@ def predict_prepared(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool = Fa
 
     Parameters
     ----------
-    fit
-        A fit.
+    fit : a fit.
     data : sequence of FitTrial
         Trials to predict.
     from_rest : bool
@@ -124,8 +122,7 @@ def laid_on(fit: Fit, data: Sequence[FitTrial], *, from_rest: bool) -> tuple[Pre
 
     Parameters
     ----------
-    fit
-        A fit.
+    fit : a fit.
     data : sequence of FitTrial
         Trials to lay it on.
     from_rest : bool

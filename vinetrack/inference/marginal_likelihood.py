@@ -67,10 +67,8 @@ def marginal(grams: Floats, problem: MixedProblem, state: FitState) -> Marginal:
     ----------
     grams : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual], see `whitening`.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------
@@ -92,10 +90,8 @@ def left_to_keys(part: Marginal, problem: MixedProblem, spread: tuple[float, flo
 
     Parameters
     ----------
-    part
-        Release and origin eliminated.
-    problem
-        What does not change during the fit.
+    part : release and origin eliminated.
+    problem : what does not change during the fit.
     spread : (float, float)
         Between-trial standard deviations of pressure and ln B.
 
@@ -118,12 +114,9 @@ def normal_equations(
 
     Parameters
     ----------
-    part
-        Release and origin eliminated.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    part : release and origin eliminated.
+    problem : what does not change during the fit.
+    state : where the fit stands.
     spread : (float, float)
         Between-trial standard deviations of pressure and ln B.
 
@@ -150,12 +143,9 @@ def deviance(
 
     Parameters
     ----------
-    part
-        Release and origin eliminated.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    part : release and origin eliminated.
+    problem : what does not change during the fit.
+    state : where the fit stands.
     spread : (float, float)
         Between-trial standard deviations of pressure and ln B.
     restricted : bool
@@ -208,12 +198,9 @@ def estimate_spreads(
 
     Parameters
     ----------
-    part
-        Release and origin eliminated.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    part : release and origin eliminated.
+    problem : what does not change during the fit.
+    state : where the fit stands.
     estimable : (bool, bool)
         Which of the two are estimated.
     restricted : bool
@@ -266,10 +253,8 @@ def estimate_noise(
     ----------
     grams : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual], see `whitening`.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    problem : what does not change during the fit.
+    state : where the fit stands.
     rho : float, optional
         Correlation, where it is known.
     within : bool

@@ -76,10 +76,8 @@ def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, 
 
     Parameters
     ----------
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------
@@ -97,8 +95,7 @@ def spreads(problem: MixedProblem, spread: tuple[float, float]) -> Floats:
 
     Parameters
     ----------
-    problem
-        What does not change during the fit.
+    problem : what does not change during the fit.
     spread : (float, float)
         Between-trial standard deviations of pressure, relative, and of ln B.
 
@@ -116,10 +113,8 @@ def shared_penalty(problem: MixedProblem, state: FitState) -> float:
 
     Parameters
     ----------
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------
@@ -133,10 +128,8 @@ def trial_effect_penalty(problem: MixedProblem, state: FitState) -> Floats:
 
     Parameters
     ----------
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------
@@ -152,8 +145,7 @@ def cross_products(blocks: Floats, problem: MixedProblem) -> Floats:
     Parameters
     ----------
     blocks : array, shape (n_trials, n_keys, n_keys)
-    problem
-        Its `index` places the keys of each trial among the free numbers.
+    problem : its `index` places the keys of each trial among the free numbers.
 
     Returns
     -------
@@ -171,8 +163,7 @@ def cross_products_vector(blocks: Floats, problem: MixedProblem) -> Floats:
     Parameters
     ----------
     blocks : array, shape (n_trials, n_keys)
-    problem
-        Its `index` places the keys of each trial among the free numbers.
+    problem : its `index` places the keys of each trial among the free numbers.
 
     Returns
     -------
@@ -192,10 +183,8 @@ def newton_step(grams: Floats, problem: MixedProblem, state: FitState, damping: 
     ----------
     grams : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual], see `whitening`.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    problem : what does not change during the fit.
+    state : where the fit stands.
     damping : float
         Of Levenberg and Marquardt; 0 for a Gauss–Newton step.
 
@@ -234,10 +223,8 @@ def trial_effect_step(grams: Floats, problem: MixedProblem, state: FitState, *, 
     ----------
     grams : array, shape (n_trials, 3, k, k)
         Products of [trial effects, keys, residual], see `whitening`.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    problem : what does not change during the fit.
+    state : where the fit stands.
     pinned : bool
         Whether the release stays.
 
@@ -264,8 +251,7 @@ def bounded_solve(square: Floats, slope: Floats, problem: MixedProblem, theta: F
         Information of the free numbers.
     slope : array, shape (n_free,)
         Half the negative gradient of the sum of squares.
-    problem
-        Bounds, and which numbers may move.
+    problem : bounds, and which numbers may move.
     theta : array, shape (n_free,)
         Where they stand, scaled.
 
@@ -355,10 +341,8 @@ def trial_effects_eliminated(grams: Floats, n_keys: int, problem: MixedProblem, 
         Products of [trial effects, keys, residual, more].
     n_keys : int
         Number of keys.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------
@@ -378,8 +362,7 @@ def put_back(white: Floats, state: FitState, residual: int) -> Floats:
     ----------
     white : array, shape (n_trials, k, k)
         Whitened products, trial effects first.
-    state
-        Holds the deviations.
+    state : holds the deviations.
     residual : int
         Place of the column of the residual.
 

@@ -28,10 +28,8 @@ def check_damping(fit: Fit, damping: Mapping[str, Any]) -> pd.DataFrame:
 
     Parameters
     ----------
-    fit
-        A fit with B and n free.
-    damping
-        One fit of `damping.json`: `both_axes` or `log_log`.
+    fit : a fit with B and n free.
+    damping : one fit of `damping.json`: `both_axes` or `log_log`.
 
     Returns
     -------

@@ -104,12 +104,9 @@ def solve(
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
-    problem
-        What does not change during the fit.
-    state
-        Where to begin.
+    predictor : of the trials to fit.
+    problem : what does not change during the fit.
+    state : where to begin.
     held : FixedTerms, optional
         Spreads and noise that are not estimated.
     warm : bool
@@ -194,10 +191,8 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
 
     Returns
     -------
@@ -240,8 +235,7 @@ def variances_moved(before: FitState, after: FitState) -> float:
 
     Parameters
     ----------
-    before, after
-        States.
+    before, after : states.
 
     Returns
     -------
@@ -297,12 +291,9 @@ def cost(predictor: Predictor, problem: MixedProblem, state: FitState) -> float:
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    predictor : of the trials to fit.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------

@@ -242,8 +242,7 @@ def make_layout(
 
     Parameters
     ----------
-    model
-        Sum of effects with its values.
+    model : sum of effects with its values.
     data : sequence of FitTrial
     fixed, free : iterable of str
         Names to hold at the value of the model, or to find although held. The parameter's own name will do where it is

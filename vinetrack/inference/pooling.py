@@ -70,10 +70,8 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the fit ended.
+    predictor : of the trials that were fitted.
+    solution : where the fit ended.
     shared : int
         How many of its free numbers may scatter between trials: the first ones.
 

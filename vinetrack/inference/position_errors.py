@@ -59,8 +59,7 @@ def position_shapes(predictor: Predictor, grown_m: Sequence[Floats]) -> list[Flo
 
     Parameters
     ----------
-    predictor
-        Of the trials.
+    predictor : of the trials.
     grown_m : sequence of arrays, shape (n_points,), m
         Growth at each point of each trial.
 
@@ -86,10 +85,8 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
     held : FixedTerms, optional
         Spreads and noise that the fit was told instead of estimating them.
 
@@ -171,8 +168,7 @@ def with_shapes(problem: MixedProblem, count: int) -> MixedProblem:
 
     Parameters
     ----------
-    problem
-        Of the fit.
+    problem : of the fit.
     count : int
         Number of shapes.
 

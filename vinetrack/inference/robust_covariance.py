@@ -61,10 +61,8 @@ def few_trials(predictor: Predictor, solution: Solution) -> bool:
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        At the end of the fit.
+    predictor : of the trials that were fitted.
+    solution : at the end of the fit.
 
     Returns
     -------
@@ -86,14 +84,11 @@ def widened_covariance(
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
     trials : sequence of TrialFit
         In the order of the fit.
-    known
-        Covariance by the noise model.
+    known : covariance by the noise model.
     wide : Solution, optional
         The fit with smooth errors of position among its numbers, to which `known` then belongs.
     pooled : Pooled, optional
@@ -135,10 +130,8 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
 
     Returns
     -------
@@ -260,8 +253,7 @@ def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
 
     Parameters
     ----------
-    trials
-        In the order of the fit.
+    trials : in the order of the fit.
 
     Returns
     -------
@@ -283,12 +275,9 @@ def group_scatter(single: Floats, groups: Sequence[str], fitted: int) -> Floats:
 
     Parameters
     ----------
-    single
-        Scores of single trials, shape (n_trials, n_free), their mean taken out.
-    groups
-        Name of the group of each trial.
-    fitted
-        How many numbers were fitted, p.
+    single : scores of single trials, shape (n_trials, n_free), their mean taken out.
+    groups : name of the group of each trial.
+    fitted : how many numbers were fitted, p.
 
     Returns
     -------

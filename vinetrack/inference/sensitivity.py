@@ -110,8 +110,7 @@ class Predictor:
 
         Parameters
         ----------
-        model
-            Simulated in place of the fit's.
+        model : simulated in place of the fit's.
         jobs : sequence of Job
         rows : array, shape (n_jobs, n_parameters), SI
         times_s : sequence of arrays, optional
@@ -337,8 +336,7 @@ def moved_by(before: Floats, after: Trajectory) -> Floats:
     ----------
     before : array, shape (n_points,), m
         Observed positions of the unmoved trajectory.
-    after
-        The trajectory that was moved.
+    after : the trajectory that was moved.
 
     Returns
     -------

@@ -59,10 +59,8 @@ def solve_from_scratch(predictor: Predictor, held: FixedTerms, watch: Watch | No
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
-    held
-        Spreads and noise that are not estimated.
+    predictor : of the trials to fit.
+    held : spreads and noise that are not estimated.
     watch : callable or None
         Called with each step.
     thorough : bool
@@ -109,10 +107,8 @@ def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
 
     Returns
     -------
@@ -126,10 +122,8 @@ def missed_fraction(predictor: Predictor, solution: Solution) -> float:
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
 
     Returns
     -------
@@ -224,14 +218,12 @@ def solve_from(
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
+    predictor : of the trials to fit.
     theta : array, shape (n_free,)
         Numbers to begin from, scaled.
     trial_effects : array, shape (n_trials, 4)
         Trial effects to begin from.
-    held
-        Spreads and noise that are not estimated.
+    held : spreads and noise that are not estimated.
     most_iterations : int
         Steps at most.
     watch : callable, optional
@@ -254,12 +246,9 @@ def solve_again(
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
-    solution
-        Where the iterations ended.
-    held
-        Spreads and noise that are not estimated.
+    predictor : of the trials to fit.
+    solution : where the iterations ended.
+    held : spreads and noise that are not estimated.
     watch : callable or None
         Called with each step.
     thorough : bool
@@ -295,14 +284,10 @@ def led_back(predictor: Predictor, problem: MixedProblem, state: FitState, held:
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
-    problem
-        What does not change during the fit.
-    state
-        Where a warm start would begin.
-    held
-        Spreads and noise that are not estimated.
+    predictor : of the trials to fit.
+    problem : what does not change during the fit.
+    state : where a warm start would begin.
+    held : spreads and noise that are not estimated.
 
     Returns
     -------

@@ -63,11 +63,9 @@ def candidates(
 
     Parameters
     ----------
-    layout
-        Free numbers of the fit.
+    layout : free numbers of the fit.
     data : sequence of FitTrial
-    predictor
-        Of these trials.
+    predictor : of these trials.
 
     Returns
     -------
@@ -181,8 +179,7 @@ def align(
     Parameters
     ----------
     data : sequence of FitTrial
-    predictor
-        Of these trials.
+    predictor : of these trials.
     theta : array, shape (n_free,)
         Free numbers, scaled.
     trial_effects : array, shape (n_trials, 4)

@@ -38,8 +38,7 @@ def fit_subset(
 
     Parameters
     ----------
-    fit
-        The fit to all trials.
+    fit : the fit to all trials.
     keep : iterable of str, or mask
         Names of trials, or a mask over `fit.trials`.
     held : iterable of str

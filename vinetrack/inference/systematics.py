@@ -46,10 +46,8 @@ def systematics_of(
 
     Parameters
     ----------
-    predictor
-        Of the trials that were fitted.
-    solution
-        Where the iterations ended.
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
     trials : sequence of TrialFit
         In the order of the fit.
     positions : bool

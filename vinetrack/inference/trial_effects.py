@@ -53,12 +53,9 @@ def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: Fit
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    predictor : of the trials to fit.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------
@@ -90,8 +87,7 @@ def limited(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
+    predictor : of the trials to fit.
     trial_effects : array, shape (n_trials, 4)
         Before the step.
     step : array, shape (n_trials, 4)
@@ -114,12 +110,9 @@ def trial_costs(predictor: Predictor, problem: MixedProblem, state: FitState) ->
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    predictor : of the trials to fit.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------
@@ -173,12 +166,9 @@ def search_releases(predictor: Predictor, problem: MixedProblem, state: FitState
 
     Parameters
     ----------
-    predictor
-        Of the trials to fit.
-    problem
-        What does not change during the fit.
-    state
-        Where the fit stands.
+    predictor : of the trials to fit.
+    problem : what does not change during the fit.
+    state : where the fit stands.
 
     Returns
     -------

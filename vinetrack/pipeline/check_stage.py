@@ -46,8 +46,7 @@ def check_folder(folder: Path) -> Checked:
 
     Parameters
     ----------
-    folder
-        Folder of the experiment.
+    folder : folder of the experiment.
 
     Returns
     -------

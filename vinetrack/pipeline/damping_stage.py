@@ -20,10 +20,8 @@ def fit_law(folder: Path, settings: DampingSettings) -> dict[str, Any]:
 
     Parameters
     ----------
-    folder
-        Results folder.
-    settings
-        Resamples of the bootstrap and their seed.
+    folder : results folder.
+    settings : resamples of the bootstrap and their seed.
 
     Returns
     -------

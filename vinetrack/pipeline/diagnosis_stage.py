@@ -45,10 +45,8 @@ def diagnose_results(
 
     Parameters
     ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
+    experiment : sheet and settings.
+    folder : results folder.
     report : callable
         Called with a sentence at each step.
     settings : optional
@@ -82,8 +80,7 @@ def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report 
 
     Parameters
     ----------
-    experiment
-        Sheet and settings.
+    experiment : sheet and settings.
     pairs : sequence of (Trial, Track)
     report : callable
         Called with a sentence at each step.
@@ -131,10 +128,8 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
 
     Parameters
     ----------
-    results
-        Results folder; its folder `diagnosis` is written anew.
-    diagnosis
-        What is written.
+    results : results folder; its folder `diagnosis` is written anew.
+    diagnosis : what is written.
 
     Returns
     -------
@@ -207,10 +202,8 @@ def predictions(before: Fit, after: Fit) -> dict[str, pd.DataFrame]:
 
     Parameters
     ----------
-    before
-        Fit of the first model.
-    after
-        Fit of the last model; the same object where nothing was added.
+    before : fit of the first model.
+    after : fit of the last model; the same object where nothing was added.
 
     Returns
     -------
@@ -236,10 +229,8 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
 
     Parameters
     ----------
-    experiment
-        Sheet and settings.
-    folder
-        Results folder.
+    experiment : sheet and settings.
+    folder : results folder.
     name : str
         Name of the effect.
     report : callable
@@ -282,8 +273,7 @@ def diagnosis_lines(folder: Path) -> list[str]:
 
     Parameters
     ----------
-    folder
-        Results folder.
+    folder : results folder.
 
     Returns
     -------

@@ -61,8 +61,7 @@ def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTable
 
     Parameters
     ----------
-    results
-        Results folder.
+    results : results folder.
     conditions : DataFrame
         `trial, vine, condition, condition_label` of every trial, vines and pressures in their order.
 
@@ -91,8 +90,7 @@ def assemble_tables(
 
     Parameters
     ----------
-    diagnosis
-        With a verdict.
+    diagnosis : with a verdict.
     conditions : DataFrame
         As of `read_diagnosed`.
     trials : DataFrame
@@ -130,10 +128,8 @@ def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult 
 
     Parameters
     ----------
-    results
-        Results folder.
-    experiment
-        Names the files of the user's effects.
+    results : results folder.
+    experiment : names the files of the user's effects.
 
     Returns
     -------
@@ -178,8 +174,7 @@ def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
 
     Parameters
     ----------
-    diagnosed
-        From `read_diagnosed`.
+    diagnosed : from `read_diagnosed`.
 
     Returns
     -------
@@ -213,8 +208,7 @@ def predicted_trials(results: Results, conditions: pd.DataFrame) -> pd.DataFrame
 
     Parameters
     ----------
-    results
-        Results folder.
+    results : results folder.
     conditions : DataFrame
         `trial` and `condition` of every trial.
 
@@ -362,8 +356,7 @@ def question(index: int, rounds: Sequence[Round]) -> str:
     ----------
     index : int
         Number of the round, from 0.
-    rounds
-        Of the diagnosis.
+    rounds : of the diagnosis.
 
     Returns
     -------
@@ -380,8 +373,7 @@ def ranking_table(ranked: Round) -> pd.DataFrame:
 
     Parameters
     ----------
-    ranked
-        One round of the diagnosis.
+    ranked : one round of the diagnosis.
 
     Returns
     -------
@@ -403,8 +395,7 @@ def in_order_of_rank(ranked: Round) -> tuple[list[str], list[list[float]]]:
 
     Parameters
     ----------
-    ranked
-        The first round of the diagnosis.
+    ranked : the first round of the diagnosis.
 
     Returns
     -------

@@ -30,10 +30,8 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
 
     Parameters
     ----------
-    folder
-        Results folder.
-    anyway
-        Whether a refuted model will do.
+    folder : results folder.
+    anyway : whether a refuted model will do.
 
     Returns
     -------

@@ -41,10 +41,8 @@ def set_beside_paper(experiment: Experiment, folder: Path) -> pd.DataFrame:
 
     Parameters
     ----------
-    experiment
-        Its setting `published` asks for the comparison.
-    folder
-        Results folder.
+    experiment : its setting `published` asks for the comparison.
+    folder : results folder.
 
     Returns
     -------
@@ -118,10 +116,8 @@ def draw_paper(folder: Path, settings: FigureSettings) -> None:
 
     Parameters
     ----------
-    folder
-        Results folder.
-    settings
-        Formats and resolution.
+    folder : results folder.
+    settings : formats and resolution.
     """
     from vinetrack.figures.registry import draw
     from vinetrack.figures.style import render

@@ -67,8 +67,7 @@ def read_ground(asked: Asked, needed: Sequence[str] | None = None) -> Ground:
 
     Parameters
     ----------
-    asked
-        What stands on the command line.
+    asked : what stands on the command line.
     needed : sequence of str, optional
         Columns that must be given; by default all that a prediction needs.
 
@@ -136,8 +135,7 @@ def fit_heading(asked: Asked) -> list[str]:
 
     Parameters
     ----------
-    asked
-        Numbers, sheet, fit and effects of the command line.
+    asked : numbers, sheet, fit and effects of the command line.
 
     Returns
     -------
@@ -183,8 +181,7 @@ def inputs_of(ground: Ground) -> list[PredictiveInputs]:
 
     Parameters
     ----------
-    ground
-        From `read_ground`.
+    ground : from `read_ground`.
 
     Returns
     -------
@@ -210,8 +207,7 @@ def as_option(error: Exception) -> Exception:
 
     Parameters
     ----------
-    error
-        Of an effect.
+    error : of an effect.
 
     Returns
     -------
@@ -231,8 +227,7 @@ def warnings_of(ground: Ground) -> list[str]:
 
     Parameters
     ----------
-    ground
-        From `read_ground`.
+    ground : from `read_ground`.
 
     Returns
     -------
@@ -266,8 +261,7 @@ def trial_words(trial: Trial) -> str:
 
     Parameters
     ----------
-    trial
-        What is described.
+    trial : what is described.
 
     Returns
     -------
@@ -352,10 +346,8 @@ def write_figure(fig: Figure, path: Path, dpi: float = 150) -> None:
 
     Parameters
     ----------
-    fig
-        Matplotlib figure.
-    path
-        The ending names the format.
+    fig : matplotlib figure.
+    path : the ending names the format.
     dpi : float
         Resolution of a bitmap.
 

@@ -30,14 +30,11 @@ def analyse_recording(experiment: Experiment, name: str, folder: Path, settings:
 
     Parameters
     ----------
-    experiment
-        Sheet and settings.
+    experiment : sheet and settings.
     name : str
         Name of the trial.
-    folder
-        Results folder.
-    settings
-        Of the run.
+    folder : results folder.
+    settings : of the run.
 
     Returns
     -------

@@ -17,8 +17,7 @@ def experiment_behind(folder: Path, experiment: Path | None = None) -> Experimen
 
     Parameters
     ----------
-    folder
-        Results folder.
+    folder : results folder.
     experiment : Path, optional
         Where the experiment is now, if it has moved.
 
@@ -57,8 +56,7 @@ def save_model(folder: Path, names: Sequence[str]) -> Path:
 
     Parameters
     ----------
-    folder
-        Experiment folder.
+    folder : experiment folder.
     names : sequence of str
         Effects of the model.
 

@@ -130,12 +130,9 @@ def candidates(vine_inputs: Sequence[PredictiveInputs], scope: Scope, filming: F
 
     Parameters
     ----------
-    vine_inputs
-        Predictive inputs, one for each vine, all of one model.
-    scope
-        Pressures, payloads and limits to stay within.
-    filming
-        Camera of the campaign; decides which conditions can be filmed.
+    vine_inputs : predictive inputs, one for each vine, all of one model.
+    scope : pressures, payloads and limits to stay within.
+    filming : camera of the campaign; decides which conditions can be filmed.
 
     Returns
     -------
@@ -196,10 +193,8 @@ def plan(candidate_set: Candidates, scope: Scope, n_error: float, B_error: float
 
     Parameters
     ----------
-    candidate_set
-        From `candidates`.
-    scope
-        Fewest and most pressures and replicates, and most trials.
+    candidate_set : from `candidates`.
+    scope : fewest and most pressures and replicates, and most trials.
     n_error : float
         Standard error wanted of n, absolute.
     B_error : float
@@ -309,10 +304,8 @@ def trials_of(candidate_set: Candidates, design: Plan) -> list[Trial]:
 
     Parameters
     ----------
-    candidate_set
-        What the campaign was chosen from.
-    design
-        The campaign: trials of each condition.
+    candidate_set : what the campaign was chosen from.
+    design : the campaign: trials of each condition.
 
     Returns
     -------

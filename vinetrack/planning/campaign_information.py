@@ -122,8 +122,7 @@ def joint_model(vine_inputs: Sequence[PredictiveInputs]) -> Model:
 
     Parameters
     ----------
-    vine_inputs
-        Predictive inputs of each vine; the model of the first is taken.
+    vine_inputs : predictive inputs of each vine; the model of the first is taken.
 
     Returns
     -------
@@ -139,12 +138,9 @@ def filmed(model: Model, trials: Sequence[Trial], camera: FilmingPlan) -> list[F
 
     Parameters
     ----------
-    model
-        At its assumed values.
-    trials
-        Conditions, one trial each.
-    camera
-        Frame rate, noise, longest recording.
+    model : at its assumed values.
+    trials : conditions, one trial each.
+    camera : frame rate, noise, longest recording.
 
     Returns
     -------
@@ -185,10 +181,8 @@ def final_lead_speeds(model: Model, trials: Sequence[Trial], longest_s: float) -
 
     Parameters
     ----------
-    model
-        With B by vine.
-    trials
-        Conditions.
+    model : with B by vine.
+    trials : conditions.
     longest_s : float
         Growth is followed for so long, s.
 
@@ -217,12 +211,9 @@ def information(
 
     Parameters
     ----------
-    model
-        At its assumed values, with B by vine.
-    data
-        See `filmed`; None left out.
-    camera
-        Noise of a position and its correlation.
+    model : at its assumed values, with B by vine.
+    data : see `filmed`; None left out.
+    camera : noise of a position and its correlation.
     spreads : (float, float)
         Relative between-trial standard deviations of pressure and B.
 
@@ -263,10 +254,8 @@ def reaches_steady(model: Model, trials: Sequence[Trial], longest_s: float) -> n
 
     Parameters
     ----------
-    model
-        With B by vine.
-    trials
-        Conditions.
+    model : with B by vine.
+    trials : conditions.
     longest_s : float
         Growth is followed for so long, s.
 
@@ -288,10 +277,8 @@ def steady_speed(model: Model, trial: Trial) -> float:
 
     Parameters
     ----------
-    model
-        With damping; B by vine.
-    trial
-        Pressure, yield pressure, diameter and vine.
+    model : with damping; B by vine.
+    trial : pressure, yield pressure, diameter and vine.
 
     Returns
     -------
@@ -311,10 +298,8 @@ def steady_error(
 
     Parameters
     ----------
-    model
-        With damping; B by vine.
-    trials
-        Conditions.
+    model : with damping; B by vine.
+    trials : conditions.
     counts : array, shape (n_trials,)
         Trials of each condition.
     spreads : (float, float)

@@ -70,8 +70,7 @@ def design_checks(sight: VinePrediction) -> tuple[str, ...]:
 
     Parameters
     ----------
-    sight
-        Prediction of the vine.
+    sight : prediction of the vine.
 
     Returns
     -------
@@ -163,8 +162,7 @@ def neglected(inputs: PredictiveInputs, at_fraction: float) -> tuple[Neglected, 
 
     Parameters
     ----------
-    inputs
-        Predictive inputs of the vine.
+    inputs : predictive inputs of the vine.
     at_fraction : float
         y/L at which the final speed is taken.
 
@@ -195,8 +193,7 @@ def whole_model(model: Model) -> Model:
 
     Parameters
     ----------
-    model
-        Its effects beside the catalogue are kept.
+    model : its effects beside the catalogue are kept.
 
     Returns
     -------
@@ -215,8 +212,7 @@ def typical_sizes(name: str, trial: Trial) -> dict[str, float]:
     ----------
     name : str
         Name of an effect.
-    trial
-        Diameter and thickness of the vine.
+    trial : diameter and thickness of the vine.
 
     Returns
     -------
@@ -239,12 +235,9 @@ def final_m_s(inputs: PredictiveInputs, model: Model, host: Model, at_fraction: 
 
     Parameters
     ----------
-    inputs
-        Predictive inputs; their trial at the medians is simulated.
-    model
-        What is simulated.
-    host
-        A model that holds all effects of `model`, compiled once for many.
+    inputs : predictive inputs; their trial at the medians is simulated.
+    model : what is simulated.
+    host : a model that holds all effects of `model`, compiled once for many.
     at_fraction : float
         y/L at which the speed of the leading edge is taken.
 

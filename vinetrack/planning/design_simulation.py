@@ -125,8 +125,7 @@ def expected(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: in
 
     Parameters
     ----------
-    bench
-        Hypotheses, conditions, cameras.
+    bench : hypotheses, conditions, cameras.
     design : sequence of int
         Places among the conditions, one a trial.
     draws : sequence of int
@@ -148,8 +147,7 @@ def observed(bench: Bench, design: Sequence[int], draws: Sequence[int], seed: in
 
     Parameters
     ----------
-    bench
-        Hypotheses, conditions, cameras.
+    bench : hypotheses, conditions, cameras.
     design : sequence of int
         Places among the conditions, one a trial.
     draws : sequence of int
@@ -212,8 +210,7 @@ def drawn(hypothesis: Hypothesis, rng: np.random.Generator) -> Floats:
 
     Parameters
     ----------
-    hypothesis
-        Taken for true.
+    hypothesis : taken for true.
     rng : numpy.random.Generator
 
     Returns

@@ -111,14 +111,10 @@ def all_sides(
 
     Parameters
     ----------
-    hypotheses
-        Carried to the conditions, see `hypothesis_predictions.carry`.
-    conditions
-        Trials that could be made.
-    cameras
-        Of each condition.
-    runs
-        How each condition runs, see `simulated_tracks.courses`.
+    hypotheses : carried to the conditions, see `hypothesis_predictions.carry`.
+    conditions : trials that could be made.
+    cameras : of each condition.
+    runs : how each condition runs, see `simulated_tracks.courses`.
 
     Returns
     -------
@@ -201,8 +197,7 @@ def separations(sides: Sequence[Side], designs: NDArray[np.int_]) -> Floats:
 
     Parameters
     ----------
-    sides
-        From `all_sides`.
+    sides : from `all_sides`.
     designs : array of int, shape (n_designs, n_trials)
         Places among the conditions, one a trial.
 
@@ -277,8 +272,7 @@ def best_design(sides: Sequence[Side], allowed: NDArray[np.int_], trials: int) -
 
     Parameters
     ----------
-    sides
-        From `all_sides`.
+    sides : from `all_sides`.
     allowed : array of int
         Places of the conditions to choose from.
     trials : int
@@ -315,10 +309,8 @@ def likeliest_vines(
 
     Parameters
     ----------
-    sides
-        From `all_sides`.
-    conditions
-        Trials that could be made.
+    sides : from `all_sides`.
+    conditions : trials that could be made.
     places : array of int
         Places of those with new vines.
     trials : int

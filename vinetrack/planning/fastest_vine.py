@@ -116,12 +116,9 @@ def fastest(
 
     Parameters
     ----------
-    room
-        What can be built.
-    stated
-        Values of numbers in place of other sources.
-    fit
-        A fit to predict from, if any.
+    room : what can be built.
+    stated : values of numbers in place of other sources.
+    fit : a fit to predict from, if any.
     samples : int
         Draws for bands and odds.
     seed : int
@@ -186,8 +183,7 @@ def final_speeds(vine_inputs: Sequence[PredictiveInputs], at_fraction: float) ->
 
     Parameters
     ----------
-    vine_inputs
-        Predictive inputs, all of one model.
+    vine_inputs : predictive inputs, all of one model.
     at_fraction : float
         y/L at which a bare vine's final speed is taken.
 

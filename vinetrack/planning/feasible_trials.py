@@ -74,10 +74,8 @@ def conditions(data: Sequence[FitTrial], limits: Limits) -> list[Condition]:
 
     Parameters
     ----------
-    data
-        Trials of the experiment, at least one.
-    limits
-        What the user allows.
+    data : trials of the experiment, at least one.
+    limits : what the user allows.
 
     Returns
     -------

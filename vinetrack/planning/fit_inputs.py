@@ -172,8 +172,7 @@ def numbers_of(fit: Fit) -> FitNumbers:
 
     Parameters
     ----------
-    fit
-        A fit.
+    fit : a fit.
 
     Returns
     -------
@@ -197,10 +196,8 @@ def same_vine(numbers: FitNumbers, trial: Trial) -> str | None:
 
     Parameters
     ----------
-    numbers
-        Of a fit.
-    trial
-        Diameter, thickness and vine.
+    numbers : of a fit.
+    trial : diameter, thickness and vine.
 
     Returns
     -------
@@ -234,10 +231,8 @@ def nearest_vine(numbers: FitNumbers, trial: Trial) -> str | None:
 
     Parameters
     ----------
-    numbers
-        Of a fit.
-    trial
-        Diameter and thickness.
+    numbers : of a fit.
+    trial : diameter and thickness.
 
     Returns
     -------
@@ -254,8 +249,7 @@ def yield_place(numbers: FitNumbers, vine: str, stated_Pa: float) -> int | None:
 
     Parameters
     ----------
-    numbers
-        Of a fit.
+    numbers : of a fit.
     vine : str
         Name of a vine.
     stated_Pa : float

@@ -116,12 +116,10 @@ def carry(fit: Fit, name: str, conditions: Sequence[Condition]) -> Hypothesis:
 
     Parameters
     ----------
-    fit
-        One of the fits that the data cannot tell apart.
+    fit : one of the fits that the data cannot tell apart.
     name : str
         Name of the hypothesis.
-    conditions
-        Trials that could be made.
+    conditions : trials that could be made.
 
     Returns
     -------

@@ -89,12 +89,9 @@ def predictive_inputs(
 
     Parameters
     ----------
-    trial
-        The vine and its rig; a yield pressure of NaN is taken from the fit or the printed values.
-    stated
-        Numbers that a person gives.
-    fit
-        A fit, or the numbers of one; its model is then the model.
+    trial : the vine and its rig; a yield pressure of NaN is taken from the fit or the printed values.
+    stated : numbers that a person gives.
+    fit : a fit, or the numbers of one; its model is then the model.
 
     Returns
     -------

@@ -77,8 +77,7 @@ def run(
 
     Parameters
     ----------
-    inputs
-        What is drawn.
+    inputs : what is drawn.
     places_m : array, shape (n_places,), m
         Growth at which values are taken, rising.
     samples : int
@@ -133,8 +132,7 @@ def follow(inputs: PredictiveInputs, trials: Sequence[Trial], rows: Floats) -> t
 
     Parameters
     ----------
-    inputs
-        Their model is simulated.
+    inputs : their model is simulated.
     trials : sequence, n_draws
     rows : array, shape (n_draws, n_parameters)
         Parameters of the model, SI.
@@ -296,8 +294,7 @@ def told_by_payload(trial: Trial) -> bool:
 
     Parameters
     ----------
-    trial
-        Its payload and `tail_slack`.
+    trial : its payload and `tail_slack`.
 
     Returns
     -------
@@ -311,8 +308,7 @@ def final_name(inputs: PredictiveInputs) -> str:
 
     Parameters
     ----------
-    inputs
-        Of the trial.
+    inputs : of the trial.
 
     Returns
     -------
@@ -329,8 +325,7 @@ def predict_vine(
 
     Parameters
     ----------
-    inputs
-        From `predictive_inputs`.
+    inputs : from `predictive_inputs`.
     samples : int
         Number of draws.
     seed : int

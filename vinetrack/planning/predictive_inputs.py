@@ -109,8 +109,7 @@ class PredictiveInputs:
 
         Parameters
         ----------
-        draws
-            From `draw`.
+        draws : from `draw`.
 
         Returns
         -------
@@ -348,8 +347,7 @@ def even(name: str, size: Size) -> Move:
     ----------
     name : str
         Number that is drawn.
-    size
-        Range, SI.
+    size : range, SI.
 
     Returns
     -------

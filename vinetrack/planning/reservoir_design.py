@@ -33,8 +33,7 @@ def swept_m3(trial: Trial) -> float:
 
     Parameters
     ----------
-    trial
-        Diameter and length.
+    trial : diameter and length.
 
     Returns
     -------
@@ -127,8 +126,7 @@ def chambers(trial: Trial, loss: float) -> tuple[Chamber, ...]:
 
     Parameters
     ----------
-    trial
-        Pressure, size, ambient pressure and, where it has one, chamber.
+    trial : pressure, size, ambient pressure and, where it has one, chamber.
     loss : float
         Share of the gauge pressure that may be lost.
 
@@ -161,8 +159,7 @@ def supplied_loss(inputs: PredictiveInputs, chamber_m3: float, tau_s: float, gam
 
     Parameters
     ----------
-    inputs
-        Predictive inputs; the medians are simulated.
+    inputs : predictive inputs; the medians are simulated.
     chamber_m3 : float
         Volume of the chamber, m³.
     tau_s : float
@@ -189,8 +186,7 @@ def supplied_chamber(inputs: PredictiveInputs, loss: float, tau_s: float, gamma:
 
     Parameters
     ----------
-    inputs
-        Predictive inputs; the medians are simulated.
+    inputs : predictive inputs; the medians are simulated.
     loss : float
         Share of the gauge pressure that may be lost.
     tau_s : float
@@ -221,8 +217,7 @@ def final_with(inputs: PredictiveInputs, chamber_m3: float, gamma: float, at_fra
 
     Parameters
     ----------
-    inputs
-        Predictive inputs; the medians are simulated.
+    inputs : predictive inputs; the medians are simulated.
     chamber_m3 : float
         Volume of the chamber, m³.
     gamma : float

@@ -59,12 +59,9 @@ def simulate_campaign(
 
     Parameters
     ----------
-    model
-        The truth, with B by vine.
-    trials
-        Trials of the campaign, replicates one by one.
-    camera
-        Frame rate, noise and longest recording.
+    model : the truth, with B by vine.
+    trials : trials of the campaign, replicates one by one.
+    camera : frame rate, noise and longest recording.
     spreads : (float, float)
         Relative between-trial standard deviations of pressure and B.
     campaigns : int
@@ -102,12 +99,9 @@ def make(
 
     Parameters
     ----------
-    model
-        The truth, with B by vine.
-    trials
-        Trials of the campaign.
-    camera
-        Frame rate, noise and longest recording.
+    model : the truth, with B by vine.
+    trials : trials of the campaign.
+    camera : frame rate, noise and longest recording.
     spreads : (float, float)
         Relative between-trial standard deviations of pressure and B.
     draw : numpy.random.Generator

@@ -53,8 +53,7 @@ def camera_of(data: Sequence[FitTrial], like: int) -> TrackSampling:
 
     Parameters
     ----------
-    data
-        Trials of the experiment, with everting ones among them.
+    data : trials of the experiment, with everting ones among them.
     like : int
         Place of the trial whose frame rate is taken.
 
@@ -99,12 +98,10 @@ def blank(condition: Condition, time_s: Floats, data: Sequence[FitTrial], lead_p
 
     Parameters
     ----------
-    condition
-        The trial that could be made.
+    condition : the trial that could be made.
     time_s : array, shape (n_points,), s
         Times since release; those up to 0 are at rest.
-    data
-        Trials of the experiment; noise and pressure trace are those of the one the condition is like.
+    data : trials of the experiment; noise and pressure trace are those of the one the condition is like.
     lead_position_m : array, shape (n_points,), m
         Positions to fill in.
 
@@ -136,12 +133,9 @@ def courses(
 
     Parameters
     ----------
-    hypotheses
-        Carried to the conditions; the slack of the last one decides.
-    conditions
-        Trials that could be made.
-    cameras
-        Of each condition.
+    hypotheses : carried to the conditions; the slack of the last one decides.
+    conditions : trials that could be made.
+    cameras : of each condition.
 
     Returns
     -------
@@ -237,14 +231,11 @@ def film(
 
     Parameters
     ----------
-    truth
-        The hypothesis taken for true.
+    truth : the hypothesis taken for true.
     places : sequence of int
         Places among the conditions, one a trial.
-    conditions
-        All conditions.
-    cameras
-        Of all conditions.
+    conditions : all conditions.
+    cameras : of all conditions.
     theta : array, shape (n_free,)
         The true numbers, scaled.
     deviations : array, shape (n_places, 2)

@@ -53,10 +53,8 @@ class Surveyor:
 
         Parameters
         ----------
-        experiment
-            Its settings (`calibration`, `axis`) and folder.
-        trials
-            Those whose recording is there to be opened.
+        experiment : its settings (`calibration`, `axis`) and folder.
+        trials : those whose recording is there to be opened.
 
         Returns
         -------
