@@ -1,4 +1,4 @@
-"""The command `vinetrack explore` in a process of its own, and its page as a person meets it in a browser."""
+"""A command that serves a page, in a process of its own; the explorer's page as a person meets it in a browser."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ PROGRAM = "from vinetrack.cli.main import main; main()"
 
 
 class Served:
-    """`vinetrack explore RESULTS --no-browser`, from its first line to Ctrl-C. Use it as a context."""
+    """`vinetrack explore RESULTS --no-browser`, or another command, up to Ctrl-C. Use it as a context."""
 
-    def __init__(self, results: Path, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, command: str = "explore") -> None:
         self.lines: list[str] = []
         self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, "explore", str(results), "--no-browser", *arguments],
+            [sys.executable, "-c", PROGRAM, command, str(folder), "--no-browser", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

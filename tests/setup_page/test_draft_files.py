@@ -10,7 +10,7 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.core.tables import read_table
 from vinetrack.core.yaml_document import parse_yaml
 from vinetrack.experiment.folder import check_experiment
-from vinetrack.setup_page.draft_files import drafted, open_draft, write_draft
+from vinetrack.setup_page.draft_files import Draft, drafted, open_draft, write_draft
 from vinetrack.setup_page.settings_draft import first_settings, shared_values, with_shared
 from vinetrack.setup_page.setup_command import write_blanks
 from vinetrack.setup_page.sheet_draft import SheetDraft
@@ -62,7 +62,7 @@ def test_files_that_changed_since_are_left_alone(folder: Path) -> None:
     draft = open_draft(folder)
     (folder / "trials.csv").write_text(SHEET)
     with pytest.raises(ExperimentError, match="has changed since"):
-        write_draft(folder, draft.sheet, draft.settings, draft.stamp)
+        write_draft(folder, draft)
     assert (folder / "trials.csv").read_text() == SHEET
 
 
@@ -94,7 +94,7 @@ def test_a_draft_is_checked_without_touching_the_folder(folder: Path) -> None:
     sheet = SheetDraft(
         ("trial", "video", "pressure_kPa"), ({"trial": "a", "video": "a.mp4", "pressure_kPa": "12 kPa"},)
     )
-    with drafted(folder, sheet, SETTINGS) as copy:
+    with drafted(folder, Draft(sheet, SETTINGS, "")) as copy:
         problems = check_experiment(copy)
     assert [problem.trial for problem in problems if problem.column == "pressure_kPa"] == ["a"]
     assert not (folder / "trials.csv").exists()

@@ -22,18 +22,33 @@ def register(app: typer.Typer) -> None:
 
 def setup(
     folder: Annotated[Path, typer.Argument(help="A folder of recordings.", metavar="FOLDER")],
+    page: Annotated[
+        bool, typer.Option("--page/--no-page", help="Open a page, or write both files with blanks to fill.")
+    ] = True,
+    port: Annotated[
+        int | None, typer.Option("--port", min=0, max=65535, help="Port to serve on; 0 for any that is free.")
+    ] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a browser.")] = True,
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
-    """Make trials.csv and experiment.yaml of a folder of recordings, with blanks to fill.
+    """A local page that makes trials.csv and experiment.yaml of a folder of recordings, or both with blanks to fill.
 
     Parameters
     ----------
     folder : of recordings.
+    page : whether the page is opened, or both files are written with blanks to fill.
+    port : to serve on, 0 for any that is free; None looks for one.
+    browser : whether a browser is opened.
     log : file for messages and tracebacks; none if None.
     """
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
-        from vinetrack.setup_page.setup_command import write_blanks
+        if page:
+            from vinetrack.setup_page.page_server import serve
 
-        write_blanks(folder, typer.echo)
+            serve(folder, typer.echo, port, browser=browser)
+        else:
+            from vinetrack.setup_page.setup_command import write_blanks
+
+            write_blanks(folder, typer.echo)

@@ -8,6 +8,7 @@ Plain data in SI units, without files and without behaviour beyond what follows 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,6 +26,22 @@ FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "gap", "
 
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
 """A point with one of these says nothing about where the leading edge was."""
+
+
+CORRECTION_ACTIONS = ("move", "drop", "confirm")
+"""What a person may do with a point of a track."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What a person says of one frame of a recording: one of CORRECTION_ACTIONS, and to where it is moved.
+
+    `edge_px` counts along the growth axis of the trial, as the track's does; NaN where the point is not moved.
+    """
+
+    frame: int
+    action: str
+    edge_px: float = math.nan
 
 
 POSITION_SYSTEMATIC_M = 1e-4
@@ -98,6 +115,7 @@ class Trial:
     axis: PictureAxis | None = None
     frames_used: tuple[int, int] | None = None
     point_mass: str = ""
+    corrections: tuple[Correction, ...] = ()
 
     @property
     def area_m2(self) -> float:
@@ -141,13 +159,31 @@ def join_flags(*flags: str) -> str:
     return ";".join(flag for flag in FLAGS if flag in present)
 
 
+def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
+    """Mask, shape (n_frames,), of points that a person has moved, dropped or confirmed.
+
+    `gap;corrected` says that the time of a point was put right, not the point.
+
+    Parameters
+    ----------
+    flags : of every frame, separated by semicolons.
+
+    Returns
+    -------
+    array of bool, shape (n_frames,)
+    """
+    parts = [str(flag).split(";") for flag in flags]
+    return np.array(["corrected" in part and "gap" not in part for part in parts], dtype=bool)
+
+
 @dataclass(frozen=True)
 class Track:
     """Where the leading edge was at each frame of one trial. All arrays have shape (n_frames,).
 
     `lead_position_m` is NaN where there is none; `lead_position_sigma_m` the random error of that point alone (NaN
     where unknown); `flag` holds strings, see FLAGS; `pressure_Pa` the gauge pressure measured along with it, if any;
-    `notes` are sentences about the track as a whole that a person should read.
+    `notes` are sentences about the track as a whole that a person should read. `tracked_px` is `edge_px` as the tracker
+    saw it, before anything was corrected by hand; None where nothing was.
     """
 
     time_s: Floats
@@ -157,6 +193,7 @@ class Track:
     edge_px: Floats
     pressure_Pa: Floats | None = None
     notes: tuple[str, ...] = ()
+    tracked_px: Floats | None = None
 
     @property
     def usable(self) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
-from vinetrack.core.records import Trial
+from vinetrack.core.records import Correction, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
 from vinetrack.experiment.cells import oddity
+from vinetrack.experiment.corrections import read_corrections, strangers
 from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.other_units import in_sheet_units, keys_in_other_units
 from vinetrack.experiment.schema import COLUMNS, SHARED
@@ -125,6 +126,9 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
             absent |= find_missing(row, folder, table.columns) if table and settings else set()
     problems += _compare_names(rows)
     problems += [_absent_column(name) for name in COLUMNS if name in absent]
+    corrections, faults = read_corrections(folder)
+    problems += faults
+    problems += strangers(corrections, [row.name for row in rows], [row.name for row in rows if "video" in row.values])
     sheet_is_sound = not any(problem.severity == "error" for problem in problems)
     for row in rows:
         if sheet_is_sound and row.in_use and not row.failed:
@@ -134,7 +138,16 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.failed and row.in_use for row in rows)):
         raise ExperimentError(problems)
-    return _assemble(folder, settings, rows, problems)
+    return _with_corrections(_assemble(folder, settings, rows, problems), corrections)
+
+
+def _with_corrections(experiment: Experiment, corrections: Mapping[str, tuple[Correction, ...]]) -> Experiment:
+    """The experiment with what people have corrected of its recordings."""
+    trials = tuple(
+        replace(trial, corrections=corrections[trial.name]) if trial.video and trial.name in corrections else trial
+        for trial in experiment.trials
+    )
+    return replace(experiment, trials=trials)
 
 
 def _assemble(folder: Path, settings: ExperimentSettings, rows: list[Row], problems: list[Problem]) -> Experiment:

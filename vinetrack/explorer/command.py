@@ -8,15 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vinetrack.core.problems import UserError
+from vinetrack.core.local_page import PageError
 
 if TYPE_CHECKING:
     from vinetrack.explorer.campaign import Campaign
     from vinetrack.explorer.choice import ModelChoice
-
-
-class PageError(UserError, RuntimeError):
-    """The page cannot be served; one sentence with a remedy."""
 
 
 @dataclass(frozen=True)

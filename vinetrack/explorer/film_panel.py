@@ -230,6 +230,8 @@ class FilmPanel:
         ]
         if not reason and self._view is None:
             reason = str(view_of(Results(self.campaign.folder), seen.data.trial))
+        if self._view is not None and frame < self._view.by_hand.size and self._view.by_hand[frame]:
+            positions_text.append("corrected by hand")
         words_ = f"<p>{escaped(reason)}</p>" if reason else ""
         self.caption.text = f"{words_}<p>{1e3 * since_s:.1f} ms since release · {' · '.join(positions_text)}</p>"
         self._instant(seen.name, since_s)

@@ -11,7 +11,7 @@ from bokeh.models import CategoricalColorMapper, CustomJS, Div, InlineStyleSheet
 from bokeh.plotting import figure
 from bokeh.themes import Theme
 
-from vinetrack.figures.page_tokens import TOKENS, page_tokens
+from vinetrack.figures.page_tokens import TOKENS, page_frame
 from vinetrack.figures.style import GRID, INK, MUTED, VINE_COLOURS
 
 TEMPLATES = Path(__file__).with_name("templates")
@@ -53,7 +53,7 @@ def page_template() -> str:
 
 def page_style() -> str:
     """CSS of the page around the widgets."""
-    return page_tokens() + (TEMPLATES / "page.css").read_text(encoding="utf-8")
+    return page_frame() + (TEMPLATES / "page.css").read_text(encoding="utf-8")
 
 
 def screen_script(figures: Sequence[figure]) -> CustomJS:

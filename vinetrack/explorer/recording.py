@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Trial
+from vinetrack.core.records import Floats, Trial, hand_corrected
 from vinetrack.pipeline.overlays_stage import shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
 
@@ -38,7 +38,7 @@ class RecordingView:
 
     `edge_px`, shape (n_frames,), counts along the axis, NaN where the edge was not found; `time_s` and
     `lead_position_m` are those of the track. `shake_px`, shape (n_frames,), is how far along the axis a shaken camera
-    moved each picture.
+    moved each picture; `by_hand`, likewise, whether a person has corrected the point.
     """
 
     trial: str
@@ -50,6 +50,7 @@ class RecordingView:
     edge_px: Floats
     lead_position_m: Floats
     shake_px: Floats
+    by_hand: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def along_px(self, lead_position_m: Floats) -> Floats:
         """Where positions on the track's ruler lie along the axis; beyond the track, in a straight line.
@@ -136,6 +137,7 @@ def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> RecordingV
         edge_px=table["edge_px"].to_numpy(dtype=float),
         lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
         shake_px=shake_along(axis, len(table)),
+        by_hand=hand_corrected(table["flag"]),
     )
 
 

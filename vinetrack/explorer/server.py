@@ -17,12 +17,8 @@ from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
 from bokeh.server.server import Server
 
-from vinetrack.explorer.command import PageError
+from vinetrack.core.local_page import LOOPBACK, on_a_free_port
 from vinetrack.explorer.fitting import BackgroundFit
-
-LOOPBACK = "127.0.0.1"
-FIRST_PORT, PORTS = 5070, 30
-"""Chosen: free of well-known services; 30 pages on one machine, then any free port."""
 
 QUIET = ("bokeh", "tornado")
 SWITCH_S = 1e-3
@@ -69,11 +65,7 @@ def start_server(ground: BackgroundFit, port: int | None = None) -> Server:
     PageError
         If it is taken.
     """
-    tried = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
-    for number in tried:
-        with contextlib.suppress(OSError):
-            return _serve(ground, number)
-    raise PageError(f"Port {port} is taken: give another with --port, or none to have one found.")
+    return on_a_free_port(lambda number: _serve(ground, number), port)
 
 
 def _serve(ground: BackgroundFit, port: int) -> Server:

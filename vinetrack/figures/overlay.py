@@ -42,13 +42,15 @@ unequal length, so that all edges stay visible where they agree."""
 class Edge:
     """One edge through a clip: its name, its colour, and where it is along the axis in every frame, px (NaN: unseen).
 
-    `off_mm` is how far it lies ahead of the tracked edge in every frame, None for that itself.
+    `off_mm` is how far it lies ahead of the tracked edge in every frame, None for that itself; `by_hand` tells that it
+    is the tracked edge where a person has corrected it.
     """
 
     name: str
     colour: str
     along_px: Floats
     off_mm: Floats | None = None
+    by_hand: bool = False
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
     picture : the recording's frame in grey levels, uint8 (see `levels`).
     frame : its number, which the edges count by.
     time_ms : since release.
-    edges : the tracked one first, then those of the models before and after.
+    edges : the tracked one first, then those of the models before and after, then that of corrected points.
 
     Returns
     -------
@@ -104,7 +106,9 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
     bar_px = _even(1.35 * line_px * max(len(edges), 2) + 0.8 * line_px)
     small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR).convert("RGB")
     pen = ImageDraw.Draw(small)
-    for edge, reach in (*zip(edges[1:], _REACHES, strict=False), *((edge, 0.0) for edge in edges[:1])):
+    models = [edge for edge in edges[1:] if not edge.by_hand]
+    seen = [edge for i, edge in enumerate(edges) if i == 0 or edge.by_hand]
+    for edge, reach in (*zip(models, _REACHES, strict=False), *((edge, 0.0) for edge in seen)):
         _draw_edge(pen, view, edge, frame, reach)
     _scale_bar(pen, view, line_px)
     whole = Image.new("RGB", (width, height + bar_px), BAR)

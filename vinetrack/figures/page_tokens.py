@@ -23,6 +23,11 @@ def page_tokens() -> str:
     return Path(__file__).with_name("page_tokens.css").read_text(encoding="utf-8")
 
 
+def page_frame() -> str:
+    """CSS of local pages: the properties of `page_tokens`, and what frames a page, its heading and its cards."""
+    return page_tokens() + Path(__file__).with_name("page_frame.css").read_text(encoding="utf-8")
+
+
 def follows_screen(colour: str) -> str:
     """CSS of a figure's colour, where a page may change it.
 

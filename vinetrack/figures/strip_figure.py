@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.records import UNUSABLE_FLAGS
+from vinetrack.core.records import UNUSABLE_FLAGS, hand_corrected
 from vinetrack.figures.panels import legend_above
-from vinetrack.figures.style import INK, MUTED, ORANGE, SKY, VERMILLION, look
+from vinetrack.figures.style import GREEN, INK, MUTED, ORANGE, SKY, VERMILLION, look
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,13 +63,19 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
     half_ms = 0.5 * float(np.median(np.diff(time_ms)))
     extent = (-0.5, strip.shape[1] - 0.5, float(time_ms[-1]) + half_ms, float(time_ms[0]) - half_ms)
     ax.imshow(small, aspect="auto", extent=extent, cmap="gray", vmin=dark, vmax=light, interpolation="none")
-    edge, odd = track.edge_px, flagged(track.flag)
-    fine = ~odd & np.isfinite(edge)
+    edge, by_hand = track.edge_px, hand_corrected(track.flag)
+    odd = flagged(track.flag) & ~by_hand
+    fine = ~odd & ~by_hand & np.isfinite(edge)
     ax.plot(edge[fine], time_ms[fine], color=ORANGE, linewidth=1.0, label=f"leading edge, N = {int(fine.sum())}")
     if odd.any():
         shown = odd & np.isfinite(edge)
         label = f"flagged, N = {int(odd.sum())}"
         ax.plot(edge[shown], time_ms[shown], "x", color=SKY, markersize=4, markeredgewidth=1.1, label=label)
+    if by_hand.any():
+        before = edge if track.tracked_px is None else track.tracked_px
+        ax.plot(before[by_hand], time_ms[by_hand], "+", color=SKY, markersize=5, markeredgewidth=1.0)
+        label = f"corrected by hand (+ as tracked), N = {int(by_hand.sum())}"
+        ax.plot(edge[by_hand], time_ms[by_hand], "o", color=GREEN, markersize=4, fillstyle="none", label=label)
     ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)")
     ax.grid(visible=False)
 
@@ -81,7 +87,7 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
 
     top = ax.secondary_xaxis(-0.21, functions=(in_mm, in_px))
     top.set_xlabel("along the growth axis (mm)")
-    legend_above(ax, 2)
+    legend_above(ax, 2 if not by_hand.any() else 3)
     ax.set_title(title, loc="right", fontsize=10, color=MUTED, fontweight="normal")
 
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.numbers import with_error
-from vinetrack.core.records import UNUSABLE_FLAGS
+from vinetrack.core.records import UNUSABLE_FLAGS, hand_corrected
 from vinetrack.figures.panels import fitting_size
-from vinetrack.figures.style import GRID, INK, MUTED, RULE_COLOURS, RULE_NAMES, VERMILLION, blank, look, rows
+from vinetrack.figures.style import GREEN, GRID, INK, MUTED, RULE_COLOURS, RULE_NAMES, VERMILLION, blank, look, rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,7 +55,11 @@ def draw_trial_motion(
     if kinematics.empty:
         return blank(f"{title}: no positions to draw.", _WIDTH_IN)
     unusable = _unusable(track)
-    notes = [_counts(len(kinematics), int(unusable.sum())), *(line for row in rows(windows) for line in _verdict(row))]
+    by_hand = hand_corrected(track["flag"].fillna(""))
+    notes = [
+        _counts(len(kinematics), int(unusable.sum()), int(by_hand.sum())),
+        *(line for row in rows(windows) for line in _verdict(row)),
+    ]
     with look():
         text_in = _LINE_IN * len(notes) + 0.1
         strip_in = 0.24 * max(len(windows), 1)
@@ -92,8 +96,9 @@ def _unusable(track: pd.DataFrame) -> np.ndarray:
     return flags.map(lambda flag: bool(UNUSABLE_FLAGS.intersection(flag.split(";")))).to_numpy(dtype=bool)
 
 
-def _counts(n_used: int, n_left: int) -> tuple[str, str]:
-    return MUTED, f"{n_used} points" + (f", {n_left} left out (×)" if n_left else "")
+def _counts(n_used: int, n_left: int, n_by_hand: int) -> tuple[str, str]:
+    left = f", {n_left} left out (×)" if n_left else ""
+    return MUTED, f"{n_used} points{left}" + (f", {n_by_hand} corrected by hand (○)" if n_by_hand else "")
 
 
 def _draw_position(ax: Axes, track: pd.DataFrame, kinematics: pd.DataFrame, unusable: np.ndarray) -> None:
@@ -103,6 +108,9 @@ def _draw_position(ax: Axes, track: pd.DataFrame, kinematics: pd.DataFrame, unus
     ax.plot(time_s[~unusable][::step], position_mm[~unusable][::step], ".", color=MUTED, ms=3.5, mew=0)
     if (unusable & np.isfinite(position_mm)).any():
         ax.plot(time_s[unusable], position_mm[unusable], "x", color=VERMILLION, ms=4, mew=1)
+    by_hand = hand_corrected(track["flag"].fillna(""))
+    if by_hand.any():
+        ax.plot(time_s[by_hand], position_mm[by_hand], "o", color=GREEN, ms=4, fillstyle="none", mew=1)
     ax.plot(kinematics["time_s"], 1e3 * kinematics["lead_position_m"], "-", color=INK, lw=1.1)
     ax.set_ylabel("leading edge (mm)")
 

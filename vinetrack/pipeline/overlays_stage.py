@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.records import hand_corrected
+from vinetrack.figures.style import GREEN
 from vinetrack.narrative.verdict_summary import plain
 from vinetrack.pipeline.pool import map_trials
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
@@ -316,9 +318,12 @@ def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Ed
 
     edge_px = track["edge_px"].to_numpy(dtype=float)
     edges = [Edge("tracked edge", TRACKED, edge_px)]
+    by_hand = hand_corrected(track["flag"].fillna(""))
+    corrected = [Edge("corrected by hand", GREEN, np.where(by_hand, edge_px, math.nan), by_hand=True)]
+    corrected = corrected if by_hand.any() else []
     path = results.predictions(trial)
     if not path.exists():
-        return edges, float(_first_moving_s(track))
+        return [*edges, *corrected], float(_first_moving_s(track))
     predicted = read_result(path)
     to_px = metres_to_px(track)
     added = _added_effects(results)
@@ -332,7 +337,7 @@ def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Ed
         position_m = np.interp(time_s, known["time_s"], known[column], right=math.nan)
         off_mm = 1e3 * (position_m - measured_m)
         edges.append(Edge(name, BEFORE if column == "model_before_m" else AFTER, to_px(position_m), off_mm))
-    return edges, _release_s(trial, results, track)
+    return [*edges, *corrected], _release_s(trial, results, track)
 
 
 def metres_to_px(track: pd.DataFrame) -> Any:

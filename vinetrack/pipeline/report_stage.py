@@ -11,6 +11,7 @@ from vinetrack.experiment.provenance import describe_run
 from vinetrack.figures.registry import CAMPAIGN_FIGURES, PAPER_FIGURES, RegisteredFigure
 from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, read_diagnosis
 from vinetrack.pipeline.figures_stage import describe_conditions
+from vinetrack.pipeline.workflow import SHARED_FILES
 from vinetrack.results.folder_layout import Results, read_json, read_result
 from vinetrack.results.stored import read_fit
 
@@ -111,7 +112,7 @@ def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str
     target = getattr(experiment.settings.calibration, "image", None)
     inputs += [experiment.folder / target] if target is not None else []
     inputs += [experiment.folder / path for path in experiment.settings.effects]
-    shared = [path for name in ("trials.csv", "experiment.yaml") if (path := experiment.folder / name).exists()]
+    shared = [path for name in SHARED_FILES if (path := experiment.folder / name).exists()]
     return describe_run(experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model)
 
 

@@ -267,6 +267,7 @@ def _track_table(track: Track) -> pd.DataFrame:
         track.lead_position_m,
         track.lead_position_sigma_m,
         track.flag,
+        track.edge_px if track.tracked_px is None else track.tracked_px,
     )
     return pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
 

@@ -36,7 +36,7 @@ PAPER_TABLES = (
 )
 """Tables that an experiment gets besides where published numbers are set beside it."""
 
-SHARED_FILES = ("trials.csv", "experiment.yaml")
+SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 
 SNAKEFILE = PACKAGE / "pipeline" / "Snakefile"
 """The rules, in the package: `vinetrack run` runs them from anywhere, the Snakefile of a checkout includes them."""
@@ -68,7 +68,7 @@ class WorkflowPlan:
 
     @property
     def sheets(self) -> list[str]:
-        """The trial sheet and, where there is one, the settings beside it."""
+        """The trial sheet and, where there are any, the settings and corrections beside it."""
         return [path.as_posix() for path in self.inputs if path.name in SHARED_FILES]
 
     @property

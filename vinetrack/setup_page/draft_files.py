@@ -1,30 +1,36 @@
-"""The two files of a draft: read, checked in a copy of the folder, and written whole."""
+"""The files of a draft: read, checked in a copy of the folder, and written whole."""
 
 from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.records import Correction
 from vinetrack.core.tables import write_text
+from vinetrack.experiment.corrections import CORRECTIONS, corrections_text, read_corrections
 from vinetrack.experiment.folder import SETTINGS
 from vinetrack.experiment.sheet import SHEET
 from vinetrack.setup_page.clip_names import list_recordings
 from vinetrack.setup_page.settings_draft import read_settings_text, shared_values
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft, with_recordings
 
+FILES = (SHEET, SETTINGS, CORRECTIONS)
+"""All that is ever written."""
+
 
 @dataclass(frozen=True)
 class Draft:
-    """A sheet and settings not yet written; `stamp` tells whether the files have changed since they were read."""
+    """A sheet, settings and corrections not yet written; `stamp` tells whether the files have changed since."""
 
     sheet: SheetDraft
     settings: str
     stamp: str
+    corrections: Mapping[str, tuple[Correction, ...]] = field(default_factory=dict)
 
 
 def open_draft(folder: Path) -> Draft:
@@ -54,11 +60,15 @@ def open_draft(folder: Path) -> Draft:
         message = "holds no recording"
         remedy = "put films (mp4, mov, avi, mkv) or folders of pictures in it"
         raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
-    return Draft(with_recordings(sheet, recordings, shared_values(settings)), settings, files_stamp(folder))
+    corrections, problems = read_corrections(folder)
+    if problems:
+        raise ExperimentError(problems)
+    rows = with_recordings(sheet, recordings, shared_values(settings))
+    return Draft(rows, settings, files_stamp(folder), corrections)
 
 
 def files_stamp(folder: Path) -> str:
-    """A fingerprint of the two files as they are now.
+    """A fingerprint of the files as they are now.
 
     Parameters
     ----------
@@ -69,20 +79,19 @@ def files_stamp(folder: Path) -> str:
     hexadecimal digits.
     """
     digest = hashlib.sha256()
-    for name in (SHEET, SETTINGS):
+    for name in FILES:
         path = folder / name
         digest.update(path.read_bytes() if path.is_file() else b"\0absent\0")
     return digest.hexdigest()
 
 
-def write_draft(folder: Path, sheet: SheetDraft, settings: str, stamp: str) -> list[str]:
+def write_draft(folder: Path, draft: Draft) -> list[str]:
     """Write what differs from the files that are there; nothing else in the folder is touched.
 
     Parameters
     ----------
     folder : of the experiment.
-    sheet, settings : what the files are to hold.
-    stamp : of the files when they were read.
+    draft : what the files are to hold, with the stamp of those that were read.
 
     Returns
     -------
@@ -93,17 +102,20 @@ def write_draft(folder: Path, sheet: SheetDraft, settings: str, stamp: str) -> l
     ExperimentError
         If somebody else has changed the files since.
     """
-    if files_stamp(folder) != stamp:
+    if files_stamp(folder) != draft.stamp:
         message = "has changed since it was read, and is left as it is"
         name = SHEET if (folder / SHEET).exists() else SETTINGS
         raise ExperimentError([Problem(message=message, file=name, remedy="reload the page, and enter it again")])
     written = []
-    if not (folder / SHEET).exists() or not same_cells(read_draft(folder), sheet):
-        write_text(folder / SHEET, sheet.text())
+    if not (folder / SHEET).exists() or not same_cells(read_draft(folder), draft.sheet):
+        write_text(folder / SHEET, draft.sheet.text())
         written.append(SHEET)
-    if not (folder / SETTINGS).exists() or read_settings_text(folder) != settings:
-        write_text(folder / SETTINGS, settings)
+    if not (folder / SETTINGS).exists() or read_settings_text(folder) != draft.settings:
+        write_text(folder / SETTINGS, draft.settings)
         written.append(SETTINGS)
+    if corrections_text(read_corrections(folder)[0]) != corrections_text(draft.corrections):
+        write_text(folder / CORRECTIONS, corrections_text(draft.corrections))
+        written.append(CORRECTIONS)
     return written
 
 
@@ -128,13 +140,13 @@ def same_cells(first: SheetDraft, other: SheetDraft) -> bool:
 
 
 @contextmanager
-def drafted(folder: Path, sheet: SheetDraft, settings: str) -> Iterator[Path]:
+def drafted(folder: Path, draft: Draft) -> Iterator[Path]:
     """A folder as the experiment would be with this draft: links to everything else, for `check` and the tracker.
 
     Parameters
     ----------
     folder : of the experiment.
-    sheet, settings : as they would be written.
+    draft : as it would be written.
 
     Yields
     ------
@@ -144,8 +156,10 @@ def drafted(folder: Path, sheet: SheetDraft, settings: str) -> Iterator[Path]:
         copy = Path(temporary) / (folder.resolve().name or "experiment")
         copy.mkdir()
         for path in folder.iterdir():
-            if path.name not in (SHEET, SETTINGS):
+            if path.name not in FILES:
                 (copy / path.name).symlink_to(path.resolve(), target_is_directory=path.is_dir())
-        write_text(copy / SHEET, sheet.text())
-        write_text(copy / SETTINGS, settings)
+        write_text(copy / SHEET, draft.sheet.text())
+        write_text(copy / SETTINGS, draft.settings)
+        if draft.corrections:
+            write_text(copy / CORRECTIONS, corrections_text(draft.corrections))
         yield copy

@@ -25,7 +25,7 @@ def write_blanks(folder: Path, say: Callable[[str], None]) -> None:
         If the folder holds no recording, or a file in it cannot be read.
     """
     draft = open_draft(folder)
-    written = write_draft(folder, draft.sheet, draft.settings, draft.stamp)
+    written = write_draft(folder, draft)
     rows = draft.sheet.rows
     filled = [name for name in draft.sheet.columns if name not in ("trial", "video") and any(r.get(name) for r in rows)]
     for name in written:

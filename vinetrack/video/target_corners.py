@@ -137,6 +137,51 @@ def checkerboard_corners(picture: NDArray[Any], board: Checkerboard) -> tuple[Fl
     raise CornersError(_no_checkerboard(grey, across, down))
 
 
+def markers_seen(grey: Grey, dictionary: str) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
+    """Markers of a dictionary in a picture: corners of each, shape (1, 4, 2), px, and their numbers, shape (n, 1).
+
+    Parameters
+    ----------
+    grey : grey levels, shape (height, width).
+    dictionary : its name in OpenCV.
+    """
+    return _markers(grey, _words(dictionary))
+
+
+def marker_agreement(
+    corners: list[Any], ids: NDArray[np.int32], board: Charuco, dictionary: str
+) -> tuple[float, float]:
+    """Share of markers that lie where a board has them, and their size (mm) beside squares of its `square_mm`.
+
+    Boards printed by OpenCV before 4.6 count too.
+
+    Parameters
+    ----------
+    corners, ids : as of `markers_seen`.
+    board : layout and sizes; its own dictionary is not used.
+    dictionary : that the markers belong to.
+    """
+    words = _words(dictionary)
+    layouts = [_charuco_board(board, words, legacy) for legacy in (False, True)]
+    return max((_agreeing_markers(layout, corners, ids, board) for layout in layouts), key=lambda one: one[0])
+
+
+def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
+    """Squares across and down of the checkerboard in a picture, as far as it can be seen; None where there is none.
+
+    Parameters
+    ----------
+    grey : grey levels, shape (height, width).
+    """
+    import cv2
+
+    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
+    seen, corners, shape = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
+    if seen and _is_a_grid(corners.reshape(*shape.shape, 2)):
+        return shape.shape[1] + 1, shape.shape[0] + 1
+    return None
+
+
 def _enlarged(grey: Grey, times: int) -> Grey:
     """The picture, or a larger copy for squares that are only a few pixels wide."""
     import cv2
@@ -275,14 +320,10 @@ def _no_markers(grey: Grey, dictionary: str) -> str:
 
 def _no_checkerboard(grey: Grey, across: int, down: int) -> str:
     """Say that there is no such checkerboard, and name the size of the one that is there, if any."""
-    import cv2
-
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
-    seen, corners, shape = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
-    if seen and _is_a_grid(corners.reshape(*shape.shape, 2)):
-        rows, columns = shape.shape[0] + 1, shape.shape[1] + 1
+    squares = checkerboard_squares(grey)
+    if squares is not None:
         return (
-            f"no checkerboard of {across} × {down} squares is seen, but {columns} × {rows} squares are; "
+            f"no checkerboard of {across} × {down} squares is seen, but {squares[0]} × {squares[1]} squares are; "
             "correct `squares` (squares, not inner corners), or show the whole board"
         )
     return (

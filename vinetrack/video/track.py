@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
 from vinetrack.video.frames import Frames, RecordingError, capture_rate, inspect_recording, read_frames
+from vinetrack.video.hand_corrections import corrected_by_hand
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
@@ -195,6 +196,7 @@ def track_frames(
         first = int(np.flatnonzero(rejected)[0])
         notes.append(f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {first}")
     track = _assemble(frames, kept, edge_fit, sigma, verdict, capture_fps, exposure_s, notes)
+    track = corrected_by_hand(track, trial.corrections)
     track = _in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
     pictures = tuple((int(kept[i]), luma[i]) for i in chosen)

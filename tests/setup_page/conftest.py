@@ -1,0 +1,32 @@
+"""A folder of rendered clips, as a person brings it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from plain_scene import Plan, plain_scene, write_video
+
+CLIPS = ("d15 24kPa 1.mp4", "d15 30kPa 1.mp4")
+
+
+@pytest.fixture(scope="session")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two clips of a straight tube, 480 × 160 px, and nothing else."""
+    folder = tmp_path_factory.mktemp("rendered")
+    for seed, name in enumerate(CLIPS):
+        plan = Plan(
+            seed=seed, width=480, height=160, from_px=(20, 80), start_px=40, end_px=400, speed=14 + 4 * seed, radius=20
+        )
+        write_video(folder / name, plain_scene(plan).frames)
+    return folder
+
+
+@pytest.fixture
+def clips(rendered: Path, tmp_path: Path) -> Path:
+    """The same, to write in."""
+    folder = tmp_path / "campaign"
+    folder.mkdir()
+    for name in CLIPS:
+        (folder / name).write_bytes((rendered / name).read_bytes())
+    return folder

@@ -1,0 +1,176 @@
+"""The page in a real browser: fill in, click a ruler, drag the axis, track, save; by keyboard, narrow, dark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from chrome import Chrome, find_chrome
+from served import Served
+
+from vinetrack.core.tables import read_table
+from vinetrack.core.yaml_document import read_yaml
+from vinetrack.experiment.settings import read_experiment_settings
+
+pytestmark = pytest.mark.skipif(find_chrome() is None, reason="needs a browser: apt install chromium")
+
+SHARED = {"capture_fps": "1000", "thickness_um": "100", "length_mm": "300", "yield_pressure_kPa": "3"}
+NAME = "a.getAttribute('aria-label') || a.labels?.[0]?.textContent || a.textContent.slice(0, 40) || a.tagName"
+
+
+class Person:
+    """What somebody does on the page."""
+
+    def __init__(self, chrome: Chrome, address: str) -> None:
+        self.chrome = chrome
+        chrome.open(address)
+        chrome.wait("document.body.dataset.ready === 'yes'", "the page", 120)
+        chrome.wait("document.querySelector('#over .axis-line') !== null", "the axis", 120)
+
+    def fill(self, column: str, row: str | int, text: str) -> None:
+        field = f'document.querySelector(\'[data-column="{column}"][data-row="{row}"]\')'
+        self.chrome.run(f"{field}.focus(), {field}.select()")
+        self.chrome.send("Input.insertText", text=text)
+
+    def key(self, name: str, code: int) -> None:
+        for kind in ("rawKeyDown", "keyUp"):
+            self.chrome.send("Input.dispatchKeyEvent", type=kind, key=name, code=name, windowsVirtualKeyCode=code)
+
+    def press(self, element: str) -> None:
+        self.chrome.run(f"document.querySelector({element!r}).click()")
+
+    def at(self, x_px: float, y_px: float) -> tuple[float, float]:
+        """Place in the window of a pixel of the picture, 480 × 160 px."""
+        self.chrome.run("document.querySelector('#over').scrollIntoView({block: 'center'})")
+        left, top, width, height = self.chrome.run(
+            "(() => { const r = document.querySelector('#over').getBoundingClientRect();"
+            " return [r.x, r.y, r.width, r.height]; })()"
+        )
+        return left + (x_px + 0.5) / 480 * width, top + (y_px + 0.5) / 160 * height
+
+    def text(self, element: str) -> str:
+        return str(self.chrome.run(f"document.querySelector({element!r}).textContent"))
+
+
+@pytest.fixture
+def person(clips: Path, tmp_path: Path) -> Iterator[Person]:
+    with Served(clips, "--port", "0", command="setup") as served, Chrome(tmp_path / "chrome") as chrome:
+        made = Person(chrome, served.address)
+        yield made
+        assert [text for text in chrome.complaints if "422" not in text] == []
+
+
+def test_a_folder_of_clips_becomes_an_experiment(person: Person, clips: Path) -> None:
+    """The whole way: four shared values, two ruler marks, one length, a track, and a save."""
+    for column, value in SHARED.items():
+        person.fill(column, "shared", value)
+    person.press("input[name=tool][value=scale]")
+    for x_px in (15.0, 465.0):
+        person.chrome.click(*person.at(x_px, 150))
+    person.chrome.wait("document.activeElement.id === 'length'", "the field of the length")
+    for digit in "337.5":
+        person.chrome.send("Input.insertText", text=digit)
+    person.chrome.wait("document.querySelector('#headline').textContent.includes('ready to run')", "the check")
+    person.press("#track")
+    person.chrome.wait("document.querySelector('.strip img') !== null", "the strip", 120)
+    assert "growth" in person.text("#tracked")
+    person.press("#save")
+    person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
+    settings = read_experiment_settings(clips / "experiment.yaml")
+    assert settings.calibration is not None
+    assert settings.calibration.kind == "two_points"
+    assert settings.calibration.from_px == pytest.approx((15, 150), abs=0.6)
+    assert settings.calibration.length_mm == 337.5
+    assert settings.capture_fps == 1000
+    assert read_table(clips / "trials.csv").columns == ("trial", "video", "diameter_mm", "pressure_kPa")
+
+
+def test_the_axis_is_dragged_and_moved_by_the_keyboard(person: Person, clips: Path) -> None:
+    person.at(0, 0)
+    x, y = person.chrome.run(
+        "(() => { const r = document.querySelector('[data-handle^=End]').getBoundingClientRect();"
+        " return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+    )
+    person.chrome.mouse("move", x, y)
+    person.chrome.mouse("press", x, y)
+    target = person.at(440, 90)
+    person.chrome.mouse("move", *target, held=True)
+    assert person.chrome.run("document.querySelector('.lens') !== null")
+    person.chrome.mouse("release", *target)
+    person.chrome.wait("document.activeElement.dataset.handle?.startsWith('End')", "the focus on the handle")
+    person.key("ArrowDown", 40)
+    person.press("#save")
+    person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
+    axis = read_yaml(clips / "experiment.yaml").content["axis"]
+    assert axis["to_px"] == pytest.approx([440, 91], abs=1.0)
+
+
+def test_a_frame_is_proofread_and_the_file_says_so(person: Person, clips: Path) -> None:
+    """Frame 20 is dropped by its button, frame 21 moved in the picture by the keyboard, and 22 taken back."""
+    person.press("#track")
+    person.chrome.wait("document.querySelector('.strip svg') !== null", "the strip", 120)
+    show = (
+        "(() => { const f = document.querySelector('#frame'); f.value = %d; f.dispatchEvent(new Event('input')); })()"
+    )
+    for frame, button in ((20, "#drop"), (22, "#confirm"), (22, "#undo")):
+        person.chrome.run(show % frame)
+        person.press(button)
+    person.press("[aria-label='Frame before']")
+    edge = "document.querySelector('[data-handle^=Leading]')"
+    person.chrome.wait(f"{edge} !== null && document.querySelector('#frame').value === '21'", "the edge in the picture")
+    person.chrome.run(f"{edge}.focus()")
+    person.key("ArrowRight", 39)
+    assert person.chrome.run("document.querySelector('.strip .by-hand').getAttribute('d').split('M').length") == 2
+    person.press("#save")
+    person.chrome.wait("document.querySelector('#status').textContent.includes('corrections.csv')", "the save")
+    rows = read_table(clips / "corrections.csv").rows
+    assert [(row["trial"], row["frame"], row["action"]) for row in rows] == [
+        ("d15_24kPa_1", "20", "drop"),
+        ("d15_24kPa_1", "21", "move"),
+    ]
+
+
+def test_a_problem_stands_under_the_cell_it_concerns(person: Person) -> None:
+    person.fill("pressure_kPa", 1, "30 kPa")
+    cell = '[data-column=pressure_kPa][data-row="1"]'
+    person.chrome.wait(f"document.querySelector('{cell}').closest('td').querySelector('small') !== null", "the words")
+    assert "is not a number" in str(person.chrome.run(f"document.querySelector('{cell}').closest('td').textContent"))
+    assert person.chrome.run(f"document.querySelector('{cell}').getAttribute('aria-invalid')") == "true"
+
+
+def test_a_unit_is_chosen_and_written_as_the_column(person: Person, clips: Path) -> None:
+    person.chrome.run(
+        "(() => { const s = document.querySelector('select[aria-label=\"Unit of pressure\"]'); s.value = 'psi';"
+        " s.dispatchEvent(new Event('change')); })()"
+    )
+    person.press("#save")
+    person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
+    assert "pressure_psi" in read_table(clips / "trials.csv").columns
+
+
+def test_every_control_is_reached_by_tab_and_has_a_name(person: Person) -> None:
+    seen = set()
+    for _ in range(160):
+        person.key("Tab", 9)
+        seen.add(person.chrome.run(f"(() => {{ const a = document.activeElement; return {NAME}; }})()"))
+    joined = " | ".join(map(str, seen))
+    for words in (
+        "Save",
+        "capture fps, all trials",
+        "pressure, d15_24kPa_1",
+        "Start of the growth axis",
+        "Track this one",
+    ):
+        assert words in joined
+    assert "INPUT" not in seen
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_eight_hundred_pixels_are_enough_in_both_schemes(person: Person, scheme: str) -> None:
+    person.chrome.send("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+    person.chrome.size(800, 900)
+    assert person.chrome.run("document.documentElement.scrollWidth") <= 800
+    back = person.chrome.run("getComputedStyle(document.body).backgroundColor")
+    brightness = sum(int(part) for part in str(back).strip("rgb()").split(",")[:3]) / 3
+    assert brightness > 200 if scheme == "light" else brightness < 60

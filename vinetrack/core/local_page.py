@@ -1,0 +1,43 @@
+"""What local pages have in common: the address they are bound to, their port, and why one cannot be served."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from typing import TypeVar
+
+from vinetrack.core.problems import UserError
+
+LOOPBACK = "127.0.0.1"
+FIRST_PORT, PORTS = 5070, 30
+"""Chosen: free of well-known services; 30 pages on one machine, then any free port."""
+
+Server = TypeVar("Server")
+
+
+class PageError(UserError, RuntimeError):
+    """The page cannot be served; one sentence with a remedy."""
+
+
+def on_a_free_port(serve: Callable[[int], Server], port: int | None) -> Server:
+    """A server on a port, or on the first that is free.
+
+    Parameters
+    ----------
+    serve : starts one on a port; OSError where it is taken.
+    port : to take, 0 for any that is free; None looks for the first free one from `FIRST_PORT`.
+
+    Returns
+    -------
+    what `serve` returns.
+
+    Raises
+    ------
+    PageError
+        If the port is taken.
+    """
+    tried = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
+    for number in tried:
+        with contextlib.suppress(OSError):
+            return serve(number)
+    raise PageError(f"Port {port} is taken: give another with --port, or none to have one found.")

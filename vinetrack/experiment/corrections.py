@@ -1,0 +1,129 @@
+"""Points of recordings that somebody has looked at: `corrections.csv` beside the sheet.
+
+One line a point: `trial, frame, action, edge_px`. The tracker does what it says and marks the point `corrected`; where
+the tracker itself saw the edge stays in the results.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from vinetrack.core.problems import Problem
+from vinetrack.core.records import CORRECTION_ACTIONS, Correction
+from vinetrack.core.tables import Table, TableError, parse_number, read_table
+
+CORRECTIONS = "corrections.csv"
+COLUMNS_OF_CORRECTIONS = ("trial", "frame", "action", "edge_px")
+
+
+def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], list[Problem]]:
+    """Corrections by trial, and what is wrong with the file.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+
+    Returns
+    -------
+    corrections, problems : both empty where there is no such file.
+    """
+    path = folder / CORRECTIONS
+    if not path.exists():
+        return {}, []
+    try:
+        table = read_table(path)
+    except TableError as error:
+        message, _, remedy = str(error).partition(": ")
+        return {}, [Problem(message=message, file=CORRECTIONS, remedy=remedy)]
+    missing = [name for name in COLUMNS_OF_CORRECTIONS if name not in table.columns]
+    if missing:
+        remedy = f"its columns are {', '.join(COLUMNS_OF_CORRECTIONS)}"
+        return {}, [Problem(message="is missing", file=CORRECTIONS, column=missing[0], remedy=remedy)]
+    found: dict[str, dict[int, Correction]] = {}
+    problems: list[Problem] = []
+    for i, row in enumerate(table.rows):
+        correction = _read_line(table, i, problems)
+        of_trial = found.setdefault(row["trial"], {})
+        if correction is None:
+            continue
+        if correction.frame in of_trial:
+            problems.append(_problem(table, i, "frame", "is corrected twice", "keep one of the lines"))
+        of_trial[correction.frame] = correction
+    return {trial: tuple(of_trial[frame] for frame in sorted(of_trial)) for trial, of_trial in found.items()}, problems
+
+
+def _read_line(table: Table, index: int, problems: list[Problem]) -> Correction | None:
+    """One correction; None where the line has a fault, which is noted."""
+    row = table.rows[index]
+    if row["action"] not in CORRECTION_ACTIONS:
+        remedy = f"write {', '.join(CORRECTION_ACTIONS[:-1])} or {CORRECTION_ACTIONS[-1]}"
+        problems.append(_problem(table, index, "action", "is no correction", remedy))
+        return None
+    numbers = {}
+    for column in ("frame", "edge_px"):
+        if column == "edge_px" and row["action"] != "move":
+            continue
+        try:
+            numbers[column] = parse_number(row[column], table.decimal)
+        except TableError as error:
+            message, _, remedy = str(error).partition(": ")
+            problems.append(_problem(table, index, column, message, remedy))
+            return None
+    if numbers["frame"] < 0 or numbers["frame"] != int(numbers["frame"]):
+        problems.append(_problem(table, index, "frame", "is no frame", "frames are counted 0, 1, 2, …"))
+        return None
+    return Correction(int(numbers["frame"]), row["action"], numbers.get("edge_px", math.nan))
+
+
+def _problem(table: Table, index: int, column: str, message: str, remedy: str) -> Problem:
+    row = table.rows[index]
+    place = {"file": CORRECTIONS, "column": column, "trial": row["trial"], "value": row[column]}
+    return Problem(message=message, line=table.lines[index], remedy=remedy, **place)
+
+
+def strangers(corrections: Mapping[str, object], names: Iterable[str], filmed: Iterable[str]) -> list[Problem]:
+    """A warning for every trial that corrections name and that is not in the sheet, or is no recording.
+
+    Parameters
+    ----------
+    corrections : by trial.
+    names : of all trials of the sheet.
+    filmed : of those that are recordings.
+    """
+    known, recordings = set(names), set(filmed)
+    return [
+        Problem(
+            message="is no recording, and its corrections are ignored" if trial in known else "is not in the sheet",
+            file=CORRECTIONS,
+            column="trial",
+            value=trial,
+            severity="warning",
+        )
+        for trial in corrections
+        if trial not in recordings
+    ]
+
+
+def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
+    """The file that holds these corrections.
+
+    Parameters
+    ----------
+    corrections : by trial.
+
+    Returns
+    -------
+    CSV, its header first.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS_OF_CORRECTIONS)
+    for trial, of_trial in corrections.items():
+        for one in of_trial:
+            place = f"{one.edge_px:.2f}" if math.isfinite(one.edge_px) else ""
+            writer.writerow([trial, one.frame, one.action, place])
+    return out.getvalue()

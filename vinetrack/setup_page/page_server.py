@@ -1,0 +1,249 @@
+"""The page served on this machine's own address: its files, what it asks for, and what it saves, until Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import signal
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from vinetrack.core.local_page import LOOPBACK, on_a_free_port
+from vinetrack.core.problems import ExperimentError, UserError
+from vinetrack.experiment.corrections import corrections_text
+from vinetrack.setup_page.clip_views import ClipStore, jpeg, track_row, warm_up
+from vinetrack.setup_page.draft_files import drafted, files_stamp, write_draft
+from vinetrack.setup_page.page_state import draft_of, page_state, problems_json, problems_of
+from vinetrack.video.frames import RecordingError
+
+log = logging.getLogger(__name__)
+
+TEMPLATES = Path(__file__).with_name("templates")
+LARGEST_REQUEST_BYTES = 20_000_000
+"""Chosen: a sheet of ten thousand rows takes a few megabytes; half would do, twice only wastes memory."""
+
+ASKED_BY = "X-Vinetrack"
+"""Header of every request that changes or computes something: a page from elsewhere cannot send it unasked."""
+
+KINDS = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
+POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'"
+
+
+class SetupServer(ThreadingHTTPServer):
+    """A server for one folder, bound to the loopback address."""
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, folder: Path, port: int) -> None:
+        super().__init__((LOOPBACK, port), _Handler)
+        self.folder = folder
+        self.clips = ClipStore(folder)
+        self.tracking = threading.Lock()
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"http://{LOOPBACK}:{self.server_port}/"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One request."""
+
+    server: SetupServer
+    protocol_version = "HTTP/1.1"
+
+    def log_message(self, format: str, *args: Any) -> None:
+        log.info(format, *args)
+
+    def do_GET(self) -> None:
+        """Files of the page, frames and pictures."""
+        if not self._is_for_us():
+            return
+        url = urlsplit(self.path)
+        asked = {key: values[0] for key, values in parse_qs(url.query).items()}
+        if url.path in ("/", "/setup.css") or url.path.endswith(".js"):
+            self._send_file("setup.html" if url.path == "/" else url.path.lstrip("/"))
+            return
+        clips = self.server.clips
+        answers: dict[str, Callable[[], bytes | dict[str, Any] | None]] = {
+            "/api/state": lambda: page_state(self.server.folder),
+            "/api/clip": lambda: clips.clip(asked["recording"]).to_json(),
+            "/api/frame": lambda: _frame(clips, asked["recording"], int(asked["frame"])),
+            "/api/thumbnail": lambda: clips.thumbnail(asked["recording"]),
+            "/api/picture": lambda: jpeg(clips.picture(asked["picture"])),
+            "/api/board": lambda: clips.board(asked["picture"]),
+        }
+        self._answer(answers.get(url.path))
+
+    def do_POST(self) -> None:
+        """Drafts to be checked, tracked or saved."""
+        if not self._is_for_us():
+            return
+        length = int(self.headers.get("Content-Length") or 0)
+        if self.headers.get(ASKED_BY) != "setup" or not 0 < length <= LARGEST_REQUEST_BYTES:
+            self.close_connection = True
+            self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
+            return
+        body = self.rfile.read(length)
+        answers: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+            "/api/check": self._check,
+            "/api/track": self._track,
+            "/api/save": self._save,
+        }
+        chosen = answers.get(self.path)
+        self._answer(None if chosen is None else lambda: chosen(json.loads(body)))
+
+    def _check(self, content: dict[str, Any]) -> dict[str, Any]:
+        draft = draft_of(self.server.folder, content)
+        found = problems_of(self.server.folder, draft, thorough=bool(content.get("thorough")))
+        texts = {"sheet_text": draft.sheet.text(), "settings_text": draft.settings}
+        return {**found, **texts, "corrections_text": corrections_text(draft.corrections) if draft.corrections else ""}
+
+    def _track(self, content: dict[str, Any]) -> dict[str, Any]:
+        draft = draft_of(self.server.folder, content)
+        with self.server.tracking, drafted(self.server.folder, draft) as copy:
+            return track_row(copy, int(content["row"]))
+
+    def _save(self, content: dict[str, Any]) -> dict[str, Any]:
+        folder = self.server.folder
+        draft = draft_of(folder, content)
+        written = write_draft(folder, draft)
+        return {"written": written, "stamp": files_stamp(folder)}
+
+    def _is_for_us(self) -> bool:
+        """Whether the request names this server: a name elsewhere that leads here is refused."""
+        port = self.server.server_port
+        hosts = {f"{LOOPBACK}:{port}", f"localhost:{port}"}
+        origin = self.headers.get("Origin")
+        if self.headers.get("Host") in hosts and (origin is None or origin in {f"http://{host}" for host in hosts}):
+            return True
+        self.close_connection = True
+        self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
+        return False
+
+    def _answer(self, answer: Callable[[], bytes | dict[str, Any] | None] | None) -> None:
+        """Bytes are a JPEG, everything else JSON; what is wrong with the input is said in a sentence."""
+        if answer is None:
+            self._send(HTTPStatus.NOT_FOUND, b"", "text/plain")
+            return
+        try:
+            given = answer()
+        except ExperimentError as error:
+            self._send_json({"problems": problems_json(error), "words": str(error)}, HTTPStatus.UNPROCESSABLE_ENTITY)
+        except (UserError, RecordingError) as error:
+            self._send_json({"words": str(error)}, HTTPStatus.UNPROCESSABLE_ENTITY)
+        except (KeyError, ValueError, TypeError, OSError) as error:
+            log.exception("%s", self.path)
+            self._send_json({"words": f"{type(error).__name__}: {error}"}, HTTPStatus.BAD_REQUEST)
+        else:
+            if isinstance(given, bytes):
+                self._send(HTTPStatus.OK, given, "image/jpeg")
+            else:
+                self._send_json(given, HTTPStatus.OK)
+
+    def _send_json(self, content: Any, status: HTTPStatus) -> None:
+        self._send(status, json.dumps(content, ensure_ascii=False).encode(), "application/json")
+
+    def _send_file(self, name: str) -> None:
+        path = TEMPLATES / name
+        if "/" in name or not path.is_file():
+            self._send(HTTPStatus.NOT_FOUND, b"", "text/plain")
+            return
+        data = path.read_bytes()
+        if path.suffix == ".css":
+            from vinetrack.figures.page_tokens import page_frame
+
+            data = page_frame().encode() + data
+        self._send(HTTPStatus.OK, data, KINDS[path.suffix])
+
+    def _send(self, status: HTTPStatus, data: bytes, kind: str) -> None:
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.send_response(status)
+            charset = "; charset=utf-8" if kind.startswith("text/") else ""
+            self.send_header("Content-Type", kind + charset)
+            self.send_header("Content-Length", str(len(data)))
+            self.send_header("Cache-Control", "no-store")
+            self.send_header("Content-Security-Policy", POLICY)
+            self.send_header("X-Content-Type-Options", "nosniff")
+            self.send_header("Referrer-Policy", "no-referrer")
+            self.end_headers()
+            self.wfile.write(data)
+
+
+def _frame(clips: ClipStore, recording: str, number: int) -> bytes:
+    frames = clips.clip(recording).frames
+    return frames[min(max(number, 0), len(frames) - 1)]
+
+
+def start_server(folder: Path, port: int | None = None) -> SetupServer:
+    """A server for a folder, not yet answering.
+
+    Parameters
+    ----------
+    folder : of recordings.
+    port : to take, 0 for any that is free; None looks for one.
+
+    Returns
+    -------
+    SetupServer
+
+    Raises
+    ------
+    PageError
+        If the port is taken.
+    """
+    return on_a_free_port(lambda number: SetupServer(folder, number), port)
+
+
+def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:
+    """Serve until Ctrl-C (or SIGTERM).
+
+    Parameters
+    ----------
+    folder : of recordings.
+    say : prints a line.
+    port : as of `start_server`.
+    browser : whether a browser is opened.
+
+    Raises
+    ------
+    ExperimentError
+        If the folder holds no recording, or a file in it cannot be read.
+    PageError
+        If the port is taken.
+    """
+    page_state(folder)
+    server = start_server(folder, port)
+    threading.Thread(target=warm_up, daemon=True).start()
+    say(f"Set-up: {server.address}")
+    say("For this machine alone. Ctrl-C ends it.")
+    if browser:
+        threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
+    with _ended_by_signals(server):
+        server.serve_forever(poll_interval=0.2)
+    server.server_close()
+    say("Set-up ended.")
+
+
+@contextlib.contextmanager
+def _ended_by_signals(server: SetupServer) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the loop between two requests."""
+
+    def end(_number: int, _frame: Any) -> None:
+        # From the thread that serves, a shutdown would wait for itself.
+        threading.Thread(target=server.shutdown, daemon=True).start()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

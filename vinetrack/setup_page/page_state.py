@@ -1,0 +1,204 @@
+"""What passes between the page and the files: columns to choose from, cells, settings, and problems by their field."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.core.records import Correction
+from vinetrack.core.units import UNITS, split_unit
+from vinetrack.core.yaml_document import parse_yaml
+from vinetrack.core.yaml_edit import with_value
+from vinetrack.experiment.folder import SETTINGS, check_experiment
+from vinetrack.experiment.schema import COLUMNS, SHARED
+from vinetrack.experiment.sheet import NEEDED
+from vinetrack.setup_page.clip_names import list_pictures, list_recordings, units_of
+from vinetrack.setup_page.draft_files import Draft, drafted, open_draft, same_cells
+from vinetrack.setup_page.settings_draft import shared_values, with_shared
+from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft
+
+OFFERED = ("capture_fps", *NEEDED, "payload_g", "growth_angle_deg", "exposure_us", "pressure_trace")
+"""Columns that the page shows from the start, whether or not the sheet has them."""
+
+
+def page_state(folder: Path) -> dict[str, Any]:
+    """Everything the page begins with.
+
+    Parameters
+    ----------
+    folder : of recordings, with or without a sheet and settings.
+
+    Raises
+    ------
+    ExperimentError
+        If the folder holds no recording, or a file in it cannot be read.
+    """
+    draft = open_draft(folder)
+    there = read_draft(folder)
+    content = parse_yaml(draft.settings, SETTINGS).content
+    shared = {key: str(value) for key, value in shared_values(draft.settings).items()}
+    return {
+        "name": folder.resolve().name,
+        "folder": str(folder),
+        "stamp": draft.stamp,
+        "known": {name: _column_json(name) for name in COLUMNS if name not in ("trial", "video")},
+        "units": {key: unit.text for key, unit in UNITS.items()},
+        "offered": list(OFFERED),
+        "sheet": _sheet_json(draft.sheet),
+        "kept": list(there.columns) if there.rows else ["trial", "video"],
+        "unsaved": not (folder / SETTINGS).exists() or not there.rows or not same_cells(there, draft.sheet),
+        "shared": shared,
+        "calibration": content.get("calibration"),
+        "axis": content.get("axis"),
+        "corrections": {
+            trial: [vars(one) | _place(one) for one in given] for trial, given in draft.corrections.items()
+        },
+        "recordings": list_recordings(folder),
+        "pictures": list_pictures(folder),
+    }
+
+
+def _column_json(name: str) -> dict[str, Any]:
+    column = COLUMNS[name]
+    return {
+        "quantity": split_unit(name)[0],
+        "units": units_of(name),
+        "unit": split_unit(name)[1] if units_of(name) else "",
+        "kind": column.kind,
+        "meaning": column.meaning,
+        "measured": column.measured,
+        "default": column.default,
+        "shared": name in SHARED,
+    }
+
+
+def _sheet_json(sheet: SheetDraft) -> dict[str, Any]:
+    rows = [dict(row) for row in sheet.rows]
+    return {"columns": list(sheet.columns), "rows": rows, "delimiter": sheet.delimiter, "decimal": sheet.decimal}
+
+
+def _place(one: Correction) -> dict[str, Any]:
+    """To where a point is moved, for JSON, which knows no NaN."""
+    return {"edge_px": one.edge_px if math.isfinite(one.edge_px) else None}
+
+
+def draft_of(folder: Path, content: Mapping[str, Any]) -> Draft:
+    """The draft that the page has sent; comments and keys that it knows nothing of come from the files.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+    content : `sheet`, `shared`, `calibration`, `axis`, `corrections` and `stamp` as the page has them.
+
+    Returns
+    -------
+    Draft
+
+    Raises
+    ------
+    ExperimentError
+        If a file cannot be read, or a key cannot be set without harm.
+    """
+    there = open_draft(folder)
+    sent = content["sheet"]
+    columns = tuple(str(column) for column in sent["columns"])
+    rows = tuple({name: str(row.get(name, "")) for name in columns} for row in sent["rows"])
+    sheet = SheetDraft(columns, rows, there.sheet.delimiter, there.sheet.decimal)
+    text = with_shared(there.settings, {str(key): str(cell) for key, cell in content["shared"].items()})
+    present = parse_yaml(text, SETTINGS).content
+    for key in ("calibration", "axis"):
+        value = content.get(key)
+        if value is not None or present.get(key) is not None:
+            text = with_value(text, key, value, SETTINGS)
+    corrections = {
+        str(trial): tuple(
+            Correction(int(one["frame"]), str(one["action"]), math.nan if one["edge_px"] is None else one["edge_px"])
+            for one in sorted(given, key=lambda one: int(one["frame"]))
+        )
+        for trial, given in content.get("corrections", {}).items()
+        if given
+    }
+    return Draft(sheet, text, str(content["stamp"]), corrections)
+
+
+def problems_of(folder: Path, draft: Draft, thorough: bool = False) -> dict[str, Any]:
+    """What `vinetrack check` would say of a draft, each problem with the field it concerns.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+    draft : as it would be written.
+    thorough : whether recordings are opened too.
+
+    Returns
+    -------
+    mapping of JSON types: `problems` (severity, trial, column, text, field), `notes`, `understood`.
+    """
+    notes: list[str] = []
+    understood: list[str] = []
+    with drafted(folder, draft) as copy:
+        if thorough:
+            from vinetrack.pipeline.check_stage import check_folder
+
+            checked = check_folder(copy)
+            problems, notes, understood = list(checked.problems), list(checked.notes), list(checked.recording_lines)
+        else:
+            problems = [*check_experiment(copy), *_scale_missing(draft)]
+    return {
+        "problems": [_problem_json(problem, draft) for problem in problems],
+        "notes": notes,
+        "understood": understood,
+    }
+
+
+def _scale_missing(draft: Draft) -> list[Problem]:
+    """What the recordings' own check would say of a scale that nobody gives."""
+    content = parse_yaml(draft.settings, SETTINGS).content
+    has_scale = content.get("calibration") is not None or content.get("mm_per_px") is not None
+    without = [row for row in draft.sheet.rows if row.get("video") and not row.get("mm_per_px")]
+    if has_scale or not without:
+        return []
+    remedy = "click two marks on a ruler, or choose a picture of a printed board"
+    return [Problem(message="is missing: no recording has a scale", file=SETTINGS, column="calibration", remedy=remedy)]
+
+
+def problems_json(error: ExperimentError) -> list[dict[str, Any]]:
+    """Problems that keep a draft from being read at all.
+
+    Parameters
+    ----------
+    error : what was raised.
+    """
+    return [_problem_json(problem, None) for problem in error.problems]
+
+
+def _problem_json(problem: Problem, draft: Draft | None) -> dict[str, Any]:
+    """A problem with its field: a cell of the sheet, a value for all trials, the scale, the axis, or the whole."""
+    column = problem.column
+    field = "whole"
+    if column.split(".")[0] in ("calibration", "axis") and not problem.trial:
+        field = column.split(".")[0]
+    elif problem.trial and column:
+        field = "cell"
+    elif problem.trial:
+        field = "row"
+    elif column in COLUMNS or split_unit(column)[0] in {split_unit(name)[0] for name in COLUMNS}:
+        field = "shared"
+    if field in ("cell", "shared") and draft is not None:
+        column = _as_drafted(column, draft)
+    return {
+        "severity": problem.severity,
+        "field": field,
+        "trial": problem.trial,
+        "column": column,
+        "text": problem.reason,
+    }
+
+
+def _as_drafted(column: str, draft: Draft) -> str:
+    """A column by the name it has in the draft, where it may stand in another unit."""
+    quantity = split_unit(column)[0]
+    return next((name for name in draft.sheet.columns if split_unit(name)[0] == quantity), column)

@@ -1,0 +1,374 @@
+// The picture: frames of the chosen recording, the growth axis dragged on it, and its scale.
+import {$, ask, changed, decimals, el, numberOf, round, state, url} from "./state.js";
+
+const view = {source: "", frame: 0, tool: "axis", image: null, width: 1, height: 1, board: "", words: "", edge: null};
+const LENS = 7; // Pixels of the screen for one of the picture.
+const MM = {mm: 1, cm: 10, in: 25.4};
+let lengthUnit = "mm";
+let askedFor = "";
+
+export const row = () => state.sheet.rows[state.chosen];
+export const shownFrame = () => view.frame;
+
+export async function showRecording() {
+  const recording = row()?.video ?? "";
+  askedFor = recording;
+  state.clip = null;
+  view.source = "";
+  view.words = "";
+  drawSources();
+  $("three").replaceChildren();
+  $("stage").replaceChildren(el("p", {class: "busy tool"}, recording ? `Decoding ${recording} …` : "No recording in this row."));
+  if (!recording) return;
+  try {
+    const clip = await ask(url("api/clip", {recording}));
+    if (askedFor !== recording) return;
+    state.clip = clip;
+    view.frame = Math.floor(clip.frames / 2);
+    $("frame").max = clip.frames - 1;
+    drawPicture();
+  } catch (error) {
+    if (askedFor === recording) $("stage").replaceChildren(el("p", {class: "tool"}, error.message));
+  }
+}
+
+function drawSources() {
+  $("source").replaceChildren(el("option", {value: ""}, row()?.video || "no recording"), ...state.pictures.map((name) => el("option", {value: name, selected: name === view.source}, name)));
+  $("source").onchange = (event) => { view.source = event.target.value; drawPicture(); };
+}
+
+const imageOf = (frame) => (view.source ? url("api/picture", {picture: view.source}) : url("api/frame", {recording: row().video, frame}));
+
+export function showFrame(frame, edge = null) {
+  view.frame = Math.max(0, Math.min(state.clip.frames - 1, frame));
+  view.edge = edge;
+  if (view.source) { view.source = ""; drawSources(); drawPicture(); return; }
+  $("frame").value = view.frame;
+  $("frame-at").textContent = `${view.frame} of ${state.clip.frames - 1}`;
+  if (view.image) view.image.src = imageOf(view.frame);
+  drawOver();
+}
+
+export function drawPicture() {
+  if (!state.clip) return;
+  const image = el("img", {alt: view.source || `Frame ${view.frame} of ${row().video}`, draggable: "false", src: imageOf(view.frame)});
+  view.image = image;
+  image.onload = () => {
+    view.width = image.naturalWidth;
+    view.height = image.naturalHeight;
+    drawOver();
+  };
+  const over = el("svg", {id: "over", preserveAspectRatio: "none"});
+  $("stage").replaceChildren(image, over);
+  over.addEventListener("pointerdown", place);
+  over.addEventListener("pointermove", (event) => { if (view.tool === "scale" && scaleKind() === "two_points") lens(event); });
+  over.addEventListener("pointerleave", () => document.querySelector(".lens")?.remove());
+  $("frame").value = view.frame;
+  $("frame").disabled = Boolean(view.source);
+  $("frame-at").textContent = `${view.frame} of ${state.clip.frames - 1}`;
+  $("frame").oninput = (event) => showFrame(Number(event.target.value));
+  for (const radio of document.querySelectorAll("input[name=tool]")) {
+    radio.onchange = () => { view.tool = radio.value; $("axis-tool").hidden = view.tool !== "axis"; $("scale-tool").hidden = view.tool !== "scale"; drawOver(); drawTools(); };
+  }
+  const frames = [0, Math.floor((state.clip.frames - 1) / 2), state.clip.frames - 1];
+  $("three").replaceChildren(...frames.map((frame, i) => el("button", {type: "button", "data-frame": frame, onclick: () => showFrame(frame)},
+    el("img", {src: url("api/frame", {recording: row().video, frame}), alt: ""}), el("svg", {viewBox: `0 0 ${state.clip.width} ${state.clip.height}`, preserveAspectRatio: "none"}),
+    el("span", {}, `${["First", "Middle", "Last"][i]} frame, ${frame}`))));
+  drawTools();
+}
+
+// ---- the axis ----------------------------------------------------------------------------------------------------
+
+function ofCell(text) {
+  const parts = (text ?? "").split(":").map((part) => part.split(",").map(Number));
+  return parts.length >= 2 && parts.every((part) => part.every(Number.isFinite)) ? {from_px: parts[0], to_px: parts[1], width: parts[2]?.[0]} : null;
+}
+
+export function currentAxis() {
+  const own = ofCell(row()?.axis);
+  if (own) return {...own, given: "trial"};
+  if (state.axis) return {...state.axis, given: "all"};
+  return state.clip?.axis ? {...state.clip.axis, given: ""} : null;
+}
+
+function setAxis(axis, scope) {
+  const ends = {from_px: axis.from_px.map((v) => round(v)), to_px: axis.to_px.map((v) => round(v))};
+  if (scope === "trial") {
+    const width = axis.width ? `:${axis.width}` : "";
+    row().axis = `${ends.from_px.join(",")}:${ends.to_px.join(",")}${width}`;
+    if (!state.sheet.columns.includes("axis")) state.sheet.columns.push("axis");
+  } else {
+    state.axis = {...(state.axis?.width_mm ? {width_mm: state.axis.width_mm} : {}), ...ends};
+    if (row().axis) row().axis = "";
+  }
+  changed();
+}
+
+function clearAxis() {
+  if (row().axis) row().axis = "";
+  else state.axis = null;
+  changed();
+  drawOver();
+  drawTools();
+}
+
+// ---- what is drawn over the picture ------------------------------------------------------------------------------
+
+export function drawOver() {
+  const over = $("over");
+  if (!over || !state.clip) return;
+  over.setAttribute("viewBox", `0 0 ${view.width} ${view.height}`);
+  $("stage").classList.toggle("scale", view.tool === "scale");
+  over.replaceChildren();
+  const unit = view.width / Math.max($("stage").clientWidth, 1);
+  const axis = currentAxis();
+  if (axis && !view.source) drawAxis(over, axis, unit, view.tool === "axis");
+  for (const button of $("three").children) {
+    button.setAttribute("aria-pressed", Number(button.dataset.frame) === view.frame && !view.source);
+    const small = button.querySelector("svg");
+    small.replaceChildren();
+    if (axis) drawAxis(small, axis, state.clip.width / Math.max(button.clientWidth, 1), false);
+  }
+  if (view.tool === "scale" && scaleKind() === "two_points") drawMarks(over, unit);
+  if (view.edge && !view.source) drawEdge(over, unit);
+}
+
+// The edge in this frame, to be moved along the axis.
+function drawEdge(over, unit) {
+  const {line, middle, put} = view.edge;
+  over.append(el("line", {...line, class: "edge-line", "stroke-width": 2 * unit}));
+  const words = "Leading edge in this frame";
+  over.append(handle("circle", {cx: middle()[0], cy: middle()[1], r: 8 * unit, "stroke-width": 2 * unit, class: "handle given"}, words, middle, (point) => put(point)));
+}
+
+function drawAxis(over, axis, unit, handles) {
+  const kind = axis.given ? "axis-line given" : "axis-line proposed";
+  const [[x0, y0], [x1, y1]] = [axis.from_px, axis.to_px];
+  const line = (cls, dx, dy, width) => el("line", {class: cls, x1: x0 + dx, y1: y0 + dy, x2: x1 + dx, y2: y1 + dy, "stroke-width": width * unit});
+  const length = Math.hypot(x1 - x0, y1 - y0);
+  const half = (axis.width_px ?? 0) / 2;
+  if (half) for (const side of [-half, half]) over.append(line(`${kind} side`, (-side * (y1 - y0)) / length, (side * (x1 - x0)) / length, 1));
+  over.append(line(kind, 0, 0, 2));
+  const [ux, uy] = [(x1 - x0) / length, (y1 - y0) / length];
+  const tip = 11 * unit;
+  over.append(el("path", {class: kind, "stroke-width": 2 * unit, d: `M${x1 - tip * (ux + 0.5 * uy)} ${y1 - tip * (uy - 0.5 * ux)} L${x1} ${y1} L${x1 - tip * (ux - 0.5 * uy)} ${y1 - tip * (uy + 0.5 * ux)}`}));
+  if (!handles) return;
+  for (const end of ["from_px", "to_px"]) {
+    const words = end === "from_px" ? "Start of the growth axis" : "End of the growth axis";
+    over.append(handle("circle", {cx: axis[end][0], cy: axis[end][1], r: 8 * unit, "stroke-width": 2 * unit, class: axis.given ? "handle given" : "handle"}, words, () => currentAxis()[end], (point) => {
+      const now = currentAxis();
+      setAxis({...now, [end]: point}, now.given || scopeWanted());
+      drawOver();
+      drawTools();
+    }));
+  }
+}
+
+const scopeWanted = () => document.querySelector("#axis-scope")?.value ?? "all";
+
+function handle(tag, given, words, where, put) {
+  const made = el(tag, {...given, tabindex: 0, role: "button", "aria-label": `${words}; arrow keys move it by a pixel, with Shift by ten, with Alt by a tenth`, "data-handle": words});
+  made.addEventListener("pointerdown", (event) => { event.stopPropagation(); event.preventDefault(); drag(event, words, put); });
+  made.addEventListener("keydown", (event) => {
+    const step = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
+    const by = {ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, -step], ArrowDown: [0, step]}[event.key];
+    if (!by) return;
+    event.preventDefault();
+    const [x, y] = where();
+    put(inside([x + by[0], y + by[1]]));
+    document.querySelector(`[data-handle="${words}"]`)?.focus();
+  });
+  return made;
+}
+
+const inside = ([x, y]) => [Math.min(Math.max(x, 0), view.width - 1), Math.min(Math.max(y, 0), view.height - 1)];
+
+function at(event) {
+  const box = $("over").getBoundingClientRect();
+  // Pixel centres lie at whole numbers.
+  return inside([((event.clientX - box.left) / box.width) * view.width - 0.5, ((event.clientY - box.top) / box.height) * view.height - 0.5]);
+}
+
+function drag(event, words, put) {
+  const over = $("over");
+  over.setPointerCapture(event.pointerId);
+  const move = (next) => { lens(next); put(at(next)); };
+  const end = () => {
+    over.removeEventListener("pointermove", move);
+    document.querySelector(".lens")?.remove();
+    document.querySelector(`[data-handle="${words}"]`)?.focus();
+  };
+  over.addEventListener("pointermove", move);
+  over.addEventListener("pointerup", end, {once: true});
+  over.addEventListener("pointercancel", end, {once: true});
+}
+
+function lens(event) {
+  const glass = document.querySelector(".lens") ?? $("stage").appendChild(el("div", {class: "lens", "aria-hidden": "true"}));
+  const [x, y] = at(event);
+  const box = $("stage").getBoundingClientRect();
+  const [left, top] = [event.clientX - box.left, event.clientY - box.top];
+  glass.style.left = `${Math.min(Math.max(left + (left > box.width / 2 ? -190 : 40), 0), box.width - 150)}px`;
+  glass.style.top = `${Math.min(Math.max(top - 75, 2), Math.max(box.height - 152, 2))}px`;
+  glass.style.backgroundImage = `url("${view.image.src}")`;
+  glass.style.backgroundSize = `${view.width * LENS}px ${view.height * LENS}px`;
+  glass.style.backgroundPosition = `${73 - (x + 0.5) * LENS}px ${73 - (y + 0.5) * LENS}px`;
+}
+
+// ---- the scale ---------------------------------------------------------------------------------------------------
+
+const marks = {from_px: null, to_px: null, length: "", square: "", marker: "", own: ""};
+let kind = null;
+
+export function readCalibration() {
+  const given = state.calibration;
+  kind = given?.kind ?? "two_points";
+  if (given?.kind === "two_points") Object.assign(marks, {from_px: given.from_px, to_px: given.to_px, length: String(given.length_mm)});
+  if (given?.kind === "mm_per_px") marks.own = String(given.mm_per_px);
+  if (given?.squares) Object.assign(marks, {square: String(given.square_mm), marker: String(given.marker_mm ?? ""), board: given});
+}
+
+const scaleKind = () => (kind === "checkerboard" || kind === "charuco" ? "board" : kind);
+
+function place(event) {
+  if (view.tool !== "scale" || scaleKind() !== "two_points") return;
+  const point = at(event).map((v) => round(v));
+  if (!marks.from_px) marks.from_px = point;
+  else if (!marks.to_px) marks.to_px = point;
+  else return;
+  writeScale();
+  drawOver();
+  drawTools();
+  // The press itself takes the focus to what was pressed.
+  if (marks.to_px) addEventListener("pointerup", () => setTimeout(() => $("length")?.focus()), {once: true});
+}
+
+function drawMarks(over, unit) {
+  if (marks.from_px && marks.to_px) {
+    over.append(el("line", {class: "ruler-line", x1: marks.from_px[0], y1: marks.from_px[1], x2: marks.to_px[0], y2: marks.to_px[1], "stroke-width": 1.5 * unit}));
+  }
+  for (const [end, words] of [["from_px", "First ruler mark"], ["to_px", "Second ruler mark"]]) {
+    if (!marks[end]) continue;
+    const [x, y] = marks[end];
+    const r = 9 * unit;
+    over.append(handle("path", {class: "mark", "stroke-width": 1.6 * unit, d: `M${x - r} ${y}H${x + r}M${x} ${y - r}V${y + r}M${x - r * 0.6} ${y}a${r * 0.6} ${r * 0.6} 0 1 0 ${r * 1.2} 0a${r * 0.6} ${r * 0.6} 0 1 0 ${-r * 1.2} 0`}, words, () => marks[end], (point) => {
+      marks[end] = point.map((v) => round(v));
+      writeScale();
+      drawOver();
+      drawTools();
+    }));
+  }
+}
+
+function writeScale() {
+  const length = numberOf(marks.length) * MM[lengthUnit];
+  if (kind === "two_points") state.calibration = marks.from_px && marks.to_px && length > 0 ? {kind, from_px: marks.from_px, to_px: marks.to_px, length_mm: round(length, 4)} : null;
+  if (kind === "mm_per_px") state.calibration = numberOf(marks.own) > 0 ? {kind, mm_per_px: numberOf(marks.own)} : null;
+  if (scaleKind() === "board") {
+    const {board} = marks;
+    const [square, marker] = [numberOf(marks.square), numberOf(marks.marker)];
+    const whole = board && square > 0 && (board.kind === "checkerboard" || marker > 0);
+    state.calibration = whole ? {kind: board.kind, image: board.image, squares: board.squares, square_mm: square, ...(board.kind === "charuco" ? {marker_mm: marker, dictionary: board.dictionary} : {})} : null;
+  }
+  changed();
+}
+
+function mmPerPx() {
+  const given = state.calibration;
+  if (given?.kind === "mm_per_px") return given.mm_per_px;
+  if (given?.kind !== "two_points") return null;
+  return given.length_mm / Math.hypot(given.to_px[0] - given.from_px[0], given.to_px[1] - given.from_px[1]);
+}
+
+async function findBoard() {
+  const picture = view.source || row().video;
+  view.words = "busy";
+  drawTools();
+  try {
+    const board = await ask(url("api/board", {picture}));
+    view.words = board ? "" : `No printed board is seen in ${picture}: show it whole, in focus and not mirrored.`;
+    if (board) { marks.board = board; kind = board.kind; if (numberOf(marks.square)) marks.marker = suggested(); writeScale(); }
+  } catch (error) {
+    view.words = error.message;
+  }
+  drawTools();
+}
+
+const suggested = () => (marks.board?.marker_share ? String(round(numberOf(marks.square) * marks.board.marker_share, 1)) : "");
+
+// ---- words and fields below the picture --------------------------------------------------------------------------
+
+function said(field) {
+  const found = state.problems.filter((problem) => problem.field === field || (problem.field === "cell" && problem.column === field && problem.trial === row()?.trial));
+  return el("ul", {class: "problems"}, ...found.map((problem) => el("li", {class: problem.severity}, problem.text)));
+}
+
+function field(id, label, value, write, more = {}) {
+  return el("label", {}, `${label} `, el("input", {id, type: "text", value, inputmode: "decimal", autocomplete: "off", ...more, oninput: (event) => { write(event.target.value); writeScale(); facts(); }}));
+}
+
+export function drawTools() {
+  if (!state.clip) return;
+  drawAxisTool();
+  drawScaleTool();
+}
+
+// Fields stay as they are: somebody may be typing in one.
+export function drawProblems() {
+  for (const [tool, name] of [["axis-tool", "axis"], ["scale-tool", "calibration"]]) $(tool).querySelector(".problems")?.replaceWith(said(name));
+}
+
+function drawAxisTool() {
+  const axis = currentAxis();
+  const words = {
+    "": axis ? "Found from the motion of this recording. Nothing is written: each recording finds its own. Drag an end where it is wrong." : `No axis is found: ${state.clip.no_axis}.`,
+    all: "Given for all trials, in experiment.yaml.", trial: `Given for ${row().trial} alone, in its row.`,
+  }[axis?.given ?? ""];
+  const ends = axis ? ["from_px", "to_px"].map((end) => axis[end].map((v) => round(v)).join(", ")).join(" to ") : "";
+  const scope = el("select", {id: "axis-scope", onchange: (event) => { const now = currentAxis(); if (now?.given) { const value = event.target.value; if (value === "trial") setAxis(now, "trial"); else setAxis(now, "all"); drawOver(); drawTools(); } }},
+    el("option", {value: "all", selected: axis?.given !== "trial"}, "all trials"), el("option", {value: "trial", selected: axis?.given === "trial"}, "this trial alone"));
+  const place = () => { const [w, h] = [state.clip.width, state.clip.height]; setAxis({from_px: [0.1 * w, h / 2], to_px: [0.9 * w, h / 2]}, "all"); drawOver(); drawTools(); };
+  $("axis-tool").replaceChildren(said("axis"), el("p", {class: "hint"}, words), el("div", {class: "row"},
+    axis ? el("span", {class: "fact"}, el("b", {}, ends), " px") : el("button", {type: "button", onclick: place}, "Draw one"),
+    el("label", {}, "A dragged axis holds for ", scope), axis?.given ? el("button", {type: "button", class: "plain", onclick: clearAxis}, "Take what the motion shows") : null));
+}
+
+function facts() {
+  const scale = mmPerPx();
+  const apart = marks.from_px && marks.to_px ? Math.hypot(marks.to_px[0] - marks.from_px[0], marks.to_px[1] - marks.from_px[1]) : null;
+  const words = [];
+  if (kind === "two_points" && apart) words.push(`${decimals(apart, 4)} px apart`);
+  if (scale) words.push(`${decimals(scale, 4)} mm a pixel`, `the picture is ${decimals(scale * state.clip.width, 3)} mm wide`);
+  if (view.source && (view.width !== state.clip.width || view.height !== state.clip.height)) {
+    words.push(`this picture is ${view.width} × ${view.height} px, the recording ${state.clip.width} × ${state.clip.height}: take it with the camera's settings of the trials`);
+  }
+  const place = $("scale-facts");
+  if (place) place.textContent = words.join("; ");
+}
+
+function drawScaleTool() {
+  const kinds = [["two_points", "Two marks on a ruler"], ["board", "A printed board"], ["mm_per_px", "The scale itself"]];
+  const choose = (value) => { kind = value === "board" ? marks.board?.kind ?? "charuco" : value; writeScale(); drawOver(); drawTools(); };
+  const segments = el("div", {class: "segments", role: "radiogroup", "aria-label": "Where the scale comes from"}, ...kinds.map(([value, words]) =>
+    el("label", {}, el("input", {type: "radio", name: "scale", id: `scale-${value}`, value, checked: scaleKind() === value, onchange: () => choose(value)}), words)));
+  const parts = [];
+  if (kind === "two_points") {
+    const step = !marks.from_px ? "Click the first mark of a ruler that lies in the plane of growth." : !marks.to_px ? "Click the second mark, as far away as the ruler allows." : "Drag a mark, or move it with the arrow keys.";
+    parts.push(el("p", {class: "hint"}, step), el("div", {class: "row"},
+      field("length", "Length between them", marks.length, (value) => { marks.length = value; }),
+      el("select", {id: "length-unit", "aria-label": "Unit of the length", onchange: (event) => { lengthUnit = event.target.value; writeScale(); facts(); }}, ...Object.keys(MM).map((unit) => el("option", {value: unit, selected: unit === lengthUnit}, unit))),
+      marks.from_px ? el("button", {type: "button", class: "plain", onclick: () => { Object.assign(marks, {from_px: null, to_px: null}); writeScale(); drawOver(); drawTools(); }}, "Click both anew") : null));
+  } else if (kind === "mm_per_px") {
+    parts.push(el("div", {class: "row"}, field("own-scale", "Millimetres a pixel", marks.own, (value) => { marks.own = value; })));
+  } else {
+    const {board} = marks;
+    parts.push(el("div", {class: "row"}, el("button", {type: "button", id: "find-board", onclick: findBoard}, "Look for a board here"),
+      view.words === "busy" ? el("span", {class: "busy"}, "looking …") : board ? el("span", {class: "fact"}, el("b", {}, `${board.kind === "charuco" ? "ChArUco board" : "Checkerboard"}, ${board.squares.join(" × ")} squares`), board.dictionary ? ` of ${board.dictionary}` : "", ` in ${board.image}`) : el("span", {class: "muted"}, view.words || "Choose its picture above, or a recording that shows it in its first frame.")));
+    if (board) {
+      parts.push(el("div", {class: "row"}, field("square", "Side of a square, mm", marks.square, (value) => { marks.square = value; if (board.marker_share) { marks.marker = suggested(); if ($("marker")) $("marker").value = marks.marker; } }),
+        board.kind === "charuco" ? field("marker", "of a marker, mm", marks.marker, (value) => { marks.marker = value; }) : null, el("span", {class: "muted"}, "measured on the print")));
+    }
+  }
+  $("scale-tool").replaceChildren(said("calibration"), el("div", {class: "row"}, segments), ...parts, el("p", {class: "fact muted", id: "scale-facts"}));
+  facts();
+}

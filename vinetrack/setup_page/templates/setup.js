@@ -1,0 +1,95 @@
+// The page begins, listens, checks and saves.
+import {$, ask, content, el, listeners, state} from "./state.js";
+import {drawOver, drawProblems, readCalibration, showRecording} from "./picture.js";
+import {drawTable, markProblems} from "./table.js";
+import {forget, track} from "./motion.js";
+
+function choose(i) {
+  if (i === state.chosen) return;
+  state.chosen = i;
+  for (const line of $("trials").querySelectorAll("tr[data-row]")) line.classList.toggle("chosen", Number(line.dataset.row) === i);
+  forget();
+  showRecording();
+}
+
+function showWhole(extra = []) {
+  const found = [...extra, ...state.problems.filter((problem) => problem.field === "whole")];
+  $("whole").replaceChildren(...found.map((problem) => el("li", {class: problem.severity}, problem.text)));
+}
+
+function showState(notes = []) {
+  const errors = state.problems.filter((problem) => problem.severity === "error").length;
+  const warnings = state.problems.length - errors;
+  const n = state.sheet.rows.length;
+  $("headline").textContent = errors ? `${n} trials, ${errors} ${errors === 1 ? "thing" : "things"} to fill in or correct` : `${n} trials, ready to run`;
+  const words = [];
+  if (warnings) words.push(`${warnings} ${warnings === 1 ? "warning" : "warnings"}`);
+  words.push(state.dirty ? "not saved" : "saved as shown", ...notes);
+  if (!errors && !state.dirty) words.push(`next: vinetrack run ${state.folder}`);
+  $("status").textContent = words.join(" · ");
+  $("save").disabled = !state.dirty;
+}
+
+let turn = 0;
+async function check(thorough = false) {
+  const mine = ++turn;
+  if (thorough) $("status").textContent = "Opening every recording …";
+  try {
+    const found = await ask("api/check", content({thorough}));
+    if (mine !== turn) return;
+    state.problems = found.problems;
+    $("sheet-text").textContent = found.sheet_text;
+    $("settings-text").textContent = found.settings_text;
+    $("corrections-text").textContent = found.corrections_text;
+    $("corrections-shown").hidden = !found.corrections_text;
+    showWhole(found.understood.length ? [{severity: "note", text: found.understood.join(" · ")}] : []);
+    showState(found.notes);
+  } catch (error) {
+    if (mine !== turn) return;
+    state.problems = error.content?.problems ?? [];
+    showWhole(state.problems.length ? [] : [{severity: "error", text: error.message}]);
+    showState();
+  }
+  markProblems();
+  drawProblems();
+}
+
+async function save() {
+  try {
+    const made = await ask("api/save", content());
+    state.stamp = made.stamp;
+    state.dirty = false;
+    await check();
+    $("status").textContent = `${made.written.length ? `Written: ${made.written.join(", ")}` : "Nothing had changed"} · ${$("status").textContent}`;
+  } catch (error) {
+    showWhole([{severity: "error", text: error.message}]);
+  }
+}
+
+async function begin() {
+  try {
+    Object.assign(state, await ask("api/state"));
+  } catch (error) {
+    $("headline").textContent = "This folder cannot be set up yet";
+    showWhole([{severity: "error", text: error.message}]);
+    return;
+  }
+  state.dirty = state.unsaved;
+  $("name").textContent = state.name;
+  document.title = `${state.name} – vinetrack set-up`;
+  readCalibration();
+  drawTable(choose);
+  listeners.push(check);
+  await Promise.all([check(), showRecording()]);
+  document.body.dataset.ready = "yes";
+}
+
+$("save").onclick = save;
+$("check").onclick = () => check(true);
+$("track").onclick = track;
+addEventListener("keydown", (event) => {
+  if ((event.ctrlKey || event.metaKey) && event.key === "s") { event.preventDefault(); save(); }
+});
+addEventListener("beforeunload", (event) => { if (state.dirty) event.preventDefault(); });
+addEventListener("resize", drawOver);
+begin();

@@ -1,0 +1,92 @@
+// What the page knows, how it asks the server, and how it makes elements.
+export const state = {
+  known: {}, units: {}, offered: [], sheet: {columns: [], rows: []}, kept: [], shared: {}, calibration: null, axis: null, corrections: {},
+  recordings: [], pictures: [], stamp: "", chosen: 0, problems: [], dirty: false, clip: null,
+};
+
+export const $ = (id) => document.getElementById(id);
+
+export function el(tag, given = {}, ...children) {
+  const svg = ["svg", "line", "circle", "path", "text", "g", "polyline", "rect"].includes(tag);
+  const made = svg ? document.createElementNS("http://www.w3.org/2000/svg", tag) : document.createElement(tag);
+  for (const [key, value] of Object.entries(given)) {
+    if (key.startsWith("on")) made.addEventListener(key.slice(2), value);
+    else if (value === true) made.setAttribute(key, "");
+    else if (value !== false && value !== null && value !== undefined) made.setAttribute(key, value);
+  }
+  made.append(...children.filter((child) => child !== null && child !== undefined));
+  return made;
+}
+
+export async function ask(path, body) {
+  const options = body === undefined ? {} : {
+    method: "POST", body: JSON.stringify(body), headers: {"Content-Type": "application/json", "X-Vinetrack": "setup"},
+  };
+  let answer;
+  try {
+    answer = await fetch(path, options);
+  } catch {
+    throw Object.assign(new Error("The program has ended: start vinetrack setup again; nothing here is saved."), {gone: true});
+  }
+  const content = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw Object.assign(new Error(content.words || `The server answers ${answer.status}.`), {content});
+  return content;
+}
+
+export const url = (path, given) => `${path}?${new URLSearchParams(given)}`;
+
+export function quantityOf(name) {
+  if (state.known[name]) return state.known[name].quantity;
+  const ending = Object.keys(state.units).filter((unit) => name.endsWith(`_${unit}`)).sort((a, b) => b.length - a.length)[0];
+  return ending ? name.slice(0, -ending.length - 1) : name;
+}
+
+export function baseOf(name) {
+  if (state.known[name]) return name;
+  const quantity = quantityOf(name);
+  return Object.keys(state.known).find((key) => state.known[key].quantity === quantity && state.known[key].units.length) ?? null;
+}
+
+// Columns shown: those of the sheet and those offered, each quantity once, in the unit it is written in.
+export function shownColumns() {
+  const names = state.sheet.columns.filter((name) => !["trial", "video"].includes(name));
+  const quantities = new Set(names.map(quantityOf));
+  for (const name of [...Object.keys(state.shared), ...state.offered]) {
+    if (quantities.has(quantityOf(name))) continue;
+    quantities.add(quantityOf(name));
+    names.push(name);
+  }
+  const order = (name) => { const i = state.offered.indexOf(baseOf(name)); return i < 0 ? 99 : i; };
+  return names.map((name, i) => [order(name), i, name]).sort((a, b) => a[0] - b[0] || a[1] - b[1]).map((entry) => entry[2]);
+}
+
+// A column as a person says it: without its unit where that can be chosen.
+export function labelOf(name) {
+  const known = state.known[baseOf(name)];
+  return (known && known.units.length > 1 ? known.quantity : name).replaceAll("_", " ");
+}
+
+export function sharedValue(name) {
+  const key = Object.keys(state.shared).find((other) => quantityOf(other) === quantityOf(name));
+  return key === undefined ? "" : state.shared[key];
+}
+
+// Columns that nobody filled in are not written, unless the sheet had them.
+export function content(more = {}) {
+  const {rows} = state.sheet;
+  const columns = state.sheet.columns.filter((name) => state.kept.includes(name) || rows.some((row) => row[name]));
+  const {shared, calibration, axis, corrections, stamp} = state;
+  return {sheet: {columns, rows}, shared, calibration, axis, corrections, stamp, ...more};
+}
+
+export const listeners = [];
+let waiting;
+export function changed() {
+  state.dirty = true;
+  clearTimeout(waiting);
+  waiting = setTimeout(() => listeners.forEach((listener) => listener()), 350);
+}
+
+export const decimals = (value, digits) => (value === null || value === undefined ? "–" : Number(value.toPrecision(digits)).toString());
+export const numberOf = (text) => { const value = parseFloat(String(text).replace(",", ".")); return Number.isFinite(value) ? value : null; };
+export const round = (value, digits = 1) => Math.round(value * 10 ** digits) / 10 ** digits;

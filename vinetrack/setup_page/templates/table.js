@@ -1,0 +1,153 @@
+// The table: one row for all trials, one for each, problems under the cell they concern.
+import {$, baseOf, changed, el, labelOf, quantityOf, sharedValue, shownColumns, state, url} from "./state.js";
+
+export function drawTable(choose) {
+  const columns = shownColumns();
+  const table = $("trials");
+  table.replaceChildren(head(columns), el("tbody", {}, sharedRow(columns), ...state.sheet.rows.map((row, i) => trialRow(row, i, columns, choose))));
+  table.onpaste = paste;
+  table.onkeydown = move;
+  drawAdder(columns);
+  markProblems();
+}
+
+function head(columns) {
+  const cells = columns.map((name) => {
+    const known = state.known[baseOf(name)];
+    const title = known ? [known.meaning, known.measured, known.default && `Blank: ${known.default}.`].filter(Boolean).join(" ") : "No column of a trial sheet: kept, and ignored.";
+    const label = el("span", {title}, labelOf(name));
+    const unit = known && known.units.length > 1
+      ? el("select", {"aria-label": `Unit of ${known.quantity}`, onchange: (event) => setUnit(name, event.target.value)},
+        ...known.units.map((key) => el("option", {value: key, selected: name.endsWith(`_${key}`) && unitOf(name) === key}, state.units[key])))
+      : el("span", {class: "unit"}, known?.unit ? state.units[known.unit] : "");
+    return el("th", {scope: "col"}, label, unit);
+  });
+  return el("thead", {}, el("tr", {}, el("th"), el("th", {scope: "col"}, "trial", el("span", {class: "unit"}, "recording")), ...cells));
+}
+
+const unitOf = (name) => name.slice(quantityOf(name).length + 1);
+
+function setUnit(name, unit) {
+  const other = `${quantityOf(name)}_${unit}`;
+  state.sheet.columns = state.sheet.columns.map((column) => (column === name ? other : column));
+  state.kept = state.kept.map((column) => (column === name ? other : column));
+  state.offered = state.offered.map((column) => (column === name ? other : column));
+  for (const row of state.sheet.rows) {
+    if (name in row) { row[other] = row[name]; delete row[name]; }
+  }
+  const key = Object.keys(state.shared).find((shared) => quantityOf(shared) === quantityOf(name));
+  if (key !== undefined && key !== other) { state.shared[other] = state.shared[key]; delete state.shared[key]; }
+  changed();
+  redraw();
+}
+
+let chooser = null;
+function redraw() { drawTable(chooser); }
+
+function sharedRow(columns) {
+  const cells = columns.map((name) => {
+    const known = state.known[baseOf(name)];
+    if (!known?.shared) return el("td");
+    const key = Object.keys(state.shared).find((other) => quantityOf(other) === quantityOf(name)) ?? name;
+    const blank = known.default.startsWith("required") ? "" : known.default.split(":")[0].slice(0, 12);
+    return cell(name, "shared", state.shared[key] ?? "", blank, (value) => { state.shared[key] = value; placeholders(name); });
+  });
+  return el("tr", {class: "all"}, el("td", {class: "pic"}), el("td", {class: "label"}, "All trials"), ...cells);
+}
+
+function trialRow(row, i, columns, choose) {
+  chooser = choose;
+  const picture = row.video
+    ? el("button", {type: "button", class: "pick", title: `Show ${row.video}`, "aria-label": `Show ${row.trial}`, onclick: () => choose(i)},
+      el("img", {src: url("api/thumbnail", {recording: row.video}), alt: "", loading: "lazy"}))
+    : null;
+  const name = cell("trial", i, row.trial ?? "", "", (value) => {
+    // Corrections follow the name of their trial.
+    if (state.corrections[row.trial] && value !== row.trial) { state.corrections[value] = state.corrections[row.trial]; delete state.corrections[row.trial]; }
+    row.trial = value;
+  });
+  name.classList.add("name");
+  name.append(el("small", {class: "file"}, row.video || row.track || ""));
+  const cells = columns.map((column) => cell(column, i, row[column] ?? "", sharedValue(column), (value) => {
+    row[column] = value;
+    if (!state.sheet.columns.includes(column)) state.sheet.columns.push(column);
+  }));
+  const line = el("tr", {"data-row": i, class: i === state.chosen ? "chosen" : ""}, el("td", {class: "pic"}, picture), name, ...cells);
+  line.addEventListener("focusin", (event) => { if (event.target.matches("input, td select")) choose(i); });
+  return line;
+}
+
+function cell(column, row, value, placeholder, write) {
+  const known = state.known[baseOf(column)];
+  const label = `${labelOf(column)}, ${row === "shared" ? "all trials" : state.sheet.rows[row].trial}`;
+  const given = {"data-column": column, "data-row": row, "aria-label": label};
+  const heard = (event) => { write(event.target.value.trim()); changed(); };
+  const field = known?.kind === "yes_no"
+    ? el("select", {...given, onchange: heard}, ...["", "yes", "no"].map((word) => el("option", {value: word, selected: word === value}, word)))
+    : el("input", {...given, type: "text", value, placeholder, spellcheck: "false", autocomplete: "off", inputmode: known?.kind === "number" ? "decimal" : "text", oninput: heard});
+  return el("td", {class: known?.kind === "number" ? "" : "text"}, field);
+}
+
+function placeholders(name) {
+  for (const field of $("trials").querySelectorAll(`tbody tr:not(.all) input[data-column="${name}"]`)) field.placeholder = sharedValue(name);
+}
+
+function move(event) {
+  const field = event.target;
+  const step = {ArrowDown: 1, ArrowUp: -1, Enter: 1}[event.key];
+  if (!step || !field.matches("input")) return;
+  const column = [...$("trials").querySelectorAll(`[data-column="${field.dataset.column}"]`)];
+  const next = column[column.indexOf(field) + step];
+  if (next) { next.focus(); next.select?.(); event.preventDefault(); }
+}
+
+function paste(event) {
+  const text = event.clipboardData.getData("text").replace(/\r/g, "").replace(/\n$/, "");
+  if (!/[\t\n]/.test(text)) return;
+  event.preventDefault();
+  const fields = (line) => [...line.querySelectorAll("[data-column]")];
+  const lines = [...$("trials").querySelectorAll("tbody tr")];
+  const start = lines.indexOf(event.target.closest("tr"));
+  const left = fields(lines[start]).indexOf(event.target);
+  text.split("\n").forEach((words, down) => words.split("\t").forEach((word, right) => {
+    const field = lines[start + down] && fields(lines[start + down])[left + right];
+    if (!field) return;
+    field.value = word.trim();
+    field.dispatchEvent(new Event(field.matches("select") ? "change" : "input"));
+  }));
+}
+
+function drawAdder(columns) {
+  const shown = new Set(columns.map(quantityOf));
+  const left = Object.keys(state.known).filter((name) => !shown.has(state.known[name].quantity));
+  $("add-column").replaceChildren(el("option", {value: ""}, "…"), ...left.map((name) => el("option", {value: name, title: state.known[name].meaning}, name)));
+  $("add-column").onchange = (event) => {
+    state.offered.push(event.target.value);
+    redraw();
+    $("trials").querySelector(`[data-column="${event.target.value}"]`)?.focus();
+  };
+}
+
+export function markProblems() {
+  for (const cell of $("trials").querySelectorAll("td")) {
+    cell.classList.remove("bad", "odd");
+    cell.querySelectorAll("small.said").forEach((words) => words.remove());
+  }
+  for (const {severity, field, trial, column, text} of state.problems) {
+    if (!["cell", "row", "shared"].includes(field)) continue;
+    const row = field === "shared" ? "shared" : state.sheet.rows.findIndex((one) => one.trial === trial);
+    const wanted = field === "row" ? "trial" : column;
+    const all = [...$("trials").querySelectorAll("[data-column]")].filter((one) => quantityOf(one.dataset.column) === quantityOf(wanted));
+    const inputs = all.filter((one) => one.dataset.row === String(row));
+    // A column that neither place has is missing for all; where no cell shows it, it stands with the trial.
+    const input = inputs[0] ?? all[0] ?? $("trials").querySelector(`[data-column="trial"][data-row="${row}"]`);
+    if (!input) continue;
+    const blank = /^\S+ is (blank|missing)/.test(text);
+    if (blank && sharedValue(column)) continue;
+    const cell = input.closest("td");
+    cell.classList.add(severity === "error" ? "bad" : "odd");
+    const short = blank ? "to be filled in" : text.replace(new RegExp(`^${column} `), "");
+    cell.append(el("small", {class: `said ${severity}`, title: text}, short));
+    input.setAttribute("aria-invalid", severity === "error");
+  }
+}
