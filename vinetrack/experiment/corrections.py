@@ -43,17 +43,19 @@ def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], l
     if missing:
         remedy = f"its columns are {', '.join(COLUMNS_OF_CORRECTIONS)}"
         return {}, [Problem(message="is missing", file=CORRECTIONS, column=missing[0], remedy=remedy)]
-    found: dict[str, dict[int, Correction]] = {}
+    by_trial: dict[str, dict[int, Correction]] = {}
     problems: list[Problem] = []
     for i, row in enumerate(table.rows):
         correction = _read_line(table, i, problems)
-        of_trial = found.setdefault(row["trial"], {})
+        of_trial = by_trial.setdefault(row["trial"], {})
         if correction is None:
             continue
         if correction.frame in of_trial:
             problems.append(_problem(table, i, "frame", "is corrected twice", "keep one of the lines"))
         of_trial[correction.frame] = correction
-    return {trial: tuple(of_trial[frame] for frame in sorted(of_trial)) for trial, of_trial in found.items()}, problems
+    return {
+        trial: tuple(of_trial[frame] for frame in sorted(of_trial)) for trial, of_trial in by_trial.items()
+    }, problems
 
 
 def _read_line(table: Table, index: int, problems: list[Problem]) -> Correction | None:
@@ -93,6 +95,10 @@ def strangers(corrections: Mapping[str, object], names: Iterable[str], filmed: I
     corrections : by trial.
     names : of all trials of the sheet.
     filmed : of those that are recordings.
+
+    Returns
+    -------
+    problems : warnings.
     """
     known, recordings = set(names), set(filmed)
     return [
@@ -123,7 +129,7 @@ def corrections_text(corrections: Mapping[str, Iterable[Correction]]) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS_OF_CORRECTIONS)
     for trial, of_trial in corrections.items():
-        for one in of_trial:
-            place = f"{one.edge_px:.2f}" if math.isfinite(one.edge_px) else ""
-            writer.writerow([trial, one.frame, one.action, place])
+        for correction in of_trial:
+            place = f"{correction.edge_px:.2f}" if math.isfinite(correction.edge_px) else ""
+            writer.writerow([trial, correction.frame, correction.action, place])
     return out.getvalue()

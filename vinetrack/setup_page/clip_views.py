@@ -73,6 +73,10 @@ class ClipStore:
         ----------
         recording : path relative to the folder.
 
+        Returns
+        -------
+        Clip
+
         Raises
         ------
         RecordingError
@@ -95,6 +99,10 @@ class ClipStore:
         ----------
         recording : path relative to the folder.
 
+        Returns
+        -------
+        bytes : JPEG.
+
         Raises
         ------
         RecordingError
@@ -108,6 +116,10 @@ class ClipStore:
         Parameters
         ----------
         name : path relative to the folder.
+
+        Returns
+        -------
+        array, shape (height, width)
 
         Raises
         ------
@@ -163,6 +175,10 @@ def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None =
     picture : grey levels, shape (height, width).
     widest : width that it is shrunk to, px.
     white : grey level shown white; for 16 bits the brightest where None.
+
+    Returns
+    -------
+    bytes
     """
     import cv2
 
@@ -176,7 +192,16 @@ def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None =
 
 
 def axis_json(axis: Axis) -> dict[str, Any]:
-    """An axis for the page, px to a hundredth."""
+    """An axis for the page, px to a hundredth.
+
+    Parameters
+    ----------
+    axis : in the picture.
+
+    Returns
+    -------
+    mapping of JSON types: `from_px`, `to_px`, and `width_px`, None where unknown.
+    """
     width = round(axis.width_px, 2) if math.isfinite(axis.width_px) else None
     ends = {"from_px": [round(v, 2) for v in axis.from_px], "to_px": [round(v, 2) for v in axis.to_px]}
     return {**ends, "width_px": width}
@@ -216,12 +241,12 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
         rate = inspect_recording(trial.video).capture_fps
         timed = rate is not None
         trial = replace(trial, capture_fps=rate or 1.0, exposure_s=trial.exposure_s if timed else math.nan)
-    said: list[str] = []
+    remarks: list[str] = []
     measurement = None
     if scaled:
         measurement = measure_recording(trial, settings, folder)
         tracking = measurement.tracking
-        said = [problem.reason for problem in size_problems(trial, tracked_facts(trial, measurement))]
+        remarks = [problem.reason for problem in size_problems(trial, tracked_facts(trial, measurement))]
     else:
         tracking = track_recording(trial, _axis_of(trial, settings))
     return {
@@ -229,7 +254,7 @@ def track_row(folder: Path, index: int) -> dict[str, Any]:
         **_scale_json(measurement),
         "timed": timed,
         "scaled": scaled,
-        "notes": [*said, *tracking.track.notes],
+        "notes": [*remarks, *tracking.track.notes],
         "pressure": _pressure_json(trial),
     }
 

@@ -103,9 +103,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _check(self, content: dict[str, Any]) -> dict[str, Any]:
         draft = draft_of(self.server.folder, content)
-        found = problems_of(self.server.folder, draft, thorough=bool(content.get("thorough")))
+        judged = problems_of(self.server.folder, draft, thorough=bool(content.get("thorough")))
         texts = {"sheet_text": draft.sheet.text(), "settings_text": draft.settings}
-        return {**found, **texts, "corrections_text": corrections_text(draft.corrections) if draft.corrections else ""}
+        return {**judged, **texts, "corrections_text": corrections_text(draft.corrections) if draft.corrections else ""}
 
     def _track(self, content: dict[str, Any]) -> dict[str, Any]:
         draft = draft_of(self.server.folder, content)

@@ -31,6 +31,10 @@ def page_state(folder: Path) -> dict[str, Any]:
     ----------
     folder : of recordings, with or without a sheet and settings.
 
+    Returns
+    -------
+    mapping of JSON types.
+
     Raises
     ------
     ExperimentError
@@ -54,7 +58,8 @@ def page_state(folder: Path) -> dict[str, Any]:
         "calibration": content.get("calibration"),
         "axis": content.get("axis"),
         "corrections": {
-            trial: [vars(one) | _place(one) for one in given] for trial, given in draft.corrections.items()
+            trial: [vars(correction) | _place(correction) for correction in given]
+            for trial, given in draft.corrections.items()
         },
         "recordings": list_recordings(folder),
         "pictures": list_pictures(folder),
@@ -80,9 +85,19 @@ def _sheet_json(sheet: SheetDraft) -> dict[str, Any]:
     return {"columns": list(sheet.columns), "rows": rows, "delimiter": sheet.delimiter, "decimal": sheet.decimal}
 
 
-def _place(one: Correction) -> dict[str, Any]:
+def _place(correction: Correction) -> dict[str, Any]:
     """To where a point is moved, for JSON, which knows no NaN."""
-    return {"edge_px": one.edge_px if math.isfinite(one.edge_px) else None}
+    return {"edge_px": correction.edge_px if math.isfinite(correction.edge_px) else None}
+
+
+def _frame(point: Mapping[str, Any]) -> int:
+    return int(point["frame"])
+
+
+def _correction(point: Mapping[str, Any]) -> Correction:
+    """A correction as the page sends it."""
+    edge_px = math.nan if point["edge_px"] is None else float(point["edge_px"])
+    return Correction(_frame(point), str(point["action"]), edge_px)
 
 
 def draft_of(folder: Path, content: Mapping[str, Any]) -> Draft:
@@ -113,14 +128,8 @@ def draft_of(folder: Path, content: Mapping[str, Any]) -> Draft:
         value = content.get(key)
         if value is not None or present.get(key) is not None:
             text = with_value(text, key, value, SETTINGS)
-    corrections = {
-        str(trial): tuple(
-            Correction(int(one["frame"]), str(one["action"]), math.nan if one["edge_px"] is None else one["edge_px"])
-            for one in sorted(given, key=lambda one: int(one["frame"]))
-        )
-        for trial, given in content.get("corrections", {}).items()
-        if given
-    }
+    given = content.get("corrections", {}).items()
+    corrections = {str(trial): tuple(map(_correction, sorted(points, key=_frame))) for trial, points in given if points}
     return Draft(sheet, text, str(content["stamp"]), corrections)
 
 
@@ -171,6 +180,10 @@ def problems_json(error: ExperimentError) -> list[dict[str, Any]]:
     Parameters
     ----------
     error : what was raised.
+
+    Returns
+    -------
+    list of mappings of JSON types, as of `problems_of`.
     """
     return [_problem_json(problem, None) for problem in error.problems]
 

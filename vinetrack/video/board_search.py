@@ -26,7 +26,8 @@ FEWEST_MARKERS = 6
 """Markers by which a board is told from chance. Chosen: of OpenCV's families one word in some hundreds is met by chance
 in a cluttered picture; with half, clutter may pass; with twice, a board half hidden is missed."""
 IN_PLACE = 0.8
-"""Share of the markers that must lie where a board has them; as `charuco_corners` asks."""
+"""Share of the markers that must lie where a board has them. Chosen: as `charuco_corners` asks; at half a wrong
+layout of the same count may pass, twice cannot be."""
 MOST_SQUARES = 40
 """Squares along a side at most; chosen: boards of more have markers of a few pixels. At half a long ruler of squares is
 missed; twice doubles the search."""
@@ -58,7 +59,7 @@ def find_board(picture: NDArray[Any]) -> BoardSeen | None:
     """
     grey = eight_bits(picture)
     seen = [(*markers_seen(grey, _largest(family)), family) for family in OTHER_DICTIONARIES]
-    corners, ids, family = max(seen, key=lambda one: len(one[1]))
+    corners, ids, family = max(seen, key=lambda markers: len(markers[1]))
     if len(ids) >= FEWEST_MARKERS:
         board = _charuco(corners, ids, family)
         if board is not None:

@@ -39,21 +39,21 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
     flag = track.flag.astype("<U80")
     done: Counter[str] = Counter()
     notes = []
-    for one in corrections:
-        if one.frame >= len(edge):
-            notes.append(f"the correction of frame {one.frame} is ignored: the recording has {len(edge)} frames")
+    for point in corrections:
+        if point.frame >= len(edge):
+            notes.append(f"the correction of frame {point.frame} is ignored: the recording has {len(edge)} frames")
             continue
-        if one.action == "confirm" and not math.isfinite(edge[one.frame]):
-            notes.append(f"frame {one.frame} has no edge to be confirmed; move it to where the edge is")
+        if point.action == "confirm" and not math.isfinite(edge[point.frame]):
+            notes.append(f"frame {point.frame} has no edge to be confirmed; move it to where the edge is")
             continue
-        kept = [part for part in str(flag[one.frame]).split(";") if part not in SETTLED]
-        if one.action == "move":
-            edge[one.frame], sigma[one.frame] = one.edge_px, CLICK_SIGMA_PX
-        elif one.action == "drop":
-            edge[one.frame] = sigma[one.frame] = math.nan
+        kept = [part for part in str(flag[point.frame]).split(";") if part not in SETTLED]
+        if point.action == "move":
+            edge[point.frame], sigma[point.frame] = point.edge_px, CLICK_SIGMA_PX
+        elif point.action == "drop":
+            edge[point.frame] = sigma[point.frame] = math.nan
             kept.append("rejected")
-        flag[one.frame] = join_flags(*kept, "corrected")
-        done[DONE[one.action]] += 1
+        flag[point.frame] = join_flags(*kept, "corrected")
+        done[DONE[point.action]] += 1
     if done:
         parts = ", ".join(f"{count} {words}" for words, count in done.items())
         notes.append(f"points corrected by hand: {parts}")

@@ -144,6 +144,10 @@ def markers_seen(grey: Grey, dictionary: str) -> tuple[list[NDArray[np.float32]]
     ----------
     grey : grey levels, shape (height, width).
     dictionary : its name in OpenCV.
+
+    Returns
+    -------
+    corners, ids
     """
     return _markers(grey, _words(dictionary))
 
@@ -160,10 +164,16 @@ def marker_agreement(
     corners, ids : as of `markers_seen`.
     board : layout and sizes; its own dictionary is not used.
     dictionary : that the markers belong to.
+
+    Returns
+    -------
+    share, marker_mm
     """
     words = _words(dictionary)
     layouts = [_charuco_board(board, words, legacy) for legacy in (False, True)]
-    return max((_agreeing_markers(layout, corners, ids, board) for layout in layouts), key=lambda one: one[0])
+    return max(
+        (_agreeing_markers(layout, corners, ids, board) for layout in layouts), key=lambda agreement: agreement[0]
+    )
 
 
 def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
@@ -172,6 +182,10 @@ def checkerboard_squares(grey: Grey) -> tuple[int, int] | None:
     Parameters
     ----------
     grey : grey levels, shape (height, width).
+
+    Returns
+    -------
+    across, down; or None.
     """
     import cv2
 
