@@ -41,7 +41,7 @@ STRIP_PX = 1600
 
 
 @dataclass(frozen=True)
-class Clip:
+class DecodedClip:
     """A decoded recording: its frames as JPEG, and the axis found from the motion, or in words why there is none."""
 
     frames: tuple[bytes, ...]
@@ -63,10 +63,10 @@ class ClipStore:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._clips: OrderedDict[tuple[str, int], Clip] = OrderedDict()
+        self._clips: OrderedDict[tuple[str, int], DecodedClip] = OrderedDict()
         self._lock = threading.Lock()
 
-    def clip(self, recording: str) -> Clip:
+    def clip(self, recording: str) -> DecodedClip:
         """A recording, decoded.
 
         Parameters
@@ -75,7 +75,7 @@ class ClipStore:
 
         Returns
         -------
-        Clip
+        DecodedClip
 
         Raises
         ------
@@ -155,7 +155,7 @@ def _first_frame(path: Path) -> NDArray[Any]:
     return frame
 
 
-def _decoded(path: Path) -> Clip:
+def _decoded(path: Path) -> DecodedClip:
     frames = read_frames(path)
     height, width = frames.luma.shape[1:]
     try:
@@ -164,7 +164,7 @@ def _decoded(path: Path) -> Clip:
         axis, no_axis = None, str(error)
     top = float(np.quantile(frames.luma[0], 0.999)) if frames.luma.dtype != np.uint8 else 255.0
     pictures = tuple(jpeg(luma, white=top) for luma in frames.luma)
-    return Clip(pictures, width, height, axis, no_axis, frames.notes)
+    return DecodedClip(pictures, width, height, axis, no_axis, frames.notes)
 
 
 def jpeg(picture: NDArray[Any], widest: int | None = None, white: float | None = None) -> bytes:
