@@ -7,7 +7,7 @@ effect, and fitted with it and with what it is easily taken for. The trials that
 with the truth, releases, origins, noise and scatter of their own, B of new vines 15 % off the guess; then everything is
 fitted again. A row a kind of tie:
 
-foretold    √(Δ−2 ln L) that was promised if the truth is true, median over campaigns
+predicted    √(Δ−2 ln L) that was promised if the truth is true, median over campaigns
 simulated   what the check by simulation gave in the direction that separates less, against its promise, median ratio
 realised    what the trials gave, against what was promised, median and range of the ratio
 kept        campaigns in which trials were asked for, and those in which 0.8 of the promise or more came true
@@ -138,7 +138,7 @@ def measure(tie: Tie, seed: int) -> dict[str, float] | None:
     (pair,) = found.separation_sigma
     promised = found.if_true_sigma[pair][tie.effect]
     return {
-        "foretold": promised,
+        "predicted": promised,
         "simulated": found.simulated_sigma[pair][0] / found.separation_sigma[pair],
         "realised": math.sqrt(max(gained[0] - gained[1], 0.0)) / promised,
         "cpu": spent,
@@ -157,7 +157,7 @@ def main() -> None:
         seeds = range(arguments.first_seed, arguments.first_seed + arguments.campaigns)
         every = [measure(tie, seed) for seed in tqdm(seeds, desc=tie.effect, leave=False)]
         rows.append(_row(tie, [one for one in every if one is not None], len(every)))
-    head = ("true", "taken for", "foretold σ", "simulated", "realised", "range", "kept", "CPU s")
+    head = ("true", "taken for", "predicted σ", "simulated", "realised", "range", "kept", "CPU s")
     print("\n".join(table(rows, head)))
 
 
@@ -170,7 +170,7 @@ def _row(tie: Tie, seen: Sequence[Mapping[str, float]], campaigns: int) -> tuple
     return (
         name,
         tie.other,
-        f"{np.median(columns['foretold']):.1f}",
+        f"{np.median(columns['predicted']):.1f}",
         f"{np.median(columns['simulated']):.2f}",
         f"{np.median(ratio):.2f}",
         f"{ratio.min():.2f}–{ratio.max():.2f}",

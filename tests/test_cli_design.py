@@ -66,7 +66,7 @@ def test_a_supply_without_a_wall_says_what_is_missing() -> None:
     assert "give --thickness-um to use --supply-s" in run("reservoir", *INJECTOR, "--supply-s", 0.1).output
 
 
-def test_a_campaign_is_planned_rehearsed_and_written_as_a_sheet(tmp_path: Path) -> None:
+def test_a_campaign_is_planned_simulated_and_written_as_a_sheet(tmp_path: Path) -> None:
     sheet = tmp_path / "mine" / "trials.csv"
     done = run("campaign", *TWO, "--pressure-kPa", "9:40", "--payload-g", "0,35.6", "--check", 2, "--sheet", sheet,
                "--figure", tmp_path / "a.svg", "--yield-pressure-kPa", 3)  # fmt: skip

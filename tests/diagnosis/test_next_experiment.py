@@ -1,4 +1,4 @@
-"""The next experiment: what is foretold is what trials grown in the laboratory then show.
+"""The next experiment: what is predicted is what trials grown in the laboratory then show.
 
 Seeds 4001 to 4003 score; those below 1000 were looked at while the method was made.
 """
@@ -124,18 +124,18 @@ def test_another_connector_tells_drag_from_inlet_loss_and_no_vine_has_to_be_made
     assert "an inlet of" in advised.text
 
 
-def test_what_is_foretold_is_what_the_simulation_shows(advised: NextExperiment) -> None:
+def test_what_is_predicted_is_what_the_simulation_shows(advised: NextExperiment) -> None:
     (sigma,), ((mean, _),) = advised.separation_sigma.values(), advised.simulated_sigma.values()
     assert sigma == pytest.approx(mean, rel=0.2)
 
 
-def test_what_is_foretold_is_what_the_trials_show_once_they_are_made(
+def test_what_is_predicted_is_what_the_trials_show_once_they_are_made(
     dragged: tuple[Pairs, list[Fit]], advised: NextExperiment
 ) -> None:
     pairs, fits = dragged
     new = grown(as_trials(advised, pairs[0][0]), 4101, {"air_drag.C_D": 60.0}, 1e-4)
-    foretold = advised.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
-    assert shown(fits, pairs + new) == pytest.approx(foretold, rel=0.2)
+    predicted = advised.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
+    assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
 def test_a_new_vine_tells_them_apart_although_its_damping_was_guessed_wrong(dragged: tuple[Pairs, list[Fit]]) -> None:
@@ -144,9 +144,9 @@ def test_a_new_vine_tells_them_apart_although_its_damping_was_guessed_wrong(drag
     assert any(trial["new_vine"] for trial in found.trials)
     assert "its yield pressure has to be measured" in found.text
     new = grown(as_trials(found, pairs[0][0]), 4102, {"air_drag.C_D": 60.0}, 1e-4, off=1.15)
-    foretold = found.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
-    assert foretold > 5
-    assert shown(fits, pairs + new) == pytest.approx(foretold, rel=0.2)
+    predicted = found.if_true_sigma["air_drag | inlet_loss"]["air_drag"]
+    assert predicted > 5
+    assert shown(fits, pairs + new) == pytest.approx(predicted, rel=0.2)
 
 
 def test_smaller_tubes_of_the_same_shape_with_matched_connectors_never_do(dragged: tuple[Pairs, list[Fit]]) -> None:

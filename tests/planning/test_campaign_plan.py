@@ -1,4 +1,4 @@
-"""Campaigns: the errors that are promised are those that fits then have; seeds 900 and up rehearse."""
+"""Campaigns: the errors that are promised are those that fits then have; seeds 900 and up simulate them."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_the_information_is_that_of_a_fit_to_the_same_trials(planned: tuple[Cand
         assert error == pytest.approx(number.sigma / number.value, rel=0.1)
 
 
-def test_a_rehearsal_finds_the_errors_that_were_promised(planned: tuple[Candidates, Planned, Scope]) -> None:
+def test_simulated_campaigns_show_the_errors_that_were_promised(planned: tuple[Candidates, Planned, Scope]) -> None:
     """Root mean square of 12 campaigns, seed 901: its own standard error is 20 %, so 50 % are two and a half."""
     found, made, _ = planned
     assert made.best is not None

@@ -1,4 +1,4 @@
-"""What is foretold, against the laws of motion written out by hand and against another integrator."""
+"""What is predicted, against the laws of motion written out by hand and against another integrator."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time() -> Non
     )
 
 
-def test_the_same_seed_foretells_the_same() -> None:
+def test_the_same_seed_predicts_the_same() -> None:
     inputs = predictive_inputs(planned_trial(FAST).trials[0])
     one, other = predict_vine(inputs, samples=60), predict_vine(inputs, samples=60)
     assert one.table.equals(other.table)

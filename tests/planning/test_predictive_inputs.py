@@ -1,4 +1,4 @@
-"""Beliefs: which source a number comes from, and that draws have the spread and covariance that are said."""
+"""Predictive inputs: which source a number comes from, and that draws have the spread and covariance that are said."""
 
 from __future__ import annotations
 

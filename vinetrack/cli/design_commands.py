@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from vinetrack.cli.design_options import (
-    BELIEF,
     GUESSED_YIELD,
+    INPUTS,
     OUT,
     RIG,
     VINE,
@@ -300,17 +300,17 @@ def _campaign(
     pressure_spread: Annotated[
         float | None,
         typer.Option("--P-spread", min=0, max=4, help="Of pressure from trial to trial, per cent (1).",
-                     rich_help_panel=BELIEF, show_default=False),
+                     rich_help_panel=INPUTS, show_default=False),
     ] = None,
     damping_spread: Annotated[
         float | None,
         typer.Option("--B-spread", min=0, max=15, help="Of B from trial to trial, per cent (3).",
-                     rich_help_panel=BELIEF, show_default=False),
+                     rich_help_panel=INPUTS, show_default=False),
     ] = None,
     results: Results = None,
     n: Exponent = None,
     effects: Effects = None,
-    check: Annotated[int, typer.Option("--check", min=0, max=1000, help="Campaigns to rehearse.")] = 20,
+    check: Annotated[int, typer.Option("--check", min=0, max=1000, help="Simulated campaigns that try it.")] = 20,
     seed: Seed = 1,
     sheet: Annotated[
         Path | None,
@@ -322,7 +322,7 @@ def _campaign(
     anyway: Anyway = False,
     log: LogPath = None,
 ) -> None:  # fmt: skip
-    """Pressures, payloads and replicates that pin n and B to a wanted error, rehearsed before they are made."""
+    """Pressures, payloads and replicates that pin n and B to a wanted error, simulated before they are made."""
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):

@@ -14,7 +14,7 @@ import typer.core
 from vinetrack.experiment.column import Column
 from vinetrack.experiment.schema import COLUMNS, option
 
-VINE, RIG, BELIEF, OUT = "The vine", "The rig", "Inputs of the model", "Output files"
+VINE, RIG, INPUTS, OUT = "The vine", "The rig", "Inputs of the model", "Output files"
 
 
 _VINE_COLUMNS = frozenset(
@@ -123,43 +123,43 @@ def _column_option(column: Column, meaning: str | None) -> inspect.Parameter:
 Results = Annotated[
     Path | None,
     typer.Option(
-        "--fit", help="Results folder whose fit gives the inputs.", metavar="RESULTS", rich_help_panel=BELIEF,
+        "--fit", help="Results folder whose fit gives the inputs.", metavar="RESULTS", rich_help_panel=INPUTS,
         show_default=False,
     ),
 ]  # fmt: skip
 Damping = Annotated[
     float | None,
-    typer.Option("--B", min=1e-9, help="Damping coefficient, N·(s/m)ⁿ; guessed if not given.", rich_help_panel=BELIEF,
+    typer.Option("--B", min=1e-9, help="Damping coefficient, N·(s/m)ⁿ; guessed if not given.", rich_help_panel=INPUTS,
                  show_default=False),
 ]  # fmt: skip
 DampingError = Annotated[
-    float, typer.Option("--B-error", min=0, max=200, help="Its error, per cent.", rich_help_panel=BELIEF)
+    float, typer.Option("--B-error", min=0, max=200, help="Its error, per cent.", rich_help_panel=INPUTS)
 ]
 Exponent = Annotated[
     float | None,
-    typer.Option("--n", min=0, max=2, help="Damping exponent.", rich_help_panel=BELIEF, show_default=False),
+    typer.Option("--n", min=0, max=2, help="Damping exponent.", rich_help_panel=INPUTS, show_default=False),
 ]
-ExponentError = Annotated[float, typer.Option("--n-error", min=0, max=1, help="Its error.", rich_help_panel=BELIEF)]
+ExponentError = Annotated[float, typer.Option("--n-error", min=0, max=1, help="Its error.", rich_help_panel=INPUTS)]
 Effects = Annotated[
     list[str] | None,
     typer.Option(
-        "--effect", metavar="NAME[=SIZE]", rich_help_panel=BELIEF, show_default=False,
+        "--effect", metavar="NAME[=SIZE]", rich_help_panel=INPUTS, show_default=False,
         help="A further effect; its size as a number, or a range such as 1:1.4. May be repeated.",
     ),
 ]  # fmt: skip
-Samples = Annotated[int, typer.Option("--samples", min=50, max=100_000, help="Draws.", rich_help_panel=BELIEF)]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Of the random numbers.", rich_help_panel=BELIEF)]
+Samples = Annotated[int, typer.Option("--samples", min=50, max=100_000, help="Draws.", rich_help_panel=INPUTS)]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Of the random numbers.", rich_help_panel=INPUTS)]
 AtFraction = Annotated[
     float,
     typer.Option(
-        "--final-at-fraction", min=0.05, max=0.99, help="y/L at which final speeds are taken.", rich_help_panel=BELIEF
+        "--final-at-fraction", min=0.05, max=0.99, help="y/L at which final speeds are taken.", rich_help_panel=INPUTS
     ),
 ]
 Anyway = Annotated[
     bool,
     typer.Option(
         "--anyway", help="Predict from a fit whose model its diagnosis refuted; the verdict stands above.",
-        rich_help_panel=BELIEF,
+        rich_help_panel=INPUTS,
     ),
 ]  # fmt: skip
 FigurePath = Annotated[

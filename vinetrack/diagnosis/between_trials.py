@@ -55,7 +55,7 @@ DAY_B_SD, DAY_PA_SD = 0.03, 300.0
 """The same from day to day: film in other air, a gauge zeroed anew. Chosen: a gauge holds its zero to 0.3 kPa."""
 
 PLAUSIBLE_DRIFT = 0.05
-"""Change of ln B a trial that is still believed. Chosen: a tube whose B rises by 5 % a trial is done for after ten."""
+"""Change of ln B a trial that is still plausible. Chosen: a tube whose B rises by 5 % a trial is done for after ten."""
 
 FEWEST_TRIALS = 6
 """Trials from which a drift or a change is asked for: below, any order of a few pressures is like any other. Chosen:

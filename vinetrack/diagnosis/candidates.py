@@ -213,7 +213,7 @@ def _first_step(size: Parameter) -> float:
 
 
 def plausible_range(parameter: Parameter) -> tuple[float, float]:
-    """What an experimenter would believe; where the effect does not say, a factor of three about its default.
+    """Range that an experimenter would expect; where the effect does not say, a factor of three about its default.
 
     Parameters
     ----------

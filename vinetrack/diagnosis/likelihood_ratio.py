@@ -199,7 +199,7 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
 
     Excluded is what is worse by 9 than the best, in −2 ln L as far as the scatter of trials bears it out plus what its
     sizes lie beyond the plausible (`prior_surprise`). Set aside are those that hold a simpler one as a limit and are no
-    better by 9 than it, and those that need a size beyond belief where another does not.
+    better by 9 than it, and those that need a size beyond what is plausible where another does not.
 
     Parameters
     ----------
@@ -244,10 +244,10 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
             aside[ratio.label] = f"it holds {simpler[0].names[-1]} as a limit, and is no better"
         else:
             kept.append(ratio)
-    believed = [hypothesis for hypothesis in kept if hypothesis.credible]
-    if believed and len(believed) < len(kept):
+    credible = [hypothesis for hypothesis in kept if hypothesis.credible]
+    if credible and len(credible) < len(kept):
         aside |= {hypothesis.label: hypothesis.reason for hypothesis in kept if not hypothesis.credible}
-        kept = believed
+        kept = credible
     return kept, aside
 
 

@@ -77,7 +77,7 @@ class SubsetFit:
 
     @property
     def hopeless(self) -> bool:
-        """Whether it ended at sizes so far beyond belief that a full fit will not bring it back."""
+        """Whether it ended at sizes so far beyond what is plausible that a full fit will not bring it back."""
         return any(
             not is_plausible(parameter, value, 0.0, widened=FAR_BEYOND)
             for effect in self.effects
@@ -196,7 +196,7 @@ def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
     if shape.whole:
         size = shape.step
     elif parameter.plausible is not None:
-        # A prediction far beyond belief is a straight line drawn too far.
+        # A prediction far beyond what is plausible is a straight line drawn too far.
         reach = 3 * max(abs(bound - parameter.zero) for bound in parameter.plausible)
         size = float(np.clip(size, -reach, reach))
     if parameter.sign * size < 0 or size == 0:

@@ -4,7 +4,7 @@
     print(found.text)
 
 Every trial within the limits is looked at by sensitivities, the best set of them found by exchange, and what it will
-bring foretold by refitting simulated trials; then the trials are simulated once more, truth and all drawn anew, as a
+bring predicted by refitting simulated trials; then the trials are simulated once more, truth and all drawn anew, as a
 check. Where no trials help, or only measurements are in doubt, it says what to measure instead.
 """
 
@@ -214,9 +214,9 @@ def _options(bench: Bench, sides: list[Side], limits: Limits, seed: int) -> list
     for allowed in _by_effort(bench, sides, limits.trials):
         if any(option.weakest >= ENOUGH for option in options[:-1]):
             break
-        design, foretold = best_design(sides, allowed, limits.trials)
-        if foretold > GAIN * before:
-            before = foretold
+        design, predicted = best_design(sides, allowed, limits.trials)
+        if predicted > GAIN * before:
+            before = predicted
             options.append(_Option(tuple(design.tolist()), expected(bench, design.tolist(), [0], seed)))
     return options
 

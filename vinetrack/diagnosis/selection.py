@@ -121,8 +121,8 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     if not questions.something and not questions.suspect:
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
     tried = [hypothesis for hypothesis in tried if hypothesis not in between]
-    believed = [hypothesis for hypothesis in tried if hypothesis.credible]
-    if not believed or _best_of(believed).sigma < questions.threshold:
+    credible = [hypothesis for hypothesis in tried if hypothesis.credible]
+    if not credible or _best_of(credible).sigma < questions.threshold:
         # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
         loud = questions.possible.max(initial=0.0) > questions.threshold + LOUD
         fails = questions.fails or questions.off or loud

@@ -50,7 +50,7 @@ class PredictionPicture:
     final: tuple[float, float, float]
 
 
-def draw_foresight(pictures: Sequence[PredictionPicture], at_fraction: float) -> Figure:
+def draw_predictions(pictures: Sequence[PredictionPicture], at_fraction: float) -> Figure:
     """Draw one condition with the uncertainty budget of its final speed, or several conditions over each other.
 
     Parameters

@@ -125,13 +125,13 @@ def _out_of_reach(planned: Planned, most_trials: int) -> Iterator[str]:
     yield "widen the pressures, allow more (--most-trials, --replicates, --pressures), add vines, accept larger errors"
 
 
-def rehearsal_lines(planned: Planned, rehearsal: SimulatedCampaigns) -> list[str]:
+def simulation_lines(planned: Planned, simulated: SimulatedCampaigns) -> list[str]:
     """Return the errors of simulated campaigns beside the expected ones, as lines of text.
 
     Parameters
     ----------
     planned : the campaign, with its expected errors.
-    rehearsal : simulated campaigns, fitted.
+    simulated : simulated campaigns, fitted.
 
     Returns
     -------
@@ -140,23 +140,23 @@ def rehearsal_lines(planned: Planned, rehearsal: SimulatedCampaigns) -> list[str
     from vinetrack.core.terminal import table
 
     assert planned.best is not None
-    if rehearsal.campaigns == 0:
+    if simulated.campaigns == 0:
         return ["", "! none of the simulated campaigns could be fitted"]
-    room = rehearsal.uncertainty
+    room = simulated.uncertainty
     rows = [
-        ("n", f"{planned.best.n_error:.4f}", f"{rehearsal.n_stated:.4f}", _rms_with_error(rehearsal.n_rms, room, 4), "")
+        ("n", f"{planned.best.n_error:.4f}", f"{simulated.n_stated:.4f}", _rms_with_error(simulated.n_rms, room, 4), "")
     ]
     for vine, expected in planned.best.B_errors.items():
-        stated, rms = (100 * errors.get(vine, math.nan) for errors in (rehearsal.B_stated, rehearsal.B_rms))
+        stated, rms = (100 * errors.get(vine, math.nan) for errors in (simulated.B_stated, simulated.B_rms))
         rows.append((f"B ({vine})", f"{100 * expected:.2f}", f"{stated:.2f}", _rms_with_error(rms, room, 2), "%"))
     lines = [
         "",
-        f"simulated {rehearsal.campaigns} times: with scatter and noise, fitted, compared with the true values",
+        f"simulated {simulated.campaigns} times: with scatter and noise, fitted, compared with the true values",
     ]
     lines += table(rows, ("error of", "expected", "stated by fits", "simulated", "unit"), align="<>>><")
-    lines.append(f"95 % intervals contained the true value in {rehearsal.covered:.0%} of cases")
-    if rehearsal.failed:
-        lines.append(f"! {rehearsal.failed} of the campaigns could not be fitted")
+    lines.append(f"95 % intervals contained the true value in {simulated.covered:.0%} of cases")
+    if simulated.failed:
+        lines.append(f"! {simulated.failed} of the campaigns could not be fitted")
     return lines
 
 

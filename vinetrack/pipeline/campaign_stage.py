@@ -13,7 +13,7 @@ import numpy as np
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_csv
-from vinetrack.narrative.campaign_text import campaign_lines, rehearsal_lines
+from vinetrack.narrative.campaign_text import campaign_lines, simulation_lines
 from vinetrack.pipeline.design_stage import read_list, read_range
 from vinetrack.pipeline.prediction_inputs import Asked, as_option, check_figure, inputs_of, read_ground, write_figure
 from vinetrack.results.folder_layout import ResultsError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _VINE = re.compile(r"\s*([^x×]+)[x×]([^x×]+)[x×]([^x×]+)\s*")
 STAND_IN_KPA = "100"
-"""A vine is believed at some pressure; those of the campaign take its place."""
+"""A vine needs some pressure to be read; those of the campaign take its place."""
 
 
 @dataclass(frozen=True)
@@ -112,14 +112,14 @@ def design_campaign(
     try:
         with waiting("weighing conditions"):
             planned = plan(candidates(vine_inputs, scope, camera), scope, wanted.n_error, wanted.B_error)
-        rehearsal = _rehearsed(planned, vine_inputs, camera, wanted)
+        simulated = _simulated(planned, vine_inputs, camera, wanted)
     except EffectError as error:
         raise as_option(error) from None
     except (SimulationError, FitError, CampaignError) as error:
         raise ResultsError(str(error)) from None
     lines = list(campaign_lines(planned, vine_inputs, camera, wanted.n_error, wanted.B_error, wanted.most_trials))
-    if rehearsal is not None:
-        lines += rehearsal_lines(planned, rehearsal)
+    if simulated is not None:
+        lines += simulation_lines(planned, simulated)
     shown = planned.best or planned.nearest
     if sheet is not None:
         write_csv(sheet, _film_sheet(planned.candidates, shown, wanted))
@@ -157,7 +157,7 @@ def _scope(wanted: Wanted) -> Scope:
     )
 
 
-def _rehearsed(
+def _simulated(
     planned: Planned, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan, wanted: Wanted
 ) -> SimulatedCampaigns | None:
     """The campaign made so many times and fitted; None where there is none to make."""
@@ -169,7 +169,7 @@ def _rehearsed(
         return None
     trials = trials_of(planned.candidates, planned.best)
     bar: Progress[None]
-    with progress(wanted.check, "rehearsing", unit="campaign") as bar:
+    with progress(wanted.check, "simulating", unit="campaign") as bar:
         return simulate_campaign(
             planned.candidates.model,
             trials,

@@ -198,7 +198,7 @@ def _check(room: Room, films: str, diameter: str) -> None:
 
 
 def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
-    """There is no fastest of vines that do not move, at the medians of what is believed."""
+    """There is no fastest of vines that do not move, at the medians of the predictive inputs."""
     if choices[0].sight.final.median > 0:
         return
     highest_Pa = max(choice.sight.inputs.trial.pressure_Pa for choice in choices)

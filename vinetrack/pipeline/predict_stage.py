@@ -89,9 +89,9 @@ def predict_conditions(
     lines = [*_one(predictions[0])] if len(predictions) == 1 else [*_several(predictions)]
     lines += [f"! {words}" for words in warnings_of(ground)]
     if figure is not None:
-        from vinetrack.figures.prediction_figures import draw_foresight
+        from vinetrack.figures.prediction_figures import draw_predictions
 
-        write_figure(draw_foresight([_picture(prediction.sight) for prediction in predictions], at_fraction), figure)
+        write_figure(draw_predictions([_picture(prediction.sight) for prediction in predictions], at_fraction), figure)
         lines.append(f"Figure: {figure}")
     if csv is not None:
         write_csv(csv, pd.concat([prediction.sight.curve for prediction in predictions], ignore_index=True))

@@ -1,4 +1,4 @@
-"""The picture of what is foretold: everything on it, labelled, whether vines get there or not."""
+"""The picture of what is predicted: everything on it, labelled, whether vines get there or not."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.figures.prediction_figures import MOST_CURVES, PredictionPicture, draw_foresight
+from vinetrack.figures.prediction_figures import MOST_CURVES, PredictionPicture, draw_predictions
 from vinetrack.figures.style import render
 from vinetrack.planning.prediction import CURVE_COLUMNS
 
@@ -27,7 +27,7 @@ def picture(until_s: float = 0.02, arrives: bool = True, least_N: float = 1.0) -
 
 
 def words(pictures: list[PredictionPicture]) -> str:
-    fig = draw_foresight(pictures, 0.95)
+    fig = draw_predictions(pictures, 0.95)
     texts = [text.get_text() for ax in fig.axes for text in (ax.xaxis.label, ax.yaxis.label, *ax.texts)]
     texts += [ax.get_title(loc="left") for ax in fig.axes]
     ticks = [label.get_text() for ax in fig.axes for label in ax.get_yticklabels()]
@@ -56,10 +56,10 @@ def test_a_tail_that_pushes_is_marked() -> None:
 
 
 def test_times_far_apart_have_a_logarithmic_axis() -> None:
-    assert draw_foresight([picture(), picture(1.0)], 0.95).axes[0].get_xscale() == "log"
-    assert draw_foresight([picture(), picture(0.03)], 0.95).axes[0].get_xscale() == "linear"
+    assert draw_predictions([picture(), picture(1.0)], 0.95).axes[0].get_xscale() == "log"
+    assert draw_predictions([picture(), picture(0.03)], 0.95).axes[0].get_xscale() == "linear"
 
 
 @pytest.mark.parametrize("arrives", [True, False])
 def test_it_can_be_saved_whether_the_vine_gets_there_or_not(arrives: bool) -> None:
-    assert render(draw_foresight([picture(arrives=arrives)], 0.95), ("svg",))["svg"].startswith(b"<?xml")
+    assert render(draw_predictions([picture(arrives=arrives)], 0.95), ("svg",))["svg"].startswith(b"<?xml")

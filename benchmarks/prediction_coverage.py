@@ -1,10 +1,10 @@
 """Whether a prediction from a fit holds: how often the 90 % band of a final speed has the trial that is then made.
 
-    python benchmarks/foresight_coverage.py [--campaigns 80] [--first-seed 3100]
+    python benchmarks/prediction_coverage.py [--campaigns 80] [--first-seed 3100]
 
 Campaigns of 24 trials, two vines at four pressures, three trials each, are grown in the virtual laboratory (B scatters
 by 3 %, P by 1 %, noise 0.1 mm, yield pressures misread by 0.2 kPa), fitted, and kept as `fit.json` would keep them.
-Then three trials are foretold that the fit has not seen, each with a pressure and a B of its own:
+Then three trials are predicted that the fit has not seen, each with a pressure and a B of its own:
 
 same       a vine of the fit at a pressure between those filmed
 beyond     the same at twice the highest pressure that was filmed
@@ -44,7 +44,7 @@ def sheet() -> list[Trial]:
 
 
 def unseen() -> dict[str, Trial]:
-    """The trials that are foretold."""
+    """The trials that are predicted."""
     big = isometric_vine(4)
     found = {"same": big.trial("same", 20.5), "beyond": big.trial("beyond", 56.0)}
     found["longer"] = replace(big, length_mm=420.0).trial("longer", 25.0, payload_g=35.6)
@@ -65,7 +65,7 @@ def made(trial: Trial, nature: Nature, yield_Pa: float, draw: np.random.Generato
 
 
 def measure(seed: int) -> list[dict[str, object]]:
-    """One campaign fitted, and what was foretold beside what was made."""
+    """One campaign fitted, and what was predicted beside what was made."""
     nature = Nature(
         values=damping_values(sheet()),
         damping_scatter=DAMPING_SCATTER,
@@ -110,7 +110,7 @@ def main() -> None:
         held = float(part["held"].mean())
         lines.append(
             {
-                "foretold": name,
+                "predicted": name,
                 "in the 90 % band": f"{100 * held:.0f} ± {100 * np.sqrt(held * (1 - held) / len(part)):.0f} %",
                 "half of the band": f"{100 * part['half_width'].mean():.1f} %",
                 "made − median": f"{100 * part['error'].mean():+.1f} ± {100 * part['error'].std():.1f} %",
