@@ -232,7 +232,8 @@ def refit(
     for k, number in enumerate(layout.free):
         if number.name in values and number.key not in (start or {}):
             theta[k] = number.inside(float(np.clip(values[number.name], number.lower, number.upper)))
-    held = FixedTerms(old.spread if hold_spreads else None, (old.rho, old.variance) if hold_noise else None)
+    beside = before.state
+    held = FixedTerms(beside.spread if hold_spreads else None, (beside.rho, beside.variance) if hold_noise else None)
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))

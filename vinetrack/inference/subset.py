@@ -60,7 +60,7 @@ def fit_subset(
     rows = _rows(fit, keep)
     places = _numbers_felt(fit.predictor.layout, rows)
     predictor = _subset_predictor(fit.predictor, rows, places)
-    state = _subset_state(fit.solution.state, rows, places)
+    state = _subset_state(fit.state, rows, places)
     problem = _subset_frame(fit.solution.problem, predictor.layout, rows, places)
     names = set(held)
     free = [not names & {number.name, number.key} for number in predictor.layout.free]
