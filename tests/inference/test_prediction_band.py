@@ -80,17 +80,14 @@ def test_a_trial_of_a_campaign_has_the_band_of_what_its_trials_scatter_by() -> N
 
 
 @needs_recordings
-def test_every_stack_of_cups_is_within_the_band_of_the_others() -> None:
-    pairs, _ = pairs_of(vt.read_experiment(Path(FOLDER) / "falling_cups"))
-    held = [next_of(pairs, FALL, k).within_band >= MOSTLY for k in range(len(pairs))]
-    assert sum(held) >= 0.9 * len(held)
-
-
-@needs_recordings
-def test_every_recording_of_a_tube_is_within_the_band_of_the_others(tmp_path: Path) -> None:
-    recordings = [
-        one for part in ("everting_tube", "everting_tube_repeats") for one in read_recordings(Path(FOLDER) / part)
-    ]
-    pairs, _ = pairs_of(vt.read_experiment(write_folder(recordings, tmp_path / "tubes")))
-    held = [next_of(pairs, vt.base_model(), k).within_band >= MOSTLY for k in range(len(pairs))]
-    assert sum(held) >= 0.9 * len(held)
+def test_nine_of_ten_real_repeats_are_within_the_band_of_the_others(tmp_path: Path) -> None:
+    """Eight stacks of cups and six recordings of three tubes, each predicted from the others of its kind."""
+    cups, _ = pairs_of(vt.read_experiment(Path(FOLDER) / "falling_cups"))
+    folders = (Path(FOLDER) / part for part in ("everting_tube", "everting_tube_repeats"))
+    recordings = [one for folder in folders for one in read_recordings(folder)]
+    tubes, _ = pairs_of(vt.read_experiment(write_folder(recordings, tmp_path / "tubes")))
+    predicted = [next_of(cups, FALL, k) for k in range(len(cups))]
+    predicted += [next_of(tubes, vt.base_model(), k) for k in range(len(tubes))]
+    assert len(predicted) == 14
+    assert np.mean([trial.within_band >= MOSTLY for trial in predicted]) >= 0.9
+    assert np.mean([trial.within_band for trial in predicted]) >= 0.9

@@ -301,11 +301,22 @@ def _aligned(
     white = whiten(design, trial_data.first, weigh, trial_data.relative_sd)
     fixed = np.array([not trial_data.let_in, True])
     inverse = np.linalg.pinv(white.T @ white * np.outer(fixed, fixed), rcond=1e-10, hermitian=True)
+    points = missed.size
+    whitener = whiten(np.eye(points), trial_data.first, weigh, trial_data.relative_sd)
+    lever = inverse @ (white.T @ whitener)
     both = np.column_stack([loadings, missed])
-    left = both - design @ (inverse @ (white.T @ whiten(both, trial_data.first, weigh, trial_data.relative_sd)))
-    random = noise * (np.ones(missed.size) if trial_data.relative_sd is None else trial_data.relative_sd**2)
-    if weigh == state.rho:
-        # What the alignment takes of the noise it was weighed by; a point keeps what it adds to the one before.
-        taken = noise * (1 - weigh**2) * np.einsum("nk,kl,nl->n", design, inverse, design)
-        random = np.maximum(random - taken, (1 - weigh**2) * random)
-    return left[:, :-1], random, left[:, -1]
+    left = both - design @ (lever @ both)
+    covariance = noise * _correlation(trial_data, state.rho)
+    through = lever @ covariance
+    taken = 2 * np.einsum("nk,kn->n", design, through) - np.einsum("nk,kl,nl->n", design, through @ lever.T, design)
+    return left[:, :-1], np.maximum(np.diag(covariance) - taken, 0.0), left[:, -1]
+
+
+def _correlation(trial_data: FitTrial, rho: float) -> Floats:
+    """Covariance of the noise of a trial's points over its variance, shape (n_points, n_points); stretches apart."""
+    points = np.arange(trial_data.time_s.size)
+    stretch = np.cumsum(trial_data.first)
+    together = stretch[:, None] == stretch
+    sd = np.ones(points.size) if trial_data.relative_sd is None else trial_data.relative_sd
+    apart = np.power(rho, np.arange(points.size))[np.abs(points[:, None] - points)]
+    return np.asarray(np.where(together, apart, 0.0) * sd[:, None] * sd)
