@@ -168,6 +168,7 @@ def shapes_of(effect: Effect) -> list[CandidateShape]:
     Parameters
     ----------
     effect
+        An effect of the catalogue or of the user.
 
     Returns
     -------
@@ -190,6 +191,7 @@ def whole_shapes(effect: Effect, other_values: Sequence[tuple[float, ...]] = (()
     Parameters
     ----------
     effect
+        An effect of the catalogue or of the user.
     other_values : sequence of tuple of float
         Values of the parameters behind the first, SI; several are tried.
 
@@ -218,6 +220,7 @@ def plausible_range(parameter: Parameter) -> tuple[float, float]:
     Parameters
     ----------
     parameter
+        Of an effect.
 
     Returns
     -------
@@ -248,6 +251,7 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
     Parameters
     ----------
     parameter
+        Of an effect.
     value, sigma : float, SI
         Size and its standard error.
     reach : float

@@ -37,6 +37,7 @@ class Against:
         Parameters
         ----------
         trial
+            Row of the sheet.
 
         Returns
         -------

@@ -131,6 +131,7 @@ class Law:
         Parameters
         ----------
         motion
+            A fitted motion.
 
         Returns
         -------

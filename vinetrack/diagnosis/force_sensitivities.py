@@ -121,7 +121,9 @@ def as_it_was(trial: Trial, job: Job) -> Trial:
     Parameters
     ----------
     trial
+        Row of the sheet.
     job
+        Trajectory to simulate.
 
     Returns
     -------
@@ -152,6 +154,7 @@ def with_derivatives(motion: FittedMotion) -> FittedMotion:
     Parameters
     ----------
     motion
+        A fitted motion.
 
     Returns
     -------

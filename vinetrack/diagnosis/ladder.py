@@ -147,6 +147,7 @@ def in_sample(fit: Fit) -> Errors:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------
@@ -161,6 +162,7 @@ def left_out(fit: Fit) -> Errors:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------
@@ -177,6 +179,7 @@ def highest_pressure(fit: Fit) -> Errors:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------

@@ -236,6 +236,7 @@ class MisfitTests:
         Parameters
         ----------
         effect
+            An effect of the catalogue or of the user.
 
         Returns
         -------

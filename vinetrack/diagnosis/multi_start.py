@@ -180,6 +180,7 @@ def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
     Parameters
     ----------
     shape
+        Form in which the effect is tried.
     size : float, SI
         Predicted size, from the parameter's zero.
 
@@ -284,6 +285,7 @@ def from_other_starts(fit: Fit) -> Fit:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------

@@ -70,6 +70,7 @@ def lay(fit: Fit) -> AlignedTrial:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------
@@ -93,6 +94,7 @@ def per_trial_estimates(fit: Fit, key: str, laid: AlignedTrial) -> PerTrialEstim
     Parameters
     ----------
     fit
+        A fitted model.
     key : str
         Name of a parameter, `effect.parameter`.
     laid : the model aligned with its trials, from `lay`.

@@ -139,7 +139,9 @@ def stretch_covariance(scatter: Scatter, group: Stretches) -> Floats:
     Parameters
     ----------
     scatter
+        What replicates differ by.
     group
+        Stretches of one condition.
 
     Returns
     -------

@@ -111,6 +111,7 @@ def frames_at_rest(trial: TrialFit) -> int:
     Parameters
     ----------
     trial
+        A trial under the model.
 
     Returns
     -------
@@ -321,6 +322,7 @@ def first_that_counts(trial: TrialFit) -> int:
     Parameters
     ----------
     trial
+        A trial under the model.
 
     Returns
     -------

@@ -47,6 +47,7 @@ def pushes(fit: Fit) -> bool:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------

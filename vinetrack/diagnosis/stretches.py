@@ -55,6 +55,7 @@ def courses_of(fit: Fit) -> tuple[list[Course], tuple[TrialFit, ...]]:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------
@@ -92,6 +93,7 @@ def replicate_scatter(fit: Fit, courses: Sequence[Course]) -> Scatter:
     Parameters
     ----------
     fit
+        A fitted model.
     courses : sequence of Course
 
     Returns
@@ -143,6 +145,7 @@ def means_of(course: Course, along: str, edges: Floats) -> tuple[Floats, Floats]
     Parameters
     ----------
     course
+        One trial along its growth.
     along : str
         Attribute of the course that the edges belong to.
     edges : array, shape (n_stretches + 1,)
@@ -194,9 +197,11 @@ def variances_of(course: Course, part: tuple[Floats, Floats], scatter: Scatter) 
     Parameters
     ----------
     course
+        One trial along its growth.
     part : (means, frames)
         From `means_of`.
     scatter
+        What replicates differ by.
 
     Returns
     -------

@@ -44,6 +44,7 @@ def conditions_apart(fit: Fit) -> float:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------
@@ -89,6 +90,7 @@ def noisier_in_motion(fit: Fit) -> float:
     Parameters
     ----------
     fit
+        A fitted model.
 
     Returns
     -------
