@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,7 @@ def test_an_effect_put_in_by_hand_joins_the_history_of_the_ladder(results: Path)
     code, output = run("add", "air_drag", results)
     assert code == 0, output
     assert "air_drag added to" in output
+    assert re.search(r"Δχ² = -", output) is None
     assert "highest pressure" in output
     rows = list(csv.DictReader((results / "ladder.csv").read_text().splitlines()))
     assert [row["added"] for row in rows] == ["", "reservoir_depletion", "air_drag"]

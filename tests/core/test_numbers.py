@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from vinetrack.core.numbers import decimals, half_width, interval, number, with_error
+from vinetrack.core.numbers import decimals, interval, number, with_error, with_interval
 from vinetrack.core.units import display_unit
 
 
@@ -32,6 +32,8 @@ def test_a_number_has_three_digits_and_an_exponent_only_where_needed(value: floa
         (0.36981, 0.0123, "0.370 ± 0.012"),
         (0.3712, 0.00999999, "0.371 ± 0.010"),
         (152.7, 31.0, "153 ± 31"),
+        (-3.464e-9, 2.3e-6, "(0.0 ± 2.3)·10⁻⁶"),
+        (1.2341e-5, 2.3e-7, "(12.34 ± 0.23)·10⁻⁶"),
         (2.5, 0.0, "2.50"),
         (2.5, math.nan, "2.50"),
     ],
@@ -54,8 +56,8 @@ def test_an_unknown_interval_is_a_dash(bounds: list | None) -> None:
 
 
 def test_half_an_interval() -> None:
-    assert half_width([1.0, 4.0]) == 1.5
-    assert math.isnan(half_width([None, None]))
+    assert with_interval(0.4001, [0.359, 0.4412]) == "0.400 (95 %: 0.359 to 0.441)"
+    assert with_interval(0.4001, [None, None]) == "0.400"
 
 
 @pytest.mark.parametrize(("sigma", "count"), [(0.0123, 3), (31.0, 0), (1e-20, 12), (0.0, 0), (math.nan, 0)])

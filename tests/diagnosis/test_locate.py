@@ -61,7 +61,8 @@ def test_three_times_the_frames_make_no_error_smaller() -> None:
 def test_an_emptying_chamber_makes_it_fail_and_the_words_say_where(depleting: Failure) -> None:
     assert depleting.fails
     worst = depleting.by_condition.iloc[0]
-    assert worst["z"] == depleting.by_condition["z"].max() > 3.5
+    assert worst["rms_m"] == depleting.by_condition["rms_m"].max()
+    assert depleting.by_condition["z"].max() > 3.5
     first = depleting.sentences()[0]
     assert first.startswith(f"The model fails most at {worst['pressure_Pa'] / 1e3:.3g} kPa ({worst['vine']})")
     assert "where replicates scatter by" in first

@@ -86,7 +86,7 @@ def test_both_rules_have_a_panel_with_their_own_points() -> None:
     figure = draw_paper_damping(points(), damping(), {1: 0.57, 4: 6.44}, 0.37)
     counts = [[len(line.get_xdata()) for line in ax.lines if line.get_marker() in ("o", "s")] for ax in figure.axes]
     assert counts == [[4, 4], [3, 3]]
-    assert "n = 0.380 ± 0.012 (95 %), printed 0.37" in words(figure)
+    assert "n = 0.380 (95 %: 0.360 to 0.384), printed 0.37" in words(figure)
     assert "R = 4: B 6.40, printed 6.44; N = 3" in words(figure)
 
 

@@ -77,6 +77,8 @@ def test_the_end_of_growth_is_not_in_the_window(vine):
         window = gated(trial.track)
         assert window.accepted
         assert window.to_s < trial.grown_s + 0.5 / 1069
+        grown_m = trial.lead_position_m - trial.lead_position_m[0]
+        assert grown_m[inside(trial, window)].max() <= 0.95 * grown_m.max() + 1e-4
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 3e-5, 3e-4])

@@ -117,12 +117,13 @@ def test_where_nothing_was_added_there_is_no_model_after(tmp_path: Path) -> None
     assert edges[1].off_mm == pytest.approx(np.full(N, 20.0))
 
 
-def test_a_prediction_that_ends_is_not_drawn_beyond_its_end(tmp_path: Path) -> None:
+def test_no_model_is_drawn_before_the_first_frame_of_its_fit_nor_after_the_last(tmp_path: Path) -> None:
     _, results = campaign(tmp_path)
     path = results / "diagnosis" / "predictions" / "a.csv"
     pd.read_csv(path).iloc[5:40].to_csv(path, index=False)
     edges, _ = edges_of("a", Results(results), read_result(Results(results).track("a")))
-    assert np.isfinite(edges[1].along_px[:40]).all()
+    assert np.isfinite(edges[1].along_px[5:40]).all()
+    assert np.isnan(edges[1].along_px[:5]).all()
     assert np.isnan(edges[1].along_px[40:]).all()
 
 

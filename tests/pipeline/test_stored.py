@@ -83,7 +83,7 @@ def test_without_a_diagnosis_there_is_none(tmp_path: Path) -> None:
     assert read_diagnosis(Results(tmp_path)) is None
 
 
-@pytest.mark.parametrize("content", ["[]", '{"model": 3}', '{"numbers": []}'])
+@pytest.mark.parametrize("content", ["[]", '{"model": 3}', '{"numbers": [1]}'])
 def test_a_fit_that_is_none_of_ours_is_one_sentence(tmp_path: Path, content: str) -> None:
     Results(tmp_path).fit.write_text(content, encoding="utf-8")
     with pytest.raises(ResultsError, match="delete it and run snakemake again"):

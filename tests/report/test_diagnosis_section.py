@@ -258,7 +258,7 @@ def test_a_refusal_is_said_with_its_reason_and_the_law_still_stands() -> None:
 
 
 def test_without_a_diagnosis_the_law_is_the_headline() -> None:
-    assert heading(page()).startswith("Damping exponent n =")
+    assert heading(page()).startswith("From steady speeds: damping exponent n =")
     assert diagnosis_section(None) is None
 
 

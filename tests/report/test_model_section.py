@@ -87,7 +87,7 @@ def test_without_replicates_no_floor_is_claimed() -> None:
 def test_the_page_shows_comparison_numbers_check_and_warnings() -> None:
     text = words(page(model=result()))
     assert "c1 4.00 1.00 4.0 0.250 70.0 123" in text
-    assert "B v 6.44 ± 0.12 6.20 to 6.68 N·(s/m)ⁿ" in text
+    assert "B v 6.44 ± 0.12 6.200 to 6.680 N·(s/m)ⁿ" in text
     assert "P_y all 3.00 open kPa" in text
     assert "B 3.0 %; pressure 1.0 %, held" in text
     assert "v 0.370 0.490 6.44 6.10 5.1" in text

@@ -108,12 +108,13 @@ def test_the_first_screen_says_n_with_its_error_and_how_many_trials() -> None:
     html = page(damping=damping("v", "w"), trials=trials("a", "b"))
     heading = re.search(r"<h1>(.*?)</h1>", html)
     assert heading is not None
-    assert heading[1] == "One damping exponent fits all vines: n = 0.371 ± 0.010 (95 %), from 8 trials of 2 vines."
+    law = "one damping exponent fits all vines: n = 0.371 (95 %: 0.361 to 0.381), from 8 trials of 2 vines."
+    assert heading[1] == f"From steady speeds: {law}"
     assert "2 trials: 2 ok." in html
 
 
 def test_one_vine_has_b_in_the_headline() -> None:
-    assert "B = 2.00 ± 0.10 N·(s/m)ⁿ" in headline(damping("v"))
+    assert "B = 2.00 (95 %: 1.90 to 2.10) N·(s/m)ⁿ" in headline(damping("v"))
 
 
 def test_a_refusal_is_the_headline() -> None:

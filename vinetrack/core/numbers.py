@@ -12,6 +12,11 @@ from typing import Any
 _FIXED_EXPONENTS = (-4, 6)
 """Decimal exponents written without "e": the range of Python's own `g` format, 0.0001 to 999999."""
 
+_FINEST_PLACES = 6
+"""Decimals beyond which a value and its error share a power of ten. Chosen: six zeros can still be counted."""
+
+_RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
 _MOST_DECIMALS = 12
 """Derived: an error below 1e-11 is the rounding of a double of order 1e5."""
 
@@ -88,8 +93,12 @@ def with_error(value: float | None, sigma: float | None) -> str:
     if sigma is None or not math.isfinite(sigma) or sigma <= 0:
         return number(value)
     places = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # 0.00999 is written 0.010, and counts as that
-    if places > 6:
-        return f"{value:.3e} ± {sigma:.1e}"
+    if places > _FINEST_PLACES:
+        power = 3 * ((places - 1) // 3)
+        shown = max(places - power, 0)
+        scaled = value * 10.0**power
+        scaled = 0.0 if abs(scaled) < 0.5 * 10.0**-shown else scaled  # no "-0.0"
+        return f"({scaled:.{shown}f} ± {sigma * 10.0**power:.{shown}f})·10⁻{str(power).translate(_RAISED)}"
     return f"{value:.{max(places, 0)}f} ± {sigma:.{max(places, 0)}f}"
 
 
@@ -112,18 +121,24 @@ def interval(bounds: Sequence[float | None] | None) -> str:
     return f"{low:.{places}f} to {high:.{places}f}"
 
 
-def half_width(bounds: Sequence[float | None] | None) -> float:
-    """Return half the width of an interval, NaN where it is unknown.
+def with_interval(value: float | None, bounds: Sequence[float | None] | None) -> str:
+    """Return `value (95 %: low to high)`, all to the digit that the width allows; the value alone where unknown.
 
     Parameters
     ----------
-    bounds : low and high, in the same unit; None where unknown.
+    value : in the unit of the bounds; None where unknown.
+    bounds : of the 95 % interval.
 
     Returns
     -------
-    half the width, in that unit; NaN where unknown.
+    text
+
+    >>> with_interval(0.4001, (0.359, 0.4412))
+    '0.400 (95 %: 0.359 to 0.441)'
     """
-    if bounds is None or any(bound is None for bound in bounds):
-        return math.nan
+    if value is None or bounds is None or any(bound is None or not math.isfinite(bound) for bound in bounds):
+        return number(value)
     low, high = (float(bound) for bound in bounds if bound is not None)
-    return (high - low) / 2
+    half = float(f"{(high - low) / 2:.1e}")  # 0.00999 is written 0.010, and counts as that
+    places = min(max(1 - math.floor(math.log10(half)), 0), 6) if half > 0 else 3
+    return f"{value:.{places}f} (95 %: {low:.{places}f} to {high:.{places}f})"

@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from vinetrack.core.records import Track
-from vinetrack.diagnosis.candidates import host_for, shapes_of
+from vinetrack.diagnosis.candidates import candidates_of, shapes_of
+from vinetrack.diagnosis.initial_fit import initial_fit
 from vinetrack.diagnosis.multi_start import SubsetFitter, best_subset_fit, full_fit, start_of
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import EffectError, find_effect
-from vinetrack.inference.fit import fit as fit_model
 from vinetrack.inference.fit import refit
-from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_data import FitError, pairs_of
 from vinetrack.inference.fit_result import Fit
 
 if TYPE_CHECKING:
@@ -61,7 +61,10 @@ def add(
         raise EffectError(f"{effect.name} is in the model already: {' + '.join(model.names)}.")
     check_needs(model + effect, *(trial for trial in experiment.trials if trial.name in tracks))
     report("fitting the model as it is")
-    before = fit_model(model, experiment, tracks=tracks, host=host_for(model, (effect,)), profile=False)
+    questioned = candidates_of(model, experiment.settings.candidates, user_effects)
+    if effect not in questioned:
+        questioned = (*questioned, effect)
+    before = initial_fit(model, pairs_of(experiment, tracks)[0], questioned, profile=False)
     report(f"fitting it with {effect.name}")
     slope = SubsetFitter(before)
     starts = [((effect,), start_of(shape, shape.step * 10)) for shape in shapes_of(effect)]

@@ -19,6 +19,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import candidates_of, host_for, testable
 from vinetrack.diagnosis.contradictions import contradictions
+from vinetrack.diagnosis.initial_fit import initial_fit
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, weights_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (
@@ -40,7 +41,6 @@ from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK
 from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
-from vinetrack.inference.fit import fit as fit_model
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.sensitivity import Predictor
@@ -128,7 +128,7 @@ def diagnose(
         pairs, dropped = _frames_put_right(pairs)
         wild = listed_wild_points({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
-        fit = fit_model(model, pairs, host=host_for(model, questioned), profile=False, thorough=False)
+        fit = initial_fit(model, pairs, questioned, profile=False)
         fit = replace(fit, left_out={**left_out, **fit.left_out})
     effects, blind = testable(questioned, fit.predictor.data)
     findings = select_effects(fit, effects, report)
@@ -360,6 +360,8 @@ def _predicted(questions: MisfitTests, effect: Effect, place: int) -> tuple[Numb
             high=value + 1.96 * sigma,
             dof=questions.scores.degrees,
             method="predicted",
+            lower=parameter.bounds[0],
+            upper=parameter.bounds[1],
         ),
     )
 

@@ -68,10 +68,11 @@ SPEED_COLUMNS = ("vine", "condition", "from_m_s", "to_m_s", "lead_velocity_m_s",
 class Failure:
     """Where a model fails; tables in SI, a residual is measurement minus model.
 
-    `by_condition`, columns `CONDITION_COLUMNS`, worst first: `z` tells how unlikely replicates alone make the
-    course of the mean residual. `along_time`, `along_position` and `along_speed` (since release; growth and speed of
-    the leading edge in the model) hold the mean residual of a stretch with its error; rows with a blank `condition`
-    take all trials of a vine together. `drift` tells which parameter knows a condition it should not.
+    `by_condition`, columns `CONDITION_COLUMNS`, has the largest root mean square first, which every page calls the
+    worst condition; `z` tells how unlikely replicates alone make the course of the mean residual. `along_time`,
+    `along_position` and `along_speed` (since release; growth and speed of the leading edge in the model) hold the mean
+    residual of a stretch with its error; rows with a blank `condition` take all trials of a vine together. `drift`
+    tells which parameter knows a condition it should not.
     """
 
     model: str
@@ -125,7 +126,7 @@ def locate(fit: Fit) -> Failure:
     whole = {vine: [course for course in courses if course.trial.vine == vine] for vine in vines}
     return Failure(
         model="+".join(fit.model.names),
-        by_condition=table.sort_values("z", ascending=False, kind="stable", ignore_index=True),
+        by_condition=table.sort_values("rms_m", ascending=False, kind="stable", ignore_index=True),
         along_time=_table([(of[n], "time_s", edges[n], n) for n in conditions], TIME_COLUMNS, scatter),
         along_position=_along("lead_position_m", of, whole, POSITION_COLUMNS, scatter),
         along_speed=_along("lead_velocity_m_s", of, whole, SPEED_COLUMNS, scatter),
@@ -219,14 +220,14 @@ def _fail(z: Floats) -> bool:
 
 def _where(table: pd.DataFrame, fails: bool) -> list[str]:
     """Sentences about conditions; the table has the worst first."""
-    failing = table[table["z"] > min(MISSED, float(table["z"].iloc[0]) - 1e-9)]
+    failing = table[table["z"] > min(MISSED, float(table["z"].max()) - 1e-9)]
     if not fails:
         worst = table.sort_values("z").iloc[-1]
         return [
             "Nowhere does the mean of the replicates leave the model by more than they explain themselves"
             f" (at most {max(float(worst['z']), 0.0):.1f} σ, at {_named(worst, table)})."
         ]
-    worst = failing.iloc[0]
+    worst = table.iloc[0]
     beside = (
         f"where replicates scatter by {_mm(worst['floor_m'])}"
         if math.isfinite(worst["floor_m"])

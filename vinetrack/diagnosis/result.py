@@ -224,6 +224,11 @@ class Diagnosis:
         return self.rounds[0].ranking if self.rounds else ()
 
     @property
+    def refutes(self) -> bool:
+        """Whether the initial model lacks physics, so that what is drawn with it must say so."""
+        return self.verdict in (MISSING, AMBIGUOUS, UNEXPLAINED)
+
+    @property
     def initial_model(self) -> tuple[str, ...]:
         """Names of the effects of the model the user came with."""
         return self.rounds[0].model if self.rounds else ()
@@ -298,7 +303,10 @@ class Diagnosis:
         Diagnosis
             Without fits, `failure` and `force_table`, which the file does not hold.
         """
-        rounds = content.get("rounds") or ([{"verdict": content["verdict"]}] if content.get("verdict") else [])
+        rounds = list(content.get("rounds") or [{}] if content.get("verdict") else [])
+        if rounds:
+            whole = {key: content[key] for key in ("verdict", "answer_set", "cosines") if key in content}
+            rounds[0] = {**whole, **rounds[0]}
         return cls(
             rounds=tuple(Round.from_json(stored) for stored in rounds),
             effects=tuple(content.get("effects") or ()),

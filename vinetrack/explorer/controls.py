@@ -208,9 +208,12 @@ def _say_found(div: Div, size: SizeControl, fitted: Fitted | None) -> None:
         return
     unit, factor = size.shown
     low, high, value = (factor * x for x in (number.low, number.high, number.value))
-    error = f" ± {factor * number.sigma:.2g}" if math.isfinite(number.sigma) else ""
-    at_bound = " · at its bound" if math.isfinite(number.bound) else ""
-    text = f"<small>fitted: <b>{value:.4g}{error}</b> {escaped(unit)} · 95 %: {low:.4g} to {high:.4g}{at_bound}</small>"
+    if math.isfinite(number.bound):
+        text = f"<small>fitted: <b>{factor * number.bound:.4g}</b> {escaped(unit)}, at its bound</small>"
+    else:
+        error = f" ± {factor * number.sigma:.2g}" if math.isfinite(number.sigma) else ""
+        ends = f" (its {number.ends_at} bound)" if number.ends_at else ""
+        text = f"<small>fitted: <b>{value:.4g}{error}</b> {escaped(unit)} · 95 %: {low:.4g} to {high:.4g}{ends}</small>"
     div.update(text=text, visible=True)
 
 

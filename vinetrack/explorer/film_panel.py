@@ -36,7 +36,7 @@ class FilmPanel:
         self._playing: Any = None
         names = [seen.name for seen in campaign.trials]
         self.choose = Select(
-            options=names, value=names[0], width=220, name="film_trial", stylesheets=[sheet()], margin=0
+            options=names, value=names[0], width=220, title="trial", name="film_trial", stylesheets=[sheet()], margin=0
         )
         self.play = Button(label="▶ play", width=84, name="film_play", stylesheets=[sheet()], margin=0)
         self.frame = Slider(
@@ -184,8 +184,10 @@ class FilmPanel:
         time_s, seen = self._time_s(frame), self._seen()
         place = self.campaign.trials.index(seen)
         at = np.array([time_s])
+        # The fit begins at the first frame that it uses: before that the model says nothing.
+        silent = time_s < float(seen.data.time_s[0])
         model_m = [
-            math.nan if curves is None else float(curves[place].lead_position_m(at)[0])
+            math.nan if curves is None or silent else float(curves[place].lead_position_m(at)[0])
             for curves in (self._earlier, self._curves)
         ]
         if self._view is None:
@@ -221,8 +223,8 @@ class FilmPanel:
     def _say_frame(self, frame: int, reason: str = "") -> None:
         seen = self._seen()
         since_s = self._time_s(frame) - seen.release_s
-        positions = zip(("tracked", "at first", "model"), self._positions(frame), strict=True)
-        colours = {"tracked": MEASURED_EDGE, "at first": EARLIER_EDGE, "model": MODEL_EDGE}
+        positions = zip(("tracked", "compared with", "model"), self._positions(frame), strict=True)
+        colours = {"tracked": MEASURED_EDGE, "compared with": EARLIER_EDGE, "model": MODEL_EDGE}
         positions_text = [
             f'<span style="border-bottom:3px solid {colours[name]}">{name} {1e3 * (at - seen.origin_m):.1f} mm</span>'
             for name, at in positions
@@ -233,7 +235,8 @@ class FilmPanel:
         if self._view is not None and frame < self._view.by_hand.size and self._view.by_hand[frame]:
             positions_text.append("corrected by hand")
         words_ = f"<p>{escaped(reason)}</p>" if reason else ""
-        self.caption.text = f"{words_}<p>{1e3 * since_s:.1f} ms since release · {' · '.join(positions_text)}</p>"
+        when = f"{1e3 * since_s:.1f} ms since release" if since_s >= 0 else f"−{-1e3 * since_s:.1f} ms, before release"
+        self.caption.text = f"{words_}<p>{when} · {' · '.join(positions_text)}</p>"
         self._instant(seen.name, since_s)
 
     def refresh(self) -> None:

@@ -23,11 +23,13 @@ from vinetrack.explorer.sides import (
     DIAGNOSIS,
     DiagnosisSummary,
     FittedRung,
+    HeldModel,
     headline,
     next_panel,
     numbers_words,
     read_summary,
     rung_of,
+    side_by_side,
     tied_panel,
 )
 from vinetrack.figures.page_tokens import follows_screen
@@ -63,6 +65,7 @@ class Page:
         self.errors_m: Mapping[str, float] = {}
         self.last: Fitted | None = None
         self.rungs: list[FittedRung] = []
+        self.held: HeldModel | None = None
         self.story: DiagnosisSummary | None = read_summary(self.campaign.folder)
         self._story_time = self._diagnosed_at()
         self._touched = False
@@ -92,11 +95,16 @@ class Page:
         self.keep = KeepPanel(self)
         self.refit = Button(label="Refit", button_type="primary", width=110, name="refit", stylesheets=[sheet()])
         self.back = Button(label="As fitted", width=96, name="as_fitted", stylesheets=[sheet()])
+        self.hold = Button(label="Hold to compare", width=132, name="hold", stylesheets=[sheet()])
         self.refit.on_click(self._refit_or_stop)
+        self.hold.on_click(self._hold)
         self.back.on_click(self._as_fitted)
         self.said = words(name="commands")
-        buttons = Row(children=[self.refit, self.back], margin=0, stylesheets=[sheet(":host { gap: 6px; }")])
-        hint = words("<small>Tick an effect or drag its size; then refit. The same from the command line:</small>")
+        buttons = Row(children=[self.refit, self.back, self.hold], margin=0, stylesheets=[sheet(":host { gap: 6px; }")])
+        hint = words(
+            "<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps this "
+            "model beside the next. The same from the command line:</small>"
+        )
         actions = Column(children=[buttons, hint, self.said], sizing_mode="stretch_width", name="actions", margin=0)
         roots = [self.headline, self.status, self.chooser.root, self.plots.motion, self.plots.residual]
         roots += [self.plots.errors, self.panel.root, actions, self.numbers, self.tied, self.next]
@@ -128,6 +136,7 @@ class Page:
     def _ticked(self, effect: str, wanted: bool) -> None:
         self.choice = self.choice.with_effect(effect, wanted)
         self._touch()
+        self._begin_refit()
 
     def _moved(self, effect: str, number: str, value: float) -> None:
         known = effect in self.choice
@@ -143,7 +152,7 @@ class Page:
         self._redraw_soon()
 
     def _selection_changed(self) -> None:
-        self.plots.set_shown(self.chooser.shown, self.ground.curves if self._differs() else None)
+        self.plots.set_shown(self.chooser.shown, self._reference.curves if self._differs() else None)
         if self.curves is not None:
             self.plots.set_curves(self.curves, self.chooser.shown)
             self._show_errors()
@@ -159,10 +168,32 @@ class Page:
         if self._job is not None or self._wanted:
             self._end_job("The fit was stopped.")
             return
+        self._begin_refit()
+
+    def _begin_refit(self) -> None:
         self._wanted = True
         self._waiting.begin(time.monotonic())
         self.refit.label = "Stop"
         self._ground_changed()
+
+    def _hold(self) -> None:
+        """Keep the model as it is drawn, to compare with; pressed again, the page compares with how it opened."""
+        if self.held is not None:
+            self.held = None
+        elif self.curves is not None:
+            fit = self.last if not self._touched else None
+            self.held = HeldModel(self.choice.effects, self.curves, dict(self.errors_m), fit)
+        self.hold.label = "Hold to compare" if self.held is None else "Let go"
+        if self.curves is not None:
+            self._draw()
+            self._say()
+
+    @property
+    def _reference(self) -> HeldModel:
+        """What the page compares with: the model that is held, else the one in use as the page opened."""
+        if self.held is not None:
+            return self.held
+        return HeldModel(self.campaign.in_use, self.ground.curves, self.ground.errors_m, self.ground.fitted)
 
     # ---- fits ----------------------------------------------------------------------------------------------------
 
@@ -253,6 +284,7 @@ class Page:
         self._waiting.end(reason)
         self.refit.label = "Refit"
         self._clock()
+        self._say_soon()
 
     # ---- drawing -------------------------------------------------------------------------------------------------
 
@@ -287,25 +319,33 @@ class Page:
     def _draw(self) -> None:
         assert self.curves is not None
         self.plots.set_curves(self.curves, self.chooser.shown)
-        self.plots.set_earlier(self.ground.curves if self._differs() else None, self.chooser.shown)
+        self.plots.set_earlier(self._reference.curves if self._differs() else None, self.chooser.shown)
         self._show_errors()
 
     def _show_errors(self) -> None:
         floors = self.campaign.floors_m
-        self.plots.set_errors(self.errors_m, self.ground.errors_m, floors, self.chooser.conditions)
+        self.plots.set_errors(self.errors_m, self._reference.errors_m, floors, self.chooser.conditions)
 
     def _differs(self) -> bool:
-        """Whether what is drawn is not the model in use as it was."""
-        return self.curves is not None and self.curves is not self.ground.curves
+        """Whether what is drawn is not the model that the page compares with."""
+        return self.curves is not None and self.curves is not self._reference.curves
 
     def _say(self) -> None:
         """Everything that is in words."""
         self._words_pending = False
-        _set(self.headline, headline(self.campaign, self.choice, self.errors_m, self.ground.errors_m))
+        if self._job is None and not self._wanted:
+            # A step of a fit, or a model not fitted yet, says nothing of what the effect brings.
+            _set(self.headline, headline(self.campaign, self.choice, self.errors_m, self.ground.errors_m))
         if self.curves is not None:
-            self.film.set_curves(self.curves, self.ground.curves)
+            self.film.set_curves(self.curves, self._reference.curves)
             self.film.refresh()
-        _set(self.numbers, numbers_words(self.campaign, self.last, self.rungs, self._touched))
+        fit = None if self._touched else self.last
+        beside = (
+            ""
+            if self.curves is None
+            else side_by_side(self.campaign, self.held, HeldModel(self.choice.effects, self.curves, self.errors_m, fit))
+        )
+        _set(self.numbers, beside + numbers_words(self.campaign, self.last, self.rungs, self._touched))
         _set(self.tied, tied_panel(self.campaign, self.story, self.last))
         _set(self.next, next_panel(self.campaign, self.story))
         _set(self.said, self.keep.commands())

@@ -45,9 +45,12 @@ class Plots:
         )
         ghost = {"line_color": MUTED, "line_width": 1.5, "line_dash": [2, 3]}
         fig.multi_line("xs", "ys", source=self._earlier, **ghost)
-        fig.multi_line("xs", "ys", source=self._model, line_color=INK, line_width=2, line_dash=[7, 4])
+        model = fig.multi_line("xs", "ys", source=self._model, line_color=INK, line_width=2, line_dash=[7, 4])
+        values = [("since release", "$x{0.0} ms"), ("growth", "$y{0.0} mm")]
+        tips = [("trial", "@trial"), ("", "@condition"), *values]
         fig.add_tools(
-            HoverTool(renderers=[lines], tooltips=[("trial", "@trial"), ("", "@condition")], line_policy="interp")
+            HoverTool(renderers=[lines], tooltips=tips, line_policy="interp"),
+            HoverTool(renderers=[model], tooltips=[("", "model"), *values], line_policy="interp"),
         )
         self.instant = Span(dimension="height", line_color=INK, line_width=1, line_alpha=0.5, visible=False)
         fig.add_layout(self.instant)
@@ -59,9 +62,9 @@ class Plots:
         )
         fig.add_layout(Span(location=0, dimension="width", line_color=INK, line_width=1.5, line_dash=[7, 4]))
         lines = fig.multi_line("xs", "ys", source=self._left, line_color=vine_colour(), line_width=1.4)
-        fig.add_tools(
-            HoverTool(renderers=[lines], tooltips=[("trial", "@trial"), ("", "@condition")], line_policy="interp")
-        )
+        values = [("growth", "$x{0.0} mm"), ("measured − model", "$y{0.00} mm")]
+        tips = [("trial", "@trial"), ("", "@condition"), *values]
+        fig.add_tools(HoverTool(renderers=[lines], tooltips=tips, line_policy="interp"))
         return fig
 
     def _draw_errors(self) -> Any:
@@ -83,7 +86,7 @@ class Plots:
         tips = [
             ("", "@label"),
             ("now", "@now{0.000} mm"),
-            ("at first", "@before{0.000} mm"),
+            ("compared with", "@before{0.000} mm"),
             ("replicates", "@floor{0.000} mm"),
         ]
         fig.add_tools(HoverTool(renderers=[bars], tooltips=tips), TapTool(renderers=[bars, fig.renderers[0]]))

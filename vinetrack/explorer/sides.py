@@ -13,13 +13,14 @@ from vinetrack.core.units import SLIDER_UNITS, display_unit
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.choice import ModelChoice
-from vinetrack.explorer.curves import overall_m
+from vinetrack.explorer.curves import Curves, overall_m
 from vinetrack.explorer.export import model_words
 from vinetrack.explorer.fitting import Fitted, gained_words, tied_words
 from vinetrack.explorer.look import command_block, escaped, table
 from vinetrack.explorer.series import vine_colours
 from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
+from vinetrack.narrative.verdict_summary import size
 from vinetrack.results.folder_layout import Results, ResultsError
 from vinetrack.results.stored import read_diagnosis
 
@@ -41,6 +42,43 @@ class FittedRung:
     effects: tuple[str, ...]
     rms_m: float
     gained: str
+
+
+@dataclass(frozen=True)
+class HeldModel:
+    """A model to compare with: its effects, curves, errors by condition (m), and its fit where it is one."""
+
+    effects: tuple[str, ...]
+    curves: Curves | None
+    errors_m: Mapping[str, float]
+    fitted: Fitted | None
+
+
+def side_by_side(campaign: Campaign, held: HeldModel | None, now: HeldModel) -> str:
+    """Return the held model and the present one as a table: error, and every fitted number of either.
+
+    Parameters
+    ----------
+    campaign : as `read_campaign` returns it.
+    held : None where nothing is held.
+    now : the model as it is drawn.
+
+    Returns
+    -------
+    str, HTML; blank where nothing is held
+    """
+    if held is None:
+        return ""
+    models = (held, now)
+    rows = [
+        ("effects", *(model_words(model.effects) for model in models)),
+        ("rms of position", *(_mm(overall_m(model.errors_m, campaign.conditions)) for model in models)),
+    ]
+    fits = [{} if model.fitted is None else {n.name: n for n in model.fitted.fit.numbers} for model in models]
+    for name in dict.fromkeys(name for numbers in fits for name in numbers):
+        title = next(numbers[name].title for numbers in fits if name in numbers)
+        rows.append((title, *(size(n[name]).partition(" = ")[2] if name in n else "–" for n in fits)))
+    return table(rows, ("", "held", "now"), ())
 
 
 def headline(campaign: Campaign, choice: ModelChoice, now_m: Mapping[str, float], before_m: Mapping[str, float]) -> str:
@@ -114,7 +152,9 @@ def numbers_words(campaign: Campaign, fitted: Fitted | None, rungs: Sequence[Fit
 def _number_row(number: Number, vine: str) -> tuple[str, ...]:
     unit, factor = display_unit(number.unit, SLIDER_UNITS)
     name = f"{number.symbol}, {unit}" if unit else number.symbol
-    if not math.isfinite(number.sigma):
+    if math.isfinite(number.bound):
+        return name, vine, f"{number.bound * factor:.4g}", "at its bound", ""
+    if not (math.isfinite(number.sigma) and number.sigma > 0):
         return name, vine, f"{number.value * factor:.4g}", "open", ""
     digits = decimals(number.sigma * factor)
     value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinetrack.core.numbers import half_width, number, with_error
+from vinetrack.core.numbers import number, with_interval
 from vinetrack.figures.panels import legend_above, line_key, plain_log_ticks
 from vinetrack.figures.style import INK, METHOD_COLOURS, METHOD_LINES, MUTED, PAPER, VineStyle, blank, look, vine_styles
 from vinetrack.narrative.law_text import METHOD_NAMES
@@ -135,8 +135,8 @@ def _law_title(damping: dict[str, Any]) -> str:
     fit = damping.get("both_axes") or {}
     if fit.get("n") is None or fit.get("refused"):
         return "Steady force and speed (no fit: see the report)"
-    n = with_error(fit["n"], half_width(fit.get("n_95")))
-    return f"One exponent for all vines: n = {n} (95 %)"
+    n = with_interval(fit["n"], fit.get("n_95"))
+    return f"One exponent for all vines: n = {n}"
 
 
 def _law_legend(fig: Figure, points: pd.DataFrame, damping: dict[str, Any], styles: dict[str, VineStyle]) -> None:
@@ -194,7 +194,7 @@ def draw_exponents(damping: dict[str, Any], published: dict[str, Any] | None = N
         fig = Figure(figsize=(9.4, 1.9 + max(0.5 * len(vines), 1.2)), layout="constrained")
         left, right = fig.subplots(1, 2, width_ratios=(1, 1.35))
         for method, fit in fits.items():
-            n = with_error(fit["n"], half_width(fit.get("n_95")))
+            n = with_interval(fit["n"], fit.get("n_95"))
             label = f"{METHOD_NAMES[method]}: n = {n}"
             _draw_estimate(left, method, 0, fit["n"], fit.get("n_95"), fit.get("n_95_total"), label)
             for i, vine in enumerate(vines):
@@ -237,7 +237,7 @@ def _finish_exponents(left: Axes, right: Axes, best: dict[str, dict[str, Any]]) 
     left.spines["left"].set_visible(False)
     right.set(ylim=(len(best) - 0.45, -0.55), xlabel="B, deviation from the value at the left (%)")
     labels = [
-        f"{vine}\nB = {with_error(law['B'], half_width(law.get('B_95')))}, N = {law['n_trials']}"
+        f"{vine}\nB = {with_interval(law['B'], law.get('B_95')).partition(' (')[0]}, N = {law['n_trials']}"
         for vine, law in best.items()
     ]
     right.set_yticks(range(len(best)), labels, fontsize=9)

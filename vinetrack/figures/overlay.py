@@ -203,7 +203,8 @@ def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time
         if edge.off_mm is not None and math.isfinite(edge.off_mm[frame]):
             words = f"{edge.off_mm[frame]:+.1f} mm".replace("-", "−")
             pen.text((0.6 * width, _row_y(i, line_px)), words, font=font, fill=BAR_INK, anchor="rm")
-    words = f"{time_ms:.1f} ms, {view.slowed:.3g} times slower".replace("-", "−")
+    before = " (before release)" if time_ms < 0 else ""
+    words = f"{time_ms:.1f} ms{before}, {view.slowed:.3g} times slower".replace("-", "−")
     pen.text((width - line_px, _row_y(1, line_px)), words, font=font, fill=BAR_MUTED, anchor="rm")
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core import published
-from vinetrack.core.numbers import half_width, number, with_error
+from vinetrack.core.numbers import number, with_interval
 from vinetrack.figures.panels import plain_log_ticks
 from vinetrack.figures.style import (
     BLUE,
@@ -67,8 +67,8 @@ def draw_paper_damping(
             law = damping.get(method) or {}
             steady = scaled[scaled[wanted] & (scaled[x] > 0) & (scaled[y] > 0)]
             _draw_force_panel(ax, steady, x, y, law, printed, exponent)
-            n = with_error(law.get("n"), half_width(law.get("n_95")))
-            ax.set_title(f"{title}\nn = {n} (95 %), printed {exponent:g}", fontsize=10.5)
+            n = with_interval(law.get("n"), law.get("n_95"))
+            ax.set_title(f"{title}\nn = {n}, printed {exponent:g}", fontsize=10.5)
             ax.set_xlabel("steady tail speed x_ss (m/s)")
         axes[0].set_ylabel("growth force above yield (N)")
         for ax in axes:

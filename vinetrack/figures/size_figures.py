@@ -262,11 +262,12 @@ def _efficiency_title(family: dict[str, Any], n_families: int) -> str:
 
 _MAX_VINES = 6
 """Chosen: two rows of three panels."""
-_MODEL_LABEL = "model and its 95 %"
+PAYLOAD_LINE = "model and its 95 %"
+"""Name of the model's curve in the legend."""
 
 
 def draw_payload_speed(
-    conditions: pd.DataFrame, model: pd.DataFrame, note: str = "", line: str = _MODEL_LABEL
+    conditions: pd.DataFrame, model: pd.DataFrame, note: str = "", line: str = PAYLOAD_LINE
 ) -> Figure:
     """Draw final speeds of vines that were grown with more than one payload.
 

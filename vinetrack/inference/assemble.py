@@ -244,6 +244,8 @@ def _numbers(
                 dof=float(dof[k]),
                 method=method,
                 bound=_bound_outside(number, at[0]) if at else math.nan,
+                lower=_bound_outside(number, problem.lower[k]),
+                upper=_bound_outside(number, problem.upper[k]),
             )
         )
     return tuple(numbers)

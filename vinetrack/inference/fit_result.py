@@ -30,7 +30,8 @@ class Number:
     """One fitted number, SI, with its standard error, degrees of freedom and 95 % interval.
 
     `vine` is blank where the number holds for all. `method` tells where the interval comes from: `linear`, `profile`
-    where a bound is near, `none` where the data leave it open. `bound` is the bound it sits at, NaN elsewhere.
+    where a bound is near, `none` where the data leave it open. `bound` is the bound it sits at, NaN elsewhere;
+    `lower` and `upper` are those that it was kept within.
     """
 
     key: str
@@ -44,6 +45,8 @@ class Number:
     dof: float
     method: str
     bound: float = math.nan
+    lower: float = -math.inf
+    upper: float = math.inf
 
     @property
     def name(self) -> str:
@@ -68,6 +71,8 @@ class Number:
             "high_95": self.high,
             "interval": self.method,
             "bound": self.bound,
+            "lower_bound": self.lower,
+            "upper_bound": self.upper,
         }
 
     @classmethod
@@ -97,7 +102,16 @@ class Number:
             dof=math.nan,
             method=str(entry.get("interval") or ("linear" if math.isfinite(low) else "none")),
             bound=bound,
+            lower=-math.inf if entry.get("lower_bound") is None else float(entry["lower_bound"]),
+            upper=math.inf if entry.get("upper_bound") is None else float(entry["upper_bound"]),
         )
+
+    @property
+    def ends_at(self) -> str:
+        """Which ends of the 95 % interval are bounds and no findings: `lower`, `upper`, `lower and upper`, or blank."""
+        slack = 1e-6 * max(abs(self.high - self.low), 1e-12 * max(abs(self.low), abs(self.high)))
+        ends = [("lower", self.low - self.lower <= slack), ("upper", self.upper - self.high <= slack)]
+        return " and ".join(name for name, is_bound in ends if is_bound)
 
 
 @dataclass(frozen=True)
@@ -353,7 +367,9 @@ def number_row(number: Number) -> tuple[str, ...]:
     tuple of str
     """
     unit, factor = display_unit(number.unit)
-    if not math.isfinite(number.sigma):
+    if math.isfinite(number.bound):
+        return number.title, f"{number.bound * factor:.4g}", "at its bound", "", unit
+    if not (math.isfinite(number.sigma) and number.sigma > 0):
         return number.title, f"{number.value * factor:.4g}", "open", "", unit
     digits = decimals(number.sigma * factor)
     value, low, high = (f"{x * factor:.{digits}f}" for x in (number.value, number.low, number.high))

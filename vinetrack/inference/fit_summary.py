@@ -107,7 +107,7 @@ class FitSummary(NumberTable):
 
         Parameters
         ----------
-        content : of `fit.json`; keys other than `model` may be absent.
+        content : of `fit.json`; what is absent is empty.
 
         Returns
         -------
@@ -120,7 +120,7 @@ class FitSummary(NumberTable):
         )
         keys = [entry.name for entry in fields(TrialEstimates)]
         return cls(
-            names=tuple(content["model"]),
+            names=tuple(content.get("model") or ()),
             numbers=numbers,
             covariance=np.array(matrix, dtype=float) if matrix else np.full((len(numbers), len(numbers)), math.nan),
             spreads={

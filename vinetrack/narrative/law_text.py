@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.numbers import half_width, interval, number, with_error
+from vinetrack.core.numbers import interval, number, with_interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,14 +79,14 @@ def headline(damping: Mapping[str, Any]) -> str:
         return f"No damping law: {_sentence(fit.get('refused') or 'no trial gave a steady speed')}"
     vines = fit["vines"]
     n_trials = sum(law["n_trials"] for law in vines.values())
-    n = with_error(fit["n"], half_width(fit.get("n_95")))
+    n = with_interval(fit["n"], fit.get("n_95"))
     if len(vines) == 1:
         (law,) = vines.values()
-        B = with_error(law["B"], half_width(law.get("B_95")))
-        return f"Damping exponent n = {n}, with B = {B} N·(s/m)ⁿ (95 %), from {_count(n_trials, 'trial')} of one vine."
-    return (
-        f"One damping exponent fits all vines: n = {n} (95 %), from {_count(n_trials, 'trial')} of {len(vines)} vines."
-    )
+        B = with_interval(law["B"], law.get("B_95"))
+        law = f"damping exponent n = {n}, with B = {B} N·(s/m)ⁿ, from {_count(n_trials, 'trial')} of one vine"
+    else:
+        law = f"one damping exponent fits all vines: n = {n}, from {_count(n_trials, 'trial')} of {len(vines)} vines"
+    return f"From steady speeds: {law}."
 
 
 def tally(trials: pd.DataFrame) -> str:

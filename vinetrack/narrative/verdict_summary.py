@@ -55,6 +55,10 @@ THEREAFTER = {
 }
 """The verdict on the model with all added effects."""
 
+NONE_SEEN = 2.0
+"""Standard errors below which a size is said to be none. Chosen: the usual 95 %; at half sizes of pure noise would be
+quoted as sizes once in three, at twice some that are there would be called none."""
+
 
 @dataclass(frozen=True)
 class Fact:
@@ -244,10 +248,16 @@ def size(entry: Number) -> str:
     Returns
     -------
     str
+        With what it means where it sits at a bound, or is negative where its effect cannot be.
     """
     unit, factor = display_unit(entry.unit)
+    if known(entry.bound):
+        return f"{entry.title} = {number(factor * entry.bound)} {unit}".rstrip() + " (at its bound)"
     sigma = factor * entry.sigma if known(entry.sigma) else None
-    return f"{entry.title} = {with_error(factor * entry.value, sigma)} {unit}".strip()
+    text = f"{entry.title} = {with_error(factor * entry.value, sigma)} {unit}".strip()
+    if entry.value < entry.lower or entry.value > entry.upper:
+        text += " (negative, which it cannot be)" if entry.value < 0 <= entry.lower else " (outside its bounds)"
+    return text
 
 
 def sizes(row: Candidate) -> str:
@@ -259,9 +269,12 @@ def sizes(row: Candidate) -> str:
 
     Returns
     -------
-    str, blank where it has no fitted number
+    str
+        Blank where it has no fitted number; `none seen` follows where the candidate is less than 2 standard errors
+        from no effect at all.
     """
-    return ", ".join(size(entry) for entry in row.numbers if known(entry.value))
+    text = ", ".join(size(entry) for entry in row.numbers if known(entry.value))
+    return f"{text}: none seen" if text and known(row.sigma) and abs(row.sigma) < NONE_SEEN else text
 
 
 def _sizes(diagnosis: Diagnosis) -> list[Fact]:
@@ -274,7 +287,7 @@ def _sizes(diagnosis: Diagnosis) -> list[Fact]:
 
 
 def size_interval(entry: Number) -> str:
-    """Return the 95 % interval of a fitted number in its display unit: `95 %: 1.162 to 1.178`; "open" where unknown.
+    """Return the 95 % interval of a fitted number in its display unit, a bound that it ends at named.
 
     Parameters
     ----------
@@ -283,11 +296,14 @@ def size_interval(entry: Number) -> str:
     Returns
     -------
     str
+        `95 %: 1.371 to 1.400 (its upper bound)`; `95 %: open` where unknown.
     """
     unit, factor = display_unit(entry.unit)
     if not (known(entry.low) and known(entry.high)):
         return "95 %: open"
-    return f"95 %: {number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
+    text = f"95 %: {number(factor * entry.low, 4)} to {number(factor * entry.high, 4)} {unit}".strip()
+    ends = entry.ends_at
+    return f"{text} (its {ends} bound{'s' if ' ' in ends else ''})" if ends else text
 
 
 def _upper_limits(diagnosis: Diagnosis) -> Fact | None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from vinetrack.core.numbers import decimals
+from vinetrack.core.numbers import decimals, with_error
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -23,13 +23,14 @@ from vinetrack.diagnosis.result import (
 from vinetrack.dynamics.model import base_model
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.between_text import difference_headline, difference_in_words, remedies_in_words, trials_differ
-from vinetrack.narrative.verdict_summary import joined, size
+from vinetrack.narrative.verdict_summary import joined, size, sizes
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from vinetrack.diagnosis.confounded_sizes import Confounder
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
+    from vinetrack.diagnosis.misfit_tests import MisfitTests
     from vinetrack.diagnosis.selection import SelectionStep
     from vinetrack.inference.fit_result import Fit
 
@@ -40,6 +41,9 @@ _HEADLINES = {
     ARTEFACT: "a fault of the measurement, not of the physics",
     "unexplained": "the model fails, and no effect of the catalogue explains it",
 }
+CLEAR_GAIN = 9.0
+"""Δχ² from which an effect helps. Derived: that of the answer set, 3 standard errors for one number."""
+
 _SHOWN_CANDIDATES = 8
 """Of a round on the terminal; chosen: two rounds fit a screen of 24 lines, and `diagnosis.json` has all."""
 
@@ -201,11 +205,20 @@ def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
     if questions.possible.size:
         place = int(questions.possible.argmax())
         text += (
-            f" The most significant of {len(set(questions.answers.effects))} candidates, "
+            f" The most significant of {_count_testable(questions)} candidates, "
             f"{questions.answers.effects[place]}, has {questions.possible[place]:.1f} σ; by chance the best of "
             f"them exceeds {questions.threshold:.1f} σ once in {1 / questions.level:.0f} campaigns."
         )
     return text
+
+
+def _count_testable(questions: MisfitTests) -> int:
+    """How many effects these trials could show: those that the ranking has as tested."""
+    return sum(
+        effect.name not in questions.answers.silent
+        and (questions.largest(effect)[1] or questions.best_z(effect.name)[0] >= questions.threshold)
+        for effect in questions.effects
+    )
 
 
 def _runner_up(finding: SelectionStep) -> str:
@@ -294,7 +307,7 @@ def _ranking(step: Round) -> list[str]:
                 ("* " if candidate.in_answer_set else "  ") + candidate.effect,
                 f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
                 f"{candidate.sigma:.1f}",
-                sizes_in_words(candidate.numbers) or "",
+                sizes(candidate),
                 candidate.reason or _status(candidate),
             )
         )
@@ -325,6 +338,26 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
     return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))
 
 
+def gain_in_words(before: Fit, after: Fit) -> str:
+    """Return what an added effect brought; the larger model holds the smaller: a loss means a fit that has not ended.
+
+    Parameters
+    ----------
+    before, after : fits without and with the effect.
+
+    Returns
+    -------
+    str
+    """
+    gain = 2 * (after.log_likelihood - before.log_likelihood)
+    if gain < 0:
+        return "the fit has not settled, so whether it helps is not known"
+    helps = f"Δχ² = {gain:.1f}"
+    if gain <= CLEAR_GAIN:
+        helps = f"it does not help ({helps}; a gain begins at {CLEAR_GAIN:g})"
+    return helps if after.converged else f"{helps}; the fit has not settled"
+
+
 def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
     """Return how an effect added by hand changed errors and numbers, as lines of aligned tables.
 
@@ -340,9 +373,8 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
     """
     from vinetrack.core.terminal import table as aligned
 
-    gain = 2 * (after.log_likelihood - before.log_likelihood)
     lines = [
-        f"{after.model.names[-1]} added to {' + '.join(before.model.names)}: Δχ² = {gain:.1f}",
+        f"{after.model.names[-1]} added to {' + '.join(before.model.names)}: {gain_in_words(before, after)}",
         "",
         "position error",
         *_ladder_table(table),
@@ -352,10 +384,9 @@ def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.Dat
     changed: dict[tuple[str, str], dict[str, str]] = {}
     for row in _rows(numbers):
         unit, factor = display_unit(row.unit)
-        digits = decimals(row.sigma * factor) if math.isfinite(row.sigma) else 3
         title = f"{row.symbol} ({row.vine})" if row.vine else row.symbol
         place = changed.setdefault((title, unit), {})
-        place["after" if row.added else "before"] = f"{row.value * factor:.{digits}f} ± {row.sigma * factor:.{digits}f}"
+        place["after" if row.added else "before"] = with_error(row.value * factor, row.sigma * factor)
     body = [(title, row.get("before", "–"), row.get("after", "–"), unit) for (title, unit), row in changed.items()]
     lines += aligned(body, ("", "before", "after", "unit"))
     return lines + [f"! {message}" for message in after.messages]

@@ -14,6 +14,7 @@ import numpy as np
 from vinetrack.core.tables import write_bytes, write_json
 from vinetrack.pipeline.pool import map_trials
 from vinetrack.results.folder_layout import Results, read_json, read_result
+from vinetrack.results.stored import read_diagnosis
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -148,6 +149,7 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
         Arguments of the drawing function by name of figure; figures without content are left out.
     """
     from vinetrack.figures.registry import CAMPAIGN_FIGURES
+    from vinetrack.figures.size_figures import PAYLOAD_LINE
     from vinetrack.narrative.law_text import METHOD_NAMES
     from vinetrack.pipeline.diagnosis_tables import read_diagnosed
 
@@ -161,14 +163,18 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
     compared = label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
     scaling, diagnosed = read_json(results.scaling), read_diagnosed(results, described)
-    payload = read_result(results.payload_model)
+    payload, line = read_result(results.payload_model), PAYLOAD_LINE
+    diagnosis = read_diagnosis(results)
+    if diagnosis is not None and diagnosis.refutes:
+        compared = compared.assign(model="refuted initial model: " + compared["model"])
+        line = f"refuted initial model, {PAYLOAD_LINE.partition(' and ')[2]}"
     inputs: dict[str, tuple[Any, ...]] = {
         "damping_law": (points, damping) if len(points) else (),
         "exponents": (damping,) if in_fit else (),
         "scaling": (scaling,) if scaling["isometric"] or scaling["thickness"] else (),
         "speed_scaling": (scaling,) if scaling["steady_speed"] else (),
         "efficiency": (scaling,) if scaling["efficiency"] else (),
-        "payload_speed": (read_result(results.conditions), payload) if len(payload) else (),
+        "payload_speed": (read_result(results.conditions), payload, "", line) if len(payload) else (),
         "overview": (described, moved) if moved else (),
         "model_comparison": (compared, with_after(trajectories, diagnosed)) if len(compared) else (),
         "model_residuals": (compared, trajectories) if len(compared) else (),

@@ -183,14 +183,17 @@ def _fitted(
     kinematics: dict[str, Kinematics],
     settings: RunSettings,
 ) -> tuple[Fit, Comparison]:
+    from vinetrack.diagnosis.candidates import candidates_of
     from vinetrack.diagnosis.compare import compare
-    from vinetrack.inference.fit import fit
+    from vinetrack.diagnosis.initial_fit import initial_fit
     from vinetrack.pipeline.tracks_stage import model_of
 
     model = model_of(experiment)
+    candidates = candidates_of(model, experiment.settings.candidates, model.user_effects)
     # A falling body has nothing else to find: its g tries the whole chain, from the recording to the fit.
-    fit_result = fit(model, pairs, free=("gravity.g",) if model.names == ("gravity",) else ())
-    return fit_result, compare(fit_result, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
+    free = ("gravity.g",) if model.names == ("gravity",) else ()
+    fit = initial_fit(model, pairs, candidates, free=free)
+    return fit, compare(fit, pairs, kinematics=kinematics, final_at_fraction=settings.final_at_fraction)
 
 
 def _checked(fit: Fit, damping: dict[str, Any]) -> tuple[pd.DataFrame, str]:

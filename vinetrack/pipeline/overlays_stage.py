@@ -333,8 +333,8 @@ def edges_of(trial: str, results: Results, track: pd.DataFrame) -> tuple[list[Ed
         known = predicted[["time_s", column]].dropna()
         if not name or known.empty:
             continue
-        # The model ends with its last prediction; before its first the vine rests where it begins.
-        position_m = np.interp(time_s, known["time_s"], known[column], right=math.nan)
+        # Before the first frame of the fit and after its last the model says nothing, and nothing is drawn.
+        position_m = np.interp(time_s, known["time_s"], known[column], left=math.nan, right=math.nan)
         off_mm = 1e3 * (position_m - measured_m)
         edges.append(Edge(name, BEFORE if column == "model_before_m" else AFTER, to_px(position_m), off_mm))
     return [*edges, *corrected], _release_s(trial, results, track)

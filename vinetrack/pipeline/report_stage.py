@@ -13,6 +13,7 @@ from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, r
 from vinetrack.pipeline.figures_stage import describe_conditions
 from vinetrack.pipeline.workflow import SHARED_FILES
 from vinetrack.results.folder_layout import Results, read_json, read_result
+from vinetrack.results.stored import read_diagnosis as stored_diagnosis
 from vinetrack.results.stored import read_fit
 
 if TYPE_CHECKING:
@@ -21,7 +22,16 @@ if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.pipeline.diagnosis_tables import DiagnosisTables
     from vinetrack.report.build import Clip, ReportContent, ReportFigure, ReportSection
+    from vinetrack.report.model_section import ModelResult
     from vinetrack.report.trials_section import TrackedRecording
+
+_WHOLLY = "It shows the initial model, which the diagnosis refutes."
+_PARTLY = "The dashed model is the initial one, which the diagnosis refutes."
+OF_INITIAL_MODEL = {
+    **dict.fromkeys(("model_residuals", "payload_speed", "missing_force"), _WHOLLY),
+    **dict.fromkeys(("model_comparison", "before_after"), _PARTLY),
+}
+"""What the caption of a figure adds where the model in it is refuted."""
 
 MOST_CURVE_ROWS = 6000
 """Rows of the curves of all trials as data to download; chosen: about 300 kB of the page."""
@@ -80,7 +90,6 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         If a stage has not run.
     """
     from vinetrack.report.build import ReportContent
-    from vinetrack.report.model_section import ModelResult
 
     results = Results(folder)
     trials = read_result(results.trials)
@@ -101,7 +110,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         recordings={name: _recording(results, name) for name in filmed},
         clips={name: f"overlays/{name}.mp4" for name in filmed if results.overlay(name).exists()},
         clip=_clip(results, diagnosed, trials),
-        model=ModelResult(read_fit(results), read_result(results.comparison), read_result(results.model_check)),
+        model=_model_result(results),
         diagnosis=read_diagnosis(results, experiment),
         sections=[_paper_section(results)] if experiment.settings.published else [],
     )
@@ -114,6 +123,13 @@ def _provenance(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str
     inputs += [experiment.folder / path for path in experiment.settings.effects]
     shared = [path for name in SHARED_FILES if (path := experiment.folder / name).exists()]
     return describe_run(experiment.folder, dict.fromkeys([*shared, *inputs]), dict(settings), experiment.settings.model)
+
+
+def _model_result(results: Results) -> ModelResult:
+    from vinetrack.report.model_section import ModelResult
+
+    compared, checked = read_result(results.comparison), read_result(results.model_check)
+    return ModelResult(read_fit(results), compared, checked, stored_diagnosis(results))
 
 
 def _paper_section(results: Results) -> ReportSection:
@@ -141,6 +157,9 @@ def _figure(results: Results, figure: RegisteredFigure, own_data: str = "") -> R
     data = (results.folder / figure.data).read_text(encoding="utf-8") if figure.data else own_data
     svg = _svg(results, figure).read_text(encoding="utf-8")
     caption, data_name = figure_caption(figure.name), figure.data or f"{figure.name}.csv"
+    diagnosis = stored_diagnosis(results)
+    if diagnosis is not None and diagnosis.refutes and figure.name in OF_INITIAL_MODEL:
+        caption = f"{caption} {OF_INITIAL_MODEL[figure.name]}"
     return ReportFigure(figure.name, figure.title, caption, svg, data_name, data)
 
 

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.numbers import number, with_error
 from vinetrack.core.units import display_unit
 from vinetrack.figures.style import rows
+from vinetrack.narrative.verdict_summary import listed, size_interval
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.result import Diagnosis
     from vinetrack.inference.fit_result import BetweenTrialSpread, Number
     from vinetrack.inference.fit_summary import FitSummary
 
@@ -31,6 +33,7 @@ class ModelResult:
     fit: FitSummary
     comparison: pd.DataFrame
     check: pd.DataFrame
+    diagnosis: Diagnosis | None = None
 
 
 def model_section(result: ModelResult | None) -> dict[str, Any] | None:
@@ -49,6 +52,8 @@ def model_section(result: ModelResult | None) -> dict[str, Any] | None:
     fit = result.fit
     return {
         "names": " + ".join(fit.names),
+        "final": _final(result.diagnosis),
+        "is_refuted": result.diagnosis is not None and result.diagnosis.refutes,
         "refused": fit.refused,
         "explained": _EXPLAINED,
         "verdict": verdict(result.comparison),
@@ -59,6 +64,27 @@ def model_section(result: ModelResult | None) -> dict[str, Any] | None:
         "warnings": list(fit.warnings),
         "conditions": [_condition(row) for row in rows(result.comparison)],
         "check": [_check(row) for row in rows(result.check)],
+    }
+
+
+def _final(diagnosis: Diagnosis | None) -> dict[str, Any] | None:
+    """The model that the diagnosis ended with; None where nothing was added."""
+    if diagnosis is None or not diagnosis.effects:
+        return None
+    text = ""
+    if diagnosis.ladder is not None and len(diagnosis.ladder):
+        last = diagnosis.ladder.iloc[-1]
+        inside, outside, floor = (
+            number(1e3 * float(last[key])) for key in ("rms_in_sample_m", "rms_left_out_m", "floor_m")
+        )
+        text = (
+            f"With {listed(diagnosis.effects)} the model is off by {inside} mm, and by {outside} mm on conditions left "
+            f"out of the fit; replicates scatter by {floor} mm (root mean square)."
+        )
+    return {
+        "names": " + ".join(diagnosis.final_model),
+        "verdict": text,
+        "numbers": [_number(entry) for entry in diagnosis.parameters],
     }
 
 
@@ -98,13 +124,12 @@ def _rms(values: pd.Series) -> float:
 
 def _number(entry: Number) -> dict[str, str]:
     unit, factor = display_unit(entry.unit)
-    known = math.isfinite(entry.low) and math.isfinite(entry.high)
     return {
         "symbol": entry.symbol,
         "vine": entry.vine,
         "parameter": entry.key,
         "value": with_error(factor * entry.value, factor * entry.sigma),
-        "interval": f"{number(factor * entry.low)} to {number(factor * entry.high)}" if known else "open",
+        "interval": size_interval(entry).removeprefix("95 %: ").removesuffix(f" {unit}"),
         "unit": unit,
     }
 

@@ -1,0 +1,55 @@
+"""What `vinetrack add` says of an effect that helps, one that does not, and one whose fit has not settled."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from vinetrack.inference.fit_result import Number
+from vinetrack.narrative.verdict_summary import NONE_SEEN, size, size_interval, sizes
+from vinetrack.narrative.verdict_text import gain_in_words
+
+
+def fit(log_likelihood: float, converged: bool = True) -> Any:
+    return SimpleNamespace(log_likelihood=log_likelihood, converged=converged)
+
+
+@pytest.mark.parametrize(
+    ("after", "words"),
+    [
+        (fit(110.0), "Δχ² = 20.0"),
+        (fit(101.0), "it does not help (Δχ² = 2.0; a gain begins at 9)"),
+        (fit(47.0), "the fit has not settled, so whether it helps is not known"),
+        (fit(110.0, converged=False), "Δχ² = 20.0; the fit has not settled"),
+    ],
+)
+def test_a_gain_is_said_as_what_it_is(after: Any, words: str) -> None:
+    assert gain_in_words(fit(100.0), after) == words
+
+
+def number(value: float, sigma: float, **more: float) -> Number:
+    return Number(
+        "tail_stretch.compliance", "", "1/E", "1/Pa", value, sigma, value - sigma, value + sigma, 9.0, "x", **more
+    )
+
+
+def test_a_size_at_its_bound_is_said_to_be_there() -> None:
+    assert size(number(-3.464e-12, float("nan"), bound=0.0)) == "1/E = 0 1/kPa (at its bound)"
+
+
+def test_a_negative_size_of_what_cannot_be_negative_is_said_to_be_one() -> None:
+    assert size(number(-2e-3, 1e-4, lower=0.0)).endswith("(negative, which it cannot be)")
+
+
+def test_a_bound_that_an_interval_ends_at_is_named() -> None:
+    assert size_interval(number(1.0, 0.5, upper=1.5)).endswith("(its upper bound)")
+    assert size_interval(number(1.0, 0.5, upper=2.0)).endswith("1/kPa")
+
+
+def test_a_size_less_than_two_errors_from_none_is_none_seen() -> None:
+    from vinetrack.diagnosis.result import Candidate
+
+    row = Candidate("tail_stretch", "physical", "refitted", 1.0, NONE_SEEN - 0.1, (number(1.0, 0.6),))
+    assert sizes(row).endswith(": none seen")
