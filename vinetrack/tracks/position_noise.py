@@ -24,8 +24,8 @@ REST_MARGIN = 3  # the corner between rest and motion is found to within about t
 By reasoning: at half, motion enters the noise; at twice, three frames are lost."""
 
 LONG_TRACK = 90
-"""Moving points from which stretches are twice as long. Chosen: six stretches of 12 determine σ but not ρ; half or
-twice moves which tracks get the longer stretches."""
+"""Moving points from which stretches are twice as long. Chosen: seven stretches of 12 determine σ; from there on longer
+ones, which show slow correlation, gain more than further ones. Half or twice moves which tracks get them."""
 
 REST_STRETCH, REST_ORDER = 32, 1
 """Points in a stretch at rest and degree of its polynomial. Chosen: a line takes up drift, and 32 points show
