@@ -6,7 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from vinetrack.setup_page.clip_names import guess_columns, list_pictures, list_recordings, trial_names, units_of
+from vinetrack.setup_page.clip_names import (
+    guess_columns,
+    list_pictures,
+    list_recordings,
+    list_tables,
+    trial_names,
+    units_of,
+)
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -61,3 +68,9 @@ def test_units_to_choose_measure_the_same_quantity() -> None:
     assert {"psi", "bar"} <= set(units_of("pressure_kPa"))
     assert "mm" not in units_of("pressure_kPa")
     assert units_of("trial") == []
+
+
+def test_tables_are_offered_as_pressure_traces(tmp_path: Path) -> None:
+    touch(tmp_path, "trials.csv", "corrections.csv", "p 10.csv", "p 2.csv", "traces/a.csv", "results/provenance.json")
+    touch(tmp_path, "results/trials.csv")
+    assert list_tables(tmp_path) == ["p 2.csv", "p 10.csv", "traces/a.csv"]

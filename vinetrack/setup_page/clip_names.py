@@ -92,6 +92,23 @@ def list_pictures(folder: Path) -> list[str]:
     return sorted((path.relative_to(folder).as_posix() for path in there), key=_natural)
 
 
+def list_tables(folder: Path) -> list[str]:
+    """Tables that may be pressure traces, as paths relative to the folder.
+
+    Parameters
+    ----------
+    folder : of the experiment.
+
+    Returns
+    -------
+    paths with slashes : CSV files in the folder and in those directly in it, but for sheet and corrections.
+    """
+    folders = [folder, *(path for path in _entries(folder) if path.is_dir() and not (path / PROVENANCE).exists())]
+    tables = [path for place in folders for path in _entries(place) if path.suffix.lower() == ".csv"]
+    names = (path.relative_to(folder).as_posix() for path in tables)
+    return sorted((name for name in names if name not in ("trials.csv", "corrections.csv")), key=_natural)
+
+
 def trial_names(recordings: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
     """A name for the trial of each recording: that of its file, with its folder's where two are called alike.
 

@@ -15,7 +15,7 @@ from vinetrack.core.yaml_edit import with_value
 from vinetrack.experiment.folder import SETTINGS, check_experiment
 from vinetrack.experiment.schema import COLUMNS, SHARED
 from vinetrack.experiment.sheet import NEEDED
-from vinetrack.setup_page.clip_names import list_pictures, list_recordings, units_of
+from vinetrack.setup_page.clip_names import list_pictures, list_recordings, list_tables, units_of
 from vinetrack.setup_page.draft_files import Draft, drafted, open_draft, same_cells
 from vinetrack.setup_page.settings_draft import shared_values, with_shared
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft
@@ -63,6 +63,7 @@ def page_state(folder: Path) -> dict[str, Any]:
         },
         "recordings": list_recordings(folder),
         "pictures": list_pictures(folder),
+        "traces": list_tables(folder),
     }
 
 

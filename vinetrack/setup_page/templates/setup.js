@@ -1,5 +1,5 @@
 // The page begins, listens, checks and saves.
-import {$, ask, content, el, listeners, state} from "./state.js";
+import {$, ask, content, el, listeners, settle, state} from "./state.js";
 import {drawOver, drawProblems, readCalibration, showRecording} from "./picture.js";
 import {drawTable, markProblems} from "./table.js";
 import {forget, track} from "./motion.js";
@@ -33,6 +33,7 @@ function showState(notes = []) {
 let turn = 0;
 async function check(thorough = false) {
   const mine = ++turn;
+  settle();
   if (thorough) $("status").textContent = "Opening every recording …";
   try {
     const found = await ask("api/check", content({thorough}));
@@ -42,7 +43,9 @@ async function check(thorough = false) {
     $("settings-text").textContent = found.settings_text;
     $("corrections-text").textContent = found.corrections_text;
     $("corrections-shown").hidden = !found.corrections_text;
-    showWhole(found.understood.length ? [{severity: "note", text: found.understood.join(" · ")}] : []);
+    showWhole();
+    $("understood").hidden = !found.understood.length;
+    $("understood").textContent = found.understood.join("\n");
     showState(found.notes);
   } catch (error) {
     if (mine !== turn) return;
@@ -79,7 +82,7 @@ async function begin() {
   document.title = `${state.name} – vinetrack set-up`;
   readCalibration();
   drawTable(choose);
-  listeners.push(check);
+  listeners.push(() => check());
   await Promise.all([check(), showRecording()]);
   document.body.dataset.ready = "yes";
 }

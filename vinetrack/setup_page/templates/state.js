@@ -1,7 +1,7 @@
 // What the page knows, how it asks the server, and how it makes elements.
 export const state = {
   known: {}, units: {}, offered: [], sheet: {columns: [], rows: []}, kept: [], shared: {}, calibration: null, axis: null, corrections: {},
-  recordings: [], pictures: [], stamp: "", chosen: 0, problems: [], dirty: false, clip: null,
+  recordings: [], pictures: [], traces: [], stamp: "", chosen: 0, problems: [], dirty: false, clip: null,
 };
 
 export const $ = (id) => document.getElementById(id);
@@ -86,6 +86,9 @@ export function changed() {
   clearTimeout(waiting);
   waiting = setTimeout(() => listeners.forEach((listener) => listener()), 350);
 }
+
+// What is about to be checked anyway need not be checked again.
+export const settle = () => clearTimeout(waiting);
 
 export const decimals = (value, digits) => (value === null || value === undefined ? "–" : Number(value.toPrecision(digits)).toString());
 export const numberOf = (text) => { const value = parseFloat(String(text).replace(",", ".")); return Number.isFinite(value) ? value : null; };

@@ -7,6 +7,7 @@ export function drawTable(choose) {
   table.replaceChildren(head(columns), el("tbody", {}, sharedRow(columns), ...state.sheet.rows.map((row, i) => trialRow(row, i, columns, choose))));
   table.onpaste = paste;
   table.onkeydown = move;
+  $("traces").replaceChildren(...state.traces.map((name) => el("option", {value: name})));
   drawAdder(columns);
   markProblems();
 }
@@ -84,7 +85,7 @@ function cell(column, row, value, placeholder, write) {
   const heard = (event) => { write(event.target.value.trim()); changed(); };
   const field = known?.kind === "yes_no"
     ? el("select", {...given, onchange: heard}, ...["", "yes", "no"].map((word) => el("option", {value: word, selected: word === value}, word)))
-    : el("input", {...given, type: "text", value, placeholder, spellcheck: "false", autocomplete: "off", inputmode: known?.kind === "number" ? "decimal" : "text", oninput: heard});
+    : el("input", {...given, type: "text", value, placeholder, spellcheck: "false", autocomplete: "off", list: column === "pressure_trace" ? "traces" : null, inputmode: known?.kind === "number" ? "decimal" : "text", oninput: heard});
   return el("td", {class: known?.kind === "number" ? "" : "text"}, field);
 }
 
