@@ -255,6 +255,8 @@ def _first_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
         raise ValueError("nothing moves along the axis")
     where = np.flatnonzero(run & strong)
     passed = max(int(where[0]), after_jump(path)), int(where[-1]) + 1
+    if passed[0] >= passed[1]:
+        raise ValueError("what changes along the axis does so all at once: nothing grows")
     return _run_up(np.clip(path, *passed)), passed
 
 
