@@ -1,16 +1,17 @@
 """Recordings of a real everting tube that sticks and slips: where Eq. (2) fails on them, and what mends how much.
 
-    VINETRACK_REAL_DATA=FOLDER python benchmarks/everting_tube.py [--recordings FOLDER] [--keep FOLDER]
+    VINETRACK_REAL_DATA=FOLDER python benchmarks/everting_tube.py [--recordings FOLDER ...] [--keep FOLDER]
                                                                   [--picture FILE.png] [--no-diagnosis]
+                                                                  [--models NAME ...]
 
-The recordings (blake5634/evtMod on GitHub, `dataAndyMay24`; no licence, so nothing of them is kept here) are four
-trials of tubes of low-density polyethylene, 2 mil, about an inch wide, that grew to 0.56 m off a reel with a brake, two
-with little friction and two with much. They give length by the reel's encoder, gauge pressure and flow some fifty times
-a second. Their authors fit a pressure to start (113.1 kPa absolute), a lower one to stop (108.0 kPa), drag that rises
-with the length, and the supply.
+The recordings (blake5634/evtMod on GitHub, `dataAndyMay24`; no licence, so nothing of them is kept here) are six
+trials, two each of three tubes of low-density polyethylene, 2 mil, about an inch wide, that grew to 0.56 m off a reel
+with a brake, one tube with little friction and two with much. They give length by the reel's encoder, gauge pressure
+and flow some fifty times a second. Their authors fit a pressure to start (113.1 kPa absolute), a lower one to stop
+(108.0 kPa), drag that rises with the length, and the supply.
 
 Printed are: what can be read off the recordings without any equation of motion; the errors of named models, each fitted
-to every tube by itself, on these trials and on a trial left out (of the one tube that has two); their numbers in SI;
+to every tube by itself, on these trials and on each trial predicted from the other of its tube; their numbers in SI;
 thresholds beside the authors'; and what `diagnose` says of all trials, and of the tube that sticks alone.
 Absolute pressures take the air at 101.325 kPa: the recordings do not say what it was. No constant of the package was
 tuned on these recordings; the starts of the fits (`tube.models`) were chosen looking at them.
@@ -74,6 +75,7 @@ def errors_table(outcomes: Sequence[Outcome]) -> pd.DataFrame:
             "rms_in_sample_mm": one.rms_m * 1e3,
             "falls_by": first.rms_m / one.rms_m,
             "rms_left_out_mm": one.left_out_m * 1e3,
+            **{f"left_out_tube_{tube}": error_m * 1e3 for tube, error_m in one.left_out_by_tube.items()},
             **{trial.name: one.rms_of(trial.name) * 1e3 for trial in one.trials},
         }
         for one in outcomes
@@ -131,21 +133,23 @@ def diagnose(what: str, experiment: Experiment) -> None:
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--recordings", type=Path, help="folder of the CSV files")
+    parser.add_argument("--recordings", type=Path, nargs="+", help="folders of the CSV files")
+    parser.add_argument("--models", nargs="+", choices=list(models()), default=list(models()), metavar="NAME")
     parser.add_argument("--keep", type=Path, help="where the experiment folder is written and stays")
     parser.add_argument("--picture", type=Path, help="PNG of measured and modelled length")
     parser.add_argument("--no-diagnosis", action="store_true")
     given = parser.parse_args()
-    folder = given.recordings or Path(os.environ.get("VINETRACK_REAL_DATA", "")) / "everting_tube"
+    real = Path(os.environ.get("VINETRACK_REAL_DATA", ""))
+    folders = given.recordings or [real / "everting_tube", real / "everting_tube_repeats"]
     try:
-        recordings = read_recordings(folder)
+        recordings = [one for folder in folders for one in read_recordings(folder)]
     except FileNotFoundError as error:
         raise SystemExit(f"{error}: set VINETRACK_REAL_DATA, or give --recordings.") from error
     readings(recordings)
     with tempfile.TemporaryDirectory() as scratch:
         experiment = vt.read_experiment(write_folder(recordings, given.keep or Path(scratch) / "tube"))
         outcomes = []
-        for name, model in models().items():
+        for name, model in ((name, models()[name]) for name in given.models):
             began = time.process_time()
             outcomes.append(fit_tubes(name, model, experiment, recordings))
             print(f"{name}: fitted in {time.process_time() - began:.0f} s of processor time", flush=True)

@@ -29,12 +29,13 @@ FRICTION_N_M, INERTIA_KG = 2.5, 0.2
 
 @dataclass(frozen=True)
 class Outcome:
-    """One model fitted to every tube by itself: fits by tube, predictions of all trials, error on left-out ones, m."""
+    """One model fitted to every tube by itself: fits by tube, predictions of all trials, errors on left-out ones, m."""
 
     name: str
     fits: Mapping[str, Fit]
     trials: tuple[TrialFit, ...]
     left_out_m: float
+    left_out_by_tube: Mapping[str, float]
 
     @property
     def rms_m(self) -> float:
@@ -93,14 +94,17 @@ def fit_tubes(name: str, model: Model, experiment: Experiment, recordings: Seque
     tube_of = {one.name: one.tube for one in recordings}
     fits: dict[str, Fit] = {}
     trials: list[TrialFit] = []
-    left_m: list[float] = []
+    left_m: dict[str, float] = {}
     for tube in dict.fromkeys(one.tube for one in recordings):
         members = [pair for pair in pairs if tube_of[pair[0].name] == tube]
         fit, predicted = _best(name, model, members, recordings)
         fits[tube] = fit
         trials += predicted
-        left_m += [float(np.mean(one.residual_m**2)) for one in left_out(fit).trials] if len(members) > 1 else []
-    return Outcome(name, fits, tuple(trials), math.sqrt(float(np.mean(left_m))) if left_m else math.nan)
+        if len(members) > 1:
+            squares = [float(np.mean(one.residual_m**2)) for one in left_out(fit).trials]
+            left_m[tube] = math.sqrt(float(np.mean(squares))) if squares else math.nan
+    every = math.sqrt(float(np.mean(np.square(list(left_m.values()))))) if left_m else math.nan
+    return Outcome(name, fits, tuple(trials), every, left_m)
 
 
 def _best(
