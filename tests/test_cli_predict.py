@@ -172,7 +172,7 @@ def test_a_vine_that_never_gets_there_says_never() -> None:
 
 def test_python_predicts_what_the_command_does() -> None:
     trial = vt.planned_trial({"diameter_mm": "25", "thickness_um": "100", "length_mm": "400", "pressure_kPa": "62"})
-    sight = vt.predict_vine(vt.predictive_inputs(trial.trials[0]), samples=60)
+    prediction = vt.predict_vine(vt.predictive_inputs(trial.trials[0]), samples=60)
     shown = row(run("predict", *FAST, *FEW).output, "speed of the leading edge")[2]
-    assert float(shown) == pytest.approx(sight.final.median, rel=0.01)
-    assert math.isnan(sight["hoop stress PD/2t"].y_over_L)
+    assert float(shown) == pytest.approx(prediction.final.median, rel=0.01)
+    assert math.isnan(prediction["hoop stress PD/2t"].y_over_L)

@@ -42,7 +42,7 @@ def test_the_python_on_the_page_runs() -> None:
     assert code is not None
     known: dict[str, object] = {}
     exec(code[1].replace("vt.predictive_inputs(trial))  ", "vt.predictive_inputs(trial), samples=50)  "), known)
-    assert known["sight"].table["unit"].tolist()[0] == "m/s"  # type: ignore[attr-defined]
+    assert known["prediction"].table["unit"].tolist()[0] == "m/s"  # type: ignore[attr-defined]
 
 
 def test_a_page_is_rewritten_with_its_output_and_nothing_else() -> None:

@@ -23,7 +23,7 @@ SAFE = {
 }
 
 
-def sight(said: StatedValues | None = None, tail_slack: str = "taut", **values: object) -> VinePrediction:
+def prediction(said: StatedValues | None = None, tail_slack: str = "taut", **values: object) -> VinePrediction:
     from dataclasses import replace
 
     trial = planned_trial({**SAFE, **{name: str(value) for name, value in values.items()}}).trials[0]
@@ -31,42 +31,44 @@ def sight(said: StatedValues | None = None, tail_slack: str = "taut", **values: 
 
 
 def test_a_sound_vine_has_no_hazard() -> None:
-    assert design_checks(sight()) == ()
+    assert design_checks(prediction()) == ()
 
 
 @pytest.mark.parametrize(("pressure_kPa", "words"), [(129, "about to burst"), (131, "would burst")])
 def test_a_wall_near_its_burst_stress_and_beyond_it(pressure_kPa: float, words: str) -> None:
     # PD/2t = 7.8 MPa at 2 × 150 µm × 7.8 MPa/18 mm = 130 kPa.
-    found = design_checks(sight(pressure_kPa=pressure_kPa))
+    found = design_checks(prediction(pressure_kPa=pressure_kPa))
     assert any(words in one and "130 kPa" in one for one in found)
 
 
 def test_a_pressure_below_the_yield_pressure() -> None:
-    found = design_checks(sight(pressure_kPa=2.5))
+    found = design_checks(prediction(pressure_kPa=2.5))
     assert any("2.5 kPa lies below the yield pressure" in one and "raise the pressure" in one for one in found)
 
 
 def test_a_pressure_that_may_lie_below_the_yield_pressure() -> None:
-    found = design_checks(sight(pressure_kPa=3.2, yield_pressure_sigma_kPa=0.2))
+    found = design_checks(prediction(pressure_kPa=3.2, yield_pressure_sigma_kPa=0.2))
     assert any("of the draws the vine does not grow to its end" in one for one in found)
 
 
 def test_a_tail_that_would_have_to_push() -> None:
-    found = design_checks(sight(diameter_mm=24, thickness_um=200, payload_g=35.6, pressure_kPa=14, growth_angle_deg=0))
+    found = design_checks(
+        prediction(diameter_mm=24, thickness_um=200, payload_g=35.6, pressure_kPa=14, growth_angle_deg=0)
+    )
     assert any("would have to push in every draw" in one for one in found)
 
 
 def test_a_tail_that_seldom_pushes_is_told_how_low_its_tension_comes() -> None:
     """A median above 0 alone would deny what the sentence says."""
     vine = {"diameter_mm": 24, "thickness_um": 200, "payload_g": 35.6, "pressure_kPa": 28, "growth_angle_deg": 60}
-    found = sight(StatedValues(B=6.44, B_error=0.1), **vine)
+    found = prediction(StatedValues(B=6.44, B_error=0.1), **vine)
     assert 0.05 < found.slack < 0.5
     (sentence,) = (one for one in design_checks(found) if "would have to push" in one)
     assert "in one draw of twenty below -" in sentence
 
 
 def test_a_tail_that_may_go_slack_does() -> None:
-    loose = sight(
+    loose = prediction(
         tail_slack="free", diameter_mm=24, thickness_um=200, payload_g=35.6, pressure_kPa=14, growth_angle_deg=0
     )
     found = design_checks(loose)
@@ -79,18 +81,18 @@ def test_a_tail_that_may_go_slack_does() -> None:
 
 def test_a_reservoir_that_sags() -> None:
     # 60 cm³ of vine at y/L = 0.95 in 1 L: 125.3 kPa/1.060 is 7.1 kPa less, 30 % of 24 kPa; γ = 1.4 makes 41 %.
-    found = design_checks(sight(chamber_l=1))
+    found = design_checks(prediction(chamber_l=1))
     assert any("reservoir of 1 L loses 30% (slow) to 41% (fast)" in one for one in found)
 
 
 def test_drag_above_a_twentieth_of_the_drive() -> None:
     # ½ρ ẏ² is 5 % of 60 kPa at 71 m/s; without damping ẏ = √(F/λ ln 20) = 89 m/s, F = 7.3 N, λ = 2.7 g/m.
-    found = design_checks(sight(StatedValues(B=1e-6, n=0.37), thickness_um=40, pressure_kPa=60, length_mm=290))
+    found = design_checks(prediction(StatedValues(B=1e-6, n=0.37), thickness_um=40, pressure_kPa=60, length_mm=290))
     assert any("air drag" in one and "above 5%" in one for one in found)
 
 
 def test_what_an_effect_left_out_would_do_is_what_it_does_when_put_in() -> None:
-    inputs = sight().inputs
+    inputs = prediction().inputs
     drag = next(one for one in neglected(inputs, 0.95) if one.effect == "air_drag")
     model = make_model([*inputs.model.names, "air_drag"]).with_values(inputs.model.values)
     found = simulate(model, inputs.trial, np.linspace(0, 2.0, 20_001))
@@ -103,7 +105,7 @@ def test_effects_in_the_model_and_those_whose_columns_are_blank_are_not_among_th
     from vinetrack.planning.predictive_inputs import read_sizes
 
     said = StatedValues(effects=("air_drag",), sizes=read_sizes("air_drag=1")[1])
-    names = {one.effect for one in neglected(sight(said).inputs, 0.95)}
+    names = {one.effect for one in neglected(prediction(said).inputs, 0.95)}
     assert "air_drag" not in names
     assert "inlet_loss" not in names  # no inlet in the sheet
     assert "payload_drag" not in names  # no payload
@@ -112,5 +114,5 @@ def test_effects_in_the_model_and_those_whose_columns_are_blank_are_not_among_th
 
 def test_wall_stretch_follows_from_the_wall() -> None:
     # (1 − ν/4) D/(2Et) = 0.875 × 18 mm/(2 × 25 MPa × 150 µm) = 2.1e-6 1/Pa.
-    trial = sight().inputs.trial
+    trial = prediction().inputs.trial
     assert typical_sizes("wall_stretch", trial)["wall_stretch.kappa"] == pytest.approx(2.1e-6)

@@ -30,7 +30,7 @@ def room(pressure_kPa: float = 62, **values: object) -> Room:
 
 def test_the_papers_fast_vine_is_the_fastest_of_its_setup() -> None:
     """25 mm and 40 cm were the largest the setup held; 62 kPa is just under burst for 100 µm."""
-    best = fastest(room(), EXACT, samples=50)[0].sight.inputs.trial
+    best = fastest(room(), EXACT, samples=50)[0].prediction.inputs.trial
     assert (best.diameter_m, best.length_m, best.pressure_Pa) == pytest.approx((0.025, 0.4, 62e3), rel=1e-3)
 
 
@@ -42,7 +42,7 @@ def test_no_vine_of_a_fine_grid_is_faster() -> None:
         for D in np.linspace(10e-3, 60e-3, 41)
         for L in np.linspace(0.1, 0.3, 9)
     ]
-    assert choice.sight.final.median > 0.995 * final_speeds(grid, 0.95).max()
+    assert choice.prediction.final.median > 0.995 * final_speeds(grid, 0.95).max()
 
 
 def test_at_the_burst_stress_acceleration_is_the_same_for_every_film() -> None:
@@ -58,7 +58,7 @@ def test_at_the_burst_stress_acceleration_is_the_same_for_every_film() -> None:
         for D, film in ((10e-3, 50e-6), (20e-3, 200e-6))
     ]
     expected = 0.5 * math.sqrt(4 * math.log(5) * 0.5 * 7.8e6 / (2 * 1200 * 2))  # ẋ² = 4F/λ ln 5, F/λ = σ/(4ρ)
-    speeds = [sight.final.median for sight in sights]
+    speeds = [prediction.final.median for prediction in sights]
     assert speeds[0] == pytest.approx(speeds[1], rel=0.01)
     assert speeds[1] == pytest.approx(expected, rel=0.01)
 
@@ -81,5 +81,5 @@ def test_odds_add_up_and_a_film_that_is_slower_in_every_draw_has_none() -> None:
 
 def test_with_a_payload_speed_is_that_of_the_payload() -> None:
     (choice,) = fastest(room(payload_g=10), EXACT, samples=50)
-    assert choice.sight.final.name == "ejection speed of the payload"
-    assert choice.sight.final.y_over_L == 1.0
+    assert choice.prediction.final.name == "ejection speed of the payload"
+    assert choice.prediction.final.y_over_L == 1.0

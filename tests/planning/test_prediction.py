@@ -67,44 +67,44 @@ def test_without_damping_a_bare_vine_has_the_speed_that_the_balance_of_momentum_
     one = trial(yield_pressure_kPa=2, growth_angle_deg=90)
     film = 1200 * math.pi * 25e-3 * 100e-6
     force = 0.5 * 60e3 * math.pi * 25e-3**2 / 4
-    sight = predict_vine(certain(one, 1e-9), samples=2, at_fraction=0.8)
-    assert sight[TAIL].median == pytest.approx(math.sqrt(4 * force / film * math.log(5)), rel=2e-3)
-    assert sight[EDGE].median == pytest.approx(sight[TAIL].median / 2)
-    assert sight[TENSION].median == pytest.approx(force, rel=1e-6)
+    prediction = predict_vine(certain(one, 1e-9), samples=2, at_fraction=0.8)
+    assert prediction[TAIL].median == pytest.approx(math.sqrt(4 * force / film * math.log(5)), rel=2e-3)
+    assert prediction[EDGE].median == pytest.approx(prediction[TAIL].median / 2)
+    assert prediction[TENSION].median == pytest.approx(force, rel=1e-6)
 
 
 def test_a_payload_without_damping_takes_all_the_work_of_the_gas() -> None:
     """Film of a thousandth of the payload's mass: ½ m v² = F·2L, F = ½(P − P_y)A on the tail, which runs 2L."""
     one = trial(yield_pressure_kPa=2, growth_angle_deg=90, payload_g=500, thickness_um=5, film_density_kg_m3=100)
     force = 0.5 * 60e3 * math.pi * 25e-3**2 / 4
-    sight = predict_vine(certain(one, 1e-9), samples=2)
-    assert sight[EJECTION].median == pytest.approx(math.sqrt(2 * force * 2 * 0.4 / 0.5), rel=2e-3)
-    assert sight[EJECTION].y_over_L == 1.0
-    assert sight.final == sight[EJECTION]
+    prediction = predict_vine(certain(one, 1e-9), samples=2)
+    assert prediction[EJECTION].median == pytest.approx(math.sqrt(2 * force * 2 * 0.4 / 0.5), rel=2e-3)
+    assert prediction[EJECTION].y_over_L == 1.0
+    assert prediction.final == prediction[EJECTION]
 
 
 def test_time_and_speed_are_those_of_another_integrator() -> None:
     one = trial(diameter_mm=24, thickness_um=200, length_mm=280, pressure_kPa=28, yield_pressure_kPa=3, payload_g=35.6)
-    sight = predict_vine(certain(one, 6.44), samples=2)
+    prediction = predict_vine(certain(one, 6.44), samples=2)
     times = np.linspace(0, 0.3, 30_001)
     truth = grown_position(one, times, 6.44, 0.37)
     there = np.interp(0.95 * 0.28, truth[np.isfinite(truth)], times[np.isfinite(truth)])
-    assert sight[TIME].median == pytest.approx(there, rel=1e-4)
+    assert prediction[TIME].median == pytest.approx(there, rel=1e-4)
     near = np.abs(times - there) < 1e-3
-    assert sight[EDGE].median == pytest.approx(np.polyfit(times[near], truth[near], 1)[0], rel=1e-3)
+    assert prediction[EDGE].median == pytest.approx(np.polyfit(times[near], truth[near], 1)[0], rel=1e-3)
 
 
 def test_the_tension_is_what_the_tip_leaves_of_the_drive() -> None:
     """T₁ = ½(P − P_y)A − ½Bẋⁿ all along: 35.6 g pull the tail slack at 14 kPa, in the equation."""
     one = trial(diameter_mm=24, thickness_um=200, length_mm=280, pressure_kPa=14, yield_pressure_kPa=3, payload_g=35.6)
-    sight = predict_vine(certain(one, 6.44), samples=2)
-    curve = sight.curve
+    prediction = predict_vine(certain(one, 6.44), samples=2)
+    curve = prediction.curve
     force = 0.5 * 11e3 * math.pi * 24e-3**2 / 4
     expected = force - 0.5 * 6.44 * curve["tail_velocity_m_s"] ** 0.37
     assert curve["tension_N"].to_numpy()[5:] == pytest.approx(expected.to_numpy()[5:], abs=0.01)
     assert curve["tension_N"].iloc[0] == pytest.approx(force)
-    assert sight.slack == 1.0
-    assert sight[LEAST_TENSION].median == pytest.approx(curve["tension_N"].min(), abs=0.01)
+    assert prediction.slack == 1.0
+    assert prediction[LEAST_TENSION].median == pytest.approx(curve["tension_N"].min(), abs=0.01)
 
 
 def test_the_steady_speed_is_that_of_the_balance_of_forces() -> None:
@@ -116,32 +116,32 @@ def test_the_steady_speed_is_that_of_the_balance_of_forces() -> None:
 def test_bands_are_those_of_the_one_thing_that_is_uncertain() -> None:
     """Speed falls as the yield pressure rises: its quantiles are the speeds at the quantiles of that."""
     inputs = predictive_inputs(planned_trial(FAST).trials[0], StatedValues(B=3.3, n=0.37, spreads=(0.0, 0.0)))
-    sight = predict_vine(inputs, samples=1500)
+    prediction = predict_vine(inputs, samples=1500)
     drawn = np.quantile(inputs.draw(1500, 1)[YIELD], BAND, method="inverted_cdf")
     speeds = [
         predict_vine(certain(trial(yield_pressure_kPa=P_y / 1e3), 3.3), samples=1).quantities[0].median for P_y in drawn
     ]
-    assert [sight[EDGE].high, sight[EDGE].median, sight[EDGE].low] == pytest.approx(speeds, rel=2e-3)
-    (share,) = sight.shares
-    assert (share.low, share.high) == pytest.approx((sight[EDGE].low, sight[EDGE].high), rel=0.03)
+    assert [prediction[EDGE].high, prediction[EDGE].median, prediction[EDGE].low] == pytest.approx(speeds, rel=2e-3)
+    (share,) = prediction.shares
+    assert (share.low, share.high) == pytest.approx((prediction[EDGE].low, prediction[EDGE].high), rel=0.03)
 
 
 def test_draws_that_never_get_there_are_counted_as_standing_still() -> None:
     weak = planned_trial({**FAST, "pressure_kPa": "3.2", "growth_angle_deg": "180"}).trials[0]
-    sight = predict_vine(predictive_inputs(weak), samples=200)
-    assert 0.2 < sight.arrives < 0.8
-    assert sight[EDGE].low == 0
-    assert math.isinf(sight[TIME].high)
+    prediction = predict_vine(predictive_inputs(weak), samples=200)
+    assert 0.2 < prediction.arrives < 0.8
+    assert prediction[EDGE].low == 0
+    assert math.isinf(prediction[TIME].high)
 
 
 def test_a_quantile_of_time_along_the_growth_is_one_of_position_in_time() -> None:
     inputs = predictive_inputs(planned_trial(FAST).trials[0])
-    sight = predict_vine(inputs, samples=300)
-    runs = run(inputs, sight.curve["lead_position_m"].to_numpy(), 300, 1)
-    when = float(sight.curve["time_high_90_s"].iloc[60])
+    prediction = predict_vine(inputs, samples=300)
+    runs = run(inputs, prediction.curve["lead_position_m"].to_numpy(), 300, 1)
+    when = float(prediction.curve["time_high_90_s"].iloc[60])
     positions = [float(np.interp(when, times, runs.places_m)) for times in runs.time_s]
     assert np.quantile(positions, 0.05, method="inverted_cdf") == pytest.approx(
-        float(sight.curve["lead_position_m"].iloc[60]), rel=0.01
+        float(prediction.curve["lead_position_m"].iloc[60]), rel=0.01
     )
 
 

@@ -199,10 +199,10 @@ def _check(room: Room, films: str, diameter: str) -> None:
 
 def _refuse_standstill(room: Room, choices: Sequence[Choice]) -> None:
     """There is no fastest of vines that do not move, at the medians of the predictive inputs."""
-    if choices[0].sight.final.median > 0:
+    if choices[0].prediction.final.median > 0:
         return
-    highest_Pa = max(choice.sight.inputs.trial.pressure_Pa for choice in choices)
-    yield_kPa = choices[0].sight.inputs.trial.yield_pressure_Pa / 1e3
+    highest_Pa = max(choice.prediction.inputs.trial.pressure_Pa for choice in choices)
+    yield_kPa = choices[0].prediction.inputs.trial.yield_pressure_Pa / 1e3
     message = f"moves none of these vines to its end, against a yield pressure of {yield_kPa:.3g} kPa"
     remedy = "raise it, or give a lower yield pressure as --yield-pressure-kPa"
     if highest_Pa < 0.995 * room.pressure_Pa:
@@ -216,7 +216,7 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     from vinetrack.planning.design_checks import design_checks
     from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
-    best = choices[0].sight
+    best = choices[0].prediction
     yield (
         f"fastest by {best.final.name}"
         + ("" if best.final.y_over_L == 1 else f" at y/L = {best.final.y_over_L:g}")
@@ -226,7 +226,7 @@ def _vine_lines(room: Room, choices: Sequence[Choice]) -> Iterator[str]:
     yield ""
     rows = []
     for choice in choices:
-        trial, final = choice.sight.inputs.trial, choice.sight.final
+        trial, final = choice.prediction.inputs.trial, choice.prediction.final
         rows.append(
             (
                 f"{1e6 * trial.thickness_m:g}",
@@ -266,13 +266,13 @@ def _vine_picture(choices: Sequence[Choice]) -> Figure:
             thickness_um=1e6 * choice.thickness_m,
             diameters_mm=1e3 * choice.others[:, 0],
             speeds_m_s=choice.others[:, 1],
-            best=(1e3 * choice.sight.inputs.trial.diameter_m, choice.sight.final.median),
-            band=(choice.sight.final.low, choice.sight.final.high),
+            best=(1e3 * choice.prediction.inputs.trial.diameter_m, choice.prediction.final.median),
+            band=(choice.prediction.final.low, choice.prediction.final.high),
             odds=choice.odds,
         )
         for choice in choices
     ]
-    return draw_choice(films, choices[0].sight.final.name, choices[0].sight.final.y_over_L)
+    return draw_choice(films, choices[0].prediction.final.name, choices[0].prediction.final.y_over_L)
 
 
 SIZED = ("diameter_mm", "length_mm", "pressure_kPa")

@@ -44,7 +44,7 @@ one per cent are missing."""
 class ConditionPrediction:
     """One condition: its prediction, what speaks against it, and what effects left out would change."""
 
-    sight: VinePrediction
+    prediction: VinePrediction
     hazards: tuple[str, ...]
     neglected: tuple[Neglected, ...]
 
@@ -85,19 +85,19 @@ def predict_conditions(
 
     check_figure(figure)
     ground = read_ground(asked)
-    predictions = _predict_all(ground, samples, seed, at_fraction)
-    lines = [*_one(predictions[0])] if len(predictions) == 1 else [*_several(predictions)]
+    entries = _predict_all(ground, samples, seed, at_fraction)
+    lines = [*_one(entries[0])] if len(entries) == 1 else [*_several(entries)]
     lines += [f"! {words}" for words in warnings_of(ground)]
     if figure is not None:
         from vinetrack.figures.prediction_figures import draw_predictions
 
-        write_figure(draw_predictions([_picture(prediction.sight) for prediction in predictions], at_fraction), figure)
+        write_figure(draw_predictions([_picture(entry.prediction) for entry in entries], at_fraction), figure)
         lines.append(f"Figure: {figure}")
     if csv is not None:
-        write_csv(csv, pd.concat([prediction.sight.curve for prediction in predictions], ignore_index=True))
+        write_csv(csv, pd.concat([entry.prediction.curve for entry in entries], ignore_index=True))
         lines.append(f"Curves: {csv}")
     if json is not None:
-        write_json(json, [_entry(prediction) for prediction in predictions])
+        write_json(json, [_entry(entry) for entry in entries])
         lines.append(f"Everything: {json}")
     return [] if json == STANDARD_OUTPUT else lines
 
@@ -116,36 +116,36 @@ def _predict_all(ground: Ground, samples: int, seed: int, at_fraction: float) ->
     from vinetrack.planning.design_checks import design_checks, neglected
     from vinetrack.planning.prediction import predict_vine
 
-    predictions = []
+    entries = []
     try:
         for inputs in progress(inputs_of(ground), "predicting", unit="condition"):
-            sight = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
-            predictions.append(ConditionPrediction(sight, design_checks(sight), neglected(inputs, at_fraction)))
+            prediction = predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction)
+            entries.append(ConditionPrediction(prediction, design_checks(prediction), neglected(inputs, at_fraction)))
     except SimulationError as error:
         raise ResultsError(f"{error} Leave an effect out, or give it another size.") from None
     except EffectError as error:
         raise as_option(error) from None
-    return predictions
+    return entries
 
 
-def _one(prediction: ConditionPrediction) -> Iterator[str]:
+def _one(entry: ConditionPrediction) -> Iterator[str]:
     """Everything about one condition."""
     from vinetrack.core.terminal import table
 
-    sight = prediction.sight
-    inputs = sight.inputs
+    prediction = entry.prediction
+    inputs = prediction.inputs
     yield f"{trial_words(inputs.trial)}; {' + '.join(inputs.model.names)}"
     yield ""
     yield from table(input_rows(inputs.bands()), ("what goes in", "median", "90 % band", "unit", "from"), align="<><<<")
     yield ""
-    rows = [_quantity_row(quantity) for quantity in sight.quantities]
+    rows = [_quantity_row(quantity) for quantity in prediction.quantities]
     yield from table(rows, ("what comes out", "at y/L", "median", "90 % band", "unit"), align="<<><<")
     yield ""
-    head = (f"uncertainties included ({sight.samples} draws)", "final speed by it alone", "why")
-    yield from table([_share_row(share.name, share.low, share.high, share.words) for share in sight.shares], head)
-    yield from _left_out(prediction)
+    head = (f"uncertainties included ({prediction.samples} draws)", "final speed by it alone", "why")
+    yield from table([_share_row(share.name, share.low, share.high, share.words) for share in prediction.shares], head)
+    yield from _left_out(entry)
     yield ""
-    yield from (f"! {words}" for words in prediction.hazards)
+    yield from (f"! {words}" for words in entry.hazards)
 
 
 def _quantity_row(quantity: Quantity) -> tuple[str, str, str, str, str]:
@@ -166,7 +166,7 @@ def _share_row(name: str, low: float, high: float, words: str) -> tuple[str, str
     return name, f"{shown(low, 'm/s')} to {shown(high, 'm/s')} m/s", words
 
 
-def _left_out(prediction: ConditionPrediction) -> Iterator[str]:
+def _left_out(entry: ConditionPrediction) -> Iterator[str]:
     """Effects that no vine is free of and the model leaves out, with what they would make of the final speed."""
     from vinetrack.core.terminal import table
 
@@ -177,7 +177,7 @@ def _left_out(prediction: ConditionPrediction) -> Iterator[str]:
             f"{shown(effect_left_out.without_m_s, 'm/s')} → {shown(effect_left_out.final_m_s, 'm/s')} m/s",
             f"{effect_left_out.change:+.1%}",
         )
-        for effect_left_out in prediction.neglected
+        for effect_left_out in entry.neglected
         if abs(effect_left_out.change) >= WORTH_SHOWING
     ]
     if rows:
@@ -185,61 +185,59 @@ def _left_out(prediction: ConditionPrediction) -> Iterator[str]:
         yield from table(rows, ("left out of the model", "if it were", "the final speed went", ""))
 
 
-def _several(predictions: Sequence[ConditionPrediction]) -> Iterator[str]:
+def _several(entries: Sequence[ConditionPrediction]) -> Iterator[str]:
     """A row a condition."""
     from vinetrack.core.terminal import table
     from vinetrack.planning.prediction import TIME
 
-    first = predictions[0].sight
+    first = entries[0].prediction
     yield f"{' + '.join(first.inputs.model.names)}; medians and 90 % bands of {first.samples} draws"
     rows = [
         (
-            prediction.sight.inputs.trial.condition,
-            *_quantity_row(prediction.sight.final)[1:4],
-            *_quantity_row(prediction.sight[TIME])[2:4],
-            f"{prediction.sight.slack:.0%}",
+            entry.prediction.inputs.trial.condition,
+            *_quantity_row(entry.prediction.final)[1:4],
+            *_quantity_row(entry.prediction[TIME])[2:4],
+            f"{entry.prediction.slack:.0%}",
         )
-        for prediction in predictions
+        for entry in entries
     ]
     head = ("condition", "at y/L", "final speed", "90 % band", "time", "90 % band", "slack tail")
     yield from table(rows, head, ("", "", "m/s", "m/s", "ms", "ms", "of draws"), align="<<><><>")
-    if any(prediction.sight.inputs.trial.payload_kg > 0 for prediction in predictions):
+    if any(entry.prediction.inputs.trial.payload_kg > 0 for entry in entries):
         yield "final speed: of the leading edge; at y/L = 1, of a payload as it leaves the vine"
     yield ""
     yield "uncertainties included:"
-    words = dict.fromkeys((share.name, share.words) for prediction in predictions for share in prediction.sight.shares)
+    words = dict.fromkeys((share.name, share.words) for entry in entries for share in entry.prediction.shares)
     yield from (f"  {name}: {text}" for name, text in words)
     yield ""
-    hazards = dict.fromkeys(text for prediction in predictions for text in prediction.hazards)
+    hazards = dict.fromkeys(text for entry in entries for text in entry.hazards)
     for text in hazards:
-        conditions = [
-            prediction.sight.inputs.trial.condition for prediction in predictions if text in prediction.hazards
-        ]
-        yield f"! {'all conditions' if len(conditions) == len(predictions) else ', '.join(conditions)}: {text}"
+        conditions = [entry.prediction.inputs.trial.condition for entry in entries if text in entry.hazards]
+        yield f"! {'all conditions' if len(conditions) == len(entries) else ', '.join(conditions)}: {text}"
 
 
-def _picture(sight: VinePrediction) -> PredictionPicture:
+def _picture(prediction: VinePrediction) -> PredictionPicture:
     from vinetrack.figures.prediction_figures import PredictionPicture
 
     return PredictionPicture(
-        title=trial_words(sight.inputs.trial),
-        curve=sight.curve,
-        final_name=sight.final.name,
-        shares=[(share.name, share.low, share.high) for share in sight.shares],
-        final=(sight.final.low, sight.final.median, sight.final.high),
+        title=trial_words(prediction.inputs.trial),
+        curve=prediction.curve,
+        final_name=prediction.final.name,
+        shares=[(share.name, share.low, share.high) for share in prediction.shares],
+        final=(prediction.final.low, prediction.final.median, prediction.final.high),
     )
 
 
-def _entry(prediction: ConditionPrediction) -> dict[str, Any]:
+def _entry(entry: ConditionPrediction) -> dict[str, Any]:
     """One condition as JSON holds it, SI."""
-    sight = prediction.sight
+    prediction = entry.prediction
     return {
-        "condition": sight.inputs.trial.condition,
-        "model": list(sight.inputs.model.names),
-        "samples": sight.samples,
+        "condition": prediction.inputs.trial.condition,
+        "model": list(prediction.inputs.model.names),
+        "samples": prediction.samples,
         "inputs": [
             {"name": i.name, "unit": i.unit, "median": i.median, "low_90": i.low, "high_90": i.high, "from": i.origin}
-            for i in sight.inputs.bands()
+            for i in prediction.inputs.bands()
         ],
         "quantities": [
             {
@@ -250,17 +248,17 @@ def _entry(prediction: ConditionPrediction) -> dict[str, Any]:
                 "low_90": q.low,
                 "high_90": q.high,
             }
-            for q in sight.quantities
+            for q in prediction.quantities
         ],
         "uncertainties": [
             {"name": s.name, "words": s.words, "alone_low_90_m_s": s.low, "alone_high_90_m_s": s.high}
-            for s in sight.shares
+            for s in prediction.shares
         ],
         "left_out": [
             {"effect": n.effect, "size": n.size, "final_m_s": n.final_m_s, "without_m_s": n.without_m_s}
-            for n in prediction.neglected
+            for n in entry.neglected
         ],
-        "arrives": sight.arrives,
-        "slack": sight.slack,
-        "warnings": list(prediction.hazards),
+        "arrives": prediction.arrives,
+        "slack": prediction.slack,
+        "warnings": list(entry.hazards),
     }

@@ -65,12 +65,12 @@ class Neglected:
         return self.final_m_s / self.without_m_s - 1 if self.without_m_s > 0 else math.nan
 
 
-def design_checks(sight: VinePrediction) -> tuple[str, ...]:
+def design_checks(prediction: VinePrediction) -> tuple[str, ...]:
     """Sentences about what a person should know before building this, most serious first.
 
     Parameters
     ----------
-    sight : prediction of the vine.
+    prediction : of the vine.
 
     Returns
     -------
@@ -78,11 +78,11 @@ def design_checks(sight: VinePrediction) -> tuple[str, ...]:
         Blank where nothing speaks against it.
     """
     return (
-        *_burst(sight.inputs.trial),
-        *_no_growth(sight),
-        *_slack(sight),
-        *_rules(sight),
-        *sight.inputs.notes,
+        *_burst(prediction.inputs.trial),
+        *_no_growth(prediction),
+        *_slack(prediction),
+        *_rules(prediction),
+        *prediction.inputs.notes,
     )
 
 
@@ -96,26 +96,26 @@ def _burst(trial: Trial) -> Iterator[str]:
         yield f"the vine is about to burst: its {shown}, so at {highest_kPa:.3g} kPa (a guess from one vine)"
 
 
-def _no_growth(sight: VinePrediction) -> Iterator[str]:
-    trial = sight.inputs.trial
-    low, median, high = np.quantile(sight.inputs.draw(2000, 1)[YIELD], BAND) / 1e3
+def _no_growth(prediction: VinePrediction) -> Iterator[str]:
+    trial = prediction.inputs.trial
+    low, median, high = np.quantile(prediction.inputs.draw(2000, 1)[YIELD], BAND) / 1e3
     if median >= trial.pressure_Pa / 1e3:
         yield (
             f"{trial.pressure_Pa / 1e3:g} kPa lies below the yield pressure, {median:.3g} kPa ({low:.2g} to "
             f"{high:.2g}): nothing would evert; raise the pressure"
         )
-    elif sight.arrives < CERTAIN:
+    elif prediction.arrives < CERTAIN:
         yield (
-            f"in {1 - sight.arrives:.0%} of the draws the vine does not grow to its end; raise the pressure or measure "
-            "its yield pressure"
+            f"in {1 - prediction.arrives:.0%} of the draws the vine does not grow to its end; raise the pressure or "
+            "measure its yield pressure"
         )
 
 
-def _slack(sight: VinePrediction) -> Iterator[str]:
-    trial = sight.inputs.trial
-    if sight.slack < WORTH_A_WORD:
+def _slack(prediction: VinePrediction) -> Iterator[str]:
+    trial = prediction.inputs.trial
+    if prediction.slack < WORTH_A_WORD:
         return
-    often = "in every draw" if sight.slack > 0.995 else f"in {sight.slack:.0%} of the draws"
+    often = "in every draw" if prediction.slack > 0.995 else f"in {prediction.slack:.0%} of the draws"
     if trial.tail_slack == "free":
         yield (
             f"the tail goes slack on the way {often}: speeds of the tail are then those of the film at the tip, and a "
@@ -124,14 +124,14 @@ def _slack(sight: VinePrediction) -> Iterator[str]:
         return
     payload = f" and the {EJECTION} is at least what is stated" if trial.payload_kg > 0 else ""
     yield (
-        f"the tail would have to push {often} (least tension {_least_tension(sight)}), which "
+        f"the tail would have to push {often} (least tension {_least_tension(prediction)}), which "
         f"it cannot: the payload runs ahead of the film{payload}; `--tail-slack free` lets it"
     )
 
 
-def _least_tension(sight: VinePrediction) -> str:
+def _least_tension(prediction: VinePrediction) -> str:
     """The median where that is below 0 itself, else how low it comes in one draw of twenty."""
-    tension = sight[LEAST_TENSION]
+    tension = prediction[LEAST_TENSION]
     return (
         f"{tension.median:.2g} N"
         if tension.median < 0
@@ -139,11 +139,11 @@ def _least_tension(sight: VinePrediction) -> str:
     )
 
 
-def _rules(sight: VinePrediction) -> Iterator[str]:
+def _rules(prediction: VinePrediction) -> Iterator[str]:
     """Broken rules of the audit along the median motion, without what has been said of the tail."""
-    inputs = sight.inputs
+    inputs = prediction.inputs
     (moved,), _ = follow(inputs, *_medians(inputs))
-    keep = moved.lead_position_m <= sight.at_fraction * inputs.trial.length_m
+    keep = moved.lead_position_m <= prediction.at_fraction * inputs.trial.length_m
     motion = AuditedMotion(inputs.trial, moved.time_s[keep], moved.lead_position_m[keep], moved.lead_velocity_m_s[keep])
     for sentence in audit(inputs.model, [motion]).warnings:
         words = sentence.partition(": ")[2].rstrip(".")

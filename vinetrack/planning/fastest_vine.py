@@ -97,7 +97,7 @@ class Choice:
     """
 
     thickness_m: float
-    sight: VinePrediction
+    prediction: VinePrediction
     limits: tuple[str, ...]
     odds: float
     others: Floats
@@ -142,14 +142,14 @@ def fastest(
     choices = [
         Choice(
             thickness_m=inputs.trial.thickness_m,
-            sight=predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction),
+            prediction=predict_vine(inputs, samples=samples, seed=seed, at_fraction=at_fraction),
             limits=_limits(room, inputs.trial),
             odds=share,
             others=others,
         )
         for (inputs, others), share in zip(best, odds, strict=True)
     ]
-    return tuple(sorted(choices, key=lambda choice: -choice.sight.final.median))
+    return tuple(sorted(choices, key=lambda choice: -choice.prediction.final.median))
 
 
 def _best(
