@@ -117,6 +117,8 @@ function clearAxis() {
 export function drawOver() {
   const over = $("over");
   if (!over || !state.clip) return;
+  // What is drawn anew keeps the focus: a frame may arrive while its edge is moved by the keyboard.
+  const held = over.contains(document.activeElement) ? document.activeElement.dataset.handle : "";
   over.setAttribute("viewBox", `0 0 ${view.width} ${view.height}`);
   $("stage").classList.toggle("scale", view.tool === "scale");
   over.replaceChildren();
@@ -131,6 +133,7 @@ export function drawOver() {
   }
   if (view.tool === "scale" && scaleKind() === "two_points") drawMarks(over, unit);
   if (view.edge && !view.source) drawEdge(over, unit);
+  if (held) over.querySelector(`[data-handle="${held}"]`)?.focus();
 }
 
 // The edge in this frame, to be moved along the axis.
