@@ -193,9 +193,8 @@ def main() -> None:
                 print(f"seed {seed}: {fault}", flush=True)
             if faults and chosen.keep:
                 folder.rename(chosen.keep / f"drawn_{seed}")
-    print(
-        f"{chosen.count} drawn, {run} let through by check, {faulty} met a fault; {time.perf_counter() - begun:.0f} s"
-    )
+    spent = time.perf_counter() - begun
+    print(f"{drawn} drawn, {run} let through by check, {faulty} met a fault of the program; {spent:.0f} s")
 
 
 if __name__ == "__main__":

@@ -272,3 +272,9 @@ def test_500_trials_stay_below_two_megabytes() -> None:
     html = page(trials=trials(*names), windows=windows(*names), kinematics=curves(*names))
     assert html.count('class="spark"') == 500
     assert len(html.encode()) < 2e6
+
+
+def test_a_blank_direction_of_growth_is_said() -> None:
+    note = "growth_angle_deg is blank (all trials): taken as 0, straight down"
+    assert f"<p>{note}.</p>" in page(notes=[note])
+    assert "straight down" not in page()

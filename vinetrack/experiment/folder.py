@@ -68,6 +68,15 @@ class Experiment:
         """Every trial of the sheet, in its order."""
         return tuple(self.lines)
 
+    @property
+    def blank_notes(self) -> list[str]:
+        """What blank cells stand for where that decides physics, in sentences."""
+        blank = [name for name in self.angle_blank if name not in self.left_out]
+        if not blank:
+            return []
+        which = "all trials" if len(blank) == len(self.names) else f"{len(blank)} trials, {blank[0]} first"
+        return [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
+
     def trial(self, name: str) -> Trial:
         """Return the trial of a name.
 

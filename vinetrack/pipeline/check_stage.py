@@ -13,7 +13,6 @@ from vinetrack.core.problems import ExperimentError, Problem, format_problems
 
 if TYPE_CHECKING:
     from vinetrack.core.records import Trial
-    from vinetrack.experiment.folder import Experiment
 
 
 @dataclass(frozen=True)
@@ -75,16 +74,7 @@ def check_folder(folder: Path) -> Checked:
     lines = facts_rows(seen, trials) if seen else []
     if 0 < len(surveyor.looked_into) < len(seen):
         lines.append(f"{len(surveyor.looked_into)} of {len(seen)} recordings were looked into, one of each condition")
-    return Checked(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(_notes(experiment)))
-
-
-def _notes(experiment: Experiment) -> list[str]:
-    """What blank cells stand for where that decides physics."""
-    blank = [name for name in experiment.angle_blank if name not in experiment.left_out]
-    if not blank:
-        return []
-    which = "all trials" if len(blank) == len(experiment.names) else f"{len(blank)} trials, {blank[0]} first"
-    return [f"growth_angle_deg is blank ({which}): taken as 0, straight down; 90 is level, 180 straight up"]
+    return Checked(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(experiment.blank_notes))
 
 
 def _track_speed(trial: Trial) -> float:

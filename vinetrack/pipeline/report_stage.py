@@ -113,6 +113,7 @@ def report_content(experiment: Experiment, folder: Path, settings: Mapping[str, 
         model=_model_result(results),
         diagnosis=read_diagnosis(results, experiment),
         sections=[_paper_section(results)] if experiment.settings.published else [],
+        notes=experiment.blank_notes,
     )
 
 

@@ -60,7 +60,8 @@ class ReportContent:
     """Everything the report is made of: the tables of the results folder, its pictures and its provenance.
 
     `recordings` has an entry for every trial that came as one; `clips` says where beside the page the clip of a trial
-    is, and `clip` is the one to play in it. `sections` are parts that other rooms add, shown before the trials.
+    is, and `clip` is the one to play in it. `sections` are parts that other rooms add, shown before the trials. `notes`
+    say what blank cells of the sheet stand for.
     """
 
     name: str
@@ -77,6 +78,7 @@ class ReportContent:
     model: ModelResult | None = None
     diagnosis: DiagnosisResult | None = None
     sections: Sequence[ReportSection] = ()
+    notes: Sequence[str] = ()
 
 
 def build_report(content: ReportContent) -> str:
@@ -105,6 +107,7 @@ def build_report(content: ReportContent) -> str:
         style=Markup(page_tokens() + (folder / "report.css").read_text(encoding="utf-8")),
         headline=headline(content.damping),
         tally=tally(content.trials),
+        notes=content.notes,
         exponents=exponent_table(content.damping),
         without_law=without_law(content.damping),
         vines=vine_table(content.damping),
