@@ -221,7 +221,8 @@ class Page:
         self.film.set_curves(self.curves, self.ground.curves)
         worst = max(self.errors_m, key=lambda name: self.errors_m[name])
         self.film.show_trial(self.campaign.trials[self.campaign.of_condition(worst)[0]].name)
-        if self.choice is not self.ground.start:
+        as_fitted = self.last is not None and self.choice is self.last.choice
+        if self.choice is not self.ground.start and not as_fitted:
             self._touched = True
             self._redraw_soon()
 
