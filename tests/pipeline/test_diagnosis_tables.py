@@ -167,3 +167,17 @@ def test_ties_stand_in_the_order_of_the_ranking() -> None:
     assert names == ["air_drag", "leak", "time_base"]
     assert matrix == [[1, 0.3, 0.2], [0.3, 1, 0.1], [0.2, 0.1, 1]]
     assert in_order_of_rank(Round.from_json({"verdict": ""})) == ([], [])
+
+
+def test_trials_in_which_nothing_grew_have_no_places_along_the_growth() -> None:
+    import pandas as pd
+
+    from vinetrack.pipeline import diagnosis_tables
+
+    still = {"trial": ["a"] * 6, "time_s": range(6), "lead_position_m": [0.0] * 6}
+    members = pd.DataFrame(still | {"model_before_m": [0.0] * 6, "model_after_m": [0.0] * 6})
+    assert diagnosis_tables._stretched(members) == []
+    located = pd.DataFrame(
+        {"vine": ["v"], "condition": ["c"], "from_m": [0.0], "to_m": [0.0], "mean_residual_m": [0.0], "sigma_m": [1.0]}
+    )
+    assert diagnosis_tables._located(located, located, members) == []

@@ -295,6 +295,8 @@ def _where_table(trials: pd.DataFrame, labels: Mapping[str, str], located: pd.Da
 def _located(of_condition: pd.DataFrame, located: pd.DataFrame, members: pd.DataFrame) -> list[dict[str, Any]]:
     vine = str(of_condition["vine"].iloc[0])
     whole_m = float(located.loc[located["vine"] == vine, "to_m"].max())
+    if not whole_m > 0:
+        return []  # Nothing grew: there is no place along the growth.
     rows = []
     for row in iter_rows(of_condition):
         after = _means(members, "model_before_m", float(row.from_m), float(row.to_m))["model_after_m"]
@@ -314,6 +316,8 @@ def _located(of_condition: pd.DataFrame, located: pd.DataFrame, members: pd.Data
 def _stretched(members: pd.DataFrame) -> list[dict[str, Any]]:
     """Stretches of what was measured; chance is what trials differ by, less their own mean over the growth."""
     whole_m = float(members["lead_position_m"].max())
+    if not whole_m > 0:
+        return []
     edges = np.linspace(0.0, whole_m, STRETCHES + 1)
     count = int(members["trial"].nunique())
     rows = []
