@@ -33,7 +33,7 @@ def words(tracking: Tracking) -> str:
 
 
 def test_the_strip_says_how_many_points_were_corrected(tracking: Tracking) -> None:
-    assert "corrected by hand (+ as tracked), N = 2" in words(tracking)
+    assert "corrected by hand, N = 2" in words(tracking)
 
 
 def test_a_strip_without_corrections_says_nothing_of_them(tracking: Tracking) -> None:

@@ -92,3 +92,18 @@ def test_noise_that_grows_with_speed_is_not_wild():
     draw = np.random.default_rng(20002)
     y = 20.0 * time_s**2 + np.hypot(5e-5, 6e-5 * speed) * draw.standard_normal(time_s.size)
     assert not wild_points(time_s, y).any()
+
+
+def test_a_point_that_a_person_has_placed_is_not_wild() -> None:
+    time_s = np.arange(60) / 1000
+    position_m = 0.2 * time_s + 1e-6 * np.random.default_rng(20100).standard_normal(60)
+    position_m[30] += 2e-3
+    flag = np.full(60, "", dtype="<U80")
+    track = Track(time_s, position_m, np.full(60, 1e-6), flag, np.full(60, np.nan))
+    assert reject_wild_points(track).flag[30] == "rejected"
+    flag = flag.copy()
+    flag[30] = "corrected"
+    assert (
+        reject_wild_points(Track(time_s, position_m, np.full(60, 1e-6), flag, np.full(60, np.nan))).flag[30]
+        == "corrected"
+    )

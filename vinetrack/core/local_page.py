@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
-from typing import TypeVar
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
 from vinetrack.core.problems import UserError
 
@@ -41,3 +42,23 @@ def on_a_free_port(serve: Callable[[int], Server], port: int | None) -> Server:
         with contextlib.suppress(OSError):
             return serve(number)
     raise PageError(f"Port {port} is taken: give another with --port, or none to have one found.")
+
+
+@contextlib.contextmanager
+def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end a server between two turns of its loop, in the middle of nothing.
+
+    Parameters
+    ----------
+    end : asks the loop to end; called in the thread that serves, it must not wait.
+    """
+
+    def ended(_number: int, _frame: Any) -> None:
+        end()
+
+    before = {number: signal.signal(number, ended) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -181,14 +181,33 @@ def with_list(text: str, key: str, values: Sequence[str], file: str = "experimen
     else:
         begin, end = node.start_mark.index, node.end_mark.index
         changed = text[:begin] + (" " if begin == end else "") + flow + text[end:]
+    refuse_harm(changed, {**before, key: list(values)}, key, flow, file)
+    return changed
+
+
+def refuse_harm(changed: str, expected: dict[Any, Any], key: str, shown: str, file: str) -> None:
+    """Make sure that a text in which a key was set holds what it should and nothing else has changed.
+
+    Parameters
+    ----------
+    changed : YAML.
+    expected : its content.
+    key : that was set.
+    shown : the value as a person would write it.
+    file : its name, for messages.
+
+    Raises
+    ------
+    ExperimentError
+        If it does not.
+    """
     try:
-        correct = parse_yaml(changed, file).content == {**before, key: list(values)}
+        correct = parse_yaml(changed, file).content == expected
     except ExperimentError:
         correct = False
     if not correct:
-        remedy = f"set it yourself: {key}: {flow}"
+        remedy = f"set it yourself: {key}: {shown}"
         raise ExperimentError([Problem(message="cannot be set without harm", file=file, column=key, remedy=remedy)])
-    return changed
 
 
 def top_level_value(text: str, key: str) -> Any:

@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from vinetrack.core.problems import ExperimentError, Problem
-from vinetrack.core.yaml_document import parse_yaml, top_level_value
+from vinetrack.core.problems import ExperimentError
+from vinetrack.core.yaml_document import parse_yaml, refuse_harm, top_level_value
 
 _PLAIN_WORD = re.compile(r"[A-Za-z_./][\w./ -]*")
 _SPECIAL = frozenset({"yes", "no", "true", "false", "on", "off", "null", "y", "n"})
@@ -56,13 +56,7 @@ def with_value(text: str, key: str, value: Any, file: str = "experiment.yaml") -
         changed = text
         for begin, end, new in sorted(_edits(text, node, value), reverse=True):
             changed = changed[:begin] + new + changed[end:]
-    try:
-        correct = parse_yaml(changed, file).content == {**before, key: _plain(value)}
-    except ExperimentError:
-        correct = False
-    if not correct:
-        remedy = f"set it yourself: {key}: {_inline(value)}"
-        raise ExperimentError([Problem(message="cannot be set without harm", file=file, column=key, remedy=remedy)])
+    refuse_harm(changed, {**before, key: _plain(value)}, key, _inline(value), file)
     return changed
 
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import signal
 import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
 from bokeh.server.server import Server
 
-from vinetrack.core.local_page import LOOPBACK, on_a_free_port
+from vinetrack.core.local_page import LOOPBACK, ended_by_signals, on_a_free_port
 from vinetrack.explorer.fitting import BackgroundFit
 
 QUIET = ("bokeh", "tornado")
@@ -128,22 +125,7 @@ def serve(ground: BackgroundFit, say: Callable[[str], None], port: int | None = 
     say("For this machine alone. Ctrl-C ends it.")
     if browser:
         threading.Thread(target=webbrowser.open, args=(where,), daemon=True).start()
-    with _ended_by_signals(server):
+    with ended_by_signals(lambda: server.io_loop.add_callback_from_signal(server.io_loop.stop)):
         server.io_loop.start()
     server.stop()
     say("Explorer ended.")
-
-
-@contextlib.contextmanager
-def _ended_by_signals(server: Server) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the loop between two turns of it, in the middle of nothing."""
-
-    def end(_number: int, _frame: Any) -> None:
-        server.io_loop.add_callback_from_signal(server.io_loop.stop)
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -74,7 +74,7 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
     if by_hand.any():
         before = edge if track.tracked_px is None else track.tracked_px
         ax.plot(before[by_hand], time_ms[by_hand], "+", color=SKY, markersize=5, markeredgewidth=1.0)
-        label = f"corrected by hand (+ as tracked), N = {int(by_hand.sum())}"
+        label = f"corrected by hand, N = {int(by_hand.sum())}"
         ax.plot(edge[by_hand], time_ms[by_hand], "o", color=GREEN, markersize=4, fillstyle="none", label=label)
     ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)")
     ax.grid(visible=False)
@@ -87,7 +87,7 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
 
     top = ax.secondary_xaxis(-0.21, functions=(in_mm, in_px))
     top.set_xlabel("along the growth axis (mm)")
-    legend_above(ax, 2 if not by_hand.any() else 3)
+    legend_above(ax, 2)
     ax.set_title(title, loc="right", fontsize=10, color=MUTED, fontweight="normal")
 
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import signal
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from vinetrack.core.local_page import LOOPBACK, on_a_free_port
+from vinetrack.core.local_page import LOOPBACK, ended_by_signals, on_a_free_port
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.experiment.corrections import corrections_text
 from vinetrack.setup_page.clip_views import ClipStore, jpeg, track_row, warm_up
@@ -227,23 +226,8 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
     say("For this machine alone. Ctrl-C ends it.")
     if browser:
         threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
-    with _ended_by_signals(server):
+    # From the thread that serves, a shutdown would wait for itself.
+    with ended_by_signals(lambda: threading.Thread(target=server.shutdown, daemon=True).start()):
         server.serve_forever(poll_interval=0.2)
     server.server_close()
     say("Set-up ended.")
-
-
-@contextlib.contextmanager
-def _ended_by_signals(server: SetupServer) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the loop between two requests."""
-
-    def end(_number: int, _frame: Any) -> None:
-        # From the thread that serves, a shutdown would wait for itself.
-        threading.Thread(target=server.shutdown, daemon=True).start()
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

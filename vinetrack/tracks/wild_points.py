@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Track, join_flags
+from vinetrack.core.records import Floats, Track, hand_corrected, join_flags
 from vinetrack.tracks.position_noise import position_noise, rough_noise
 
 HALF_WIDTH = 6
@@ -190,7 +190,7 @@ def wild_points(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
 
 
 def reject_wild_points(track: Track) -> Track:
-    """Flag wild points of a track `rejected`, and name them in its notes.
+    """Flag wild points of a track `rejected`, and name them in its notes; those corrected by hand stay.
 
     Parameters
     ----------
@@ -202,6 +202,8 @@ def reject_wild_points(track: Track) -> Track:
     """
     rows = np.flatnonzero(track.usable)
     wild = rows[wild_points(track.time_s[rows], track.lead_position_m[rows])] if rows.size else rows
+    # Where a person has looked, the person is right.
+    wild = wild[~hand_corrected(track.flag[wild])] if wild.size else wild
     if not wild.size:
         return track
     flag = track.flag.astype("<U80")
