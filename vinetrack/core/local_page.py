@@ -51,6 +51,10 @@ def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
     Parameters
     ----------
     end : asks the loop to end; called in the thread that serves, it must not wait.
+
+    Yields
+    ------
+    None : while the signals are taken.
     """
 
     def ended(_number: int, _frame: Any) -> None:
