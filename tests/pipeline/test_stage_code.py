@@ -125,9 +125,10 @@ def test_templates_captions_and_tokens_rerun_the_report(copy: Path) -> None:
 
 
 def test_the_probe_of_a_diagnosis_and_the_truth_of_the_laboratory_count(copy: Path) -> None:
-    # Figures and report take words from the narrative, which names types of the diagnosis.
+    # The model stage imports the candidates, whose module holds the probe; the others read a diagnosis by its type,
+    # whose sentences come from the narrative, which names types of the diagnosis.
     probe = copy / "diagnosis" / "probes" / "probe_force.py"
-    assert changed_by_an_edit(probe, copy) == {"diagnosis", "figures", "report"}
+    assert changed_by_an_edit(probe, copy) == {"diagnosis", "figures", "model", "overlays", "paper", "report"}
     assert changed_by_an_edit(copy / "laboratory" / "paper.yaml", copy) == {"laboratory"}
 
 
