@@ -100,7 +100,8 @@ class Page:
         self.hold.on_click(self._hold)
         self.back.on_click(self._as_fitted)
         self.said = words(name="commands")
-        buttons = Row(children=[self.refit, self.back, self.hold], margin=0, stylesheets=[sheet(":host { gap: 6px; }")])
+        wrapped = sheet(":host { gap: 6px; flex-wrap: wrap; }")
+        buttons = Row(children=[self.refit, self.back, self.hold], margin=0, stylesheets=[wrapped])
         hint = words(
             "<small>A tick refits. A size that was dragged stays until the next fit. <i>Hold to compare</i> keeps this "
             "model beside the next. The same from the command line:</small>"
