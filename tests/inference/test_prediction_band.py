@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ import vinetrack as vt
 from vinetrack.core.records import Track
 from vinetrack.inference.fit_data import pairs_of
 from vinetrack.inference.fit_result import TrialFit
+from vinetrack.inference.position_errors import position_shapes
 
 FOLDER = os.environ.get("VINETRACK_REAL_DATA", "")
 needs_recordings = pytest.mark.skipif(not FOLDER, reason="VINETRACK_REAL_DATA is unset: no real recordings to try")
@@ -77,6 +79,12 @@ def test_a_trial_of_a_campaign_has_the_band_of_what_its_trials_scatter_by() -> N
     assert trial.within_band >= MOSTLY
     # 1 % of P and 3 % of B are 6 to 9 % of speed, half of it met by the release: some mm of 210.
     assert 1e-3 < float(np.max(trial.band_m)) < 3e-2
+
+
+def test_a_model_that_moves_nothing_has_no_smooth_errors_of_position() -> None:
+    predictor = SimpleNamespace(data=[SimpleNamespace(position_systematic_m=1e-4)] * 2)
+    shapes = position_shapes(predictor, [np.zeros(3), np.zeros(3)])  # type: ignore[arg-type]
+    assert not np.any(shapes)
 
 
 @needs_recordings
