@@ -20,7 +20,7 @@ from vinetrack.setup_page.draft_files import Draft, drafted, open_draft, same_ce
 from vinetrack.setup_page.settings_draft import shared_values, with_shared
 from vinetrack.setup_page.sheet_draft import SheetDraft, read_draft
 
-OFFERED = ("capture_fps", *NEEDED, "payload_g", "growth_angle_deg", "exposure_us", "pressure_trace")
+OFFERED = ("capture_fps", *NEEDED, "payload_g", "growth_angle_deg", "chamber_l", "exposure_us", "pressure_trace")
 """Columns that the page shows from the start, whether or not the sheet has them."""
 
 
