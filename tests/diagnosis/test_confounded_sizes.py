@@ -105,15 +105,15 @@ def test_what_trajectories_and_plausibility_say_of_a_size_is_the_posterior_by_qu
     whole = quad(density, 0, 20)[0]
     mean = quad(lambda size: size * density(size), 0, 20)[0] / whole
     variance = quad(lambda size: (size - mean) ** 2 * density(size), 0, 20)[0] / whole
-    got_mean, got_sd, limit = size_not_excluded(estimate, sigma, parameter, upwards=True)
+    got_mean, got_sd, limit = size_not_excluded(estimate, sigma, parameter)
     assert (got_mean, got_sd) == pytest.approx((mean, math.sqrt(variance)), rel=1e-6)
     assert quad(density, 0, limit)[0] / whole == pytest.approx(0.95, abs=1e-6)
 
 
-def test_a_size_of_either_sign_has_its_limit_on_the_side_asked_for() -> None:
+def test_a_size_of_either_sign_has_its_limit_on_the_side_that_the_data_favour() -> None:
     parameter = Parameter("e", "ε", "1", 0.0, plausible=(-0.1, 0.1))
-    up = size_not_excluded(0.0, 0.02, parameter, upwards=True)
-    down = size_not_excluded(0.0, 0.02, parameter, upwards=False)
-    sd = 1 / math.sqrt(1 / 0.02**2 + (1.959964 / 0.1) ** 2)
-    assert up[2] == pytest.approx(1.644854 * sd, rel=1e-6)
-    assert np.sign((up[2], down[2])).tolist() == [1, -1]
+    precision = 1 / 0.02**2 + (1.959964 / 0.1) ** 2
+    for estimate in (0.03, -0.03):
+        mean, sd, limit = size_not_excluded(estimate, 0.02, parameter)
+        assert (mean, sd) == pytest.approx((estimate / 0.02**2 / precision, precision**-0.5), rel=1e-6)
+        assert limit == pytest.approx(mean + np.sign(estimate) * 1.644854 * sd, rel=1e-6)
