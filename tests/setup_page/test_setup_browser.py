@@ -151,7 +151,10 @@ def test_a_unit_is_chosen_and_written_as_the_column(person: Person, clips: Path)
 
 def test_every_control_is_reached_by_tab_and_has_a_name(person: Person) -> None:
     seen = set()
-    for _ in range(160):
+    for count in range(160):
+        if count % 10 == 0:
+            # A row that is reached is shown, and its frames take a moment.
+            person.chrome.wait("document.querySelector('#over .axis-line') !== null", "the axis", 120)
         person.key("Tab", 9)
         seen.add(person.chrome.run(f"(() => {{ const a = document.activeElement; return {NAME}; }})()"))
     joined = " | ".join(map(str, seen))
