@@ -155,6 +155,25 @@ class CandidateFits:
         self._fit_what_is_contained()
         return list(self.fitted.values())
 
+    def fit_promising(self) -> list[LikelihoodRatio]:
+        """Fit every candidate in full whose linear promise is a part of the best one's, whatever its climb came to.
+
+        A climb on a part of the trials may end in a local minimum. Before an answer is closed no candidate is left out
+        for that.
+
+        Returns
+        -------
+        list of LikelihoodRatio
+            All hypotheses fitted so far.
+        """
+        top = self.questions.promise(self.names[0]) if self.names else 0.0
+        for name in self.names:
+            near = self.questions.promise(name) > SHARE_WORTH_A_CLIMB * top
+            if near and name not in self.fitted and name not in self.silent:
+                self._fit_from_prediction(name)
+        self._fit_what_is_contained()
+        return list(self.fitted.values())
+
     def _fit_what_is_contained(self) -> None:
         """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
         base_fit = self.questions.fit

@@ -101,7 +101,8 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     if questions.something and (slack := _slack(questions, effects, report)) is not None:
         return slack
     search = CandidateFits(questions, report)
-    tried = search.singles()
+    search.singles()
+    tried = search.fit_promising()
     between = between_fits(fit, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
     tried += between
     if not questions.something and not differ and (not tried or _best_of(tried).sigma < SUSPECT_SIGMAS):
