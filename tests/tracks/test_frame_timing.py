@@ -98,6 +98,23 @@ def test_a_gap_that_the_times_show_is_flagged_and_nothing_moved():
     assert "2 frames are missing" in out.notes[0]
 
 
+def seen_in_the_picture(track: Track, row: int) -> Track:
+    """The tracker has seen that the picture at `row` is the one before it."""
+    flag = track.flag.astype("<U80")
+    flag[row] = "duplicate"
+    return replace(track, flag=flag)
+
+
+def test_a_copy_that_the_picture_showed_moves_times_only_where_it_was_inserted():
+    clean = steady_track()
+    late = correct_frames(seen_in_the_picture(inserted(clean, 70), 70))
+    assert np.delete(late.time_s, 70) == pytest.approx(clean.time_s)
+    assert flags(late) == {70: "duplicate"}
+    replaced = correct_frames(seen_in_the_picture(stale(clean, 70), 70))
+    assert replaced.time_s == pytest.approx(clean.time_s)
+    assert flags(replaced) == {70: "duplicate"}
+
+
 @pytest.mark.parametrize(("vine", "noise_m", "rho"), CLEAR)
 @pytest.mark.parametrize("fault", [stale, inserted, dropped], ids=lambda fault: fault.__name__)
 def test_faults_in_clear_motion_are_found(vine, noise_m, rho, fault):

@@ -122,11 +122,32 @@ def correct_frames(track: Track) -> Track:
         return track
     out = _flag_visible_gaps(track, np.rint(frames).astype(int))
     noise_m, rho = _noise(out)
+    out = _retime_known_copies(out, step_s, noise_m, rho)
     tried = 0
     while (event := _next_event(out, tried, step_s, noise_m, rho)) is not None:
         out = _apply(out, event, step_s)
         tried = event.row
     return out
+
+
+def _retime_known_copies(track: Track, step_s: float, noise_m: float, rho: float) -> Track:
+    """Later times moved back behind repeated frames that the picture showed, where the motion says they were inserted.
+
+    A repeated picture tells that a frame is a copy, not whether it took the place of another.
+    """
+    copies = [i for i, flag in enumerate(track.flag) if "duplicate" in str(flag).split(";")]
+    for row in copies:
+        with_copy = track.usable
+        with_copy[row] = bool(np.isfinite(track.lead_position_m[row]))
+        rows = np.flatnonzero(with_copy)
+        i = int(np.searchsorted(rows, row)) - 1
+        if not with_copy[row] or i < 0:
+            continue
+        frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
+        event = _judge_repeat(frame, track.lead_position_m[rows], i, noise_m, rho, rows)
+        if event is not None and event.kind == "inserted":
+            track = _apply(track, event, step_s)
+    return track
 
 
 def _noise(track: Track) -> tuple[float, float]:
