@@ -155,11 +155,15 @@ class CandidateFits:
         self._fit_what_is_contained()
         return list(self.fitted.values())
 
-    def fit_promising(self) -> list[LikelihoodRatio]:
-        """Fit every candidate in full whose linear promise is a part of the best one's, whatever its climb came to.
+    def fit_in_full(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
+        """Fit candidates in full whatever their climbs came to: those that promise much, or all.
 
-        A climb on a part of the trials may end in a local minimum. Before an answer is closed no candidate is left out
-        for that.
+        A climb on a part of the trials may end in a local minimum, and a fit that has bent its numbers to do without an
+        effect may promise nothing for it, not even the right sign.
+
+        Parameters
+        ----------
+        all_of_them : also those whose linear promise is a small part of the best one's.
 
         Returns
         -------
@@ -168,7 +172,7 @@ class CandidateFits:
         """
         top = self.questions.promise(self.names[0]) if self.names else 0.0
         for name in self.names:
-            near = self.questions.promise(name) > SHARE_WORTH_A_CLIMB * top
+            near = all_of_them or self.questions.promise(name) > SHARE_WORTH_A_CLIMB * top
             if near and name not in self.fitted and name not in self.silent:
                 self._fit_from_prediction(name)
         self._fit_what_is_contained()

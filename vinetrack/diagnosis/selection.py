@@ -31,6 +31,7 @@ from vinetrack.diagnosis.misfit_tests import (
 from vinetrack.diagnosis.multi_start import from_other_starts, without
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, BETWEEN_TRIALS, MISSING, UNEXPLAINED
 from vinetrack.diagnosis.slack_hypothesis import slack_fit
+from vinetrack.diagnosis.trial_effect_tests import scatters_much
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_result import Fit
 
@@ -102,7 +103,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
         return slack
     search = CandidateFits(questions, report)
     search.singles()
-    tried = search.fit_promising()
+    tried = search.fit_in_full()
     between = between_fits(fit, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
     tried += between
     if not questions.something and not differ and (not tried or _best_of(tried).sigma < SUSPECT_SIGMAS):
@@ -111,11 +112,13 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
         rival = without(fit, _best_of(tried).fit)
         if rival.log_likelihood > fit.log_likelihood + NO_BETTER:
             return select_effects(rival, effects, report, again=again + 1)
-    alone = None if questions.far_off else _alone(questions, search, tried)
+    bent = questions.far_off or scatters_much(fit)
+    alone = None if bent else _alone(questions, search, tried)
     if alone is not None:
         return alone
-    # Linear promises choose well near the truth, not far off: there, and before `unexplained`, all are fitted.
-    tried = [*search.singles(all_of_them=True), *between]
+    # Linear promises choose well near the truth, not far from it: there, and before `unexplained`, all are fitted.
+    search.singles(all_of_them=True)
+    tried = [*search.fit_in_full(all_of_them=True), *between]
     alone = _alone(questions, search, tried)
     if alone is not None:
         return alone

@@ -65,6 +65,21 @@ def conditions_apart(fit: Fit) -> float:
     return min(2 * min(chances), 1.0)
 
 
+def scatters_much(fit: Fit) -> bool:
+    """Whether trials deviate by more than an experimenter's care allows: a model may have bent them to fit.
+
+    Parameters
+    ----------
+    fit : the fit that is questioned.
+
+    Returns
+    -------
+    bool
+    """
+    pressure, damping = fit.state.spread
+    return pressure > FEW_PER_CENT or damping > MORE_THAN_VINES
+
+
 def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
     """Upper tail of the F test between groups, 1 where their means differ by less than `allowed`, root mean square."""
     from scipy.stats import f
