@@ -106,10 +106,11 @@ def _is_worth_saying(confounder: Confounder) -> bool:
 
 def _of_number(after: MisfitTests, number: Number, lever: Floats) -> list[Confounder]:
     """Every physical effect as a confounder of one number, in the shape that moves the number most."""
-    kinds = {effect.name: effect.kind for effect in after.effects}
+    physical = {effect.name: effect for effect in after.effects if effect.kind == "physical"}
     confounders = []
     for name in dict.fromkeys(after.answers.effects):
-        if kinds.get(name) != "physical":
+        # An effect that holds the added one as a limit stands in its place, not beside it.
+        if name not in physical or number.key.split(".")[0] in physical[name].replaces:
             continue
         each = [_in_shape(after, number, place, float(lever[place])) for place in after.of(name)]
         known = [confounder for confounder in each if confounder is not None]
