@@ -29,9 +29,10 @@ LAG_S = 0.004
 NOISE_M = 3e-5
 
 TRIALS_HEADER = (
-    "trial,vine,condition,status,reason,n_frames,mm_per_px,scale_rel_sigma,tube_width_mm,growth_mm,noise_m,"
+    "trial,vine,condition,status,reason,n_frames,mm_per_px,scale_rel_sigma,noise_m,"
     "steady_from_s,steady_to_s,"
-    "steady_rule,x_ss_m_s,x_ss_sigma_m_s,x_ss_paper_m_s,cv,force_N,final_lead_velocity_m_s,efficiency"
+    "steady_rule,x_ss_m_s,x_ss_sigma_m_s,x_ss_paper_m_s,cv,force_N,final_lead_velocity_m_s,efficiency,"
+    "tube_width_mm,growth_mm"
 )
 TRACK_HEADER = "frame,time_s,edge_px,lead_position_m,lead_position_sigma_m,flag,tracked_edge_px"
 KINEMATICS_HEADER = (

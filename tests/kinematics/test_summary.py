@@ -16,9 +16,10 @@ from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.summary import TrialError, TrialResult, summarise_trial
 
 ROW = (
-    "trial,vine,condition,status,reason,n_frames,mm_per_px,scale_rel_sigma,tube_width_mm,growth_mm,noise_m,"
+    "trial,vine,condition,status,reason,n_frames,mm_per_px,scale_rel_sigma,noise_m,"
     "steady_from_s,steady_to_s,"
-    "steady_rule,x_ss_m_s,x_ss_sigma_m_s,x_ss_paper_m_s,cv,force_N,final_lead_velocity_m_s,efficiency"
+    "steady_rule,x_ss_m_s,x_ss_sigma_m_s,x_ss_paper_m_s,cv,force_N,final_lead_velocity_m_s,efficiency,"
+    "tube_width_mm,growth_mm"
 )
 SLOW = Vine(4, 1.5)
 

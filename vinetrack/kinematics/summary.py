@@ -173,11 +173,11 @@ def summarise_trial(trial: Trial, track: Track, settings: RunSettings, model: Mo
         "n_frames": track.time_s.size,
         "mm_per_px": trial.m_per_px * 1e3,
         "scale_rel_sigma": math.nan,
-        "tube_width_mm": math.nan,
-        "growth_mm": 1e3 * _growth_m(motion),
         "noise_m": kinematics.noise_m,
         **_steady_columns(steady.chosen, windows["paper"], steady.force),
         **_end_columns(trial, kinematics, motion.release, settings),
+        "tube_width_mm": math.nan,
+        "growth_mm": 1e3 * _growth_m(motion),
     }
     return TrialResult(track, kinematics, motion.release, windows, row, damping_point(trial, steady))
 

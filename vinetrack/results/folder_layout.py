@@ -34,8 +34,6 @@ TRIALS_COLUMNS = (
     "n_frames",
     "mm_per_px",
     "scale_rel_sigma",
-    "tube_width_mm",
-    "growth_mm",
     "noise_m",
     "steady_from_s",
     "steady_to_s",
@@ -47,6 +45,8 @@ TRIALS_COLUMNS = (
     "force_N",
     "final_lead_velocity_m_s",
     "efficiency",
+    "tube_width_mm",
+    "growth_mm",
 )
 STEADY_COLUMNS = (
     "trial",
