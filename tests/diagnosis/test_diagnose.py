@@ -68,14 +68,15 @@ def behind_a_known_lens(pairs: Pairs) -> Pairs:
     return [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
 
 
-def test_a_size_well_beyond_what_could_hide_would_have_been_seen() -> None:
-    """Behind a known lens, at five times the limit; four times reach 3.65 σ of a threshold of 3.71.
-
-    Where 0.1 mm of smooth error is allowed for, it takes six times the limit.
-    """
+@pytest.mark.parametrize(
+    "times",
+    [pytest.param(4, marks=pytest.mark.xfail(strict=True, reason="reaches 3.65 σ of a threshold of 3.71")), 5],
+)
+def test_a_size_well_beyond_what_could_hide_would_have_been_seen(times: int) -> None:
+    """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
     nothing = vt.diagnose(behind_a_known_lens(grown(seed=7000)), ladder=False, advice=False)
     largest = next(o for o in nothing.rounds[0].ranking if o.effect == "tail_friction").largest
-    hidden = grown({"tail_friction.mu_w": 5 * largest["tail_friction.mu_w"]}, seed=7000)
+    hidden = grown({"tail_friction.mu_w": times * largest["tail_friction.mu_w"]}, seed=7000)
     diagnosis = vt.diagnose(behind_a_known_lens(hidden), ladder=False, advice=False)
     assert diagnosis.verdict in ("missing", "ambiguous")
     assert "tail_friction" in diagnosis.answer_set
