@@ -18,7 +18,7 @@ guide: demo  ## outputs and pictures of the docs, printed and drawn anew from th
 	$(BIN)/python benchmarks/guide_pages.py
 
 test: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest -n $(CORES)
+	$(BIN)/python -m pytest -n $(CORES) --dist worksteal
 
 lint: $(STAMP)  ## style, types and the workflow's formatting
 	$(BIN)/ruff check .
