@@ -15,6 +15,7 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis.confounded_sizes import Confounder, confounders_of, size_not_excluded
+from vinetrack.diagnosis.initial_fit import candidates_of, host_for
 from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, MisfitTests, misfit_tests
 from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
@@ -47,8 +48,8 @@ def both_act() -> Pairs:
 def after() -> MisfitTests:
     """The model with the inlet loss alone, fitted to trials that have drag too, held against all other effects."""
     model = vt.base_model() + vt.effects.inlet_loss
-    candidates = hypotheses.candidates_of(model, None, None)
-    found = fit(model, both_act(), host=hypotheses.host_for(model, candidates), profile=False)
+    candidates = candidates_of(model, None, None)
+    found = fit(model, both_act(), host=host_for(model, candidates), profile=False)
     return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], LATER_LEVEL)
 
 

@@ -15,6 +15,7 @@ import vinetrack as vt
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis import misfit_tests as questions
+from vinetrack.diagnosis.initial_fit import candidates_of, host_for
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
 from vinetrack.inference.fit import fit
 from vinetrack.inference.position_errors import smooth_errors
@@ -41,8 +42,8 @@ def careful(payload_g: float, seed: int) -> Pairs:
 
 def asked(pairs: Pairs) -> MisfitTests:
     model = vt.base_model()
-    candidates = hypotheses.candidates_of(model, None, None)
-    found = fit(model, pairs, host=hypotheses.host_for(model, candidates), profile=False)
+    candidates = candidates_of(model, None, None)
+    found = fit(model, pairs, host=host_for(model, candidates), profile=False)
     return misfit_tests(found, hypotheses.testable(candidates, found.predictor.data)[0], FIRST_LEVEL)
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from vinetrack.inference.fit_result import Number
+from vinetrack.narrative.diagnosis_text import gain_in_words
 from vinetrack.narrative.verdict_summary import NONE_SEEN, size, size_interval, sizes
-from vinetrack.narrative.verdict_text import gain_in_words
 
 
 def fit(log_likelihood: float, converged: bool = True) -> Any:

@@ -125,11 +125,25 @@ def test_templates_captions_and_tokens_rerun_the_report(copy: Path) -> None:
 
 
 def test_the_probe_of_a_diagnosis_and_the_truth_of_the_laboratory_count(copy: Path) -> None:
-    # The model stage imports the candidates, whose module holds the probe; the others read a diagnosis by its type,
-    # whose sentences come from the narrative, which names types of the diagnosis.
-    probe = copy / "diagnosis" / "probes" / "probe_force.py"
-    assert changed_by_an_edit(probe, copy) == {"diagnosis", "figures", "model", "overlays", "paper", "report"}
+    # The initial fit is compiled with all that the diagnosis may ask about, the probe included.
+    assert changed_by_an_edit(copy / "diagnosis" / "probes" / "probe_force.py", copy) == {"diagnosis", "model"}
     assert changed_by_an_edit(copy / "laboratory" / "paper.yaml", copy) == {"laboratory"}
+
+
+@pytest.mark.parametrize("name", ["selection", "misfit_tests", "likelihood_ratio", "candidates", "ladder", "diagnose"])
+def test_an_edit_of_how_a_diagnosis_is_made_reruns_the_diagnosis_alone(name: str, copy: Path) -> None:
+    assert changed_by_an_edit(copy / "diagnosis" / f"{name}.py", copy) == {"diagnosis"}
+
+
+@pytest.mark.parametrize("name", ["between_text", "diagnosis_text", "law_text", "plan_text", "verdict_text"])
+def test_an_edit_of_words_refits_and_tracks_nothing(name: str, copy: Path) -> None:
+    changed = changed_by_an_edit(copy / "narrative" / f"{name}.py", copy)
+    assert not changed & {"recording", "tracks", "gather", "damping", "model"}
+
+
+def test_an_edit_of_the_optimiser_redraws_nothing_by_itself(copy: Path) -> None:
+    """What reads a fit from its file does not run the code that made it; it runs where the file has changed."""
+    assert changed_by_an_edit(copy / "inference" / "optimiser.py", copy) == {"model", "diagnosis"}
 
 
 def test_the_command_line_and_the_explorer_rerun_nothing(copy: Path) -> None:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from vinetrack.core.records import Track
-from vinetrack.diagnosis.candidates import candidates_of, shapes_of
-from vinetrack.diagnosis.initial_fit import initial_fit
+from vinetrack.diagnosis.candidates import shapes_of
+from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
 from vinetrack.diagnosis.multi_start import SubsetFitter, best_subset_fit, full_fit, start_of
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.trial_inputs import check_needs

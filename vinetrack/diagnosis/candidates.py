@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.trial_inputs import check_needs, stated
-from vinetrack.effects import Effect, EffectError, Parameter, catalogue, find_effect, load_effect
+from vinetrack.effects import Effect, EffectError, Parameter
 from vinetrack.inference.fit_data import FitTrial
-
-PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
 
 WIDE_RANGE = 10.0
 """Plausible values that differ by more than this factor are tried at geometric steps. Chosen: within a factor of ten a
@@ -68,36 +64,6 @@ class CandidateShape:
         return self.effect.parameters[0]
 
 
-def candidates_of(
-    model: Model, wanted: Iterable[str] | None, user_effects: Mapping[str, Effect] | None = None
-) -> tuple[Effect, ...]:
-    """Effects to question: those `wanted` (default the catalogue) and the user's own, less what is in the model.
-
-    Parameters
-    ----------
-    model
-        The model that is questioned.
-    wanted : iterable of str or None
-        Names of effects; the catalogue where None.
-    user_effects : mapping, optional
-        Effects of the user by name.
-
-    Returns
-    -------
-    tuple of Effect
-
-    Raises
-    ------
-    EffectError
-        If a name is unknown; the message suggests the nearest.
-    """
-    user_effects = user_effects or {}
-    names = [name for name, effect in catalogue().items() if effect.kind != "base"] if wanted is None else list(wanted)
-    names += [name for name in user_effects if name not in names]
-    replaced = {name for effect in model for name in effect.replaces}
-    return tuple(find_effect(name, user_effects) for name in names if name not in model and name not in replaced)
-
-
 def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tuple[Effect, ...], dict[str, str]]:
     """Candidates that the sheet lets act, and for the others the reason why not, by name.
 
@@ -137,29 +103,6 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
             continue
         able.append(effect)
     return tuple(able), reasons
-
-
-@lru_cache(maxsize=1)
-def probe() -> Effect:
-    """The probe force, see its file."""
-    return load_effect(PROBE_FILE)
-
-
-def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
-    """One model that holds all that may be asked for, so that one compiled form serves every hypothesis.
-
-    Parameters
-    ----------
-    model
-        The model that is questioned.
-    candidates : iterable of Effect
-
-    Returns
-    -------
-    Model
-    """
-    held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
-    return Model(tuple(held[name] for name in held))
 
 
 def shapes_of(effect: Effect) -> list[CandidateShape]:

@@ -17,9 +17,9 @@ import numpy as np
 
 from vinetrack.core.records import Track, Trial
 from vinetrack.diagnosis.between_trials import between_candidates
-from vinetrack.diagnosis.candidates import candidates_of, host_for, testable
+from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.contradictions import contradictions
-from vinetrack.diagnosis.initial_fit import initial_fit
+from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, weights_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (

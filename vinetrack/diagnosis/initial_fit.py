@@ -1,19 +1,77 @@
 """The fit of the initial model, which `fit.json` holds and the diagnosis questions: both make it alike.
 
+It is compiled with all that the diagnosis may ask about, so what is asked about (`candidates_of`) stands here.
+
 A model far off its data has several minima a little apart. Begun, compiled or iterated differently, two fits of it
 would end at numbers that differ in the third digit, and every page would show both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from pathlib import Path
 
-from vinetrack.diagnosis.candidates import host_for
 from vinetrack.dynamics.model import Model
-from vinetrack.effects import Effect
+from vinetrack.effects import Effect, catalogue, find_effect, load_effect
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit
+
+PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
+
+
+def candidates_of(
+    model: Model, wanted: Iterable[str] | None, user_effects: Mapping[str, Effect] | None = None
+) -> tuple[Effect, ...]:
+    """Effects to question: those `wanted` (default the catalogue) and the user's own, less what is in the model.
+
+    Parameters
+    ----------
+    model
+        The model that is questioned.
+    wanted : iterable of str or None
+        Names of effects; the catalogue where None.
+    user_effects : mapping, optional
+        Effects of the user by name.
+
+    Returns
+    -------
+    tuple of Effect
+
+    Raises
+    ------
+    EffectError
+        If a name is unknown; the message suggests the nearest.
+    """
+    user_effects = user_effects or {}
+    names = [name for name, effect in catalogue().items() if effect.kind != "base"] if wanted is None else list(wanted)
+    names += [name for name in user_effects if name not in names]
+    replaced = {name for effect in model for name in effect.replaces}
+    return tuple(find_effect(name, user_effects) for name in names if name not in model and name not in replaced)
+
+
+@lru_cache(maxsize=1)
+def probe() -> Effect:
+    """The probe force, see its file."""
+    return load_effect(PROBE_FILE)
+
+
+def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
+    """One model that holds all that may be asked for, so that one compiled form serves every hypothesis.
+
+    Parameters
+    ----------
+    model
+        The model that is questioned.
+    candidates : iterable of Effect
+
+    Returns
+    -------
+    Model
+    """
+    held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
+    return Model(tuple(held[name] for name in held))
 
 
 def initial_fit(

@@ -348,6 +348,6 @@ class Diagnosis:
         return html_table(("", "", ""), rows, f"{self.verdict or 'refused'}: {sentence(self)}", [self.explanation])
 
     def __str__(self) -> str:
-        from vinetrack.narrative.verdict_text import diagnosis_text
+        from vinetrack.narrative.diagnosis_text import diagnosis_text
 
         return diagnosis_text(self)

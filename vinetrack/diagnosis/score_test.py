@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.candidates import CandidateShape, probe
+from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect_sensitivities
+from vinetrack.diagnosis.initial_fit import probe
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
     FitState,

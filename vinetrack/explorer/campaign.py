@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.records import Floats, Kinematics, Track, Trial
-from vinetrack.diagnosis.candidates import host_for
+from vinetrack.diagnosis.initial_fit import host_for
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import Effect, EffectError, catalogue
@@ -24,7 +24,7 @@ from vinetrack.inference.left_out import rest_is_seen
 from vinetrack.inference.starts import initial_trial_effects
 from vinetrack.pipeline.model_stage import measured
 from vinetrack.results.folder_layout import Results, ResultsError, read_result
-from vinetrack.results.stored import read_fit
+from vinetrack.results.stored_fit import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -22,7 +22,7 @@ from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.verdict_summary import size
 from vinetrack.results.folder_layout import Results, ResultsError
-from vinetrack.results.stored import read_diagnosis
+from vinetrack.results.stored_diagnosis import read_diagnosis
 
 AT_THE_FLOOR = 1.15
 """Chosen: an error within 15 % of the replicate scatter counts as equal to it; with six replicates that scatter is

@@ -14,7 +14,8 @@ from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
 from vinetrack.inference.fit_summary import FitSummary
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
-from vinetrack.results.stored import read_diagnosis, read_fit
+from vinetrack.results.stored_diagnosis import read_diagnosis
+from vinetrack.results.stored_fit import read_fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

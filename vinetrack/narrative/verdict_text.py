@@ -1,51 +1,30 @@
-"""A diagnosis in sentences: the explanation of every round, and what `vinetrack diagnose` prints."""
+"""The explanation of every round of a diagnosis, in sentences. Its tables and headline are in `diagnosis_text`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from vinetrack.core.numbers import decimals, with_error
+from vinetrack.core.numbers import decimals
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
     BETWEEN_TRIALS,
-    DROPPED_FRAMES,
     MISSING,
-    NOT_TESTABLE,
-    Candidate,
-    Diagnosis,
-    Round,
 )
 from vinetrack.dynamics.model import base_model
 from vinetrack.inference.fit_result import Number
-from vinetrack.narrative.between_text import difference_headline, difference_in_words, remedies_in_words, trials_differ
-from vinetrack.narrative.verdict_summary import joined, size, sizes
+from vinetrack.narrative.between_text import difference_in_words, remedies_in_words, trials_differ
+from vinetrack.narrative.verdict_summary import joined, size
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from vinetrack.diagnosis.confounded_sizes import Confounder
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.misfit_tests import MisfitTests
     from vinetrack.diagnosis.selection import SelectionStep
-    from vinetrack.inference.fit_result import Fit
-
-_HEADLINES = {
-    ADEQUATE: "no missing effect can be detected",
-    MISSING: "one effect is missing",
-    AMBIGUOUS: "one of several effects is missing, and these data cannot tell which",
-    ARTEFACT: "a fault of the measurement, not of the physics",
-    "unexplained": "the model fails, and no effect of the catalogue explains it",
-}
-CLEAR_GAIN = 9.0
-"""Δχ² from which an effect helps. Derived: that of the answer set, 3 standard errors for one number."""
-
-_SHOWN_CANDIDATES = 8
-"""Of a round on the terminal; chosen: two rounds fit a screen of 24 lines, and `diagnosis.json` has all."""
 
 
 def sizes_in_words(numbers: Sequence[Number]) -> str:
@@ -251,142 +230,3 @@ def dropped_in_words(trials: Sequence[str]) -> str:
         "frame is far above those of its neighbours. Camera or disk dropped frames. The times were corrected; record "
         "again where it matters."
     )
-
-
-def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """Return what the terminal prints: verdict, rounds with their candidates, ladder, next experiment.
-
-    Parameters
-    ----------
-    diagnosis : as `vinetrack.diagnosis.diagnose` returns it.
-
-    Returns
-    -------
-    str, lines separated by line feeds
-    """
-    if not diagnosis.rounds:
-        return diagnosis.explanation
-    lines = [f"{diagnosis.verdict}: {_headline(diagnosis)}", "", diagnosis.explanation]
-    for step in diagnosis.rounds:
-        if step.ranking:
-            lines += ["", f"{' + '.join(step.model)}: {step.verdict}", *_ranking(step)]
-    if diagnosis.ladder is not None and len(diagnosis.ladder) > 1:
-        lines += ["", "position error", *_ladder_table(diagnosis.ladder)]
-    if diagnosis.where:
-        lines += ["", *diagnosis.where]
-    if diagnosis.next_experiment:
-        lines += ["", str(diagnosis.next_experiment.get("text", ""))]
-    lines += [f"! {note}" for note in diagnosis.notes]
-    return "\n".join(lines)
-
-
-def _rows(table: pd.DataFrame) -> Iterator[Any]:
-    return iter(table.itertuples(index=False))
-
-
-def _headline(diagnosis: Diagnosis) -> str:
-    if diagnosis.verdict == MISSING:
-        return joined(list(diagnosis.effects)) + (" is missing" if len(diagnosis.effects) == 1 else " are missing")
-    if diagnosis.verdict in (AMBIGUOUS, ARTEFACT) and diagnosis.answer_set:
-        if diagnosis.answer_set == (DROPPED_FRAMES,):
-            return "frames are missing from the recordings"
-        if trials_differ(diagnosis.answer_set):
-            return f"trials differ, the physics holds: {difference_headline(diagnosis.answer_set)}"
-        return f"{_HEADLINES[diagnosis.verdict]}: {joined(list(diagnosis.answer_set), 'or')}"
-    return _HEADLINES[diagnosis.verdict]
-
-
-def _ranking(step: Round) -> list[str]:
-    from vinetrack.core.terminal import table
-
-    rows = []
-    testable = [candidate for candidate in step.ranking if candidate.status != NOT_TESTABLE]
-    for candidate in testable[:_SHOWN_CANDIDATES]:
-        rows.append(
-            (
-                ("* " if candidate.in_answer_set else "  ") + candidate.effect,
-                f"{candidate.delta_chi2:.1f}" if math.isfinite(candidate.delta_chi2) else "–",
-                f"{candidate.sigma:.1f}",
-                sizes(candidate),
-                candidate.reason or _status(candidate),
-            )
-        )
-    lines = list(table(rows, ("candidate", "Δχ²", "σ", "size", "")))
-    blind = [candidate.effect for candidate in step.ranking if candidate.status == NOT_TESTABLE]
-    return lines + ([f"not testable here: {', '.join(blind)}"] if blind else [])
-
-
-def _status(candidate: Candidate) -> str:
-    """How much is known of a candidate, with its posterior weight where it shares the answer set."""
-    shared = candidate.in_answer_set and candidate.posterior_weight < 0.995
-    return f"{candidate.status}, weight {100 * candidate.posterior_weight:.0f} %" if shared else candidate.status
-
-
-def _ladder_table(ladder: pd.DataFrame) -> list[str]:
-    from vinetrack.core.terminal import table
-
-    body = [
-        (
-            str(row.added) or "initial model",
-            *(
-                f"{1e3 * value:.2f}" if math.isfinite(value) else "–"
-                for value in (row.rms_in_sample_m, row.rms_left_out_m, row.rms_highest_pressure_m, row.floor_m)
-            ),
-        )
-        for row in _rows(ladder)
-    ]
-    return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))
-
-
-def gain_in_words(before: Fit, after: Fit) -> str:
-    """Return what an added effect brought; the larger model holds the smaller: a loss means a fit that has not ended.
-
-    Parameters
-    ----------
-    before, after : fits without and with the effect.
-
-    Returns
-    -------
-    str
-    """
-    gain = 2 * (after.log_likelihood - before.log_likelihood)
-    if gain < 0:
-        return "the fit has not settled, so whether it helps is not known"
-    helps = f"Δχ² = {gain:.1f}"
-    if gain <= CLEAR_GAIN:
-        helps = f"it does not help ({helps}; a gain begins at {CLEAR_GAIN:g})"
-    return helps if after.converged else f"{helps}; the fit has not settled"
-
-
-def added_in_words(before: Fit, after: Fit, table: pd.DataFrame, numbers: pd.DataFrame) -> list[str]:
-    """Return how an effect added by hand changed errors and numbers, as lines of aligned tables.
-
-    Parameters
-    ----------
-    table : the ladder of errors, `before` and `after`.
-    numbers : one row a number and model: `symbol, vine, unit, added, value, sigma` (SI).
-    before, after : fits without and with the effect.
-
-    Returns
-    -------
-    list of str
-    """
-    from vinetrack.core.terminal import table as aligned
-
-    lines = [
-        f"{after.model.names[-1]} added to {' + '.join(before.model.names)}: {gain_in_words(before, after)}",
-        "",
-        "position error",
-        *_ladder_table(table),
-        "",
-        "numbers",
-    ]
-    changed: dict[tuple[str, str], dict[str, str]] = {}
-    for row in _rows(numbers):
-        unit, factor = display_unit(row.unit)
-        title = f"{row.symbol} ({row.vine})" if row.vine else row.symbol
-        place = changed.setdefault((title, unit), {})
-        place["after" if row.added else "before"] = with_error(row.value * factor, row.sigma * factor)
-    body = [(title, row.get("before", "–"), row.get("after", "–"), unit) for (title, unit), row in changed.items()]
-    lines += aligned(body, ("", "before", "after", "unit"))
-    return lines + [f"! {message}" for message in after.messages]

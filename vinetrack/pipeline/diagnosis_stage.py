@@ -16,7 +16,7 @@ import numpy as np
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_result
-from vinetrack.results.stored import read_diagnosis
+from vinetrack.results.stored_diagnosis import read_diagnosis
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -254,7 +254,7 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
 
     from vinetrack.diagnosis.add import add
     from vinetrack.diagnosis.ladder import LADDER_COLUMNS, moved
-    from vinetrack.narrative.verdict_text import added_in_words
+    from vinetrack.narrative.diagnosis_text import added_in_words
 
     results = Results(folder)
     pairs, _ = measured(experiment, results)

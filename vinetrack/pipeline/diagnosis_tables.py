@@ -16,8 +16,8 @@ import numpy as np
 
 from vinetrack.figures.style import rows as iter_rows
 from vinetrack.narrative.verdict_summary import listed, sizes
-from vinetrack.results import stored
 from vinetrack.results.folder_layout import Results, read_result
+from vinetrack.results.stored_diagnosis import read_diagnosis as stored_diagnosis
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,7 +69,7 @@ def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTable
     -------
     DiagnosisTables or None
     """
-    diagnosis = stored.read_diagnosis(results)
+    diagnosis = stored_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return None
     located, drifting, force = (
@@ -137,7 +137,7 @@ def read_diagnosis(results: Results, experiment: Experiment) -> DiagnosisResult 
     """
     from vinetrack.report.diagnosis_section import DiagnosisResult
 
-    diagnosis = stored.read_diagnosis(results)
+    diagnosis = stored_diagnosis(results)
     if diagnosis is None:
         return None
     paths = (results.diagnosed("moved.csv"), results.diagnosed("damping_laws.csv"))

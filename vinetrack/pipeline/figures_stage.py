@@ -14,7 +14,7 @@ import numpy as np
 from vinetrack.core.tables import write_bytes, write_json
 from vinetrack.pipeline.pool import map_trials
 from vinetrack.results.folder_layout import Results, read_json, read_result
-from vinetrack.results.stored import read_diagnosis
+from vinetrack.results.stored_diagnosis import read_diagnosis
 
 if TYPE_CHECKING:
     import pandas as pd

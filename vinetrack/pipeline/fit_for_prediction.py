@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vinetrack.results.folder_layout import Results, ResultsError, read_json
-from vinetrack.results.stored import read_diagnosis
+from vinetrack.results.stored_diagnosis import read_diagnosis
 
 _ADEQUATE = "adequate"
 

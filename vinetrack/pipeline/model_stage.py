@@ -17,7 +17,7 @@ import numpy as np
 from vinetrack.core.records import Kinematics, Track, Trial
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
-from vinetrack.results.stored import read_fit
+from vinetrack.results.stored_fit import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -183,9 +183,8 @@ def _fitted(
     kinematics: dict[str, Kinematics],
     settings: RunSettings,
 ) -> tuple[Fit, Comparison]:
-    from vinetrack.diagnosis.candidates import candidates_of
     from vinetrack.diagnosis.compare import compare
-    from vinetrack.diagnosis.initial_fit import initial_fit
+    from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
     from vinetrack.pipeline.tracks_stage import model_of
 
     model = model_of(experiment)
@@ -267,7 +266,6 @@ def comparison_lines(folder: Path) -> list[str]:
         If the model has not been fitted there.
     """
     from vinetrack.core.terminal import table as aligned
-    from vinetrack.figures.style import rows
 
     results = Results(folder)
     fit, table = read_fit(results), read_result(results.comparison)
@@ -275,15 +273,15 @@ def comparison_lines(folder: Path) -> list[str]:
         return [f"{' + '.join(fit.names)} was not fitted: {fit.refused}"]
     body = [
         (
-            str(row.condition),
-            _shown(1e3 * row.rms_position_m, 3),
-            _shown(1e3 * row.replicate_floor_m, 3),
-            _shown(row.ratio, 1),
-            _shown(row.rms_final_velocity_m_s, 3),
-            _shown(1e3 * row.worst_at_s, 1),
-            _shown(1e3 * row.worst_at_m, 1),
+            str(row["condition"]),
+            _shown(1e3 * row["rms_position_m"], 3),
+            _shown(1e3 * row["replicate_floor_m"], 3),
+            _shown(row["ratio"], 1),
+            _shown(row["rms_final_velocity_m_s"], 3),
+            _shown(1e3 * row["worst_at_s"], 1),
+            _shown(1e3 * row["worst_at_m"], 1),
         )
-        for row in rows(table)
+        for row in table.to_dict("records")
     ]
     head = ("condition", "rms position", "replicates", "ratio", "rms final speed", "worst at", "")
     lines = aligned(body, head, ("", "mm", "mm", "", "m/s", "ms", "mm"), align="<>>>>>>")

@@ -18,7 +18,8 @@ from vinetrack.figures.style import GREEN
 from vinetrack.narrative.verdict_summary import plain
 from vinetrack.pipeline.pool import map_trials
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
-from vinetrack.results.stored import read_diagnosis, read_fit
+from vinetrack.results.stored_diagnosis import read_diagnosis
+from vinetrack.results.stored_fit import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd

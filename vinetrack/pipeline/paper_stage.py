@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.tables import write_bytes, write_csv
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
-from vinetrack.results.stored import read_fit
+from vinetrack.results.stored_fit import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd

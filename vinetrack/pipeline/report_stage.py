@@ -13,8 +13,8 @@ from vinetrack.pipeline.diagnosis_tables import figure_tables, read_diagnosed, r
 from vinetrack.pipeline.figures_stage import describe_conditions
 from vinetrack.pipeline.workflow import SHARED_FILES
 from vinetrack.results.folder_layout import Results, read_json, read_result
-from vinetrack.results.stored import read_diagnosis as stored_diagnosis
-from vinetrack.results.stored import read_fit
+from vinetrack.results.stored_diagnosis import read_diagnosis as stored_diagnosis
+from vinetrack.results.stored_fit import read_fit
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,0 +1,40 @@
+"""The diagnosis of a results folder, read back as a typed object: `diagnosis.json` is read here and nowhere else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from vinetrack.results.folder_layout import Results, read_json, read_result
+from vinetrack.results.stored_fit import broken_file
+
+if TYPE_CHECKING:
+    from vinetrack.diagnosis.result import Diagnosis
+
+
+def read_diagnosis(results: Results) -> Diagnosis | None:
+    """Read `diagnosis.json` and `ladder.csv`.
+
+    Parameters
+    ----------
+    results : the folder.
+
+    Returns
+    -------
+    Diagnosis or None
+        None where there is none; `refused` holds the reason where none could be made.
+
+    Raises
+    ------
+    ResultsError
+        If the file is not one of ours.
+    """
+    from vinetrack.diagnosis.result import Diagnosis
+
+    if not results.diagnosis.exists():
+        return None
+    content = read_json(results.diagnosis)
+    ladder = read_result(results.ladder) if results.ladder.exists() else None
+    try:
+        return Diagnosis.from_json(content, ladder if ladder is not None and len(ladder) else None)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise broken_file(results.diagnosis, error) from None
