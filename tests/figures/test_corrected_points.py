@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from plain_scene import Plan, plain_scene
 
-from vinetrack.core.records import Correction, Trial, hand_corrected
+from vinetrack.core.records import Correction, Trial, hand_corrected, join_flags, with_flag
 from vinetrack.figures.strip_figure import draw_strip
 from vinetrack.video.frames import Frames, Recording
 from vinetrack.video.track import Tracking, track_frames
@@ -43,4 +43,11 @@ def test_a_strip_without_corrections_says_nothing_of_them(tracking: Tracking) ->
 
 
 def test_a_time_put_right_is_no_point_corrected_by_hand() -> None:
-    assert list(hand_corrected(["corrected", "gap;corrected", "", "rejected;corrected"])) == [True, False, False, True]
+    flags = ["corrected", "gap;retimed", "", "rejected;corrected", "corrected;gap;retimed"]
+    assert list(hand_corrected(flags)) == [True, False, False, True, True]
+
+
+def test_what_earlier_releases_wrote_is_read_as_a_time_put_right() -> None:
+    assert list(hand_corrected(["gap;corrected", "doubtful;gap;corrected"])) == [False, False]
+    assert list(with_flag(["gap;corrected", "corrected;gap"], "retimed")) == [True, False]
+    assert join_flags("gap;corrected", "doubtful") == "doubtful;gap;retimed"

@@ -10,6 +10,7 @@ from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack.core.records import Track
 from vinetrack.tracks.frame_timing import correct_frames
+from vinetrack.tracks.step_gaps import count_missing
 
 FRAME_S = 1 / CAPTURE_FPS
 CLEAR = [  # speeds at which one frame's step is at least 8 standard deviations of a position
@@ -76,7 +77,7 @@ def test_after_an_inserted_copy_times_go_back_by_one_frame():
 def test_after_dropped_frames_times_go_on_by_as_many(count):
     clean = steady_track()
     out = correct_frames(dropped(clean, 70, count))
-    assert flags(out) == {70: "gap;corrected"}
+    assert flags(out) == {70: "gap;retimed"}
     np.testing.assert_allclose(out.time_s, np.delete(clean.time_s, range(70, 70 + count)), atol=1e-12)
     assert ("1 frame is missing" if count == 1 else f"{count} frames are missing") in out.notes[0]
 
@@ -84,7 +85,7 @@ def test_after_dropped_frames_times_go_on_by_as_many(count):
 def test_several_faults_in_one_track_are_all_put_right():
     clean = steady_track()
     out = correct_frames(stale(inserted(dropped(clean, 60), 80), 100))
-    assert flags(out) == {60: "gap;corrected", 80: "duplicate", 100: "duplicate"}
+    assert flags(out) == {60: "gap;retimed", 80: "duplicate", 100: "duplicate"}
     np.testing.assert_allclose(out.time_s[-1], clean.time_s[-1], atol=1e-12)
 
 
@@ -124,7 +125,7 @@ def test_faults_in_clear_motion_are_found(vine, noise_m, rho, fault):
         trial = record(vine, rng, noise_m=noise_m, rho=rho, rest_frames=int(rng.integers(0, 80)))
         clear = np.flatnonzero(trial.lead_velocity_m_s * FRAME_S > 8 * noise_m)[4:-5]
         row = int(rng.choice(clear))
-        expected = "gap;corrected" if fault is dropped else "duplicate"
+        expected = "gap;retimed" if fault is dropped else "duplicate"
         right += flags(correct_frames(fault(trial.track, row))) == {row: expected}
         tried += 1
     assert right / tried >= 0.9
@@ -211,3 +212,42 @@ def test_a_corrected_track_is_corrected_once():
     once = correct_frames(dropped(steady_track(), 70))
     twice = correct_frames(once)
     np.testing.assert_array_equal(once.time_s, twice.time_s)
+
+
+def steps_with(long: float, number: np.ndarray | None = None):
+    """Twenty frames that move 10 px each, but for one step of `long` before the tenth."""
+    step = np.full(20, 10.0)
+    step[10] = long
+    number = np.arange(20) if number is None else number
+    no_copy = np.zeros(20, dtype=bool)
+    return count_missing(np.cumsum(step), np.full(20, 0.1), number, number, no_copy, (0, 19))
+
+
+def test_a_double_step_of_a_recording_moves_its_times_on():
+    out = steps_with(20.0)
+    assert list(np.flatnonzero(out.gap)) == list(np.flatnonzero(out.retimed)) == [10]
+    np.testing.assert_array_equal(out.slot, np.arange(20) + (np.arange(20) >= 10))
+
+
+def test_a_step_of_no_whole_number_is_told_and_moves_nothing():
+    out = steps_with(17.0)
+    assert list(np.flatnonzero(out.gap)) == [10]
+    assert not out.retimed.any()
+    np.testing.assert_array_equal(out.slot, np.arange(20))
+    assert out.notes == ("a step of 1.7 times its neighbours before frame 10: frames may be missing",)
+
+
+def test_frames_that_were_left_out_are_no_gap_and_are_counted_in_notes():
+    out = steps_with(20.0, np.arange(20) + (np.arange(20) >= 1))
+    assert list(np.flatnonzero(out.gap)) == [10]
+    assert "before frame 11 " in out.notes[0]
+
+
+def test_a_gap_that_is_marked_already_is_not_told_again():
+    rows = np.delete(np.arange(120), [70, 71])
+    track = steady_track()
+    flag = np.full(118, "", dtype="<U80")
+    flag[70] = "gap"
+    gapped = replace(make_track(track.time_s[rows], track.lead_position_m[rows]), flag=flag)
+    assert correct_frames(gapped).notes == ()
+    assert flags(correct_frames(gapped)) == {70: "gap"}

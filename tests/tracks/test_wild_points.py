@@ -76,7 +76,7 @@ def test_points_behind_a_dropped_frame_are_not_wild():
     y = np.delete(track.lead_position_m, [150, 151])
     out = correct_frames(make_track(track.time_s[:-2], y))
     assert np.flatnonzero(out.flag != "").tolist() == [150]
-    assert out.flag[150] == "gap;corrected"
+    assert out.flag[150] == "gap;retimed"
 
 
 def test_a_motion_that_starts_at_full_speed_keeps_its_points():

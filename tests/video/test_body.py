@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -82,6 +83,15 @@ def test_a_bounce_ends_the_track():
     assert any("turns back" in note for note in track.notes)
     used = np.flatnonzero(track.usable & (np.arange(len(track.flag)) > 60))
     assert np.abs(track.edge_px[used] - row[used]).max() < 1
+
+
+def test_the_end_of_the_way_is_told_by_the_frame_of_the_recording():
+    frames, row = falling_disc(307, n=185)
+    impact = int(np.argmax(row > 340))
+    there_and_back = np.concatenate([frames[: impact + 1], frames[impact - 1 : 90 : -1]])
+    later = replace(BALL, frames_used=(20, len(there_and_back) - 1))
+    notes = track_frames(in_memory(there_and_back), later, RATE).track.notes
+    assert any(f"turns back after frame {impact}:" in note for note in notes)
 
 
 def test_a_body_that_is_gone_is_lost():

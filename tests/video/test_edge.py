@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from plain_scene import Plan, plain_scene, write_video
 
-from vinetrack.core.records import FLAGS, Trial
+from vinetrack.core.records import FLAGS, Trial, with_flag
+from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import Frames, Recording, RecordingError, Region
 from vinetrack.video.point_quality import FLOOR_PX, calibrated_sigma, judge, moving_range
@@ -159,6 +162,7 @@ def test_a_wrong_second_frame_is_rejected():
     assert track.flag[1] == "rejected"
     assert np.isnan(track.edge_px[1])
     assert any("unlike all others" in note for note in track.notes)
+    assert not with_flag(track.flag, "gap").any()
 
 
 def test_a_repeated_frame_is_dropped_and_the_times_stay():
@@ -176,9 +180,20 @@ def test_a_missing_frame_is_flagged_and_the_times_are_mended():
     plan = Plan(seed=212, **SHORT)
     scene = plain_scene(plan)
     track = track_frames(in_memory(np.delete(scene.frames, 26, axis=0)), trial(plan), 1000.0).track
-    assert "gap" in track.flag[26]
+    assert track.flag[26] == "gap;retimed"
     assert track.time_s[26] - track.time_s[25] == pytest.approx(2e-3)
     assert track.time_s[27] - track.time_s[26] == pytest.approx(1e-3)
+    told = [note for note in correct_frames(track).notes if "missing" in note]
+    assert told == ["1 frame is missing before frame 26 (the step there is too long): later times moved on"]
+
+
+def test_frames_in_notes_are_those_of_the_recording():
+    plan = Plan(seed=212, **SHORT)
+    scene = plain_scene(plan)
+    late = replace(trial(plan), frames_used=(5, len(scene.frames) - 2))
+    track = track_frames(in_memory(np.delete(scene.frames, 26, axis=0)), late, 1000.0).track
+    assert track.flag[26] == "gap;retimed"
+    assert any("missing before frame 26 " in note for note in track.notes)
 
 
 def test_stated_errors_follow_the_roughness():
@@ -198,6 +213,7 @@ def test_a_lost_point_among_moving_ones_is_flagged():
     edge = np.concatenate([np.full(5, 5.0), 5 + 3.0 * np.arange(1, 21), np.full(5, 65.0)])
     edge[12] = np.nan
     nothing = np.zeros(30, dtype=bool)
-    verdict = judge(edge, np.full(30, 0.1), np.arange(30), unsure=nothing, damaged=nothing, repeated=nothing, end_px=99)
+    masks = {"unsure": nothing, "damaged": nothing, "repeated": nothing}
+    verdict = judge(edge, np.full(30, 0.1), np.arange(30), np.arange(30), **masks, end_px=99)
     assert verdict.flag[12] == "lost"
     assert any("lost in 1 moving frames" in note for note in verdict.notes)

@@ -31,7 +31,7 @@ def test_a_moved_point_is_usable_again_and_has_the_error_of_a_click() -> None:
 
 def test_a_dropped_point_is_rejected_and_a_confirmed_one_no_longer_doubtful() -> None:
     out = corrected_by_hand(px_track(), [Correction(0, "drop"), Correction(1, "confirm"), Correction(3, "move", 29.0)])
-    assert list(out.flag[[0, 1, 3]]) == ["rejected;corrected", "corrected", "gap;corrected"]
+    assert list(out.flag[[0, 1, 3]]) == ["rejected;corrected", "corrected", "corrected;gap"]
     assert np.isnan(out.edge_px[0])
     assert out.tracked_px is not None
     assert out.tracked_px[0] == 0.0

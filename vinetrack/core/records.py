@@ -21,8 +21,13 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int_]
 Bools = NDArray[np.bool_]
 
-FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "gap", "corrected", "after_end")
-"""Every flag a point of a track can carry; several are joined by `;`."""
+FLAGS = ("before_release", "doubtful", "lost", "rejected", "duplicate", "corrected", "gap", "retimed", "after_end")
+"""Every flag a point of a track can carry; several are joined by `;` in this order. `corrected`: a person has moved,
+dropped or confirmed the point. `gap`: frames are missing before it; `retimed`: the times from it on were put right."""
+
+_RETIMED_BEFORE = "gap;corrected"
+"""What releases before `retimed` wrote for `gap;retimed`; `corrected` stands before `gap` since, so that the two can be
+told apart. Read for one release."""
 
 UNUSABLE_FLAGS = frozenset({"lost", "rejected", "duplicate", "after_end"})
 """A point with one of these says nothing about where the leading edge was."""
@@ -155,25 +160,54 @@ class Trial:
 
 def join_flags(*flags: str) -> str:
     """`;`-join flags in the order of FLAGS, each once, blanks dropped."""
-    present = {part for flag in flags for part in flag.split(";") if part}
+    present = {part for flag in flags for part in split_flags(flag)}
     return ";".join(flag for flag in FLAGS if flag in present)
 
 
-def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
-    """Mask, shape (n_frames,), of points that a person has moved, dropped or confirmed.
-
-    `gap;corrected` says that the time of a point was put right, not the point.
+def split_flags(flag: str) -> list[str]:
+    """The flags of one point.
 
     Parameters
     ----------
-    flags : of every frame, separated by semicolons.
+    flag : as a track holds it, joined by `;`; `gap;corrected` of an earlier release is read as `gap;retimed`.
+
+    Returns
+    -------
+    list of str : without blanks.
+
+    >>> split_flags("doubtful;gap;corrected"), split_flags("corrected;gap")
+    (['doubtful', 'gap', 'retimed'], ['corrected', 'gap'])
+    """
+    return [part for part in flag.replace(_RETIMED_BEFORE, "gap;retimed").split(";") if part]
+
+
+def with_flag(flags: Iterable[str], name: str) -> NDArray[np.bool_]:
+    """Mask, shape (n_frames,), of points that carry a flag.
+
+    Parameters
+    ----------
+    flags : of every frame, joined by `;`.
+    name : one of FLAGS.
 
     Returns
     -------
     array of bool, shape (n_frames,)
     """
-    parts = [str(flag).split(";") for flag in flags]
-    return np.array(["corrected" in part and "gap" not in part for part in parts], dtype=bool)
+    return np.array([name in split_flags(str(flag)) for flag in flags], dtype=bool)
+
+
+def hand_corrected(flags: Iterable[str]) -> NDArray[np.bool_]:
+    """Mask, shape (n_frames,), of points that a person has moved, dropped or confirmed.
+
+    Parameters
+    ----------
+    flags : of every frame, joined by `;`.
+
+    Returns
+    -------
+    array of bool, shape (n_frames,)
+    """
+    return with_flag(flags, "corrected")
 
 
 @dataclass(frozen=True)

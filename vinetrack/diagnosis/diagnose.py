@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Track, Trial, with_flag
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.contradictions import contradictions
@@ -180,9 +180,9 @@ def _frames_put_right(pairs: Iterable[tuple[Trial, Track]]) -> tuple[list[tuple[
 
     right, dropped = [], []
     for trial, track in pairs:
-        if trial.video is None and not any("corrected" in str(flag) for flag in track.flag):
+        if trial.video is None and not with_flag(track.flag, "retimed").any():
             track = correct_frames(track)
-        if any("gap" in str(flag) and "corrected" in str(flag) for flag in track.flag):
+        if with_flag(track.flag, "retimed").any():
             dropped.append(trial.name)
         right.append((trial, track))
     return right, dropped
@@ -202,7 +202,7 @@ def _dropped_in_fit(fit: Fit) -> list[str]:
             flag=blank,
             edge_px=np.full(trial_data.time_s.size, math.nan),
         )
-        if any("corrected" in str(flag) for flag in correct_frames(track).flag):
+        if with_flag(correct_frames(track).flag, "retimed").any():
             dropped.append(trial_data.trial.name)
     return dropped
 

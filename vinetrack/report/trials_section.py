@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.numbers import number, with_error
+from vinetrack.core.records import split_flags
 from vinetrack.figures.style import RULE_NAMES, rows
 from vinetrack.report.section import data_uri
 from vinetrack.report.svg import inline_svg
@@ -34,6 +35,7 @@ KINDS = {
 FLAG_WORDS = {
     "before_release": "before release",
     "lost": "without the edge",
+    "corrected": "corrected by hand",
     "after_end": "after the end",
 }
 SHARED_ERROR = (
@@ -88,7 +90,7 @@ def count_frames(flags: Iterable[str]) -> str:
     '5 frames: 1 before release, 1 doubtful, 1 without the edge, 1 gap'
     """
     flags = list(flags)
-    counted = Counter(part for flag in flags for part in flag.split(";") if part)
+    counted = Counter(part for flag in flags for part in split_flags(flag))
     parts = [f"{count} {FLAG_WORDS.get(flag, flag)}" for flag, count in counted.items()]
     return f"{len(flags)} frames" + (f": {', '.join(parts)}" if parts else "")
 

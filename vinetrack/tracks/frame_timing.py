@@ -10,6 +10,9 @@ it as well and points farther away agree: noise may have heavy tails. Points far
 first (`wild_points`): a dropped frame displaces all later points, a wild point comes back. Nothing is called where the
 motion is slow beside the noise, where it speeds up so fast that a long step may be the motion itself (release), or
 where the times are irregular.
+
+The tracker of recordings looks at single steps with `step_gaps`, before positions are in metres; what that has marked
+as a gap is not told again by `correct_frames`.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Track, join_flags
+from vinetrack.core.records import Floats, Track, join_flags, with_flag
 from vinetrack.tracks.position_noise import position_noise, rough_noise
 from vinetrack.tracks.wild_points import reject_wild_points
 
@@ -109,8 +112,9 @@ def correct_frames(track: Track) -> Track:
     -------
     Track
         `rejected` on wild points; `duplicate` on repeated frames; `gap` on the first row after a gap in the times;
-        `gap;corrected` on the first row after dropped frames that the times did not show. Each is told in `notes`. A
-        repeated frame that was inserted is set half a frame after the frame it repeats, so that times still increase.
+        `gap;retimed` on the first row after dropped frames that the times did not show. Each is told in `notes`, but
+        for gaps in the times that were marked before. A repeated frame that was inserted is set half a frame after
+        the frame it repeats, so that times still increase.
     """
     track = reject_wild_points(track)
     spacing = np.diff(track.time_s)
@@ -135,7 +139,7 @@ def _retime_known_copies(track: Track, step_s: float, noise_m: float, rho: float
 
     A repeated picture tells that a frame is a copy, not whether it took the place of another.
     """
-    copies = [i for i, flag in enumerate(track.flag) if "duplicate" in str(flag).split(";")]
+    copies = np.flatnonzero(with_flag(track.flag, "duplicate"))
     for row in copies:
         with_copy = track.usable
         with_copy[row] = bool(np.isfinite(track.lead_position_m[row]))
@@ -162,16 +166,26 @@ def _noise(track: Track) -> tuple[float, float]:
 
 
 def _flag_visible_gaps(track: Track, frames: NDArray[np.int_]) -> Track:
-    """`gap` on the first row after each spacing of two frames or more."""
+    """`gap` on the first row after each spacing of two frames or more, where nothing has marked it yet."""
     out = track
-    for before in np.flatnonzero(frames > 1):
+    for before in np.flatnonzero((frames > 1) & ~with_flag(track.flag[1:], "gap")):
         missing = int(frames[before]) - 1
-        note = f"{_count(missing)} missing before {track.time_s[before + 1]:.5g} s, as the times say"
+        note = f"{frames_are(missing)} missing before {track.time_s[before + 1]:.5g} s, as the times say"
         out = _mark(out, int(before) + 1, "gap", note)
     return out
 
 
-def _count(frames: int) -> str:
+def frames_are(frames: int) -> str:
+    """A number of frames as the beginning of a sentence.
+
+    Parameters
+    ----------
+    frames : how many.
+
+    Returns
+    -------
+    str : with its verb.
+    """
     return "1 frame is" if frames == 1 else f"{frames} frames are"
 
 
@@ -357,8 +371,8 @@ def _apply(track: Track, event: _Event, step_s: float) -> Track:
         note = f"the frame at {at_s:.5g} s is an inserted copy: left out, later times moved back by one frame"
         return _mark(replace(track, time_s=time_s), event.row, "duplicate", note)
     time_s[event.row :] += event.missing * step_s
-    note = f"{_count(event.missing)} missing before {at_s:.5g} s (the step there is too long): later times moved on"
-    return _mark(replace(track, time_s=time_s), event.row, "gap;corrected", note)
+    note = f"{frames_are(event.missing)} missing before {at_s:.5g} s (the step there is too long): later times moved on"
+    return _mark(replace(track, time_s=time_s), event.row, "gap;retimed", note)
 
 
 def _mark(track: Track, row: int, flags: str, note: str) -> Track:

@@ -53,13 +53,22 @@ a bounce of 100 px pays within five frames, a hop back to a hand that let go doe
 
 
 @dataclass(frozen=True)
+class EndOfWay:
+    """Last frame of a body's way along the strip, where the recording goes on; `turns_back` or is not seen again."""
+
+    last_frame: int
+    turns_back: bool
+
+
+@dataclass(frozen=True)
 class BodyFit:
     """Position of the body along the strip, arrays of shape (n_frames,).
 
     `position_px` is the column of the template's middle at mid-exposure, `across_px` its place across, `sigma_px` the
     random error along, `match` the correlation with the template, `unsure` where that is poor or the body is cut by
     the strip's end. `unseen` marks frames in which the body is not seen, or that come after the end of its motion along
-    the strip, which `notes` say. `half_px` is half the length of the template.
+    the strip, which `end` tells; None where it lasts as long as the recording. `half_px` is half the length of the
+    template.
     """
 
     position_px: Floats
@@ -69,7 +78,7 @@ class BodyFit:
     unsure: NDArray[np.bool_]
     half_px: float
     unseen: NDArray[np.bool_]
-    notes: tuple[str, ...] = ()
+    end: EndOfWay | None = None
 
 
 def track_body(strip: Strip) -> BodyFit:
@@ -109,10 +118,11 @@ def track_body(strip: Strip) -> BodyFit:
     inside = (place[:, 0] > 0.6 * half) & (place[:, 0] < pictures.shape[2] - 1 - 0.6 * half)
     astray = np.abs(place[:, 1]) > SEARCH_ROWS - 0.5
     unseen = (match < LOST_MATCH) | astray | _is_absent(pictures, background, template, weight, place, half)
-    last, notes = _end_of_motion(place[:, 0], error, match, unseen)
-    unseen |= np.arange(len(unseen)) > last
+    end = _end_of_way(place[:, 0], error, match, unseen)
+    if end is not None:
+        unseen |= np.arange(len(unseen)) > end.last_frame
     unsure = ~inside | (match < POOR_MATCH)
-    return BodyFit(place[:, 0], place[:, 1], error, match, unsure, float(half), unseen, notes)
+    return BodyFit(place[:, 0], place[:, 1], error, match, unsure, float(half), unseen, end)
 
 
 def _is_absent(
@@ -135,28 +145,22 @@ def _is_absent(
     return absent
 
 
-def _end_of_motion(
-    along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]
-) -> tuple[int, tuple[str, ...]]:
-    """Last frame of the body's way along the strip, and what ends it where the recording does not.
+def _end_of_way(along: Floats, sigma: Floats, match: Floats, unseen: NDArray[np.bool_]) -> EndOfWay | None:
+    """Where the body's way along the strip ends, None where the recording ends first.
 
     It ends where the body turns back (a bounce), and where it is not recognised again (it tips over, or is gone).
     """
     known = np.flatnonzero(~unseen & (match >= POOR_MATCH))
     if len(known) < 3:
-        return len(along) - 1, ()
+        return None
     y = along[known]
     behind = np.maximum.accumulate(y) - y
     back = behind > np.maximum(BACK_PX, BACK_SIGMA * np.nan_to_num(sigma[known], nan=0.0))
     turned = np.flatnonzero(back[:-1] & back[1:])
     if len(turned):
-        last = int(known[int(np.argmax(y[: turned[0]]))])
-        why = f"the body turns back after frame {last}: a bounce, or the end of its way; later frames are not used"
-        return last, (why,)
+        return EndOfWay(int(known[int(np.argmax(y[: turned[0]]))]), turns_back=True)
     last = int(known[-1])
-    if last >= len(along) - 2:
-        return len(along) - 1, ()
-    return last, (f"the body is not recognised after frame {last}: it is gone, hidden or turned over",)
+    return EndOfWay(last, turns_back=False) if last < len(along) - 2 else None
 
 
 def _coarse_path(pictures: NDArray[np.float32], noise: float) -> tuple[Floats, int, NDArray[np.float32]]:

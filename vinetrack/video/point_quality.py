@@ -5,12 +5,13 @@ Works on positions alone, in pixels by frame; who measured them does not matter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Bools, Floats, join_flags
+from vinetrack.core.records import Bools, Floats, Indices, join_flags
+from vinetrack.tracks.step_gaps import count_missing
 
 LOST_SIGMA_PX = 4.0
 """A point known no better than this is no point. Chosen: about a millimetre at the usual 3 px/mm. At half blurred
@@ -18,24 +19,25 @@ frames are lost; at twice they stay and hardly weigh."""
 FLOOR_PX = 0.04
 """Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands. Chosen between 0.03
 and 0.06 px, which they came to. At half good frames state errors that are too small, at twice too large."""
-STEP_RATIO = 1.6
-"""A step this many times its neighbours is no acceleration: a frame is missing. Chosen as `DROP_RATIO` of
-`vinetrack.tracks.frame_timing`, with the same consequences."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Flags (n_frames,), time slots (n_frames,) as mended, and sentences for a person.
+    """Flags (n_frames,), time slots (n_frames,) with missing frames counted in, and sentences for a person.
 
-    `departure_px`, shape (n_frames,), is how far a point lies off its neighbours' curve where no error explains it.
+    `departure_px`, shape (n_frames,), is how far a point lies off its neighbours' curve where no error explains it;
+    `unseen` marks frames without an edge, and from frame `left_picture` on the edge is outside, None where it stays.
+    Frames count among those that were followed; in `notes` they are those of the recording.
     """
 
     flag: NDArray[np.str_]
-    slot: NDArray[np.int_]
+    slot: Indices
     notes: tuple[str, ...]
     first_moving: int
     last_moving: int
-    departure_px: Floats = field(default_factory=lambda: np.zeros(0))
+    left_picture: int | None
+    unseen: Bools
+    departure_px: Floats
 
 
 def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: float = 0.5) -> Floats:
@@ -111,7 +113,8 @@ def _leaves_level(y: Floats, tolerance: float) -> int:
 def judge(
     edge_px: Floats,
     sigma_px: Floats,
-    slot: NDArray[np.int_],
+    slot: Indices,
+    number: Indices,
     *,
     unsure: Bools,
     damaged: Bools,
@@ -124,48 +127,51 @@ def judge(
     ----------
     edge_px, sigma_px : shape (n_frames,), px; NaN where the edge was not found.
     slot : capture periods from the first frame, shape (n_frames,).
+    number : of each frame in the recording, shape (n_frames,).
     unsure, damaged, repeated : masks (n_frames,): a poor fit, a frame the decoder calls corrupt, a picture like the one
         before it.
     end_px : where the strip ends: an edge beyond it has left the picture.
 
     Returns
     -------
-    flags, capture periods, notes, and first and last moving frame.
+    Judgement
     """
     n = len(edge_px)
-    flags = [""] * n
-    notes: list[str] = []
     no_edge = ~np.isfinite(edge_px) | ~(sigma_px < LOST_SIGMA_PX)
     gone = np.flatnonzero(np.isfinite(edge_px) & (edge_px >= end_px))
     left = int(gone[0]) if len(gone) else n
     y = np.where(no_edge | (np.arange(n) >= left), np.nan, edge_px)
     first, last = moving_range(y, sigma_px)
-    slot, gaps, gap_notes = _mend_times(y, sigma_px, slot, repeated, first, last)
-    notes.extend(gap_notes)
+    missing = count_missing(y, sigma_px, slot, number, repeated, (first, last))
+    notes = list(missing.notes)
     if left < n:
-        notes.append(f"the leading edge leaves the picture at frame {left}; later frames are not used")
+        notes.append(f"the leading edge leaves the picture at frame {number[left]}; later frames are not used")
     copies = repeated & (np.arange(n) > first) & (np.arange(n) <= last)
     if copies.any():
-        which = int(np.flatnonzero(copies)[0])
+        which = number[copies][0]
         notes.append(f"{int(copies.sum())} frames repeat the one before them and are dropped, first frame {which}")
     departure = _departures(y, sigma_px, first, last)
     outlying = departure > 0
-    for i in range(n):
-        parts = (
+    unseen = no_edge & (np.arange(n) < left)
+    flags = [
+        join_flags(
             "before_release" if i < first else "",
             "after_end" if i > last >= 0 or i >= left else "",
-            "lost" if no_edge[i] and i < left else "",
+            "lost" if unseen[i] else "",
             "duplicate" if copies[i] else "",
-            "gap" if gaps[i] else "",
+            "gap" if missing.gap[i] else "",
+            "retimed" if missing.retimed[i] else "",
             "doubtful" if (unsure[i] or damaged[i] or outlying[i]) and not no_edge[i] else "",
         )
-        flags[i] = join_flags(*parts)
-    missing = no_edge & (np.arange(n) >= first) & (np.arange(n) <= last)
-    if missing.any():
-        notes.append(
-            f"the leading edge is lost in {int(missing.sum())} moving frames, first frame {np.flatnonzero(missing)[0]}"
-        )
-    return Judgement(np.array(flags, dtype=np.str_), slot, tuple(notes), first, last, departure)
+        for i in range(n)
+    ]
+    astray = no_edge & (np.arange(n) >= first) & (np.arange(n) <= last)
+    if astray.any():
+        notes.append(f"the leading edge is lost in {int(astray.sum())} moving frames, first frame {number[astray][0]}")
+    return Judgement(
+        np.array(flags, dtype=np.str_), missing.slot, tuple(notes), first, last, left if left < n else None, unseen,
+        departure,
+    )  # fmt: skip
 
 
 def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
@@ -196,36 +202,3 @@ def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
         if np.isfinite(ahead) and ahead > max(6 * sigma_px[i], 2.0, 0.5 * (before[-1] - before[-2]), 4 * roughness):
             out[i : last + 1] = np.maximum(out[i : last + 1], ahead)
     return out
-
-
-def _mend_times(
-    y: Floats, sigma_px: Floats, slot: NDArray[np.int_], repeated: Bools, first: int, last: int
-) -> tuple[NDArray[np.int_], Bools, list[str]]:
-    """Slots with the missing frames counted in, the frames that follow a gap, and what to say of it."""
-    n = len(y)
-    gaps = np.zeros(n, dtype=bool)
-    gaps[1:] = np.diff(slot) > 1
-    mended, notes = slot.copy(), []
-    step = np.full(n, np.nan)
-    step[1:] = np.diff(y) / np.maximum(np.diff(slot), 1)
-    for i in range(max(first, 1) + 2, min(last, n - 1) - 1):
-        around = step[[i - 2, i - 1, i + 1, i + 2]]
-        near = step[[i - 1, i + 1]]
-        if not np.all(np.isfinite(around)) or not np.isfinite(step[i]) or repeated[i - 2 : i + 3].any():
-            continue
-        usual = float(np.median(around))
-        if usual < max(2.0, 8 * float(np.max(sigma_px[i - 1 : i + 1]))) or np.ptp(around) > 0.35 * usual:
-            continue
-        ratio = step[i] / float(near.mean())
-        if ratio > STEP_RATIO:
-            gaps[i] = True
-            whole = round(ratio)
-            if abs(ratio - whole) < 0.2 and whole <= 4:
-                mended[i:] += whole - 1
-                notes.append(
-                    f"{whole - 1} frame(s) missing before frame {i} by the step of the motion; "
-                    "later frames are timed accordingly"
-                )
-            else:
-                notes.append(f"a step of {ratio:.1f} times its neighbours before frame {i}: frames may be missing")
-    return mended, gaps, notes

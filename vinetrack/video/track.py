@@ -18,6 +18,7 @@ from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, ca
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
 if TYPE_CHECKING:
+    from vinetrack.video.body import EndOfWay
     from vinetrack.video.edge import EdgeFit, Outline
 
 
@@ -81,7 +82,7 @@ class _Edge:
     exposure_frames: float
     reach_px: float
     apart_sigma_px: Floats | float = 0.0
-    notes: tuple[str, ...] = ()
+    end: EndOfWay | None = None
     width_px: tuple[float, float] = (math.nan, math.nan)
     seen_exposure: tuple[float, float] = (math.nan, math.nan)
 
@@ -172,7 +173,7 @@ def track_frames(
     sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
     end_px = strip.axis.length_px - edge_fit.reach_px
     verdict = judge(
-        edge_fit.edge_px, sigma, frames.slot[kept], unsure=edge_fit.unsure, damaged=frames.damaged[kept],
+        edge_fit.edge_px, sigma, frames.slot[kept], kept, unsure=edge_fit.unsure, damaged=frames.damaged[kept],
         repeated=repeated, end_px=end_px,
     )  # fmt: skip
     sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
@@ -184,9 +185,11 @@ def track_frames(
             )
         raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
     scale = trial.m_per_px if m_per_px is None else m_per_px
-    notes = [*frames.notes, *verdict.notes, *(f"{name}: {note}" for note in edge_fit.notes)]
-    if not edge_fit.notes and not _is_grown(edge_fit.edge_px, verdict, trial.length_m / scale):
-        notes += _ending(luma, verdict, edge_fit.edge_px, name)
+    notes = [*frames.notes, *verdict.notes]
+    if edge_fit.end is not None:
+        notes.append(f"{name}: {_end_in_words(edge_fit.end, kept)}")
+    elif not _is_grown(edge_fit.edge_px, verdict, trial.length_m / scale):
+        notes += _ending(luma, verdict, edge_fit.edge_px, name, kept)
     if not orderly:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
@@ -242,7 +245,7 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
         strip = cut_strip(luma, axis, 1.5 * half + 12)
         fit = track_body(strip)
         place = np.where(fit.unseen, np.nan, fit.position_px)
-        return strip, _Edge(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, notes=fit.notes)
+        return strip, _Edge(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end)
     from vinetrack.video.edge import outline, track_edge
 
     try:
@@ -365,17 +368,24 @@ def _is_grown(edge_px: Floats, verdict: Judgement, length_px: float) -> bool:
     return bool(abs((np.nanmedian(end) - np.nanmedian(start)) / length_px - 1) < GROWN_TOLERANCE)
 
 
-def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str) -> list[str]:
+def _end_in_words(end: EndOfWay, number: NDArray[np.int_]) -> str:
+    frame = number[end.last_frame]
+    if end.turns_back:
+        return f"the body turns back after frame {frame}: a bounce, or the end of its way; later frames are not used"
+    return f"the body is not recognised after frame {frame}: it is gone, hidden or turned over"
+
+
+def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str, number: NDArray[np.int_]) -> list[str]:
     """What is to be said of an edge that stops before the recording does."""
     n, last = len(edge_px), verdict.last_moving
-    if last < 0 or last >= n - 4 or "leaves the picture" in " ".join(verdict.notes):
+    if last < 0 or last >= n - 4 or verdict.left_picture is not None:
         return []
     small = luma[:, ::3, ::3].astype(np.float32)
     change = np.abs(np.diff(small, axis=0)).mean(axis=(1, 2))
     before = float(np.median(change[verdict.first_moving : last])) if last > verdict.first_moving else 0.0
     least = float(np.min(change)) if len(change) else 0.0
     later = float(np.median(change[last + 1 :]))
-    where = f"{name}: the leading edge stops at {np.nanmedian(edge_px[last + 1 :]):.0f} px after frame {last}"
+    where = f"{name}: the leading edge stops at {np.nanmedian(edge_px[last + 1 :]):.0f} px after frame {number[last]}"
     if later - least > 0.3 * (before - least):
         return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
     return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
@@ -391,9 +401,8 @@ def _assemble(
     flag = np.full(n, "rejected", dtype="<U64")
     flag[int(kept[-1]) + 1 :] = "after_end"
     slot = frames.slot.astype(float)
-    no_edge = np.array(["lost" in f.split(";") for f in verdict.flag], dtype=bool)
-    edge[kept] = np.where(no_edge, np.nan, edge_fit.edge_px)
-    error[kept] = np.where(no_edge, np.nan, sigma)
+    edge[kept] = np.where(verdict.unseen, np.nan, edge_fit.edge_px)
+    error[kept] = np.where(verdict.unseen, np.nan, sigma)
     flag[kept] = verdict.flag
     slot[kept] = verdict.slot
     time = slot / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)
