@@ -69,6 +69,34 @@ class Model:
         """Every parameter as `effect.parameter`, in the order of `parameters_for`."""
         return tuple(f"{effect.name}.{parameter.name}" for effect in self.effects for parameter in effect.parameters)
 
+    @cached_property
+    def places(self) -> list[slice]:
+        """Where in the parameters each effect finds its values."""
+        ends = list(itertools.accumulate((len(effect.parameters) for effect in self.effects), initial=0))
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+    @cached_property
+    def zeros(self) -> Floats:
+        """Every parameter at its `zero`, in the order of `parameter_names`."""
+        return np.array([number for effect in self.effects for number in effect.zero], dtype=float)
+
+    # A fit asks several thousand times which effects act; what of that depends on the model alone is worked out once.
+    @cached_property
+    def sized_effects(self) -> tuple[list[int], list[int]]:
+        """Places of the effects that have parameters, and where the parameters of each begin."""
+        sized = [i for i, effect in enumerate(self.effects) if effect.parameters]
+        return sized, [self.places[i].start for i in sized]
+
+    @cached_property
+    def replaced_effects(self) -> list[tuple[int, int]]:
+        """Pairs of places: an effect, and one that it replaces."""
+        return [
+            (i, j)
+            for i, effect in enumerate(self.effects)
+            for j, other in enumerate(self.effects)
+            if other.name in effect.replaces
+        ]
+
     def __add__(self, other: Effect | str) -> Model:
         effect = find_effect(other, self.user_effects) if isinstance(other, str) else other
         return replace(self, effects=(*self.effects, effect))
@@ -166,15 +194,12 @@ def effects_on(model: Model, parameters: Floats) -> NDArray[np.bool_]:
         In the order of the effects.
     """
     on = np.ones((len(parameters), len(model.effects)), dtype=bool)
-    places = _places(model)
-    for i, (effect, place) in enumerate(zip(model.effects, places, strict=True)):
-        if effect.parameters:
-            on[:, i] = np.any(parameters[:, place] != np.array(effect.zero), axis=1)
+    sized, begins = model.sized_effects
+    if sized:
+        on[:, sized] = np.logical_or.reduceat(parameters != model.zeros, begins, axis=1)
     acting = on.copy()
-    for i, effect in enumerate(model.effects):
-        for j, other in enumerate(model.effects):
-            if other.name in effect.replaces:
-                on[:, j] &= ~acting[:, i]
+    for i, j in model.replaced_effects:
+        on[:, j] &= ~acting[:, i]
     return on
 
 
@@ -200,10 +225,8 @@ def hosted(host: Model, model: Model, parameters: Floats) -> Floats:
     lacking = [name for name in model.names if name not in host]
     if lacking:
         raise EffectError(f"The host model has no effect {', '.join(lacking)}.")
-    zeros = [number for effect in host.effects for number in effect.zero]
-    wider = np.tile(np.array(zeros, dtype=float), (len(parameters), 1))
-    places = [host.parameter_names.index(name) for name in model.parameter_names]
-    wider[:, places] = parameters
+    wider = np.tile(host.zeros, (len(parameters), 1))
+    wider[:, [host.parameter_names.index(name) for name in model.parameter_names]] = parameters
     return wider
 
 
@@ -222,16 +245,10 @@ def asked(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]
     """
     functions = [
         (effect.order, i, effect.functions[hook], place)
-        for i, (effect, place) in enumerate(zip(model.effects, _places(model), strict=True))
+        for i, (effect, place) in enumerate(zip(model.effects, model.places, strict=True))
         if hook in effect.functions
     ]
     return [(i, function, place) for _, i, function, place in sorted(functions, key=lambda entry: entry[0])]
-
-
-def _places(model: Model) -> list[slice]:
-    """Where in the parameters each effect finds its own."""
-    ends = list(itertools.accumulate((len(effect.parameters) for effect in model.effects), initial=0))
-    return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
 
 def make_model(names: Iterable[str] = BASE_EFFECTS, user_effects: Mapping[str, Effect] | None = None) -> Model:

@@ -157,9 +157,10 @@ def trajectories(
     """
     out, ends = batch.run(relative_tolerance)
     edges = batch.starts.tolist()
+    motion = np.ascontiguousarray(out[:, :3].T) / np.repeat(ratios, np.diff(batch.starts))
     return [
-        _trajectory(names[i], ratios[i], batch.times_s[i], out[edges[i] : edges[i + 1]], end)
-        for i, end in enumerate(ends.tolist())
+        _trajectory(names[i], ratios[i], batch.times_s[i], motion[:, a:b], out[a:b, 3], end)
+        for i, ((a, b), end) in enumerate(zip(itertools.pairwise(edges), ends.tolist(), strict=True))
     ]
 
 
@@ -418,16 +419,19 @@ def _true_traces(
     return in_time
 
 
-def _trajectory(name: str, r: float, times_s: Floats, out: Floats, end: Sequence[float]) -> Trajectory:
+def _trajectory(
+    name: str, r: float, times_s: Floats, motion: Floats, observed_m: Floats, end: Sequence[float]
+) -> Trajectory:
+    """One trial of a batch; `motion` has position, velocity and acceleration of the leading edge in its rows."""
     status = STATUS[int(end[0])]
     if status == "too hard":
         raise SimulationError(f"Trial {name}: the model could not be integrated beyond {end[1]:.6g} s.")
     return Trajectory(
         time_s=times_s,
-        lead_position_m=out[:, 0] / r,
-        lead_velocity_m_s=out[:, 1] / r,
-        lead_acceleration_m_s2=out[:, 2] / r,
-        observed_position_m=out[:, 3],
+        lead_position_m=motion[0],
+        lead_velocity_m_s=motion[1],
+        lead_acceleration_m_s2=motion[2],
+        observed_position_m=observed_m,
         travel_ratio=r,
         status=status,
         end_time_s=end[1],
