@@ -439,15 +439,3 @@ def _trajectory(
         n_steps=int(end[3]),
         slack_from_s=end[4],
     )
-
-
-__all__ = [
-    "Batch",
-    "SimulationError",
-    "Trajectory",
-    "lay_out",
-    "prepare",
-    "simulate",
-    "simulate_many",
-    "trajectories",
-]
