@@ -213,7 +213,7 @@ def test_a_lost_point_among_moving_ones_is_flagged():
     edge = np.concatenate([np.full(5, 5.0), 5 + 3.0 * np.arange(1, 21), np.full(5, 65.0)])
     edge[12] = np.nan
     nothing = np.zeros(30, dtype=bool)
-    masks = {"unsure": nothing, "damaged": nothing, "repeated": nothing}
+    masks = {"unsure": nothing, "repeated": nothing}
     verdict = judge(edge, np.full(30, 0.1), np.arange(30), np.arange(30), **masks, end_px=99)
     assert verdict.flag[12] == "lost"
     assert any("lost in 1 moving frames" in note for note in verdict.notes)

@@ -109,8 +109,7 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, passed = _first_path(strip)
-    passed = passed[0], growth_end(strip, path, passed)
+    path, passed = _grown_path(strip)
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = _first_state(strip, path, exposure)
@@ -170,8 +169,7 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, passed = _first_path(strip)
-    passed = passed[0], growth_end(strip, path, passed)
+    path, passed = _grown_path(strip)
     pictures = _first_state(strip, np.minimum(path, passed[1]), ASSUMED_EXPOSURE).pictures
     power = (pictures[0] - pictures[1]).astype(float)[:, passed[0] : passed[1]] ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
@@ -185,6 +183,7 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     side, place = np.array(sides), np.array(places)
     width = side[:, 1] - side[:, 0]
     alike = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
+    alike |= ~alike.any()  # two kinds of width, as many of each: neither is the usual one
     slope, begin = _robust_line(place[alike], side[alike].mean(axis=1))
     middle = float(np.median(width))
     scatter = 1.4826 * float(np.median(np.abs(width - middle))) / np.sqrt(len(width))
@@ -208,9 +207,8 @@ def rough_growth(strip: Strip) -> tuple[float, float]:
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, passed = _first_path(strip)
-    end = growth_end(strip, path, passed)
-    growth = float(end - passed[0])
+    path, passed = _grown_path(strip)
+    growth = float(passed[1] - passed[0])
     early, late = (int(np.searchsorted(path, passed[0] + part * growth)) for part in (0.2, 0.9))
     return growth, 0.7 * growth / max(late - early, 1)
 
@@ -258,6 +256,15 @@ def _first_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
     if passed[0] >= passed[1]:
         raise ValueError("what changes along the axis does so all at once: nothing grows")
     return _run_up(np.clip(path, *passed)), passed
+
+
+def _grown_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
+    """Front by frame from changes alone, and the first and last column that it leaves changed for good."""
+    path, (begin, end) = _first_path(strip)
+    end = growth_end(strip, path, (begin, end))
+    if end <= begin:
+        raise ValueError("what changes along the axis does not stay changed: nothing grows")
+    return path, (begin, end)
 
 
 def _run_up(path: Floats) -> Floats:

@@ -178,9 +178,16 @@ def core_frames(state: EdgeState, fit: Floats) -> NDArray[np.bool_]:
     Returns
     -------
     mask, shape (n_frames,).
+
+    Raises
+    ------
+    ValueError
+        If no edge was found in any of them.
     """
     moving = moving_frames(state.edge)
     clear = moving & (state.edge > clear_of_start(state.edge))
+    if not np.isfinite(fit[clear if clear.sum() >= 5 else moving, 2]).any():
+        raise ValueError("something moves along the axis, but nothing like an edge is seen in any frame")
     if clear.sum() < 5:
         return moving
     good = clear & (fit[:, 2] <= 1.3 * np.nanmedian(fit[clear, 2]))

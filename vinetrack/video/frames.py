@@ -8,7 +8,7 @@ carry the true rate (tag 51044) and the exposure (33434), other image files carr
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
+from vinetrack.video.decoding import Decoded, damaged_frames, decode_container, quiet_log
 
 if TYPE_CHECKING:
     import av
@@ -24,7 +25,6 @@ CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts",
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
 DECODER_THREADS = 2
 """Chosen: as many recordings are tracked at once as there are cores; more threads gain nothing then."""
-
 
 SAME_RATE = 0.005
 """Derived: 29.97 and 30 frames a second differ by 0.1 %, 23.976 and 24 likewise; a rate of capture that is no rate of
@@ -89,7 +89,8 @@ class Frames:
 
     `luma` has shape (n_frames, height, width), uint8 or uint16; `slot` shape (n_frames,) counts capture periods from
     the first frame, as the timestamps (or the numbers of image files) tell: 0, 1, 2 … where none is missing.
-    `damaged` marks frames the decoder calls corrupt; `notes` are sentences for a person.
+    `damaged` marks frames the decoder calls corrupt, and those decoded from them: all up to the next key frame. `notes`
+    are sentences for a person.
     """
 
     recording: Recording
@@ -101,16 +102,6 @@ class Frames:
 
     def __len__(self) -> int:
         return len(self.luma)
-
-
-@dataclass
-class _Decoded:
-    """What decoding a container gathers on the way."""
-
-    pictures: list[NDArray[Any]] = field(default_factory=list)
-    pts: list[float] = field(default_factory=list)
-    corrupt: list[bool] = field(default_factory=list)
-    complaints: list[str] = field(default_factory=list)
 
 
 def inspect_recording(path: Path | str) -> Recording:
@@ -165,8 +156,14 @@ def read_frames(path: Path | str | Recording, region: Region | None = None, thre
         from vinetrack.video.images import read_images
 
         return read_images(recording, region)
-    decoded = _Decoded()
-    _fill(decoded, recording, region, threads)
+    shape = recording.height, recording.width
+    try:
+        decoded = decode_container(recording.path, shape, lambda frame: _luma_plane(frame, region), threads)
+    except MemoryError:
+        raise RecordingError(
+            f"{recording.path.name}: its frames of {recording.width} x {recording.height} px do not fit in the memory "
+            "of this machine; cut it to the growth, and to the part of the picture that shows it"
+        ) from None
     return _assemble(recording, region, decoded)
 
 
@@ -218,7 +215,7 @@ def _inspect_container(path: Path) -> Recording:
     import av
 
     try:
-        with _quiet_log() as complaints, av.open(str(path)) as container:
+        with quiet_log() as complaints, av.open(str(path)) as container:
             if not container.streams.video:
                 raise RecordingError(f"{path.name}: holds no picture; name a video file")
             stream = container.streams.video[0]
@@ -229,7 +226,8 @@ def _inspect_container(path: Path) -> Recording:
             declared = _declared_frames(stream, container)
             playback = float(stream.average_rate) if stream.average_rate else None
             return Recording(path, "container", first.width, first.height, depth, declared, playback_fps=playback)
-    except av.error.FFmpegError as error:
+    except (av.error.FFmpegError, UnicodeDecodeError) as error:
+        # PyAV takes names in a damaged header for UTF-8.
         raise RecordingError(_why_unreadable(path, complaints, str(error))) from error
 
 
@@ -261,29 +259,7 @@ def _looks_like_mp4(path: Path) -> bool:
         return stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}
 
 
-def _fill(decoded: _Decoded, recording: Recording, region: Region, threads: int) -> None:
-    import av
-
-    with _quiet_log() as complaints:
-        try:
-            with av.open(str(recording.path)) as container:
-                stream = container.streams.video[0]
-                stream.thread_type = "AUTO"
-                stream.codec_context.thread_count = threads
-                base = float(stream.time_base) if stream.time_base else 1.0
-                for frame in container.decode(stream):
-                    if (frame.height, frame.width) != (recording.height, recording.width):
-                        complaints.append("the size of the picture changes")
-                        break
-                    decoded.pictures.append(_luma_plane(frame, region))
-                    decoded.pts.append(float("nan") if frame.pts is None else frame.pts * base)
-                    decoded.corrupt.append(bool(frame.is_corrupt))
-        except av.error.FFmpegError as error:
-            complaints.append(str(error.strerror or error))
-    decoded.complaints = list(complaints)
-
-
-def _assemble(recording: Recording, region: Region, decoded: _Decoded) -> Frames:
+def _assemble(recording: Recording, region: Region, decoded: Decoded) -> Frames:
     n = len(decoded.pictures)
     name = recording.path.name
     if n == 0:
@@ -294,14 +270,14 @@ def _assemble(recording: Recording, region: Region, decoded: _Decoded) -> Frames
             f"{name}: {n} frames decoded where the file declares {recording.declared_frames}: "
             "cut short or damaged; copy it from the camera again"
         )
-    damaged = np.array(decoded.corrupt, dtype=bool)
+    slot, irregular = slots_from_times(np.array(decoded.times_s))
+    damaged = damaged_frames(decoded, slot)
     if decoded.complaints or damaged.any():
         complaint = f"; the decoder says: {decoded.complaints[0].strip()}" if decoded.complaints else ""
         notes.append(
-            f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt"
+            f"{name}: damaged: {int(damaged.sum())} of {n} frames are corrupt or made from corrupt ones"
             f" ({len(decoded.complaints)} complaints of the decoder{complaint})"
         )
-    slot, irregular = slots_from_times(np.array(decoded.pts))
     if irregular:
         notes.append(f"{name}: {irregular}")
     return Frames(recording, region, np.stack(decoded.pictures), slot, damaged, tuple(notes))
@@ -373,24 +349,3 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
             "write the rate of capture, or capture_fps_is_playback: yes where the film plays as fast as it was captured"
         )
     return stated
-
-
-class _quiet_log:  # noqa: N801 - used as a context, like a function
-    """Collect the decoder's complaints instead of printing or losing them; the log level is put back."""
-
-    def __enter__(self) -> list[str]:
-        import av.logging
-
-        self._level = av.logging.get_level()
-        av.logging.set_level(av.logging.ERROR)
-        self._capture = av.logging.Capture(False)
-        self._logs = self._capture.__enter__()
-        self._complaints: list[str] = []
-        return self._complaints
-
-    def __exit__(self, *exc: object) -> None:
-        import av.logging
-
-        self._capture.__exit__(None, None, None)
-        self._complaints.extend(message.strip() for _, _, message in self._logs)
-        av.logging.set_level(self._level)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
-from vinetrack.video.frames import Recording, RecordingError, capture_rate, inspect_recording, read_frames
+from vinetrack.video.frames import Frames, Recording, RecordingError, capture_rate, inspect_recording, read_frames
+from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.track import Tracking, track_frames
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     m_per_px, rel_sigma, position_m = trial.m_per_px, math.nan, None
     axis = given_axis(trial, settings, m_per_px if calibration is None else calibration.m_per_px)
     if calibration is not None:
-        axis = axis or _found_axis(frames.luma, trial)
+        axis = axis or _found_axis(_sound_luma(frames), trial)
         along = calibration.along(axis.from_px, axis.to_px)
         m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
     tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
@@ -132,6 +133,12 @@ def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> A
     width_px = given.width_mm / 1e3 / m_per_px if given.width_mm is not None else math.nan
     (from_x, from_y), (to_x, to_y) = given.from_px, given.to_px
     return Axis((from_x, from_y), (to_x, to_y), width_px)
+
+
+def _sound_luma(frames: Frames) -> NDArray[Any]:
+    """Pictures that are not damaged, of the stretch that will be tracked."""
+    sound = sound_stretch(frames, np.ones(len(frames), dtype=bool))
+    return frames.luma if sound.all() else frames.luma[sound]
 
 
 def _found_axis(luma: NDArray[Any], trial: Trial) -> Axis:

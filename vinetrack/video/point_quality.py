@@ -117,7 +117,6 @@ def judge(
     number: Indices,
     *,
     unsure: Bools,
-    damaged: Bools,
     repeated: Bools,
     end_px: float,
 ) -> Judgement:
@@ -128,8 +127,7 @@ def judge(
     edge_px, sigma_px : shape (n_frames,), px; NaN where the edge was not found.
     slot : capture periods from the first frame, shape (n_frames,).
     number : of each frame in the recording, shape (n_frames,).
-    unsure, damaged, repeated : masks (n_frames,): a poor fit, a frame the decoder calls corrupt, a picture like the one
-        before it.
+    unsure, repeated : masks (n_frames,): a poor fit, a picture like the one before it.
     end_px : where the strip ends: an edge beyond it has left the picture.
 
     Returns
@@ -161,7 +159,7 @@ def judge(
             "duplicate" if copies[i] else "",
             "gap" if missing.gap[i] else "",
             "retimed" if missing.retimed[i] else "",
-            "doubtful" if (unsure[i] or damaged[i] or outlying[i]) and not no_edge[i] else "",
+            "doubtful" if (unsure[i] or outlying[i]) and not no_edge[i] else "",
         )
         for i in range(n)
     ]

@@ -15,6 +15,7 @@ from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
 from vinetrack.video.frames import Frames, RecordingError, capture_rate, inspect_recording, read_frames
 from vinetrack.video.hand_corrections import corrected_by_hand
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
+from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
 
 if TYPE_CHECKING:
@@ -157,8 +158,9 @@ def track_frames(
     used = (number >= first) & (number <= last)
     if used.sum() < FEWEST_FRAMES:
         raise RecordingError(f"{name}: frames_used leaves {int(used.sum())} of {len(frames)} frames; widen it")
-    rejected &= used
-    kept = np.flatnonzero(used & ~rejected)
+    sound = sound_stretch(frames, used)
+    rejected &= sound
+    kept = np.flatnonzero(sound & ~rejected)
     luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
     try:
         axis, orderly = whereabouts(luma, axis, trial, m_per_px)
@@ -173,8 +175,7 @@ def track_frames(
     sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
     end_px = strip.axis.length_px - edge_fit.reach_px
     verdict = judge(
-        edge_fit.edge_px, sigma, frames.slot[kept], kept, unsure=edge_fit.unsure, damaged=frames.damaged[kept],
-        repeated=repeated, end_px=end_px,
+        edge_fit.edge_px, sigma, frames.slot[kept], kept, unsure=edge_fit.unsure, repeated=repeated, end_px=end_px,
     )  # fmt: skip
     sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
     if verdict.last_moving < 0:
@@ -194,6 +195,11 @@ def track_frames(
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
             "to about a pixel"
+        )
+    if frames.damaged[used].any():
+        notes.append(
+            f"{name}: {int(sound.sum())} of {len(frames)} frames are used, {kept[0]} to {kept[-1]}: damaged ones, and"
+            " those beyond them, do not count until their edge is placed in corrections.csv"
         )
     if rejected.any():
         first = int(np.flatnonzero(rejected)[0])
@@ -400,6 +406,7 @@ def _assemble(
     edge, error = np.full(n, np.nan), np.full(n, np.nan)
     flag = np.full(n, "rejected", dtype="<U64")
     flag[int(kept[-1]) + 1 :] = "after_end"
+    flag[frames.damaged] = "rejected"
     slot = frames.slot.astype(float)
     edge[kept] = np.where(verdict.unseen, np.nan, edge_fit.edge_px)
     error[kept] = np.where(verdict.unseen, np.nan, sigma)

@@ -1,0 +1,199 @@
+"""Damaged recordings: frames that a decoder fills in never count, and what is left is right or refused in a sentence.
+
+The truth is the motion that the virtual laboratory filmed, and the same recording undamaged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from vinetrack.core.records import Correction, Trial
+from vinetrack.experiment.folder import read_experiment
+from vinetrack.laboratory.camera import Camera
+from vinetrack.laboratory.filming import Filming, film
+from vinetrack.laboratory.render import Truth
+from vinetrack.laboratory.tracks import Nature, grow
+from vinetrack.video.axis import Axis
+from vinetrack.video.edge import outline, track_edge
+from vinetrack.video.edge_state import EdgeState, core_frames
+from vinetrack.video.frames import Frames, RecordingError, read_frames
+from vinetrack.video.strip import Strip
+from vinetrack.video.track import track_frames, track_recording
+
+CAPTURE_FPS = 1069.0
+KEY_FRAMES = (0, 30, 60)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A sound recording of the laboratory: H.264, a key frame in 30."""
+
+    trial: Trial
+    truth: Truth
+    frames: Frames
+
+    def damaged_at(self, folder: Path, *frames: int) -> Path:
+        """A copy with ten bytes of each of these frames' packets changed."""
+        rng = np.random.default_rng(2030)
+        data = np.fromfile(self.trial.video, np.uint8)
+        with av.open(str(self.trial.video)) as container:
+            places = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+        for frame in frames:
+            start, size = places[frame]
+            # Past the header of the slice, where a fault is met while macroblocks are decoded.
+            data[start + 40 + rng.choice(size - 40, 10, replace=False)] ^= 0x5A
+        path = folder / "damaged.mp4"
+        data.tofile(path)
+        return path
+
+    def errors_m(self, track) -> np.ndarray:
+        """Error of every usable point, m, but for the arbitrary origin."""
+        use = track.usable & np.isfinite(track.lead_position_m)
+        error = track.lead_position_m[use] - self.truth.lead_position_m[use]
+        return error - np.median(error)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Clip:
+    folder = tmp_path_factory.mktemp("clip")
+    (folder / "trials.csv").write_text(
+        "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,mm_per_px\np36,a.mp4,12,100,140,36,0.24\n"
+    )
+    (folder / "experiment.yaml").write_text(
+        f"capture_fps: {CAPTURE_FPS:g}\nexposure_us: 93.5\nyield_pressure_kPa: 3\ngrowth_angle_deg: 90\n"
+    )
+    nature = Nature(
+        values={"eversion_damping.n": 0.37, "eversion_damping.B": {"12mm-100um-140mm": 1.83}},
+        damping_scatter=0.0, pressure_scatter=0.0, release_frames=(14, 20), seed=411,
+    )  # fmt: skip
+    grown = grow(read_experiment(folder, strict=True).trials, nature)[0]
+    truth = film(grown, Filming(camera=Camera(m_per_px=2.4e-4)), grown.stated.video, seed=41)
+    return Clip(grown.stated, truth, read_frames(grown.stated.video))
+
+
+def test_frames_after_a_damaged_one_are_damaged_up_to_the_next_key_frame(clip: Clip, tmp_path: Path) -> None:
+    frames = read_frames(clip.damaged_at(tmp_path, 40))
+    wrong = np.abs(frames.luma.astype(float) - clip.frames.luma).max(axis=(1, 2)) > 8
+    assert wrong[40:60].all()  # what the decoder shows of them is wrong indeed
+    assert frames.damaged.tolist() == [40 <= i < KEY_FRAMES[2] for i in range(len(frames))]
+
+
+def test_a_recording_that_is_damaged_throughout_fails_in_one_sentence(clip: Clip, tmp_path: Path) -> None:
+    path = clip.damaged_at(tmp_path, *KEY_FRAMES)
+    with pytest.raises(
+        RecordingError, match=r"^damaged\.mp4: \d+ of 71 frames are damaged and only \d+.* from the camera"
+    ):
+        track_recording(replace(clip.trial, video=path))
+
+
+def test_sound_frames_of_a_damaged_recording_are_tracked_right_and_no_others(clip: Clip, tmp_path: Path) -> None:
+    track = track_recording(replace(clip.trial, video=clip.damaged_at(tmp_path, 62))).track
+    assert np.isfinite(track.edge_px[20:62]).all()
+    assert all("rejected" in flag for flag in track.flag[62:])
+    assert not np.isfinite(track.edge_px[62:]).any()
+    assert np.abs(clip.errors_m(track)).max() < 0.5e-3
+    assert any("0 to 61: damaged ones" in note for note in track.notes)
+
+
+def test_sound_frames_beyond_the_damage_do_not_count(clip: Clip, tmp_path: Path) -> None:
+    """The tracker would have to leap over the hole, and errs by centimetres when it does."""
+    track = track_recording(replace(clip.trial, video=clip.damaged_at(tmp_path, 50))).track
+    assert not track.usable[50:].any()
+    assert np.abs(clip.errors_m(track)).max() < 0.5e-3
+
+
+def test_one_damaged_frame_among_sound_ones_is_left_out_alone(clip: Clip) -> None:
+    damaged = np.arange(len(clip.frames)) == 35
+    track = track_frames(replace(clip.frames, damaged=damaged), clip.trial, CAPTURE_FPS).track
+    assert not np.isfinite(track.edge_px[35])
+    assert np.isfinite(track.edge_px[[34, 36, 50]]).all()
+    assert np.abs(clip.errors_m(track)).max() < 0.5e-3
+
+
+def test_a_person_may_place_the_edge_of_a_damaged_frame(clip: Clip) -> None:
+    damaged = np.arange(len(clip.frames)) == 35
+    placed = replace(clip.trial, corrections=(Correction(35, "move", 321.0),))
+    track = track_frames(replace(clip.frames, damaged=damaged), placed, CAPTURE_FPS).track
+    assert track.usable[35]
+    assert track.edge_px[35] == 321.0
+
+
+def test_frames_that_a_lossless_recording_checks_are_damaged_where_the_check_fails(clip: Clip, tmp_path: Path) -> None:
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("ffv1", rate=60)
+        stream.width, stream.height, stream.pix_fmt, stream.gop_size = 960, 320, "gray", 1
+        for i, picture in enumerate(clip.frames.luma[:12]):
+            frame = av.VideoFrame.from_ndarray(picture, format="gray")
+            frame.pts = i
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+    data = bytearray(path.read_bytes())
+    data[int(0.55 * len(data))] ^= 0xFF
+    path.write_bytes(bytes(data))
+    frames = read_frames(path)
+    wrong = np.any(frames.luma != clip.frames.luma[:12], axis=(1, 2))
+    assert wrong.sum() == 1
+    assert frames.damaged.tolist() == wrong.tolist()
+
+
+def test_a_packet_that_cannot_be_decoded_costs_its_own_frame(clip: Clip, tmp_path: Path) -> None:
+    path = tmp_path / "a.avi"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mjpeg", rate=60)
+        stream.width, stream.height, stream.pix_fmt = 960, 320, "yuvj420p"
+        for i, picture in enumerate(clip.frames.luma[:12]):
+            frame = av.VideoFrame.from_ndarray(picture, format="gray").reformat(format="yuvj420p")
+            frame.pts = i
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+    with av.open(str(path)) as container:
+        sixth = [packet.pos for packet in container.demux(video=0) if packet.size][5]
+    data = bytearray(path.read_bytes())
+    data[sixth + 8 : sixth + 400] = bytes(392)
+    path.write_bytes(bytes(data))
+    assert len(read_frames(path)) >= 11
+
+
+def test_a_recording_that_does_not_fit_in_memory_is_refused(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vinetrack.video.decoding._memory_for_pictures", lambda: 30 * 960 * 320.0)
+    with pytest.raises(RecordingError, match=r"960 x 320 px do not fit in the memory"):
+        read_frames(clip.trial.video)
+
+
+def grown_strip(half_px: np.ndarray) -> Strip:
+    """A bright tube that grows 5 columns a frame over dark noise; half its width by column, px."""
+    n, rows, columns = 60, 81, len(half_px)
+    values = np.random.default_rng(6).normal(60, 2, (n, rows, columns))
+    across = np.abs(np.arange(rows) - rows // 2)[:, None]
+    for i in range(n):
+        passed = np.arange(columns) < 5 * (i - 8)
+        values[i] += 90 * (passed & (across <= half_px))
+    axis = Axis((0, 40), (columns - 1, 40), 40)
+    return Strip(np.clip(values, 0, 255).astype(np.uint8), np.ones(n), np.zeros(n), np.zeros((n, 2)), 2.0, axis, False)
+
+
+def test_a_tube_of_two_widths_has_one_of_them() -> None:
+    """A picture half of which is damaged shows two; their median is neither."""
+    sides = outline(grown_strip(np.where(np.arange(240) < 120, 8, 30)))
+    assert np.isfinite([sides.shift_px, sides.slope, sides.width_px]).all()
+
+
+def test_a_front_that_leaves_nothing_changed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vinetrack.video.edge.growth_end", lambda *given: given[2][0])
+    for follow in (outline, track_edge):
+        with pytest.raises(ValueError, match="does not stay changed: nothing grows"):
+            follow(grown_strip(np.full(240, 20)))
+
+
+def test_motion_without_any_edge_is_refused() -> None:
+    edge = np.clip(5.0 * np.arange(60) - 40, 0, 240)
+    blank = np.zeros((4, 3, 240), np.float32)
+    state = EdgeState(edge, np.zeros(60), np.zeros(3), 1.0, blank, np.ones(3))
+    with pytest.raises(ValueError, match="nothing like an edge is seen"):
+        core_frames(state, np.full((60, 6), np.nan))
