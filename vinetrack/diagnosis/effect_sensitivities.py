@@ -15,9 +15,9 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, whole_shapes
-from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.sensitivity import moved_by
+from vinetrack.inference.sensitivity import position_change
 
 AIMED_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
 """A step is good that moves a trajectory by this part of its travel, and done again where it moves it by more than the
@@ -62,7 +62,7 @@ def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSe
     -------
     EffectSensitivities
     """
-    plain = [trial.predicted_position_m - trial.origin_m for trial in fit.trials]
+    plain = fit.predictor.unmoved(fit.solution.state.theta, fit.solution.state.trial_effects)
     kept: list[tuple[CandidateShape, list[Floats]]] = []
     heard: set[str] = set()
     names = dict.fromkeys(shape.effect.name for shape in shapes)
@@ -76,15 +76,15 @@ def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSe
         kept += answered
         heard |= {name} if answered else set()
     columns = tuple(
-        np.column_stack([column[i] for _, column in kept]) if kept else np.zeros((position.size, 0))
-        for i, position in enumerate(plain)
+        np.column_stack([column[i] for _, column in kept]) if kept else np.zeros((trajectory.time_s.size, 0))
+        for i, trajectory in enumerate(plain)
     )
     return EffectSensitivities(
         tuple(shape for shape, _ in kept), columns, tuple(name for name in names if name not in heard)
     )
 
 
-def _answer(fit: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> tuple[CandidateShape, list[Floats]] | None:
+def _answer(fit: Fit, shape: CandidateShape, plain: Sequence[Trajectory]) -> tuple[CandidateShape, list[Floats]] | None:
     """What one unit of its size does to every trial, and the shape with the step that was good; None where nothing."""
     try:
         change = _change(fit, shape, plain)
@@ -106,10 +106,10 @@ def _answer(fit: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> tuple[C
     return (shape, [moved / shape.step for moved in change]) if response > SILENT_RESPONSE else None
 
 
-def _holds_back(plain: Sequence[Floats], change: Sequence[Floats]) -> bool:
+def _holds_back(plain: Sequence[Trajectory], change: Sequence[Floats]) -> bool:
     """Whether some vine hardly starts any more, although it was seen to grow: no such size can hide."""
     return any(
-        float(np.max(before + moved)) < STARTS * float(np.max(before))
+        float(np.max(before.observed_position_m + moved)) < STARTS * float(np.max(before.observed_position_m))
         for before, moved in zip(plain, change, strict=True)
     )
 
@@ -122,11 +122,11 @@ def _response(fit: Fit, change: Sequence[Floats]) -> float:
     return worst if math.isfinite(worst) else math.inf
 
 
-def _change(fit: Fit, shape: CandidateShape, plain: Sequence[Floats]) -> list[Floats]:
+def _change(fit: Fit, shape: CandidateShape, plain: Sequence[Trajectory]) -> list[Floats]:
     """By how much the positions of every trial change with the step put in, m."""
     predictor, state = fit.predictor, fit.solution.state
     jobs = predictor.jobs(state.theta, state.trial_effects)
     rows = np.array([[*job.row, *shape.values] for job in jobs]).reshape(len(jobs), -1)
     model = fit.predictor.layout.model + shape.effect
     moved = predictor.run_as(model, jobs, rows)
-    return [moved_by(before, trajectory) for before, trajectory in zip(plain, moved, strict=True)]
+    return [position_change(before, trajectory) for before, trajectory in zip(plain, moved, strict=True)]

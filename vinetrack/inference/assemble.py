@@ -287,7 +287,7 @@ def _own_sigma(solution: Solution, known: Precision) -> Floats:
 
 def _trial_fits(predictor: Predictor, solution: Solution, known: Precision) -> tuple[TrialFit, ...]:
     state, sigma = solution.state, _own_sigma(solution, known)
-    moved = predictor.run(predictor.jobs(state.theta, state.trial_effects))
+    moved = predictor.unmoved(state.theta, state.trial_effects)
     return tuple(
         trial_fit(trial_data, state.trial_effects[i], sigma[i], moved[i].observed_position_m,
                   moved[i].lead_velocity_m_s, state.rho,

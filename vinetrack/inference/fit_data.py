@@ -269,10 +269,18 @@ def _trace(track: Track, moving_s: Floats) -> tuple[tuple[Floats, Floats] | None
     clock_s, pressure_Pa = (values[known].astype(float) for values in (track.time_s, track.pressure_Pa))
     told = (clock_s >= moving_s[0]) & (clock_s <= moving_s[-1])
     typical_Pa = abs(float(np.median(pressure_Pa[told]))) if told.any() else math.nan
-    smooth_Pa = without_noise(pressure_Pa)
+    smooth_Pa = without_noise(pressure_Pa, _growth(track, known))
     if not typical_Pa > 0 or smooth_Pa is pressure_Pa:
         return (clock_s, smooth_Pa), 0.0
     return (clock_s, smooth_Pa), noise_of(pressure_Pa) / math.sqrt(np.count_nonzero(told)) / typical_Pa
+
+
+def _growth(track: Track, known: NDArray[np.bool_]) -> Floats | None:
+    """The leading edge at the samples of a trace, m, between the frames in which it was seen."""
+    seen = track.usable & np.isfinite(track.lead_position_m) & np.isfinite(track.time_s)
+    if np.count_nonzero(seen) < 2:
+        return None
+    return np.interp(track.time_s[known], track.time_s[seen], track.lead_position_m[seen])
 
 
 def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], VagueRest | None]:

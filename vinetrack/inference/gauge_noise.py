@@ -3,7 +3,10 @@
 The speed of a light vine follows the pressure at once, so that 0.1 kPa of noise would throw it about by millimetres
 that it never moved; and a noisy pressure passes a threshold early, in every trial by another time.
 
-Where one smooth curve explains a trace, it is taken: the polynomial of least degree that leaves nothing slow. Else
+Where a few numbers explain a trace, they are fitted: a polynomial in time, or, since the pressure falls as the tube
+fills and has its corner where the growth begins, a polynomial in time and in the growth that is seen. Gauge and camera
+may differ in their clocks, so the growth may be shifted. Of the curves that leave only noise that with the least AIC
+(Akaike, IEEE Trans. Autom. Control 19, 716, 1974) is taken. Where there is none,
 around every sample straight lines are laid through ever more neighbours, for as long as what is left beside them looks
 like noise and each agrees with all narrower ones: wide where the pressure runs straight, narrow at a corner (the
 intersection of confidence intervals: Goldenshluger & Nemirovski, Math. Methods Stat. 6, 135, 1997).
@@ -38,8 +41,20 @@ MOST_BENT, LOOKED_BEYOND, SLOW_SIGMAS = 6, 12, 3.3
 """Degree of a curve at most; of so many degrees beyond its own none may show by so many standard deviations. Chosen:
 sixth degree follows any filling and draining seen; 3.3 standard deviations are a chance of 1e-3."""
 
+MOST_SHIFTED, COARSE = 60, 4
+"""Samples by which the clocks of gauge and camera may differ here, and the step in which that is looked for first.
+Chosen: 60 frames are 40 ms at 1500 frames/s, beyond which a clock is mended and not doubted; a step of four samples is
+refined to one."""
 
-def without_noise(pressure_Pa: Floats) -> Floats:
+ENOUGH = 400
+"""Samples from which the shift is found. Chosen: a few hundred tell it to a frame, more only cost time."""
+
+ALONG_GROWTH = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
+"""Degrees in time and in growth that are tried. Chosen: a chamber that empties without heat is of second degree in the
+growth to 1e-4 of its pressure, a supply that refills it is slow in time."""
+
+
+def without_noise(pressure_Pa: Floats, growth_m: Floats | None = None) -> Floats:
     """Pressure, shape (n,), of samples about evenly spaced, with white noise taken out.
 
     Returns the same values where there is no noise to speak of, or too few samples (under 9) to tell.
@@ -48,6 +63,8 @@ def without_noise(pressure_Pa: Floats) -> Floats:
     ----------
     pressure_Pa : array, shape (n,), Pa
         Samples of a trace.
+    growth_m : array, shape (n,), m, optional
+        Position of the leading edge at the same instants.
 
     Returns
     -------
@@ -58,25 +75,62 @@ def without_noise(pressure_Pa: Floats) -> Floats:
     sigma = noise_of(pressure_Pa)
     if not sigma > QUIET * abs(float(np.median(pressure_Pa))):
         return pressure_Pa
-    curve = _one_curve(pressure_Pa, sigma)
+    curve = _curve(pressure_Pa, growth_m, sigma)
     return _lines(pressure_Pa, sigma) if curve is None else curve
 
 
-def _one_curve(pressure_Pa: Floats, sigma: float) -> Floats | None:
-    """The polynomial of least degree beside which only noise is left; None where there is none."""
+def _curve(pressure_Pa: Floats, growth_m: Floats | None, sigma: float) -> Floats | None:
+    """The curve of least AIC beside which only noise is left; None where there is none."""
+    slow = _polynomials(pressure_Pa.size, min(MOST_BENT + LOOKED_BEYOND, pressure_Pa.size // 3))
+    bases = [slow[:, : degree + 1] for degree in range(min(MOST_BENT, slow.shape[1] - 2) + 1)]
+    if growth_m is not None and np.ptp(growth_m) > 0:
+        bases += _growth_bases(pressure_Pa, growth_m)
+    best, least = None, np.inf
+    for basis in bases:
+        curve = basis @ (basis.T @ pressure_Pa)
+        numbers = basis.shape[1]
+        criterion = float(np.sum((pressure_Pa - curve) ** 2)) / sigma**2 + 2 * numbers
+        if criterion < least and _is_noise(pressure_Pa - curve, sigma, numbers, slow):
+            best, least = curve, criterion
+    return best
+
+
+def _polynomials(count: int, degree: int) -> Floats:
+    """Orthonormal polynomials in time, shape (count, degree + 1)."""
     from numpy.polynomial.legendre import legvander
+
+    return np.asarray(np.linalg.qr(legvander(np.linspace(-1, 1, count), degree))[0])
+
+
+def _growth_bases(pressure_Pa: Floats, growth_m: Floats) -> list[Floats]:
+    """Orthonormal bases of polynomials in time and growth, each with the growth shifted to where it fits best."""
+    reach = min(pressure_Pa.size // 4, MOST_SHIFTED)
+    coarse = range(-reach, reach + 1, COARSE)
+
+    def basis(shift: int, bent: int, along: int) -> Floats:
+        place = np.clip(np.arange(growth_m.size) + shift, 0, growth_m.size - 1)
+        t, g = np.linspace(-1, 1, growth_m.size), (growth_m[place] - growth_m[0]) / np.ptp(growth_m)
+        powers = [t**k for k in range(bent + 1)] + [g**k for k in range(1, along + 1)]
+        return np.asarray(np.linalg.qr(np.column_stack(powers))[0])
+
+    every = max(growth_m.size // ENOUGH, 1)
+
+    def explained(shift: int) -> float:
+        few = np.linalg.qr(basis(shift, 1, 2)[::every])[0]
+        return float(np.sum((few.T @ pressure_Pa[::every]) ** 2))
+
+    best = max(coarse, key=explained)
+    best = max(range(best - COARSE, best + COARSE + 1), key=explained)
+    return [basis(best, bent, along) for bent, along in ALONG_GROWTH]
+
+
+def _is_noise(residual_Pa: Floats, sigma: float, fitted: int, slow: Floats) -> bool:
+    """Whether what a curve of so many fitted numbers leaves has neither a slow part nor more than the noise."""
     from scipy.stats import chi2
 
-    most = min(MOST_BENT + LOOKED_BEYOND, pressure_Pa.size // 3)
-    basis, _ = np.linalg.qr(legvander(np.linspace(-1, 1, pressure_Pa.size), most))
-    parts = basis.T @ pressure_Pa
-    shows = np.flatnonzero(np.abs(parts) > SLOW_SIGMAS * sigma)
-    degree = int(shows[-1]) if shows.size else 0
-    if degree > min(MOST_BENT, most - 1):
-        return None
-    curve = basis[:, : degree + 1] @ parts[: degree + 1]
-    left = float(np.sum((pressure_Pa - curve) ** 2))
-    return None if left > sigma**2 * chi2.isf(CHANCE, pressure_Pa.size - degree - 1) else np.asarray(curve)
+    if np.any(np.abs(slow.T @ residual_Pa) > SLOW_SIGMAS * sigma):
+        return False
+    return bool(residual_Pa @ residual_Pa <= sigma**2 * chi2.isf(CHANCE, residual_Pa.size - fitted))
 
 
 def _lines(pressure_Pa: Floats, sigma: float) -> Floats:

@@ -8,6 +8,7 @@ All trajectories, moved and unmoved, are simulated in one call.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -182,6 +183,22 @@ class Predictor:
         whole[:, [PRESSURE, DAMPING_DEVIATION]] += self.layout.shifts(theta)
         return whole
 
+    def unmoved(self, theta: Floats, trial_effects: Floats) -> list[Trajectory]:
+        """The trajectories with nothing moved.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        trial_effects : array, shape (n_trials, 4)
+
+        Returns
+        -------
+        list of Trajectory
+            One a trial.
+        """
+        return self.run(self.jobs(theta, trial_effects))
+
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted position of every trial, m.
 
@@ -195,7 +212,7 @@ class Predictor:
         -------
         list of arrays, shape (n_points,)
         """
-        moved = self.run(self.jobs(theta, trial_effects))
+        moved = self.unmoved(theta, trial_effects)
         return [self._residual(i, moved[i], trial_effects) for i in range(len(self.data))]
 
     def _residual(self, i: int, moved: Trajectory, trial_effects: Floats) -> Floats:
@@ -234,7 +251,7 @@ class Predictor:
             columns[i][:, -1] = self._residual(i, moved[i], trial_effects)
         for job, (place, step), other in zip(jobs, moves, moved, strict=True):
             if place >= 0:
-                columns[job.trial][:, place] = _change(moved[job.trial], other) / step
+                columns[job.trial][:, place] = position_change(moved[job.trial], other) / step
         self._share_damping(columns)
         self._share_deviations(columns)
         if not own_only:
@@ -320,32 +337,36 @@ class Predictor:
             self.pressure_step[i] = _step(float(answers[i, PRESSURE]), float(self.pressure_step[i]))
 
 
-def _change(plain: Trajectory, other: Trajectory) -> Floats:
-    """How far positions moved. Where growth has ended nothing that only delays the end moves them."""
-    change = other.observed_position_m - plain.observed_position_m
-    if plain.status == "ended":
-        over = plain.time_s > plain.end_time_s
-        change[over] = change[-1] if other.status == "ended" else 0.0
-    return change
+def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
+    """How far the observed positions of a trial answer to a small step, m, shape (n_points,).
 
-
-def moved_by(before: Floats, after: Trajectory) -> Floats:
-    """How far the observed positions of a trial moved from those `before`, m, shape (n_points,).
+    Growth ends at the same place whenever it ends, so a plain difference has a jump between the two ends, of the order
+    of the whole answer, that depends on the sign and size of the step: two effects that do exactly the same would seem
+    to differ by that one frame. So until the unmoved trajectory ends the moved one is continued at its last speed, and
+    from there on only what moves the place of the end counts.
 
     Parameters
     ----------
-    before : array, shape (n_points,), m
-        Observed positions of the unmoved trajectory.
-    after : the trajectory that was moved.
+    plain : Trajectory
+        The unmoved trajectory.
+    moved : Trajectory
+        The same trial, at the same instants, with a step made.
 
     Returns
     -------
     array, shape (n_points,), m
     """
-    change = after.observed_position_m - before
-    if after.status == "ended":
-        # Behind the end of growth the film stands still: what delays the end moves nothing there.
-        change[after.time_s > after.end_time_s] = change[-1]
+    change = moved.observed_position_m - plain.observed_position_m
+    plain_end_s, moved_end_s = (each.end_time_s if each.status == "ended" else math.inf for each in (plain, moved))
+    over = plain.time_s > plain_end_s
+    early = ~over & (plain.time_s > moved_end_s)
+    if early.any():
+        last = int(np.argmax(early)) - 1
+        if last >= 0:
+            faster = moved.lead_velocity_m_s[last] - plain.lead_velocity_m_s[last]
+            change[early] = change[last] + faster * (plain.time_s[early] - plain.time_s[last])
+    if over.any():
+        change[over] = moved.observed_position_m[-1] - plain.observed_position_m[-1] if moved.status == "ended" else 0.0
     return np.asarray(change)
 
 

@@ -16,7 +16,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_errors import position_shapes
-from vinetrack.inference.sensitivity import PRESSURE, Predictor, moved_by
+from vinetrack.inference.sensitivity import PRESSURE, Predictor, position_change
 
 PAYLOAD_ERROR = 0.005
 """Standard deviation of a payload's mass beside what the sheet states, as part of it: a gram in two hundred."""
@@ -77,13 +77,13 @@ def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFi
         return columns
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     try:
+        plain = predictor.run([jobs[i] for i in loaded])
         heavier = predictor.run([replace(jobs[i], payload_factor=1 + PAYLOAD_STEP) for i in loaded])
     except SimulationError:
         return [column[:, :0] for column in columns]
-    for i, other in zip(loaded, heavier, strict=True):
-        trial = trials[i]
-        change = moved_by(trial.predicted_position_m - trial.origin_m, other)
-        columns[i][:, places[round(trial.trial.payload_kg, 9)]] = PAYLOAD_ERROR / PAYLOAD_STEP * change
+    for i, before, after in zip(loaded, plain, heavier, strict=True):
+        place = places[round(trials[i].trial.payload_kg, 9)]
+        columns[i][:, place] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(before, after)
     return columns
 
 
