@@ -20,8 +20,8 @@ STEADY = [
 ]
 
 
-def gated(track, travel_ratio=2.0):
-    return gated_window(track, estimate_kinematics(track, travel_ratio=travel_ratio))
+def gated(track, travel_ratio=2.0, length_m=math.nan):
+    return gated_window(track, estimate_kinematics(track, travel_ratio=travel_ratio), length_m=length_m)
 
 
 def ramp(drop: float, noise_m: float, seed: int = 1000, n: int = 300):
@@ -79,6 +79,36 @@ def test_the_end_of_growth_is_not_in_the_window(vine):
         assert window.to_s < trial.grown_s + 0.5 / 1069
         grown_m = trial.lead_position_m - trial.lead_position_m[0]
         assert grown_m[inside(trial, window)].max() <= 0.95 * grown_m.max() + 1e-4
+
+
+@pytest.mark.parametrize("end_frames", [0, 1])
+@pytest.mark.parametrize("vine", [Vine(1, 1.0), Vine(2, 5.0), Vine(4, 3.0)], ids=str)
+def test_a_recording_that_stops_with_the_growth_keeps_its_end_out_of_the_window(vine, end_frames):
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        trial = record(vine, rng, noise_m=3e-5, rest_frames=40, end_frames=end_frames)
+        window = gated(trial.track, length_m=vine.length_m)
+        assert window.accepted
+        grown_m = trial.lead_position_m - trial.lead_position_m[0]
+        assert grown_m[inside(trial, window)].max() <= 0.95 * vine.length_m + 1e-4
+
+
+def test_growth_that_stops_short_of_the_length_keeps_its_window():
+    vine = Vine(2, 1.0)
+    trial = record(vine, np.random.default_rng(1000), noise_m=3e-5, rest_frames=40)
+    assert gated(trial.track, length_m=2 * vine.length_m) == gated(trial.track)
+
+
+def test_a_window_chosen_by_hand_that_runs_into_the_end_is_used_with_a_warning():
+    vine = Vine(2, 1.0)
+    trial = record(vine, np.random.default_rng(1000), noise_m=3e-5, rest_frames=40)
+    kinematics = estimate_kinematics(trial.track, travel_ratio=2)
+    last_s = float(trial.track.time_s[-1])
+    late = user_window(trial.track, kinematics, (last_s - 0.1, last_s), vine.length_m)
+    assert late.accepted
+    assert "warning: runs into the end of growth" in late.reason
+    early = user_window(trial.track, kinematics, (last_s - 0.2, last_s - 0.1), vine.length_m)
+    assert "end of growth" not in early.reason
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 3e-5, 3e-4])

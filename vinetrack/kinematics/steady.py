@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Kinematics, Track, Window
+from vinetrack.core.records import Floats, Kinematics, Track, Window, with_flag
 from vinetrack.kinematics.plateau import RangeExtremes, WindowMoments, chord_bounds, judge, trim
 
 __all__ = ["gated_window", "paper_window", "user_window"]
@@ -42,9 +42,13 @@ TRIM_BAND = 1 / 6
 decays over a tenth of the window would put the mean 0.15 % off the line."""
 
 END_FRACTION = 0.95
-"""Part of the growth behind which no window lies, where the end of growth was seen: there the moving mass goes to
-nothing, or the vine is stopped. Chosen as the fit's own END_FRACTION; at 0.9 a tenth of every window is lost, at 0.975
-windows of the demonstration still ran into the stop."""
+"""Part of the growth behind which no window lies, where its end was seen or the length of the vine says that it is
+near: there the moving mass goes to nothing, or the vine is stopped. Chosen as the fit's own END_FRACTION; at 0.9 a
+tenth of every window is lost, at 0.975 windows of the demonstration still ran into the stop."""
+
+START_FRACTION, START_SIGMAS = 0.2, 5.0
+"""A vine moves where its speed exceeds this part of the highest, and so many standard errors. Chosen as the settings of
+the run have them by default; half or twice moves the beginning of a slow start."""
 
 BAND_SIGMAS = 4.0
 """How many standard errors a single velocity may lie outside the band. Chosen: 1 in 16 000 by chance."""
@@ -54,15 +58,17 @@ def gated_window(
     track: Track,
     kinematics: Kinematics,
     *,
+    length_m: float = math.nan,
     drift_limit: float = 0.03,
-    start_fraction: float = 0.2,
-    start_sigmas: float = 5.0,
+    start_fraction: float = START_FRACTION,
+    start_sigmas: float = START_SIGMAS,
 ) -> Window:
     """The longest window in which the vine provably moves at one speed.
 
     Parameters
     ----------
     track, kinematics : the track and the motion made from it.
+    length_m : of the vine, m; NaN where unknown or where nothing grows: then only an end that was seen counts.
     drift_limit : largest change of speed across the window, and of any velocity in it from the mean, as a fraction of
         the mean.
     start_fraction, start_sigmas : the search begins where the velocity exceeds this fraction of its maximum and this
@@ -79,7 +85,7 @@ def gated_window(
         return Window("gated", False, why)
     inside = slice(first, last + 1)
     search = _Search(time_s[inside], position_m[inside], kinematics, inside, drift_limit)
-    search.latest = _before_the_end(track, position_m, first, last) - first
+    search.latest = _before_the_end(track, position_m, first, last, length_m) - first
     steady, nearest = search.longest()
     if steady is None:
         return Window("gated", False, nearest)
@@ -94,13 +100,16 @@ def gated_window(
     return _with(window, True, reason)
 
 
-def user_window(track: Track, kinematics: Kinematics, window_s: tuple[float, float]) -> Window:
-    """The window chosen by hand, always used; `reason` warns where it is not steady.
+def user_window(
+    track: Track, kinematics: Kinematics, window_s: tuple[float, float], length_m: float = math.nan
+) -> Window:
+    """The window chosen by hand, always used; `reason` warns where it is not steady or runs into the end of growth.
 
     Parameters
     ----------
     track, kinematics : of one trial.
     window_s : begin and end on the clock of the track, s.
+    length_m : see `gated_window`.
 
     Returns
     -------
@@ -122,7 +131,11 @@ def user_window(track: Track, kinematics: Kinematics, window_s: tuple[float, flo
     if not window.x_ss_m_s > 0:
         return _with(window, True, f"chosen by hand; warning: the mean tail speed is {window.x_ss_m_s:.3g} m/s")
     steady = max(abs(window.drift_95[0]), abs(window.drift_95[1])) <= 0.03
-    verdict = "chosen by hand" if steady else "chosen by hand; warning: not shown to be steady"
+    warnings = [] if steady else ["not shown to be steady"]
+    first, last, why = _gate(kinematics, START_FRACTION, START_SIGMAS)
+    if not why and inside[-1] > _before_the_end(track, position_m, first, last, length_m):
+        warnings.append("runs into the end of growth")
+    verdict = "; warning: ".join(["chosen by hand", *warnings])
     return _with(window, True, f"{verdict}: speed changes by {_percent(window)} over {window.n_points} points")
 
 
@@ -155,13 +168,17 @@ def _gate(kinematics: Kinematics, start_fraction: float, start_sigmas: float) ->
     return int(points[0]), int(points[-1]), ""
 
 
-def _before_the_end(track: Track, position_m: Floats, first: int, last: int) -> int:
-    """Last point that a window may hold: where the end of growth was seen, none of the last part of the growth."""
-    # The growth has ended where the track says so, or where a vine that moved stands again.
-    ended = last < position_m.size - 1 or any("after_end" in str(flag) for flag in track.flag)
+def _before_the_end(track: Track, position_m: Floats, first: int, last: int, length_m: float) -> int:
+    """Last point that a window may hold: where growth ended, or is about to, none of its last part."""
+    grown_m = float(np.max(position_m[first : last + 1])) - float(position_m[0])
+    # The growth has ended where the track says so, or where a vine that moved stands again; a recording that stops with
+    # the motion shows neither, but the vine has no more to grow.
+    ended = last < position_m.size - 1 or with_flag(track.flag, "after_end").any()
+    if grown_m > END_FRACTION * length_m:
+        grown_m, ended = max(grown_m, length_m), True
     if not ended:
         return last
-    reach_m = position_m[0] + END_FRACTION * (float(np.max(position_m[first : last + 1])) - position_m[0])
+    reach_m = position_m[0] + END_FRACTION * grown_m
     beyond = np.flatnonzero(position_m[first : last + 1] > reach_m)
     return max(first + int(beyond[0]) - 1, first + 2) if beyond.size else last
 

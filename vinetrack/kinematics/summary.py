@@ -194,6 +194,7 @@ def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSe
         "gated": gated_window(
             track,
             kinematics,
+            length_m=trial.length_m,
             drift_limit=steady.drift_limit,
             start_fraction=steady.start_fraction,
             start_sigmas=steady.start_sigmas,
@@ -204,7 +205,7 @@ def _windows(trial: Trial, track: Track, kinematics: Kinematics, settings: RunSe
     }
     if trial.steady_window_s is not None:
         try:
-            windows["user"] = user_window(track, kinematics, trial.steady_window_s)
+            windows["user"] = user_window(track, kinematics, trial.steady_window_s, trial.length_m)
         except ValueError as error:
             windows["user"] = Window("user", False, str(error))
     return windows
