@@ -47,6 +47,9 @@ class Plan:
     door: bool = False
     gradient: float = 0.0
     payload: bool = False
+    mouth: float = 0.0
+    """How far beyond the resting tip a launcher covers the tube; none at 0."""
+    mouth_grey: float = 20.0
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,9 @@ def plain_scene(plan: Plan) -> Scene:
             swing = 14.0 * max(0.0, i - plan.rest_frames + 3)
             panel = (along > plan.start_px + 24 + 0.6 * swing) & (along < plan.start_px + 60 + 0.6 * swing)
             picture = np.where(panel & (across < 60 - swing) & (across > -80), 25.0, picture)
+        if plan.mouth:
+            cover = np.clip(plan.start_px + plan.mouth - along + 0.5, 0, 1) * (np.abs(across) < plan.radius + 14)
+            picture = picture + cover * (plan.mouth_grey - picture)
         if plan.payload and edge[i] > 0.75 * plan.end_px:
             ahead = edge[i] + 3.0 * (edge[i] - 0.75 * plan.end_px)
             picture = np.where((np.abs(along - ahead) < 12) & (np.abs(across) < 10), 230.0, picture)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Bools, Floats
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
 from vinetrack.video.edge_repair import ASTRAY_PX, FAINTEST, disagreement, growth_end, mend_jumps
@@ -32,6 +32,7 @@ from vinetrack.video.edge_state import (
     residuals,
     seen_exposure,
 )
+from vinetrack.video.launcher_mouth import find_mouth
 from vinetrack.video.strip import Strip
 
 START_PX = 0.08
@@ -72,7 +73,8 @@ class EdgeFit:
     it in square: by the disagreement of bands, and near the start (see START_PX). `misfit` is the mean squared
     residual in units of the noise (1 is perfect), `amplitude` the contrast relative to that of the pixels it passes;
     `contrast` is their mean signed contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far
-    each row of the tip lags behind its foremost point; `passed` the first and last column passed.
+    each row of the tip lags behind its foremost point; `passed` the first and last column passed; `hidden` marks
+    frames in which a door or the mouth of a launcher may hide the tip.
     `seen_exposure_frames` is what the blur shows where it contradicts a stated exposure, else NaN, and
     `fast_px_per_frame` the speed at which it does.
     """
@@ -87,6 +89,7 @@ class EdgeFit:
     exposure_frames: float
     tip_lag_px: Floats
     passed: tuple[int, int]
+    hidden: Bools
     seen_exposure_frames: float = np.nan
     fast_px_per_frame: float = np.nan
 
@@ -391,11 +394,18 @@ def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX)
     close = (near_start > 0.1) & moving_frames(state.edge) & np.isfinite(strain)
     trouble = float(np.clip((np.mean(strain[close] ** 2) - 1) / 0.7, 0, 1)) if close.any() else 0.0
-    doubt = (START_PX + DOOR_PX * _disturbed_start(strip, state) * trouble) * near_start
+    door = DOOR_PX * _disturbed_start(strip, state) * trouble
+    doubt = (START_PX + door) * near_start
     apart = disagreement(strip, state, edge_now, core) * (1 - 0.5 * near_start)
     apart = np.hypot(apart * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), doubt)
     apart = _hidden(fit, strain**2, edge_now, apart)
-    return EdgeFit(edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed)
+    mouth = find_mouth(strip, state, edge_now)
+    apart = np.where(mouth.before, np.maximum(apart, (2 if mouth.moved_behind else 0.7) * ASTRAY_PX), apart)
+    # A door adds more to the error than any start has: the tip is half behind it, or was a moment before.
+    hidden = (door * near_start > START_PX) | mouth.before
+    return EdgeFit(
+        edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed, hidden
+    )
 
 
 def _hidden(fit: Floats, strain: Floats, edge: Floats, apart: Floats) -> Floats:

@@ -319,7 +319,7 @@ def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
     """Frames whose neighbourhood does not look like the edge elsewhere."""
     usual = float(np.nanmedian(fit.misfit))
     odd = (fit.amplitude < 0.6) | (fit.amplitude > 1.5) | (fit.misfit > 6 * max(usual, 0.3))
-    odd |= fit.apart_sigma_px > APART_PX
+    odd |= (fit.apart_sigma_px > APART_PX) | fit.hidden
     return np.asarray(odd | (fit.sigma_px > np.maximum(1.0, 5 * np.nanmedian(fit.sigma_px))))
 
 

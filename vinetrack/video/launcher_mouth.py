@@ -1,0 +1,123 @@
+"""An edge at rest that is not the tip's but that of the launcher, or of a plate, out of which the tip comes later.
+
+The border between the launcher and the background stands still while the tip moves behind it, and looks like a tip at
+rest. It is told by what the tip leaves: behind a tip that was seen at rest the film goes on without a border, behind a
+tip that came out of something the straight border of that stays where the edge rested.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Bools, Floats
+from vinetrack.video.edge_state import CLEAR_PX, EdgeState, moving_frames
+from vinetrack.video.strip import Strip
+
+FEWEST_AT_REST = 3
+"""Frames of rest from which a place is known. Chosen as in `point_quality`: two frames alike may be a slow start."""
+MIDDLE_ROWS = 0.6
+"""Part of the strip's rows, about its middle, that are the tube's whatever its sides do. Chosen: the strip is 1.15
+times as high as the tube and 10 px more. By reasoning: at half few rows say whether the border is straight; with all of
+them the background beside the tube says it is not."""
+GAP_PX, SIDE_PX = 3, 6
+"""Columns left out on either side of a border, for its blur, and those taken beyond. Chosen: blurs reach 3 px; six
+columns average film's grain. At half of them grain decides, at twice a mouth near the strip's start is not seen."""
+FILM_PX = (20, 150)
+"""From and to how far beyond the border the film's own steps are taken. Chosen: clear of what is about the start, and a
+few diameters of film. Half or twice changes the largest of them by its scatter."""
+LOOKED_PX = 3
+"""How far from the place of rest a border is looked for. Chosen: the edge at rest errs by less."""
+STRAIGHT = 0.95
+"""Part of the rows that must show the border with the same sign. Measured (tips seen at rest, laboratory and drawings
+of other code, seeds 20410-20466): 0.94 at most in 36 recordings; 1.00 at six mouths (seed 20511)."""
+STRONGEST = 2.0
+"""The border against the largest step between neighbouring columns of film further on. Measured on the same: 1.6 at
+most, and 2.6 at least at a mouth only 30 grey levels darker than the film."""
+LEAST_PART = 0.5
+"""The border against the film's contrast. Measured on the same: 0.36 at most, and 0.66 at least. By reasoning: at half,
+backgrounds with strong marks count as mouths; at twice, a mouth as bright as the film is not seen."""
+FRAMES_OUT = 5
+"""Frames after the tip has come out by which speed and acceleration there are judged. Chosen: three numbers of a
+parabola, and two frames more."""
+
+
+@dataclass(frozen=True)
+class Mouth:
+    """`before`, shape (n_frames,), marks frames in which the edge stands at a border that stays when the tip has gone.
+
+    `moved_behind`: the tip comes out faster than a start from rest at that border allows; it was further back.
+    """
+
+    before: Bools
+    moved_behind: bool
+
+
+def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
+    """Look for a border that stays where the edge rested.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : what lies before and after the edge.
+    edge : shape (n_frames,), px; finite.
+
+    Returns
+    -------
+    Mouth
+    """
+    none = Mouth(np.zeros(len(edge), dtype=bool), False)
+    first = int(np.flatnonzero(moving_frames(state.edge))[0])
+    if first < FEWEST_AT_REST:
+        return none
+    place = float(np.median(edge[:first]))
+    gone = np.flatnonzero((edge > place + CLEAR_PX) & (np.arange(len(edge)) >= first))
+    near = np.arange(round(place) - LOOKED_PX, round(place) + LOOKED_PX + 1)
+    # Not where the tip, which is round, comes to rest.
+    later = np.arange(near[-1] + FILM_PX[0], min(near[-1] + FILM_PX[1], int(edge.max() - CLEAR_PX)))
+    if len(gone) < FEWEST_AT_REST or near[0] < GAP_PX + SIDE_PX or len(later) < FILM_PX[0]:
+        return none
+    film = _middle_picture(strip, gone)
+    steps = np.stack([_border(film, int(column)) for column in near])
+    strongest = steps[int(np.argmax(np.abs(np.median(steps, axis=1))))]
+    size = float(np.median(strongest))
+    usual = max(abs(float(np.median(_border(film, int(column))))) for column in later)
+    contrast = np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))[later]
+    straight = float(np.mean(np.sign(strongest) == np.sign(size)))
+    if straight < STRAIGHT or abs(size) < max(STRONGEST * usual, LEAST_PART * float(np.median(contrast))):
+        return none
+    out = place + 3 * state.blur + 1
+    leaves = first + int(np.argmax(edge[first:] > out))
+    return Mouth(np.arange(len(edge)) < leaves, _moved_behind(edge[leaves : leaves + FRAMES_OUT], place))
+
+
+def _middle_picture(strip: Strip, frames: NDArray[np.int_]) -> NDArray[np.float32]:
+    """Median of the middle rows over some frames, grey levels freed of flicker: the moving tail averages out."""
+    rows = strip.values.shape[1]
+    edge_rows = round((1 - MIDDLE_ROWS) / 2 * rows)
+    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, 15).astype(int))]
+    values = strip.values[chosen, edge_rows : rows - edge_rows].astype(np.float32)
+    level = values * strip.scale[chosen, None, None] + strip.offset[chosen, None, None]
+    return np.asarray(np.median(level, axis=0), dtype=np.float32)
+
+
+def _border(picture: NDArray[np.float32], column: int) -> NDArray[np.float32]:
+    """Step of each row across a column, shape (n_rows,)."""
+    ahead = picture[:, column + GAP_PX : column + GAP_PX + SIDE_PX].mean(axis=1)
+    behind = picture[:, column - GAP_PX - SIDE_PX : column - GAP_PX].mean(axis=1)
+    return np.asarray(ahead - behind, dtype=np.float32)
+
+
+def _moved_behind(edge: Floats, place: float) -> bool:
+    """Whether a tip seen first at `edge` started further back than at `place`.
+
+    From rest under the acceleration a that it has now, it would have come v²/2a: the speed it has, held against the way
+    that is seen. As much again, and 5 px, are forgiven for an acceleration that falls.
+    """
+    if len(edge) < FRAMES_OUT:
+        return False
+    bend, speed, begin = np.polyfit(np.arange(FRAMES_OUT), edge, 2)
+    run = speed**2 / (4 * bend) if bend > 0 else np.inf
+    return bool(run > 2 * (begin - place) + 5)
