@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -382,4 +383,44 @@ def test_the_floor_of_the_mass_is_fold_and_gas() -> None:
     mass = masses(VINE)
     gas_kg = (14e3 + 101_325) / AIR * VINE.area_m2 * VINE.length_m
     assert mass.floor > gas_kg / 4
-    assert mass.kink_m < 2 * VINE.length_m
+    assert mass.break_m < 2 * VINE.length_m
+
+
+BAND = '''"""Band: a force that grows from a place along the way.
+
+    tail force k (y − 0.1 m) from 0.1 m on
+"""
+
+from vinetrack.effects import Parameter
+
+PARAMETERS = (Parameter("k", "k", "N/m", 500.0, bounds=(0.0, 1e4)),)
+
+
+def tail_force(s, rig, k):
+    return k * max(s.lead_position - 0.1, 0.0)
+
+
+def breakpoints(rig):
+    return (0.1,)
+'''
+
+
+def test_the_former_name_of_breakpoints_is_read_with_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "band.py").write_text(BAND.replace("breakpoints", "corners"))
+    with pytest.warns(FutureWarning, match="now called `breakpoints`"):
+        assert effects.load_effect(tmp_path / "band.py").breakpoints is not None
+
+
+def test_a_body_without_an_end_steps_onto_the_breakpoints_of_its_forces(tmp_path: Path) -> None:
+    """A ball that falls by g, and beyond 0.1 m is drawn on by k (y − 0.1 m): m z̈ = m g + k z."""
+    (tmp_path / "band.py").write_text(BAND)
+    model = make_model(["gravity"]) + effects.load_effect(tmp_path / "band.py")
+    ball = Trial(name="ball", diameter_m=0.02, payload_kg=0.1, travel_ratio=1.0)
+    times_s = np.linspace(0, 0.2, 41)
+    found = simulate(model, ball, times_s)
+    root = math.sqrt(500.0 / 0.1)
+    beyond = root * np.maximum(times_s - math.sqrt(0.2 / G), 0.0)
+    drawn = 0.1 + math.sqrt(0.2 * G) / root * np.sinh(beyond) + G / root**2 * (np.cosh(beyond) - 1)
+    truth = np.where(beyond > 0, drawn, 0.5 * G * times_s**2)
+    # Steps across the breakpoint err by 1.3e-5, those that end there by 2.7e-6: the tolerance of a step and no more.
+    np.testing.assert_allclose(found.lead_position_m, truth, rtol=5e-6)

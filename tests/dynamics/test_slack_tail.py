@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from vinetrack.core.records import Trial
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.model import base_model
-from vinetrack.dynamics.simulate import simulate
+from vinetrack.dynamics.simulate import SimulationError, simulate
 from vinetrack.effects import catalogue
 
 A = math.pi * 24e-3**2 / 4
@@ -212,3 +212,9 @@ def test_terms_of_the_model_as_written_find_the_same_onset(P: float) -> None:
     tension = evaluate(MODEL, trial(P), times, taut.lead_position_m, taut.lead_velocity_m_s).tension_N
     onset = times[np.argmax(tension < 0)]
     assert onset == pytest.approx(simulate(MODEL, trial(P), times).slack_from_s, abs=2e-4)
+
+
+def test_a_slack_phase_that_cannot_be_followed_says_when_it_was_given_up() -> None:
+    """No step meets a tolerance of nothing: the tail goes slack at release and gets no further."""
+    with pytest.raises(SimulationError, match=r"could not be integrated beyond \d[\d.e-]* s"):
+        simulate(MODEL, trial(7e3), np.linspace(0, 0.2, 20), relative_tolerance=0.0)

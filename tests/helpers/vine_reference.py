@@ -39,7 +39,7 @@ class Masses:
         return np.maximum(self.film - self.lost_per_m * x, self.floor) + self.payload
 
     @property
-    def kink_m(self) -> float:
+    def break_m(self) -> float:
         """Tail travel at which the film reaches its floor."""
         return (self.film - self.floor) / self.lost_per_m
 
@@ -55,7 +55,7 @@ def masses(trial: Trial) -> Masses:
 
 @dataclass(frozen=True)
 class Reference:
-    """Pieces of the solution (u, x, t)(s), one on each side of the kink in the mass."""
+    """Pieces of the solution (u, x, t)(s), one on each side of the breakpoint of the mass."""
 
     pieces: tuple[OdeSolution, ...]
     n: float
@@ -113,7 +113,7 @@ def reference(
 
     late.terminal = True
     pieces, start, state = [], 0.0, np.zeros(3)
-    edges = [edge for edge in (mass.kink_m, stop) if 0 < edge <= stop]
+    edges = [edge for edge in (mass.break_m, stop) if 0 < edge <= stop]
     for edge in edges:
 
         def reached(_s: float, state: Floats, edge: float = edge) -> float:

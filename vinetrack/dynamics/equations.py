@@ -109,7 +109,7 @@ class Point(NamedTuple):
     time: float
     x: float
     v: float
-    slope: float
+    acceleration: float
     chamber: float
 
 
@@ -216,7 +216,8 @@ def no_tip_tension(time, x, v, chamber, resting, trial):  # noqa: ARG001
 
     Returns
     -------
-    two zeros: no tension, no force.
+    (tension, chamber_rate)
+        0 N and 0 Pa/s: nothing calls it but where a tail may go slack.
     """
     return 0.0, 0.0
 
@@ -277,6 +278,7 @@ def no_slack_phase(equations, trial, times, row, start, stop, rtol, out, work): 
 
     Returns
     -------
-    the status TAUT, the row and the state where it began, and no time.
+    (status, row, point, tip_speed)
+        TAUT, `row` and `start` as they came, and a tip speed r·ẏ of 0 m/s, as `follow_slack` returns them.
     """
     return TAUT, row, start, 0.0

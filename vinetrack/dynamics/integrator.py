@@ -61,8 +61,8 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
     ----------
     times : array (n_times,), s since release, increasing. Before 0 the vine is at rest; after the end of growth it
         stays at `stop`, speed and acceleration 0.
-    breakpoints : array, rising, padded with infinity: where along x the forces have corners, such as where the film's
-        mass reaches its floor, m. A step ends at each, for none is accurate across it.
+    breakpoints : array, rising, padded with infinity: where along x the slope of a force changes abruptly, such as
+        where the film's mass reaches its floor, m. A step ends at each, for none is accurate across it.
     stop : tail travel at the end of growth, m; infinite for a body that moves as a whole.
     rtol : local tolerance on the speed, relative.
     out : array (n_times, 4) to be filled: x, v, a of the tail and the position of the leading edge that the camera
@@ -72,8 +72,9 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
     Returns
     -------
     (status, end_time, end_speed, n_steps, slack_time)
-        `end_time` is that of the end of growth or of the last stall, NaN where there was neither; `slack_time` when
-        the tail first went slack, NaN where it did not or may not.
+        `end_time` is that of the end of growth, of the last stall or of where a trajectory that is TOO_HARD was given
+        up, NaN where there was none of them; `slack_time` when the tail first went slack, NaN where it did not or may
+        not.
     """
     count = times.size
     point = Point(0.0, 0.0, 0.0, 0.0, equations.first_chamber(trial))
@@ -92,9 +93,9 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
                 equations, trial, times, row, point, stop, rtol, out, work
             )
             if status == ENDED:
-                end_time = point.time
                 _write_at_rest(equations, trial, times, row, np.inf, _at(point, stop), out)
             if status != TAUT:
+                end_time = end_time if status == RUNNING else point.time
                 return status, end_time, end_speed, n_steps, slack_time
             phase = AT_REST if point.v <= 0 else MOVING
             point, scale, h = _pulled_taut(equations, trial, point, scale)
@@ -125,7 +126,9 @@ def _integrate(equations, trial, times, breakpoints, stop, rtol, out, work):
             return TOO_HARD, point.time, point.v, n_steps, slack_time
         verdict, factor = _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale)
         if verdict == STANDSTILL:
-            point = Point(point.time + h, point.x + 0.5 * h * max(point.v, 0.0), point.v, point.slope, end.chamber)
+            point = Point(
+                point.time + h, point.x + 0.5 * h * max(point.v, 0.0), point.v, point.acceleration, end.chamber
+            )
             phase, end_time = AT_REST, point.time
             row = _write_at_rest(equations, trial, times, row, point.time, point, out)
             if row == count:
@@ -221,7 +224,7 @@ def integrate_trials(
 @inlined
 def _at(point, x):
     """The same point at another position."""
-    return Point(point.time, x, point.v, point.slope, point.chamber)
+    return Point(point.time, x, point.v, point.acceleration, point.chamber)
 
 
 @inlined
@@ -305,8 +308,10 @@ def _judge_step(point, end, stages, converged, error, breakpoint_x, stop, scale)
         return REFUSED, 0.3
     if error > 1:
         return REFUSED, max(0.2, 0.9 * error**-0.25)
-    if breakpoint_x < stop and end.x > breakpoint_x + 1e-7 * stop:
-        return REFUSED, _fraction_at(breakpoint_x + 5e-8 * stop, h, point, end)
+    # How near counts as at the breakpoint: of the whole way, or of the way so far where a body has no end.
+    near = 1e-7 * (stop if stop < np.inf else breakpoint_x)
+    if breakpoint_x < stop and end.x > breakpoint_x + near:
+        return REFUSED, _fraction_at(breakpoint_x + 0.5 * near, h, point, end)
     return ACCEPTED, 1.0
 
 
@@ -320,19 +325,19 @@ def _next_step_size(h, wished, error):
 @inlined
 def _set_off(equations, trial, point, until, stop):
     """From rest: the point with its acceleration, the speed that the motion will reach, and the first step."""
-    slope, _rate = equations.rates(point.time, point.x, 0.0, point.chamber, trial)
-    room = min(stop - point.x, 0.5 * slope * (until - point.time) ** 2 + 1e-9)
-    scale = _typical_speed(equations, trial, point.time, point.x, point.chamber, slope, room)
-    return Point(point.time, point.x, 0.0, slope, point.chamber), scale, 1e-4 * scale / slope
+    acceleration, _rate = equations.rates(point.time, point.x, 0.0, point.chamber, trial)
+    room = min(stop - point.x, 0.5 * acceleration * (until - point.time) ** 2 + 1e-9)
+    scale = _typical_speed(equations, trial, point.time, point.x, point.chamber, acceleration, room)
+    return Point(point.time, point.x, 0.0, acceleration, point.chamber), scale, 1e-4 * scale / acceleration
 
 
 @inlined
 def _pulled_taut(equations, trial, point, scale):
     """After a slack phase: the point with its acceleration, the speed to be expected, and the first step."""
-    time, x, v, _slope, chamber = point
-    slope, _rate = equations.rates(time, x, v, chamber, trial)
+    time, x, v, _acceleration, chamber = point
+    acceleration, _rate = equations.rates(time, x, v, chamber, trial)
     scale = max(scale, v)
-    return Point(time, x, v, slope, chamber), scale, 1e-2 * max(v, 1e-3 * scale) / max(abs(slope), 1e-9)
+    return Point(time, x, v, acceleration, chamber), scale, 1e-2 * max(v, 1e-3 * scale) / max(abs(acceleration), 1e-9)
 
 
 @compiled
@@ -366,7 +371,7 @@ def _wait_for_drive(equations, trial, point, until):
 
     The instant is past `until` where none does. The chamber goes on filling meanwhile.
     """
-    time, x, _v, _slope, chamber = point
+    time, x, _v, _acceleration, chamber = point
     steps = max(256, 2 * trial.trace_time.size)
     step = (until - time) / steps
     for _step in range(steps):
@@ -398,9 +403,9 @@ def _visible_start(equations, trial, time, until, x, chamber, delay):
         after = _filled(equations, trial, time, x, chamber, delay)
         if equations.rest_acceleration(time + delay, x, after, trial) <= 0:
             break
-        slope, _rate = equations.rates(time + delay, x, 0.0, after, trial)
-        room = 0.5 * slope * delay**2
-        speed = _typical_speed(equations, trial, time + delay, x, after, slope, room)
+        acceleration, _rate = equations.rates(time + delay, x, 0.0, after, trial)
+        room = 0.5 * acceleration * delay**2
+        speed = _typical_speed(equations, trial, time + delay, x, after, acceleration, room)
         if delay * speed > 1e-9 * (x + 1e-3):
             break
         start, pressure = time + delay, after

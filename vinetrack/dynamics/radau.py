@@ -101,7 +101,7 @@ def first_stages(point, h, before):
         p1, p2, p3 = _continued(1 + C1 * r, before), _continued(1 + C2 * r, before), _continued(1 + r, before)
         w1, w2, w3 = p1 - before.z3, p2 - before.z3, p3 - before.z3
     else:
-        w1, w2, w3 = C1 * h * point.slope, C2 * h * point.slope, h * point.slope
+        w1, w2, w3 = C1 * h * point.acceleration, C2 * h * point.acceleration, h * point.acceleration
     return Stages(h, max(w1, lowest), max(w2, lowest), max(w3, lowest))
 
 
@@ -157,7 +157,7 @@ def radau_step(equations, trial, point, stages, scale, rtol):
     (converged, error, end, stages)
         `error` in units of the tolerance, `end` the `Point` at the end of the step, `stages` the speeds gained.
     """
-    time, x, v, _slope, chamber = point
+    time, x, v, _acceleration, chamber = point
     h, z1, z2, z3 = stages
     j1 = j2 = j3 = 0.0
     g1 = g2 = g3 = 0.0
@@ -221,7 +221,7 @@ def _local_error(point, stages, scale, rtol):
     Hairer filters it with (μ/h − J)⁻¹. Not here: that hides what a long stiff step does wrong at its far end.
     """
     h, z1, z2, z3 = stages
-    raw = (h * point.slope + E1 * z1 + E2 * z2 + E3 * z3) / MU
+    raw = (h * point.acceleration + E1 * z1 + E2 * z2 + E3 * z3) / MU
     # A tenth of the final speed: what goes wrong at the start is carried through the whole growth.
     weight = rtol * max(0.1 * scale, abs(point.v), abs(point.v + z3))
     return abs(raw) / weight
@@ -232,8 +232,8 @@ def _end_of_step(point, stages, chamber):
     """The vine at the end of a step; `chamber` is the pressure at its last stage."""
     h, z1, z2, z3 = stages
     x_end = point.x + h * (point.v + A31 * z1 + A32 * z2 + A33 * z3)
-    slope_end = (S1 * z1 + S2 * z2 + S3 * z3) / h
-    return Point(point.time + h, x_end, point.v + z3, slope_end, chamber)
+    acceleration_end = (S1 * z1 + S2 * z2 + S3 * z3) / h
+    return Point(point.time + h, x_end, point.v + z3, acceleration_end, chamber)
 
 
 @inlined
@@ -251,14 +251,14 @@ def quintic(s, h, start, end):
     (x, v, a)
         Position, speed and acceleration of the tail, SI.
     """
-    d = end.x - start.x - h * start.v - 0.5 * h * h * start.slope
-    e = h * (end.v - start.v - h * start.slope)
-    f = h * h * (end.slope - start.slope)
+    d = end.x - start.x - h * start.v - 0.5 * h * h * start.acceleration
+    e = h * (end.v - start.v - h * start.acceleration)
+    f = h * h * (end.acceleration - start.acceleration)
     c3 = 10 * d - 4 * e + 0.5 * f
     c4 = -15 * d + 7 * e - f
     c5 = 6 * d - 3 * e + 0.5 * f
     s2 = s * s
-    x = start.x + h * s * start.v + 0.5 * h * h * s2 * start.slope + s2 * s * (c3 + s * (c4 + s * c5))
-    v = start.v + h * s * start.slope + s2 * (3 * c3 + s * (4 * c4 + s * 5 * c5)) / h
-    a = start.slope + s * (6 * c3 + s * (12 * c4 + s * 20 * c5)) / (h * h)
+    x = start.x + h * s * start.v + 0.5 * h * h * s2 * start.acceleration + s2 * s * (c3 + s * (c4 + s * c5))
+    v = start.v + h * s * start.acceleration + s2 * (3 * c3 + s * (4 * c4 + s * 5 * c5)) / h
+    a = start.acceleration + s * (6 * c3 + s * (12 * c4 + s * 20 * c5)) / (h * h)
     return x, v, a

@@ -184,7 +184,7 @@ class Batch:
     trace_pressure: Floats
     bend_starts: NDArray[np.int64]
     bends: Floats
-    kinks: Floats
+    breakpoints: Floats
     stops: Floats
 
     def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
@@ -229,7 +229,7 @@ class Batch:
             self.trace_pressure,
             self.bend_starts[a : b + 1],
             self.bends,
-            self.kinks[a:b],
+            self.breakpoints[a:b],
             self.stops[a:b],
             relative_tolerance,
             out,
@@ -327,7 +327,7 @@ def lay_out(
         on = effects_on(model, thetas) & ~resting
     else:
         on = effects_on(model, thetas)
-    kinks, stops = _limits(model, rigs, thetas, on, bends)
+    breakpoints, stops = _limits(model, rigs, thetas, on, bends)
     given_times = [np.asarray(t, dtype=float) for t in times_s]
     true_times = _true_times(model, rigs, thetas, on, given_times)
     traces = _true_traces(model, rigs, thetas, on, traces)
@@ -346,7 +346,7 @@ def lay_out(
         trace_pressure=np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0),
         bend_starts=_starts(bends),
         bends=np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
-        kinks=kinks,
+        breakpoints=breakpoints,
         stops=stops,
     )
 
@@ -363,10 +363,10 @@ def _limits(
     on: NDArray[np.bool_],
     bends: Sequence[Sequence[tuple[float, float, float]]],
 ) -> tuple[Floats, Floats]:
-    """Tail travel at which forces have corners, rising, and at which growth ends, m; infinite where they do not.
+    """Tail travel at the breakpoints of the forces, rising, and at which growth ends, m; infinite where there is none.
 
-    Of shape (n_trials, n_corners) and (n_trials,). Corners are where the film's mass reaches its floor, where bends
-    begin and end, and what effects say of theirs.
+    Of shape (n_trials, n_breakpoints) and (n_trials,). Breakpoints are where the film's mass reaches its floor, where
+    bends begin and end, and what effects say of theirs.
     """
     rig = TrialInputs(*rigs.T)
     film = np.ones(len(rigs))
@@ -377,20 +377,20 @@ def _limits(
     left = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
     loss = np.asarray(rig.mass_loss)
     floor = np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf)
-    cornered = [i for i, effect in enumerate(model.effects) if effect.corners is not None and on[:, i].any()]
-    if not cornered and not any(bends):
+    broken = [i for i, effect in enumerate(model.effects) if effect.breakpoints is not None and on[:, i].any()]
+    if not broken and not any(bends):
         return floor[:, None].copy(), end
     positions_m = [[edge for start, arc, _ in rows for edge in (start, start + arc)] for rows in bends]
-    for i in cornered:
-        corners = model.effects[i].corners
-        assert corners is not None
+    for i in broken:
+        of_effect = model.effects[i].breakpoints
+        assert of_effect is not None
         for k in np.flatnonzero(on[:, i]).tolist():
-            positions_m[k] += corners(TrialInputs(*rigs[k]))
-    kinks = np.full((len(rigs), 1 + max(map(len, positions_m), default=0)), math.inf)
-    kinks[:, 0] = floor
+            positions_m[k] += of_effect(TrialInputs(*rigs[k]))
+    breakpoints = np.full((len(rigs), 1 + max(map(len, positions_m), default=0)), math.inf)
+    breakpoints[:, 0] = floor
     for k, positions in enumerate(positions_m):
-        kinks[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
-    return np.sort(kinks, axis=1), end
+        breakpoints[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
+    return np.sort(breakpoints, axis=1), end
 
 
 def _true_times(

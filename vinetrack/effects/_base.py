@@ -166,7 +166,7 @@ class Effect:
     replaces: tuple[str, ...] = ()  #: effects that it contains and that rest while it is in the model
     order: int = 3  #: place among the effects of one hook
     finite: bool = False  #: small sizes look like something else (a later release): it is tried at finite ones too
-    corners: Callable[[TrialInputs], Sequence[float]] | None = None  #: lead positions where its force has a corner, m
+    breakpoints: Callable[[TrialInputs], Sequence[float]] | None = None  #: lead positions where its slope breaks, m
 
     @property
     def formula(self) -> str:

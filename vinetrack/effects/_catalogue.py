@@ -11,10 +11,12 @@ import importlib.util
 import inspect
 import re
 import sys
+import warnings
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType, ModuleType
+from typing import Any
 
 from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.problems import UserError
@@ -96,12 +98,20 @@ def load_effect(path: Path | str) -> Effect:
         replaces=tuple(getattr(module, "REPLACES", ())),
         order=int(getattr(module, "ORDER", 3)),
         finite=bool(getattr(module, "FINITE", False)),
-        corners=getattr(module, "corners", None),
+        breakpoints=_breakpoints(module),
     )
     faults = list(_faults(effect))
     if faults:
         raise EffectError(f"{path}: " + "; ".join(faults) + ".")
     return effect
+
+
+def _breakpoints(module: ModuleType) -> Any:
+    """The function `breakpoints` of an effect's file; under its former name for one release."""
+    if hasattr(module, "corners") and not hasattr(module, "breakpoints"):
+        warnings.warn(f"{module.__file__}: `corners` is now called `breakpoints`", FutureWarning, stacklevel=3)
+        return module.corners
+    return getattr(module, "breakpoints", None)
 
 
 def _faults(effect: Effect) -> Iterable[str]:

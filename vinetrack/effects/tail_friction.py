@@ -44,7 +44,7 @@ def tail_force(s, rig, mu_w):  # noqa: D103
     return -mu_w * np.minimum(s.lead_position, rig.length - s.lead_position)
 
 
-def corners(rig):  # noqa: D103
+def breakpoints(rig):  # noqa: D103
     return () if rig.tail_on_reel > 0.0 else (rig.length / 2,)
 
 

@@ -1,13 +1,37 @@
-"""The linear mixed model behind a fit: what the sensitivities of the trials say about numbers, spreads and noise.
+"""The nonlinear mixed-effects model of a fit, and its linear form about the current trajectories.
 
-About the current trajectories, measured minus predicted position of trial i is
+Point j of trial i, of vine v(i), is measured at time t_ij and lies at
 
-    r_i = X_i Δθ + Z_i u_i + e_i,   u_i ~ N(0, diag(σ_P², σ_B²)),   e_i ~ AR(1)
+    y_ij = o_i + f(t_ij − r_i; θ, ln B_v(i) + b_i + z_iᵀγ, P_i (1 + p_i + z_iᵀγ)) + e_ij
 
-with the release and the origin of every trial free. All unknowns of a trial are integrated out analytically, so the
-cost is linear in the number of trials. Alternated with new trajectories this is the method of Lindstrom & Bates,
-Biometrics 46, 673 (1990). Spreads maximise the restricted likelihood, which unlike the plain one counts the numbers
-that were fitted (Patterson & Thompson, Biometrika 58, 545, 1971).
+f : position of the leading edge that the equation of motion predicts, m, by time since release.
+θ : shared numbers: ln B of each vine, n and what else the model leaves free, yield pressures where the sheet gives
+    them an error, and γ, the coefficients of differences between trials (`parameters.BetweenTerm`: z_i is 0 without
+    them, and γ acts on ln B or on the pressure). Priors: N(stated value, stated error²) where the sheet states one, and
+    for coefficients of groups that are random; flat between the bounds of a number otherwise.
+u_i = (r_i, o_i, p_i, b_i) : random effects of the trial: release, s; origin, m; relative deviation of the pressure;
+    deviation of ln B. Independent from trial to trial and of each other, normal, with the standard deviations
+    r_i : RELEASE_ROOM_FRAMES frames about the first guess where the rest is seen, three durations of the track where
+          it is not, `fit_problem.KNOWN_RELEASE_S` where the pressure was let in during the recording;
+    o_i : ORIGIN_ROOM_SIGMAS of the noise where the rest is seen, else three spans of the track;
+    p_i : σ_P, one for all trials; the gauge's error where the pressure was measured; 0 where no pressure drives;
+    b_i : σ_B, one for all trials; 0 for bodies without B.
+e_ij : s_ij times stationary AR(1) noise with the correlation ρ of all trials and an innovation variance of each, v_i;
+    independent on either side of a gap. s_ij is the stated noise of a point relative to that of its trial, 1 without.
+
+About the current θ and u_i the residuals are linear in both, r_i = X_i Δθ + Z_i Δu_i + e_i, with the sensitivities of
+`vinetrack.inference.sensitivity`. What is estimated by which likelihood, in turns until nothing moves:
+
+1. θ and u_i by Gauss–Newton steps at given σ_P, σ_B, ρ, v_i: the mode of the penalised sum of squares, u_i eliminated
+   analytically so that the cost is linear in the number of trials; then new trajectories (Lindstrom & Bates, Biometrics
+   46, 673, 1990).
+2. σ_P and σ_B by the restricted likelihood of the linear model, u_i and θ integrated out
+   (`marginal_likelihood.estimate_spreads`; Patterson & Thompson, Biometrika 58, 545, 1971). One that too few trials
+   feel stays as stated.
+3. ρ and v_i by the restricted likelihood of what is left once u_i has been fitted, v_i drawn to the common variance as
+   far as trials differ by chance (`marginal_likelihood.estimate_noise`).
+4. Models are compared by the marginal likelihood, u_i (and random γ) integrated out, θ at its best and σ_P, σ_B at
+   theirs for it: the restricted one cannot compare models with other θ (`assemble.log_likelihood`).
 """
 
 from __future__ import annotations

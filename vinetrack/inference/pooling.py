@@ -5,10 +5,16 @@ they share (the drag of two bodies, the yield pressure of a tube from day to day
 decides the number, and what it misses in the others passes for their noise, which makes them weigh still less. So:
 
 1. The noise of a trial is what is left once its own B, n, C_D ... have been fitted too.
-2. The numbers θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M), M being the covariance that one typical
-   trial leaves. With A_i the information and g_i the score of a trial at the current numbers, its estimate has the
-   covariance A_i⁻¹ + τ² M. τ² maximises the restricted likelihood (random-effects meta-analysis: DerSimonian & Laird,
-   Controlled Clinical Trials 7, 177, 1986; REML as in Viechtbauer, J. Educ. Behav. Stat. 30, 261, 2005).
+2. The numbers θ_i of trial i scatter about the shared θ: θ_i ~ N(θ, τ² M). Assumed: the between-trial covariance is
+   proportional to M, the covariance of all numbers that one typical trial leaves by its noise (that of all trials
+   together times the number of trials that tell of a number). So there is one unknown, τ², instead of k(k + 1)/2, which
+   a handful of trials could not tell: numbers scatter in the directions in which a trial says little, and by the same
+   multiple of their errors. Where trials differ in one well-known number alone, M is wrong, and τ² too large for the
+   others. With A_i the information and g_i the score of a trial at the current numbers, its estimate has the
+   covariance A_i⁻¹ + τ² M. τ² maximises the restricted likelihood of several numbers at once (multivariate
+   random-effects meta-analysis by REML: van Houwelingen, Arends & Stijnen, Statistics in Medicine 21, 589, 2002, and
+   White, Stata Journal 9, 40, 2009, who leave the between-study covariance free; of one number: DerSimonian & Laird,
+   Controlled Clinical Trials 7, 177, 1986, and Viechtbauer, J. Educ. Behav. Stat. 30, 261, 2005).
 3. A step in θ with these weights, trajectories anew, until nothing moves.
 
 With τ² = 0 the weights are those of the noise; with a large τ² all trials count alike.
