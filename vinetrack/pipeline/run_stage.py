@@ -14,6 +14,7 @@ from typing import TextIO
 
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.core.terminal import Progress, progress
+from vinetrack.pipeline.run_lock import TAKEN_AWAY, refuse_running
 from vinetrack.pipeline.workflow import (
     PACKAGE,
     SNAKEFILE,
@@ -133,7 +134,10 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     ------
     RunError
         If a stage fails, with what it said.
+    ExperimentError
+        If another run writes the same results.
     """
+    refuse_running(paths.results)
     claim_results(paths.results, paths.experiment)
     log = paths.results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -185,6 +189,8 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
             failed.setdefault(rule, "")
         elif failed and (match := _STAGE_LOG.match(line)):
             failed[rule] = failed[rule] or match[1].split(" (check log")[0]
+        elif line.startswith(TAKEN_AWAY):
+            say(line)
         elif not _NOISE.match(line):
             words.append(line)
     if bar is not None:

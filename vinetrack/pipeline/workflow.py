@@ -378,6 +378,26 @@ def plan_or_stop(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
         raise SystemExit(1) from None
 
 
+def begin_or_stop(plan: WorkflowPlan) -> None:
+    """`begin_run`, but a refusal is printed and the process ends with status 1; for the Snakefile, as `plan_or_stop`.
+
+    Where Snakemake only shows what it would do nothing is begun; it does not tell a Snakefile, its command line does.
+
+    Parameters
+    ----------
+    plan : of this run.
+    """
+    from vinetrack.pipeline.run_lock import begin_run, only_looks
+
+    if only_looks(sys.argv[1:]):
+        return
+    try:
+        begin_run(plan.results, plan.experiment, Path.cwd(), lambda line: print(line, flush=True))
+    except ExperimentError as error:
+        print("\n".join(format_problems(error.problems)), file=sys.stderr, flush=True)
+        raise SystemExit(1) from None
+
+
 def say_where_at_exit(plan: WorkflowPlan, quiet: bool = False) -> None:
     """Let the last line of this process say where the report is, if it is there and no older than what it is made of.
 
