@@ -321,10 +321,11 @@ def _run_settings(text: str) -> RunSettings:
 @contextmanager
 def _sentences(log: Path | None) -> Iterator[None]:
     """Turn every failure into sentences and exit status 1; tracebacks go to the log."""
+    from vinetrack.core.files import is_full
     from vinetrack.core.problems import ExperimentError, UserError, format_problems
 
-    _log_to(log)
     try:
+        _log_to(log)
         yield
     except (typer.Exit, typer.BadParameter, typer.Abort):
         raise
@@ -337,6 +338,8 @@ def _sentences(log: Path | None) -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(1) from None
     except Exception as error:
+        if is_full(error):
+            _stop("The disk is full: make room and run the same command again; what was finished is kept.")
         logging.getLogger(__name__).exception("stopped by %s", type(error).__name__)
         if isinstance(error, UserError):
             _stop(str(error))

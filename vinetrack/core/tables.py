@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.files import file_size
 from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
@@ -183,13 +184,11 @@ def read_text(path: Path) -> str:
         If there is no such file, it cannot be opened, is too large or is not text.
     """
     try:
-        if path.stat().st_size > LARGEST_TABLE_BYTES:
+        if file_size(path) > LARGEST_TABLE_BYTES:
             raise TableError("is too large to be a table: is it a recording?")
         return decode_text(path.read_bytes())
     except FileNotFoundError:
         raise TableError("does not exist: check the path and its upper and lower case") from None
-    except IsADirectoryError:
-        raise TableError("is a folder, not a file") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it cannot be opened"
         raise TableError(f"cannot be read: {reason}") from None

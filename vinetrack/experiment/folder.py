@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from vinetrack.core.files import file_size
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.core.records import Correction, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
@@ -397,8 +398,10 @@ def _check_video(trial: Trial) -> list[Problem]:
         if path.is_dir():
             empty = not any(path.iterdir())
             return [Problem(message="is an empty folder", remedy="put frames in it", **place)] if empty else []
-        if path.stat().st_size == 0:
+        if file_size(path) == 0:
             return [Problem(message="is an empty file", remedy="copy it anew", **place)]
-    except (OSError, ValueError):
+    except (FileNotFoundError, ValueError):
         return [Problem(message="does not exist", remedy="check the path and its upper and lower case", **place)]
+    except OSError as error:
+        return [Problem(message=f"cannot be read: {error.strerror}", **place)]
     return []

@@ -56,15 +56,18 @@ def describe_run(
 
 
 def _hash_file(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of a folder of frames; "missing" where there is none."""
+    """SHA-256 of a file, or of the names and contents of a folder of frames; "missing" or "unreadable" else."""
     if path.is_dir():
         files = sorted(file for file in path.rglob("*") if file.is_file())
         lines = [f"{file.relative_to(path).as_posix()} {_hash_file(file)}\n" for file in files]
         return hashlib.sha256("".join(lines).encode()).hexdigest()
     if not path.is_file():
         return "missing"
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return "unreadable"
 
 
 def _shown(path: Path, folder: Path) -> str:

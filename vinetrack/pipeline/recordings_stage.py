@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.files import is_full
 from vinetrack.core.numbers import number
 from vinetrack.core.tables import write_bytes, write_json
 from vinetrack.pipeline.tracks_stage import INTERNAL_FAULT, analyse, failed_row, write_empty
@@ -90,7 +91,9 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     except (RecordingError, TrackError) as error:
         reason, fault = str(error), ""
         write_empty(results, trial.name, failed_row(trial, reason))
-    except Exception:
+    except Exception as error:
+        if is_full(error):
+            raise  # a fault of the disk is none of this trial
         reason, fault = INTERNAL_FAULT, traceback.format_exc()
         write_empty(results, trial.name, failed_row(trial, reason))
     _draw(trial, results, measurement, reason, settings)

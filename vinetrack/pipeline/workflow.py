@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vinetrack.core.files import is_readable
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
 from vinetrack.figures.registry import PAPER_FIGURES
 
@@ -209,11 +210,11 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     refuse_shared_results(results, folder)
     trials = tuple(name for name in experiment.names if name not in experiment.left_out)
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
-    present = (path for path in files if path is not None and (is_virtual or path.exists()))
+    present = (path for path in files if path is not None and (is_virtual or is_readable(path)))
     effect_files = (folder / path for path in experiment.settings.effects)
-    shared = [path for path in (*(folder / name for name in SHARED_FILES), *effect_files) if path.exists()]
+    shared = [path for path in (*(folder / name for name in SHARED_FILES), *effect_files) if is_readable(path)]
     target = getattr(experiment.settings.calibration, "image", None)
-    targets = [folder / target] if target is not None and (is_virtual or (folder / target).exists()) else []
+    targets = [folder / target] if target is not None and (is_virtual or is_readable(folder / target)) else []
     inputs = dict.fromkeys([*shared, *targets, *present])
     watched = tuple(path for path in inputs if not _has_brace(path))
     filmed = {

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.files import file_size
 from vinetrack.core.records import Trial
 from vinetrack.video.decoding import Decoded, damaged_frames, decode_container, quiet_log
 
@@ -121,13 +122,17 @@ def inspect_recording(path: Path | str) -> Recording:
         In one sentence, where there is nothing usable.
     """
     path = Path(path)
-    if not path.exists():
-        raise RecordingError(f"{path.name}: there is no such file or folder")
+    try:
+        size = 1 if path.is_dir() else file_size(path)
+    except FileNotFoundError:
+        raise RecordingError(f"{path.name}: there is no such file or folder") from None
+    except OSError as error:
+        raise RecordingError(f"{path.name}: cannot be read: {error.strerror}") from None
     if path.is_dir() or path.suffix.lower() in IMAGES:
         from vinetrack.video.images import inspect_images
 
         return inspect_images(path)
-    if path.stat().st_size == 0:
+    if size == 0:
         raise RecordingError(f"{path.name}: the file is empty; copy it from the camera again")
     return _inspect_container(path)
 

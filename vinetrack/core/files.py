@@ -1,0 +1,68 @@
+"""Files as an experiment may hold them: what is no ordinary file is never opened, since a pipe would be waited for."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Errors of a disk, or a share of one, on which nothing more can be written."""
+
+
+def file_size(path: Path) -> int:
+    """Size of an ordinary file that may be read.
+
+    Parameters
+    ----------
+    path : the file, or a link to it.
+
+    Returns
+    -------
+    bytes.
+
+    Raises
+    ------
+    OSError
+        With a `strerror` for a person: there is none, it may not be read, it is a folder, a pipe or a device.
+    """
+    status = path.stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(path))
+    if not os.access(path, os.R_OK):
+        raise PermissionError(errno.EACCES, "permission denied; allow it to be read", str(path))
+    return status.st_size
+
+
+def is_readable(path: Path) -> bool:
+    """Whether a path leads to an ordinary file, or a folder, that may be read.
+
+    Parameters
+    ----------
+    path : whatever a sheet names.
+
+    Returns
+    -------
+    False also where there is nothing.
+    """
+    try:
+        return (path.is_dir() and os.access(path, os.R_OK | os.X_OK)) or file_size(path) >= 0
+    except (OSError, ValueError):
+        return False
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether an error says that the disk is full.
+
+    Parameters
+    ----------
+    error : as it was raised.
+
+    Returns
+    -------
+    True for a full disk or a quota that is used up.
+    """
+    return isinstance(error, OSError) and error.errno in FULL
