@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
-from vinetrack.video.edge_repair import ASTRAY_PX, FAINTEST, disagreement, growth_end, mend_jumps
+from vinetrack.video.edge_repair import ASTRAY_PX, disagreement, growth_end, mend_jumps
 from vinetrack.video.edge_state import (
     ASSUMED_EXPOSURE,
-    CLEAR_PX,
     OPTICAL_BLUR_PX,
     EdgeState,
     blur_lengths,
-    clear_of_start,
     core_frames,
     find_exposure,
     find_shape,
@@ -32,7 +30,7 @@ from vinetrack.video.edge_state import (
     residuals,
     seen_exposure,
 )
-from vinetrack.video.launcher_mouth import find_mouth
+from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors
 from vinetrack.video.strip import Strip
 
 START_PX = 0.08
@@ -50,15 +48,34 @@ blurred frames at the fastest; at half more rounds are made, at twice fewer."""
 UNFIT = 3.0
 """Factor of the bands' disagreement where no blur within reason fits: all rows err together then. Chosen: pictures out
 of focus then state errors of a pixel. At half or twice they state half or twice as much."""
-HIDDEN = 3.2
-"""Misfit, in units of the noise and in usual ones, above which something else stands there and the edge is a guess.
-Chosen: sqrt(3.2) is 1.8 standard deviations in every pixel, which noise never has. By reasoning: at half textured
-backgrounds count as hidden; at twice payloads before the edge do not."""
+LARGEST_RATIO = 100.0
+"""Misfit over the usual one at most. Chosen: errors end at ASTRAY_PX long before."""
+NEAR_START = 0.1
+"""Part of the error of the start to which frames count as near it. Derived: e^−2.3, within 2.3 START_REACH_PX."""
+FULL_TROUBLE = 0.7
+"""Excess of the mean misfit ratio near the start from which a door counts in full. Chosen below 1, where the misfit is
+twice the usual one. By reasoning: at half faint doors count in full, at twice common ones by half."""
 SIDES_PX = 1.0
 """Error of a width between two sides that are each known to a blur of about 0.7 px. Derived: √2 · 0.7 px."""
 FAINT, FAINT_PART = 25.0, 0.15
 """Grey levels of contrast below which the sides of a tube fade away, and the error of its width then, a part of it.
 Measured (benchmarks/seen_sizes.py, seeds 20900 and up): 0.76 of the width is seen at 16 levels, 0.96 and more at 70."""
+LEAST_CHANGE, STRONG_PART = 5.0, 0.3
+"""Score of a column that counts as changed, in units of its expectation under noise, and as a part of the usual score.
+Chosen: five standard deviations; half the usual contrast is 0.3 of its power. By reasoning: at half the path begins in
+what never changed; at twice faint starts are cut off."""
+RUN_PX, RUN_FILLED = 9, 0.6
+"""Columns in a row of which this part must have changed for a front to have passed. Chosen: blur alone spreads a change
+over half as many. By reasoning: at half a glint counts as growth; at twice short growth does not."""
+FALL_PART, FALL_PX = 0.1, 0.2
+"""Least fall of the steps in the run-up, as a part of the first difference seen and in px. Chosen: the run-up then
+ends. By reasoning: at half it reaches twice as far back, which the second path takes back."""
+LEAP, LEAP_OVER_PX = 3.0, 2.0
+"""A step so many times those that follow, taken as this much at least, is no growth. Chosen: from rest steps grow. By
+reasoning: at half vines that slow down at once lose their start; at twice a tail that jerks passes for growth."""
+LEAST_NOVELTY = 0.05
+"""Weight of a frame that shows nothing new. Chosen: twenty frames of rest weigh as one of motion. At half or twice so
+many more or fewer do."""
 EVIDENCE_CLIP = 2.5
 """Widths beyond which a pixel is as unlike film (or background) as can be. Chosen as the usual bend of robust
 estimates, 2 to 3 standard deviations. By reasoning: at half contrast hardly counts, at twice a bright door outvotes
@@ -248,11 +265,12 @@ def _first_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
     columns = np.arange(strip.values.shape[2])
     when = np.clip(np.searchsorted(path, columns + 0.5), 0, len(path) - 1)
     got = np.max([score[np.clip(when + d, 0, len(path) - 1), columns] for d in (-1, 0, 1)], axis=0)
-    # Half the usual contrast (0.3 in power): rather begin late (the neighbours then stand in for the background) than
+    # Half the usual contrast: rather begin late (the neighbours then stand in for the background) than
     # early, where a column that never changed would say nothing at all about the edge.
-    strong = got > max(5.0, 0.3 * float(np.median(got[got > 5.0])) if np.any(got > 5.0) else 5.0)
-    run = np.convolve(strong, np.ones(9) / 9, mode="same") > 0.6
-    if run.sum() < 9:
+    seen = got[got > LEAST_CHANGE]
+    strong = got > max(LEAST_CHANGE, STRONG_PART * float(np.median(seen)) if seen.size else LEAST_CHANGE)
+    run = np.convolve(strong, np.ones(RUN_PX) / RUN_PX, mode="same") > RUN_FILLED
+    if run.sum() < RUN_PX:
         raise ValueError("nothing moves along the axis")
     where = np.flatnonzero(run & strong)
     passed = max(int(where[0]), after_jump(path)), int(where[-1]) + 1
@@ -281,7 +299,7 @@ def _run_up(path: Floats) -> Floats:
     later = path[onset + 1 :]
     if onset < 2 or len(later) < 5:
         return path
-    fall = max(float(np.median(np.diff(later[:5], 2))), 0.1 * float(later[1] - later[0]), 0.2)
+    fall = max(float(np.median(np.diff(later[:5], 2))), FALL_PART * float(later[1] - later[0]), FALL_PX)
     out, step = path.copy(), float(np.median(np.diff(later[:4])))
     for t in range(onset, -1, -1):
         step = max(step - fall, 0.0)
@@ -309,7 +327,7 @@ def after_jump(path: Floats) -> int:
     onset = int(np.argmax(steps > 0))
     begin = 0
     for t in range(onset, min(onset + 4, len(steps) - 4)):
-        if steps[t] > 3 * max(float(np.median(steps[t + 1 : t + 5])), 2.0):
+        if steps[t] > LEAP * max(float(np.median(steps[t + 1 : t + 5])), LEAP_OVER_PX):
             begin = int(path[t + 1])
     return begin
 
@@ -345,7 +363,7 @@ def _novelty(strip: Strip, edge: Floats) -> NDArray[np.float32]:
     change[0] = change[1] if len(change) > 1 else 1.0
     usual = float(np.median(change[moving_frames(edge)]))
     floor = float(np.quantile(change, 0.05))
-    return np.clip((change - floor) / max(usual - floor, 1e-6), 0.05, 1.0).astype(np.float32)
+    return np.clip((change - floor) / max(usual - floor, 1e-6), LEAST_NOVELTY, 1.0).astype(np.float32)
 
 
 def _restate(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
@@ -360,31 +378,12 @@ def _restate(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> Ed
     return replace(state, inflation=np.clip(smooth, 0.3, 50.0))
 
 
-def _disturbed_start(strip: Strip, state: EdgeState) -> float:
-    """Share of the columns before the start that change before the edge reaches them: a door swings there."""
-    begin, columns = state.edge[0], strip.values.shape[2]
-    places = np.arange(int(begin) + 6, min(int(begin + CLEAR_PX), columns - 1))
-    moving = np.flatnonzero(moving_frames(state.edge))
-    if len(places) < 10 or moving[0] < 2:
-        return 0.0
-    first = max(0, int(moving[0]) - 15)
-    rising = np.maximum.accumulate(state.edge)
-    contrast = float(np.median(np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))))
-    changed = 0
-    for place in places:
-        arrival = int(np.searchsorted(rising, place - 5.0))
-        seen = strip.values[first : max(arrival - 1, first + 1), :, place].mean(axis=1)
-        change = np.ptp(seen * strip.scale[first : first + len(seen)] + strip.offset[first : first + len(seen)])
-        changed += change > max(0.25 * contrast, 4.0)
-    return changed / len(places)
-
-
 def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed: tuple[int, int]) -> EdgeFit:
     core = core_frames(state, fit)
     # Where the picture departs from the model (a door, a glint) the edge is worse than its curvature says.
-    strain = np.sqrt(np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, 100.0))
+    misfit_ratio = np.clip(fit[:, 2] / max(float(np.nanmedian(fit[core, 2])), 1e-3), 1.0, LARGEST_RATIO)
     edge_now = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
-    edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * strain**2, ASTRAY_PX)
+    edge, sigma = fit[:, 0].copy(), np.minimum(fit[:, 1] * misfit_ratio, ASTRAY_PX)
     # A box of uniform dwell stands for the exposure: its middle is the mean position, ahead of mid-exposure by aτ²/24.
     bend = np.gradient(np.gradient(edge)) if len(edge) > 4 else np.zeros(len(edge))
     edge = edge - np.clip(bend, -50, 50) * exposure**2 / 24
@@ -392,34 +391,17 @@ def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed
     contrast[: passed[0]] = np.nan
     contrast[passed[1] :] = np.nan
     near_start = np.exp(-np.clip(edge_now - edge_now[0], 0, None) / START_REACH_PX)
-    close = (near_start > 0.1) & moving_frames(state.edge) & np.isfinite(strain)
-    trouble = float(np.clip((np.mean(strain[close] ** 2) - 1) / 0.7, 0, 1)) if close.any() else 0.0
-    door = DOOR_PX * _disturbed_start(strip, state) * trouble
+    close = (near_start > NEAR_START) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
+    trouble = float(np.clip((np.mean(misfit_ratio[close]) - 1) / FULL_TROUBLE, 0, 1)) if close.any() else 0.0
+    door = DOOR_PX * disturbed_start(strip, state) * trouble
     doubt = (START_PX + door) * near_start
     apart = disagreement(strip, state, edge_now, core) * (1 - 0.5 * near_start)
     apart = np.hypot(apart * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), doubt)
-    apart = _hidden(fit, strain**2, edge_now, apart)
+    apart = hidden_errors(fit, misfit_ratio, edge_now, apart)
     mouth = find_mouth(strip, state, edge_now)
-    apart = np.where(mouth.before, np.maximum(apart, (2 if mouth.moved_behind else 0.7) * ASTRAY_PX), apart)
+    apart = np.where(mouth.before, np.maximum(apart, NO_EDGE_PX if mouth.moved_behind else GUESSED_PX), apart)
     # A door adds more to the error than any start has: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_PX) | mouth.before
     return EdgeFit(
         edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed, hidden
     )
-
-
-def _hidden(fit: Floats, strain: Floats, edge: Floats, apart: Floats) -> Floats:
-    """Errors `apart` made larger where a door still stands before the tip, shape (n_frames,), px.
-
-    Then the edge is a guess, and none at all where the picture is quite another or hardly any contrast is left.
-    """
-    near = edge < clear_of_start(edge) + 0.5 * CLEAR_PX
-    other, odd = fit[:, 2] > HIDDEN, fit[:, 2] > HIDDEN / 2
-    covered = near & (other & (fit[:, 2] > 1.12 * HIDDEN) | odd & (fit[:, 3] < 0.1 - FAINTEST)) & (strain > 2)
-    if covered.sum() > 1:
-        # A door leaves, it does not come: what stood before it was hidden too.
-        earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
-        covered |= earlier & moving_frames(edge)
-        apart = np.where(earlier, np.hypot(apart, ASTRAY_PX), apart)
-    guessed = near & (other & (strain > HIDDEN) | odd & (strain > 2) & (fit[:, 3] < -0.25))
-    return np.where(covered, 2 * ASTRAY_PX, np.where(guessed, np.hypot(apart, 0.7 * ASTRAY_PX), apart))

@@ -24,6 +24,27 @@ if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
 
 
+BUNCHED, MOST_BUNCHED = 12, 4
+"""Groups of rows that a strip is divided into, and rows of a group at most. Chosen for time; at half noise averages out
+further and narrow vines fill one group, at twice the first path takes twice as long."""
+LEAST_SCORE, SHARE, NEVER = 3.0, 0.15, 0.2
+"""Score from which a column counts as changed; the part of its largest score that each frame must exceed to count; the
+cost of crossing a column that never changed. Chosen: three times what noise brings on average; a change seen in part,
+as by a blurred edge, still counts. By reasoning: at half noise draws the path on; at twice faint stretches end it."""
+FIRST_FRAMES = 5
+"""Frames whose median is what stands before the vine comes. Chosen: the median of five drops two odd ones."""
+
+CHANGED_ROWS = 4
+"""Rows of a column that must have changed for something to be there. Chosen: noise above the threshold never fills
+four rows. By reasoning: at half glints count, at twice thin vines do not."""
+STRONG = 4.0
+"""Change in units of the noise, with the noise of compressed pictures at 3 grey levels or more. Chosen: 6e-5 by chance
+in a pixel. By reasoning: at half noise counts as arrival, at twice dark film on dark ground does not."""
+SIGMA_PX = 0.8
+"""Half a pixel of the path's own grid, and the ragged outline of a crumpled tip. Chosen; half or twice is the stated
+error of such tracks."""
+
+
 @njit(cache=True)
 def _change_score(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, window: int, bunch: int, noise: float
@@ -147,27 +168,13 @@ def first_path(
     -------
     column of the front, shape (n_frames,), px; scores, shape (n_frames, n_along).
     """
-    bunch = int(np.clip(strip.shape[1] // 12, 1, 4))
+    bunch = int(np.clip(strip.shape[1] // BUNCHED, 1, MOST_BUNCHED))
     score = _change_score(strip, scale, offset, window, bunch, noise)
     peak = score.max(axis=0)
-    worth = np.where(peak > 3.0, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(np.float32)
+    worth = np.where(peak > LEAST_SCORE, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(np.float32)
     score = score * worth[None, :]
-    score = np.where(worth[None, :] > 0, score - 0.15 * score.max(axis=0, keepdims=True), -0.2).astype(np.float32)
+    score = np.where(worth[None, :] > 0, score - SHARE * score.max(axis=0, keepdims=True), -NEVER).astype(np.float32)
     return _collect_path(score), score
-
-
-FIRST_FRAMES = 5
-"""Frames whose median is what stands before the vine comes. Chosen: the median of five drops two odd ones."""
-
-CHANGED_ROWS = 4
-"""Rows of a column that must have changed for something to be there. Chosen: noise above the threshold never fills
-four rows. By reasoning: at half glints count, at twice thin vines do not."""
-STRONG = 4.0
-"""Change in units of the noise, with the noise of compressed pictures at 3 grey levels or more. Chosen: 6e-5 by chance
-in a pixel. By reasoning: at half noise counts as arrival, at twice dark film on dark ground does not."""
-SIGMA_PX = 0.8
-"""Half a pixel of the path's own grid, and the ragged outline of a crumpled tip. Chosen; half or twice is the stated
-error of such tracks."""
 
 
 def track_arrival(strip: Strip) -> tuple[Floats, Floats]:

@@ -20,6 +20,33 @@ FLOOR_PX = 0.04
 """Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands. Chosen between 0.03
 and 0.06 px, which they came to. At half good frames state errors that are too small, at twice too large."""
 
+FEWEST_DIFFERENCES, LARGEST_FACTOR = 8, 6.0
+"""Fourth differences that tell of the roughness, and the factor of errors at most. Chosen: the median of eight is known
+to a third, and beyond six the motion is no smooth one. By reasoning: half or twice changes stated errors of short and
+of rough tracks alone."""
+REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25
+"""An edge stands that stays this near to its level, in standard errors and in px at the start and at the end. Chosen:
+one point of 370 by chance; ringing of coders moves an edge by some tenths of a pixel. By reasoning: at half coders'
+ringing releases the vine; at twice slow starts are cut by as much."""
+LEAST_TRAVEL_PX = 2.0
+"""Travel from which something moves at all. Chosen: five times REST_PX. By reasoning: at half drift of a camera counts
+as growth, at twice hardly any recording is refused more."""
+OFF_SIGMAS, OFF_PX = 6.0, 1.0
+"""Distance from the curve of its neighbours, in standard errors and px, from which a point has another cause. Chosen:
+far beyond chance, and a pixel is 25 times FLOOR_PX. By reasoning: at half film's texture makes points doubtful, at
+twice an edge at the far side of a door does not."""
+OFF_SPREAD = 1.4
+"""Standard deviation of a point against a parabola through its four neighbours. Derived: √(1 + 34/36) for equal errors,
+the weights being −1, 4, 4, −1 sixths."""
+LEAPS, LEAP_PX = 1.2, 0.5
+"""A first step so many times the mean of the next two, and so much more, shows that the tip was not where it seemed to
+rest. Chosen: from rest the first step is the shortest. By reasoning: near 1 noise decides; at twice the tip may have
+come from a step further back unseen."""
+AHEAD_PART, AHEAD_ROUGH = 0.5, 4.0
+"""A last step longer than the line through the two before it by this part of a step, and so many times the roughness
+there, is something that flies on. Chosen: a payload leaves at twice the speed of the edge, one step more. By reasoning:
+at half a kick at the stop counts, at twice payloads pass."""
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -44,13 +71,14 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: fl
     """Stated errors scaled to the roughness of the track itself, shape (n_frames,).
 
     Fourth differences cancel any cubic motion and have variance Σ c² σ², c = (1, −4, 6, −4, 1). Their median size in
-    units of the stated errors is the factor, left at 1 where fewer than 8 of them exist; FLOOR_PX is added in square.
+    units of the stated errors is the factor, left at 1 where fewer than FEWEST_DIFFERENCES exist; FLOOR_PX is added in
+    square.
 
     Parameters
     ----------
     edge_px, sigma_px : positions and stated errors, shape (n_frames,), px; NaN where the edge was not found.
     use : mask of the frames that count, shape (n_frames,).
-    smallest : factor at least; 6 at most.
+    smallest : factor at least; LARGEST_FACTOR at most.
 
     Returns
     -------
@@ -63,16 +91,16 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: fl
     difference = windows(edge_px, 5) @ weights
     expected = np.sqrt(windows(sigma_px**2, 5) @ weights**2)
     inside = windows(use, 5).all(axis=1) & np.isfinite(difference) & (expected > 0)
-    if inside.sum() < 8:
+    if inside.sum() < FEWEST_DIFFERENCES:
         return np.hypot(sigma_px, FLOOR_PX)
     factor = 1.4826 * float(np.median(np.abs(difference[inside] / expected[inside])))
-    return np.hypot(sigma_px * float(np.clip(factor, smallest, 6.0)), FLOOR_PX)
+    return np.hypot(sigma_px * float(np.clip(factor, smallest, LARGEST_FACTOR)), FLOOR_PX)
 
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
     """First and last frame in which the edge is on its way; (0, n − 1) if it never rests, (n, −1) if it only rests.
 
-    At rest means: within three sigma, at least 0.4 px (0.25 px at the end, where a creeping stop still tells), of
+    At rest means: within three sigma, at least REST_PX (END_REST_PX at the end, where a creeping stop still tells), of
     the level that it keeps up to, or from, there.
 
     Parameters
@@ -89,10 +117,10 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
         return n, -1
     y, noise = edge_px[good], float(np.nanmedian(sigma_px[good]))
     low, high = float(np.median(y[:3])), float(np.median(y[-3:]))
-    if high - low < max(6 * noise, 2.0):
+    if high - low < max(2 * REST_SIGMAS * noise, LEAST_TRAVEL_PX):
         return n, -1
-    first = _leaves_level(y, max(3 * noise, 0.4))
-    last = len(y) - 1 - _leaves_level(-y[::-1], max(3 * noise, 0.25))
+    first = _leaves_level(y, max(REST_SIGMAS * noise, REST_PX))
+    last = len(y) - 1 - _leaves_level(-y[::-1], max(REST_SIGMAS * noise, END_REST_PX))
     return int(good[first]), int(good[max(last, first)])
 
 
@@ -175,9 +203,9 @@ def judge(
 def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
     """Distance of moving points from a parabola through their two neighbours on each side, shape (n_frames,), px.
 
-    Zero where it is less than 6 sigma or 1 px. At the start, where a door may hide the tip at rest: by how much the
-    first step is longer than those that follow. At the end, where something may fly on: from the line through the two
-    points before.
+    Zero where it is less than OFF_SIGMAS or OFF_PX. At the start, where a door may hide the tip at rest: by how much
+    the first step is longer than those that follow. At the end, where something may fly on: from the line through the
+    two points before.
     """
     out = np.zeros(len(y))
     for i in range(max(first, 2), min(last, len(y) - 1) - 1):  # a dead stop is no departure
@@ -186,17 +214,19 @@ def _departures(y: Floats, sigma_px: Floats, first: int, last: int) -> Floats:
             continue
         expected = (-around[0] + 4 * around[1] + 4 * around[2] - around[3]) / 6
         bend = abs(around[0] - 2 * around[1] + 2 * around[2] - around[3])
-        spread = 1.4 * float(np.max(sigma_px[i - 2 : i + 3]))
+        spread = OFF_SPREAD * float(np.max(sigma_px[i - 2 : i + 3]))
         far = abs(y[i] - expected)
-        out[i] = far if far > max(6 * spread, 1.0, bend) else 0.0
+        out[i] = far if far > max(OFF_SIGMAS * spread, OFF_PX, bend) else 0.0
     for i in range(max(first - 1, 1), min(first + 2, len(y) - 2)):
         leap, later = y[i] - y[i - 1], 0.5 * (y[i + 2] - y[i])
-        if np.isfinite(leap - later) and leap > 1.2 * later + max(sigma_px[i], 0.5):
+        if np.isfinite(leap - later) and leap > LEAPS * later + max(sigma_px[i], LEAP_PX):
             out[:i] = np.maximum(out[:i], leap - 0.5 * later)
     for i in range(max(first + 4, last - 2), last + 1):
         before = y[i - 4 : i]
         ahead = y[i] - 2 * before[-1] + before[-2]
         roughness = float(np.max(np.abs(np.diff(before, 2))))
-        if np.isfinite(ahead) and ahead > max(6 * sigma_px[i], 2.0, 0.5 * (before[-1] - before[-2]), 4 * roughness):
+        if np.isfinite(ahead) and ahead > max(
+            OFF_SIGMAS * sigma_px[i], 2 * OFF_PX, AHEAD_PART * (before[-1] - before[-2]), AHEAD_ROUGH * roughness
+        ):
             out[i : last + 1] = np.maximum(out[i : last + 1], ahead)
     return out

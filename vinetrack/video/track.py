@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
+from vinetrack.video.frame_faults import odd_frames, repeated_frames
 from vinetrack.video.frames import Frames, RecordingError, capture_rate, inspect_recording, read_frames
 from vinetrack.video.hand_corrections import corrected_by_hand
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
@@ -36,6 +37,26 @@ while the axis moves by more than OFF_CENTRE_PX, so that more cost little."""
 APART_PX = 1.0
 """Bands of the edge that disagree by more cannot all be its own. Chosen: 25 times FLOOR_PX. By reasoning: at half tips
 of crumpled film count as doubtful, at twice an edge half behind a door does not."""
+BRIGHT = 1.5
+"""Amplitude above which something else adds to the edge. Chosen about as far above 1 as PALE of `hidden_tip` lies
+below, in ratio. By reasoning: nearer 1 glints make points doubtful; at twice payloads before the edge pass."""
+ODD_RATIO, LEAST_MISFIT = 6.0, 0.3
+"""A frame that fits so many times worse than usual is doubtful, where usual is no less than this. Chosen: a compressed
+picture at rest leaves hardly any misfit. By reasoning: at half textured film makes points doubtful; at twice a hand
+before the tip does not."""
+VAGUE_PX, VAGUE_RATIO = 1.0, 5.0
+"""A point known worse than this, and so many times worse than usual, is doubtful. Chosen as APART_PX; the ratio spares
+recordings in which all points are vague. At half fast frames of blurred recordings are doubtful, at twice none is."""
+ROOM = 0.08
+"""Width added to a given axis, as a part of its length. Derived: the far end of an axis 2.3 degrees off lies off by
+0.04 of it, on either side."""
+MOVING_PX = 0.3
+"""Step of a frame from which the roughness of the track is judged there. Chosen: at rest compression freezes it."""
+SHORTEST_END = 4
+"""Frames of standstill at the end that are worth a word. Chosen; at half two frames alike are told of."""
+STILL_CHANGING = 0.3
+"""Part of the change of pictures in motion from which the picture goes on changing when the edge stands. Chosen between
+noise, 0, and motion, 1. At half a hand that lets go counts, at twice only film that goes on sliding does."""
 MOSTLY_LOST = 0.5
 """Part of the frames without an edge from which a recording is not one where nothing moves. Chosen: the majority; it
 decides which of two messages is given."""
@@ -152,7 +173,7 @@ def track_frames(
     exposure_s = trial.exposure_s if np.isfinite(trial.exposure_s) else (frames.recording.exposure_s or np.nan)
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
-    rejected = _odd_frames(frames.luma)
+    rejected = odd_frames(frames.luma)
     first, last = trial.frames_used or (0, len(frames) - 1)
     number = np.arange(len(frames))
     used = (number >= first) & (number <= last)
@@ -167,8 +188,8 @@ def track_frames(
         strip, edge_fit = _follow(luma, trial, axis, exposure_s * capture_fps, orderly)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
-    repeated = _repeated(strip, edge_fit.edge_px)
-    moving = np.gradient(edge_fit.edge_px) > 0.3 if len(kept) > 1 else np.ones(len(kept), bool)
+    repeated = repeated_frames(strip, edge_fit.edge_px)
+    moving = np.gradient(edge_fit.edge_px) > MOVING_PX if len(kept) > 1 else np.ones(len(kept), bool)
     sigma = calibrated_sigma(edge_fit.edge_px, edge_fit.sigma_px, moving & np.isfinite(edge_fit.edge_px))
     # Roughness and the bands' disagreement tell of the same noise; the larger one also of what the other is blind to.
     sigma = np.maximum(sigma, np.hypot(edge_fit.apart_sigma_px, FLOOR_PX))
@@ -236,7 +257,7 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
     if given:
         # Room for an axis that is a few degrees off; it is centred on what moves, here or in `_follow`.
-        axis = replace(axis, width_px=axis.width_px + 0.08 * axis.length_px)
+        axis = replace(axis, width_px=axis.width_px + ROOM * axis.length_px)
         if trial.travel_ratio == 1:
             axis = centred_on_motion(luma, axis)
     return axis, trial.travel_ratio == 1 or is_orderly(luma, axis)
@@ -317,51 +338,13 @@ def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
 
 def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
     """Frames whose neighbourhood does not look like the edge elsewhere."""
+    from vinetrack.video.hidden_tip import PALE
+
     usual = float(np.nanmedian(fit.misfit))
-    odd = (fit.amplitude < 0.6) | (fit.amplitude > 1.5) | (fit.misfit > 6 * max(usual, 0.3))
+    odd = (fit.amplitude < PALE) | (fit.amplitude > BRIGHT) | (fit.misfit > ODD_RATIO * max(usual, LEAST_MISFIT))
     odd |= (fit.apart_sigma_px > APART_PX) | fit.hidden
-    return np.asarray(odd | (fit.sigma_px > np.maximum(1.0, 5 * np.nanmedian(fit.sigma_px))))
-
-
-def _odd_frames(luma: NDArray[Any]) -> NDArray[np.bool_]:
-    """Frames among the first three that resemble none after them, shape (n,): cameras are known to write such."""
-    odd = np.zeros(len(luma), dtype=bool)
-    if len(luma) < 8:
-        return odd
-    small = luma[:8, ::4, ::4].astype(np.float32)
-
-    def apart(a: int, b: int) -> float:
-        return float(np.mean(np.abs(small[a] - small[b])))
-
-    usual = float(np.median([apart(i, i + 1) for i in range(3, 7)]))
-    unit = 1.0 if luma.dtype == np.uint8 else max(float(small.max()), 1.0) / 255
-    for i in range(3):
-        odd[i] = apart(i, 3) > max(8 * usual, 6 * unit) and apart(i, 4) > max(8 * usual, 6 * unit)
-    return odd
-
-
-def _repeated(strip: Strip, edge_px: Floats) -> NDArray[np.bool_]:
-    """Frames whose surroundings of the edge are those of the frame before, shape (n,).
-
-    Compared with what changes where the edge moves; and it must stand still between frames that show it moving on.
-    """
-    n, _, columns = strip.values.shape
-    change = np.full(n, np.inf)
-    for i in range(1, n):
-        if not np.isfinite(edge_px[i]):
-            continue
-        low, high = int(np.clip(edge_px[i] - 40, 0, columns - 1)), int(np.clip(edge_px[i] + 40, 1, columns))
-        pair = strip.values[i - 1 : i + 1, ::2, low : max(high, low + 1)].astype(np.float32)
-        change[i] = float(np.mean(np.abs(pair[1] - pair[0]))) * float(strip.scale[i])
-    moving = np.zeros(n, dtype=bool)
-    moving[1:] = np.diff(edge_px) > 1.0
-    usual = float(np.median(change[moving])) if moving.any() else np.inf
-    repeated = np.zeros(n, dtype=bool)
-    for i in range(2, n - 1):
-        usual_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
-        stands = abs(edge_px[i] - edge_px[i - 1]) < 0.1 * usual_step
-        repeated[i] = usual_step > 2.0 and stands and change[i] < 0.15 * usual
-    return repeated
+    vague = fit.sigma_px > np.maximum(VAGUE_PX, VAGUE_RATIO * np.nanmedian(fit.sigma_px))
+    return np.asarray(odd | vague)
 
 
 def _is_grown(edge_px: Floats, verdict: Judgement, length_px: float) -> bool:
@@ -384,15 +367,18 @@ def _end_in_words(end: EndOfWay, number: NDArray[np.int_]) -> str:
 def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str, number: NDArray[np.int_]) -> list[str]:
     """What is to be said of an edge that stops before the recording does."""
     n, last = len(edge_px), verdict.last_moving
-    if last < 0 or last >= n - 4 or verdict.left_picture is not None:
+    if last < 0 or last >= n - SHORTEST_END or verdict.left_picture is not None:
         return []
     small = luma[:, ::3, ::3].astype(np.float32)
     change = np.abs(np.diff(small, axis=0)).mean(axis=(1, 2))
     before = float(np.median(change[verdict.first_moving : last])) if last > verdict.first_moving else 0.0
     least = float(np.min(change)) if len(change) else 0.0
     later = float(np.median(change[last + 1 :]))
-    where = f"{name}: the leading edge stops at {np.nanmedian(edge_px[last + 1 :]):.0f} px after frame {number[last]}"
-    if later - least > 0.3 * (before - least):
+    resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
+    if not resting.size:
+        return [f"{name}: the leading edge is not seen after frame {number[last]}"]
+    where = f"{name}: the leading edge stops at {np.median(resting):.0f} px after frame {number[last]}"
+    if later - least > STILL_CHANGING * (before - least):
         return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
     return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
 

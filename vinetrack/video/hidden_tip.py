@@ -1,8 +1,9 @@
-"""An edge at rest that is not the tip's but that of the launcher, or of a plate, out of which the tip comes later.
+"""What hides the tip where it starts: a door that stands or swings before it, the mouth of a launcher.
 
-The border between the launcher and the background stands still while the tip moves behind it, and looks like a tip at
-rest. It is told by what the tip leaves: behind a tip that was seen at rest the film goes on without a border, behind a
-tip that came out of something the straight border of that stays where the edge rested.
+A door leaves: what it hid is told by pictures that resemble neither film nor background. A mouth stays, and its border
+with the background looks like a tip at rest while the tip moves behind it. That is told by what the tip leaves: behind
+a tip that was seen at rest the film goes on without a border, behind one that came out of something the straight
+border of that stays where the edge rested.
 """
 
 from __future__ import annotations
@@ -13,8 +14,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats
-from vinetrack.video.edge_state import CLEAR_PX, EdgeState, moving_frames
+from vinetrack.video.edge_repair import ASTRAY_PX
+from vinetrack.video.edge_state import CLEAR_PX, EdgeState, clear_of_start, moving_frames
 from vinetrack.video.strip import Strip
+
+HIDDEN = 3.2
+"""Misfit, in units of the noise and in usual ones, above which something else stands there and the edge is a guess.
+Chosen: sqrt(3.2) is 1.8 standard deviations in every pixel, which noise never has. By reasoning: at half textured
+backgrounds count as hidden; at twice payloads before the edge do not."""
+SURELY_HIDDEN = 1.12 * HIDDEN
+"""Misfit from which nothing of the tip is seen, whatever its contrast. Chosen: an eighth more than where it is a guess.
+By reasoning: nearer 1 every guess is given up; at twice of it doors of the film's brightness leave guesses."""
+UNUSUAL = 2.0
+"""Misfit over the usual one from which a frame differs from those clear of the start. Chosen. By reasoning: near 1
+every textured start counts, at twice dark doors before dark backgrounds do not."""
+PALE, PARTLY_PALE = 0.6, 0.75
+"""Amplitude, the contrast over that of the same pixels in other frames, below which too little of the edge is left, and
+below which part of it is. Chosen. They are not FAINTEST of `edge_repair` (0.5): below that a fit is sought again, while
+these judge what was found in the end. By reasoning: at half a door over two thirds of the tip passes; near 1 changing
+light does not."""
+GUESSED_PX, NO_EDGE_PX = 0.7 * ASTRAY_PX, 2 * ASTRAY_PX
+"""Error of an edge that is a guess, less than that of a fit gone astray, since the motion still bounds it; and where
+there is none: beyond LOST_SIGMA_PX of `point_quality`. Chosen; half or twice the first is the error of guesses."""
+DOOR_COLUMNS, DOOR_FRAMES = (6, 10), 15
+"""Columns from the start at which a door is looked for, the fewest of them that tell, and frames before the motion in
+which it may swing. Chosen: clear of the tip's blur; at half of the frames slow doors are missed, at twice flicker
+counts."""
+DOOR_PART, DOOR_GREY = 0.25, 4.0
+"""A column is changed by a door where its brightness varies by this part of the film's contrast and so many grey
+levels. Chosen. By reasoning: at half noise counts as a door, at twice dark doors on dark ground do not."""
 
 FEWEST_AT_REST = 3
 """Frames of rest from which a place is known. Chosen as in `point_quality`: two frames alike may be a slow start."""
@@ -91,6 +119,64 @@ def find_mouth(strip: Strip, state: EdgeState, edge: Floats) -> Mouth:
     out = place + 3 * state.blur + 1
     leaves = first + int(np.argmax(edge[first:] > out))
     return Mouth(np.arange(len(edge)) < leaves, _moved_behind(edge[leaves : leaves + FRAMES_OUT], place))
+
+
+def disturbed_start(strip: Strip, state: EdgeState) -> float:
+    """Share of the columns before the start that change before the edge reaches them: a door swings there.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    state : what lies before and after the edge.
+
+    Returns
+    -------
+    0 to 1.
+    """
+    begin, columns = state.edge[0], strip.values.shape[2]
+    places = np.arange(int(begin) + DOOR_COLUMNS[0], min(int(begin + CLEAR_PX), columns - 1))
+    moving = np.flatnonzero(moving_frames(state.edge))
+    if len(places) < DOOR_COLUMNS[1] or moving[0] < 2:
+        return 0.0
+    first = max(0, int(moving[0]) - DOOR_FRAMES)
+    rising = np.maximum.accumulate(state.edge)
+    contrast = float(np.median(np.abs((state.pictures[0] - state.pictures[1]).mean(axis=0))))
+    changed = 0
+    for place in places:
+        arrival = int(np.searchsorted(rising, place - 5.0))
+        seen = strip.values[first : max(arrival - 1, first + 1), :, place].mean(axis=1)
+        change = np.ptp(seen * strip.scale[first : first + len(seen)] + strip.offset[first : first + len(seen)])
+        changed += change > max(DOOR_PART * contrast, DOOR_GREY)
+    return changed / len(places)
+
+
+def hidden_errors(fit: Floats, misfit_ratio: Floats, edge: Floats, apart: Floats) -> Floats:
+    """Errors made larger where a door still stands before the tip.
+
+    Then the edge is a guess, and none at all where the picture is quite another or hardly any contrast is left.
+
+    Parameters
+    ----------
+    fit : from `edge_state.fit_edges`, shape (n_frames, 6).
+    misfit_ratio : misfit over the usual one, shape (n_frames,).
+    edge : shape (n_frames,), px.
+    apart : what is to be added to the error in square, shape (n_frames,), px.
+
+    Returns
+    -------
+    the same, larger where the tip is hidden, shape (n_frames,), px.
+    """
+    near = edge < clear_of_start(edge) + 0.5 * CLEAR_PX
+    misfit, amplitude = fit[:, 2], 1 + fit[:, 3]
+    other, odd = misfit > HIDDEN, misfit > HIDDEN / 2
+    covered = near & (misfit_ratio > UNUSUAL) & ((misfit > SURELY_HIDDEN) | odd & (amplitude < PALE))
+    if covered.sum() > 1:
+        # A door leaves, it does not come: what stood before it was hidden too.
+        earlier = np.arange(len(edge)) < int(np.flatnonzero(covered)[-1])
+        covered |= earlier & moving_frames(edge)
+        apart = np.where(earlier, np.hypot(apart, ASTRAY_PX), apart)
+    guessed = near & (other & (misfit_ratio > HIDDEN) | odd & (misfit_ratio > UNUSUAL) & (amplitude < PARTLY_PALE))
+    return np.where(covered, NO_EDGE_PX, np.where(guessed, np.hypot(apart, GUESSED_PX), apart))
 
 
 def _middle_picture(strip: Strip, frames: NDArray[np.int_]) -> NDArray[np.float32]:

@@ -1,0 +1,88 @@
+"""Pictures that are not what the camera saw at their time: odd ones at the beginning, copies of the one before."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Bools, Floats
+from vinetrack.video.strip import Strip
+
+ODD_AMONG = 3
+"""First frames that may be odd. Chosen: cameras are known to write a wrong second frame and a corrupt first one."""
+ODD_RATIO, ODD_GREY = 8.0, 6.0
+"""A frame is odd that differs from later ones by so many times what neighbours differ by, and by so many grey levels of
+255. Chosen: a release within the first frames changes part of the picture, by less. By reasoning: at half doors that
+swing in frame two reject it; at twice a frame of the same scene a second later passes."""
+AROUND_PX = 40
+"""Columns on either side of the edge that are compared. Chosen: beyond the longest step. At half fast edges leave them;
+at twice what stands still outvotes the edge."""
+SEEN_STEP_PX = 2.0
+"""Step of a frame, over three of them, from which a copy is told from slow growth; half of it counts as motion. Chosen:
+edges err by tenths of a pixel. At half noise decides, at twice copies in slow growth stay."""
+STANDS, ALIKE = 0.1, 0.15
+"""A copy moves less than this part of a step, and its picture changes by less than this part of the usual. Chosen: a
+coder changes even a copy a little. At half compressed copies stay, at twice slow frames pass for copies."""
+
+
+def odd_frames(luma: NDArray[Any]) -> Bools:
+    """Frames among the first few that resemble none after them: cameras are known to write such.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+
+    Returns
+    -------
+    mask, shape (n_frames,).
+    """
+    odd = np.zeros(len(luma), dtype=bool)
+    if len(luma) < 8:
+        return odd
+    small = luma[:8, ::4, ::4].astype(np.float32)
+
+    def apart(a: int, b: int) -> float:
+        return float(np.mean(np.abs(small[a] - small[b])))
+
+    usual = float(np.median([apart(i, i + 1) for i in range(3, 7)]))
+    unit = 1.0 if luma.dtype == np.uint8 else max(float(small.max()), 1.0) / 255
+    far = max(ODD_RATIO * usual, ODD_GREY * unit)
+    for i in range(ODD_AMONG):
+        odd[i] = apart(i, 3) > far and apart(i, 4) > far
+    return odd
+
+
+def repeated_frames(strip: Strip, edge_px: Floats) -> Bools:
+    """Frames whose surroundings of the edge are those of the frame before.
+
+    Compared with what changes where the edge moves; and it must stand still between frames that show it moving on.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    edge_px : edge along the strip, shape (n_frames,), px.
+
+    Returns
+    -------
+    mask, shape (n_frames,).
+    """
+    n, _, columns = strip.values.shape
+    change = np.full(n, np.inf)
+    for i in range(1, n):
+        if not np.isfinite(edge_px[i]):
+            continue
+        low = int(np.clip(edge_px[i] - AROUND_PX, 0, columns - 1))
+        high = int(np.clip(edge_px[i] + AROUND_PX, 1, columns))
+        pair = strip.values[i - 1 : i + 1, ::2, low : max(high, low + 1)].astype(np.float32)
+        change[i] = float(np.mean(np.abs(pair[1] - pair[0]))) * float(strip.scale[i])
+    moving = np.zeros(n, dtype=bool)
+    moving[1:] = np.diff(edge_px) > SEEN_STEP_PX / 2
+    usual = float(np.median(change[moving])) if moving.any() else np.inf
+    repeated = np.zeros(n, dtype=bool)
+    for i in range(2, n - 1):
+        usual_step = 0.5 * (edge_px[i + 1] - edge_px[i - 2])
+        stands = abs(edge_px[i] - edge_px[i - 1]) < STANDS * usual_step
+        repeated[i] = usual_step > SEEN_STEP_PX and stands and change[i] < ALIKE * usual
+    return repeated
