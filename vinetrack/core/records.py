@@ -239,6 +239,26 @@ class Track:
         return usable
 
 
+def plain_track(
+    time_s: Floats, lead_position_m: Floats, *, sigma_m: Floats | None = None, pressure_Pa: Floats | None = None
+) -> Track:
+    """Positions of which nothing else is known: no flag, no pixels, and no error unless it is given.
+
+    Parameters
+    ----------
+    time_s, lead_position_m : shape (n_frames,), s and m.
+    sigma_m : shape (n_frames,), random error of each point, m.
+    pressure_Pa : shape (n_frames,), gauge pressure measured along with it, Pa.
+
+    Returns
+    -------
+    Track
+    """
+    unknown = np.full(len(time_s), np.nan)
+    no_flag = np.full(len(time_s), "", dtype=f"<U{len(';'.join(FLAGS))}")
+    return Track(time_s, lead_position_m, unknown if sigma_m is None else sigma_m, no_flag, unknown.copy(), pressure_Pa)
+
+
 @dataclass(frozen=True)
 class Kinematics:
     """Motion of the leading edge at the usable points of a track. All arrays have shape (n,), SI units.

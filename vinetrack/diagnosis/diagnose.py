@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.core.records import Track, Trial, with_flag
+from vinetrack.core.records import Track, Trial, plain_track, with_flag
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.contradictions import contradictions
@@ -194,14 +194,7 @@ def _dropped_in_fit(fit: Fit) -> list[str]:
 
     dropped = []
     for trial_data in fit.predictor.data:
-        blank = np.full(trial_data.time_s.size, "", dtype=object)
-        track = Track(
-            time_s=trial_data.time_s,
-            lead_position_m=trial_data.lead_position_m,
-            lead_position_sigma_m=np.full(trial_data.time_s.size, math.nan),
-            flag=blank,
-            edge_px=np.full(trial_data.time_s.size, math.nan),
-        )
+        track = plain_track(trial_data.time_s, trial_data.lead_position_m)
         if with_flag(correct_frames(track).flag, "retimed").any():
             dropped.append(trial_data.trial.name)
     return dropped

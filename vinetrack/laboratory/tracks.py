@@ -19,7 +19,7 @@ import pandas as pd
 import yaml
 
 from vinetrack.core.constants import BASE_EFFECTS
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Floats, Track, Trial, plain_track
 from vinetrack.core.tables import write_csv, write_json, write_text
 from vinetrack.dynamics.force_terms import pressure_along
 from vinetrack.dynamics.model import Model, Value, make_model
@@ -133,14 +133,8 @@ def _measure(
     gauge = None
     if nature.trace_sigma_kPa is not None:
         gauge = pressure_Pa[shown] + 1e3 * nature.trace_sigma_kPa * draw.standard_normal(shown.size)
-    track = Track(
-        time_s=time_s[index],
-        lead_position_m=measured,
-        lead_position_sigma_m=np.full(shown.size, nature.noise_m if nature.stated_sigma else math.nan),
-        flag=np.full(shown.size, "", dtype="<U32"),
-        edge_px=np.full(shown.size, math.nan),
-        pressure_Pa=gauge,
-    )
+    sigma_m = np.full(shown.size, nature.noise_m) if nature.stated_sigma else None
+    track = plain_track(time_s[index], measured, sigma_m=sigma_m, pressure_Pa=gauge)
     return VirtualTrial(
         stated=trial,
         true=true,

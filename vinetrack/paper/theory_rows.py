@@ -14,7 +14,7 @@ import pandas as pd
 
 from vinetrack.core import published
 from vinetrack.core.constants import AIR_DENSITY_KG_M3
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Trial, plain_track
 from vinetrack.dynamics.simulate import Trajectory, simulate, simulate_many
 from vinetrack.kinematics.conditions import lead_velocity_at
 from vinetrack.kinematics.damping import fit_laws
@@ -238,8 +238,7 @@ def _published_window(moved: Trajectory, travel_ratio: float) -> float:
     """Steady tail speed by the published rule in a motion without noise, m/s."""
     stop = int(np.searchsorted(moved.time_s, moved.end_time_s)) if math.isfinite(moved.end_time_s) else None
     time_s, position_m = moved.time_s[:stop], moved.lead_position_m[:stop]
-    nothing: Floats = np.full(time_s.size, math.nan)
-    track = Track(time_s, position_m, nothing, np.full(time_s.size, ""), nothing)
+    track = plain_track(time_s, position_m)
     window = paper_window(
         track, travel_ratio=travel_ratio, cv_limit=published.STEADY_CV, min_points=published.STEADY_FEWEST_POINTS
     )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Floats, Track, Trial, plain_track
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.inference.fit import fit
@@ -145,9 +145,7 @@ def make(
 def _track(time_s: Floats, position_m: Floats, camera: FilmingPlan, draw: np.random.Generator) -> Track:
     """Positions with the camera's noise and an arbitrary origin."""
     noise_m = ar1_noise(time_s.size, camera.noise_m, camera.noise_correlation, draw)
-    blank = np.full(time_s.size, math.nan)
-    flags = np.full(time_s.size, "", dtype="<U32")
-    return Track(time_s, position_m + noise_m + draw.uniform(-0.05, 0.05), blank, flags, blank)
+    return plain_track(time_s, position_m + noise_m + draw.uniform(-0.05, 0.05))
 
 
 def _errors(truth: Model, fitted: Model, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, tuple[float, float, bool]]:

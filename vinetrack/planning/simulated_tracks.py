@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Floats, Trial, plain_track
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_data import END_FRACTION, FitError, FitTrial, prepare_trial
 from vinetrack.inference.fit_result import Fit
@@ -276,10 +276,8 @@ def _as_seen(
     condition: Condition, time_s: Floats, position_m: Floats, trace: tuple[Floats, Floats] | None
 ) -> FitTrial | None:
     """The usable points of the film, as a fit would choose them."""
-    unknown = np.full(time_s.size, math.nan)
     pressure = None if trace is None else np.full(time_s.size, trace[1][0])
-    track = Track(time_s, position_m, unknown, np.full(time_s.size, "", dtype="<U1"), unknown, pressure)
     try:
-        return prepare_trial(condition.trial, track)
+        return prepare_trial(condition.trial, plain_track(time_s, position_m, pressure_Pa=pressure))
     except FitError:
         return None

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from vinetrack.core.records import FLAGS, Floats, Track
+from vinetrack.core.records import Floats, Track, plain_track
 
 FEWEST_POINTS = 5
 """Points of a track at least. Derived: a cubic and one to spare."""
@@ -108,15 +109,7 @@ def new_track(
     if max(np.max(np.abs(time_s)), np.max(np.abs(lead_position_m[known]))) > LARGEST_NUMBER:
         raise TrackError("holds a time or position too large to be one: mend it")
     check_times(time_s)
-    unknown = np.full(len(time_s), np.nan)
     first, last = lead_position_m[known][[0, -1]]
     backwards = ("Position decreases from first to last point; it should grow along the axis.",) if last < first else ()
-    return Track(
-        time_s=time_s,
-        lead_position_m=lead_position_m,
-        lead_position_sigma_m=unknown if sigma_m is None else sigma_m,
-        flag=np.full(len(time_s), "", dtype=f"<U{len(';'.join(FLAGS))}"),
-        edge_px=unknown.copy() if edge_px is None else edge_px,
-        pressure_Pa=pressure_Pa,
-        notes=(*notes, *backwards),
-    )
+    track = plain_track(time_s, lead_position_m, sigma_m=sigma_m, pressure_Pa=pressure_Pa)
+    return replace(track, edge_px=track.edge_px if edge_px is None else edge_px, notes=(*notes, *backwards))
