@@ -142,6 +142,8 @@ def test_a_trial_put_aside_is_listed_and_not_judged(folder: Path) -> None:
         ("bends", "1:0:3", "not positive"),
         ("use", "perhaps", "neither yes nor no"),
         ("trial", "v 1", "is no name for a trial"),
+        ("trial", "-rf", "begins with a hyphen"),
+        ("trial", "--help", "begins with a hyphen"),
         ("trial", "", "is blank"),
         ("trial", "../x", "is no name for a trial"),
         ("trial", "x" * 101, "too long"),

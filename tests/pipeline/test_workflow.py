@@ -132,7 +132,7 @@ def test_clips_are_made_of_recordings_alone_and_only_where_they_are_wanted(tmp_p
 
 
 def test_a_folder_that_snakemake_would_take_for_a_wildcard_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ExperimentError, match=r"has a brace in its path.*rename the folder"):
+    with pytest.raises(ExperimentError, match=r"has a brace .* in its path.*rename the folder"):
         make_plan({"experiment": str(experiment(tmp_path / "v{1}"))}, tmp_path)
 
 
@@ -199,3 +199,19 @@ def test_a_users_own_effect_is_an_input_of_the_run(tmp_path: Path) -> None:
     (folder / "experiment.yaml").write_text("effects: [brush.py]\n")
     (folder / "brush.py").write_text("")
     assert make_plan({"experiment": str(folder)}, tmp_path).own_effects == [(folder / "brush.py").as_posix()]
+
+
+@pytest.mark.parametrize("name", ["a{b}", "<b>x"])
+def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_path: Path, name: str) -> None:
+    from vinetrack.pipeline.check_stage import check_folder
+
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "trials.csv").write_text("trial\n")
+    reasons = [problem.message for problem in check_folder(tmp_path / name).problems]
+    assert reasons[0] == "has a brace or a word in < > in its path, which Snakemake cannot read"
+
+
+def test_a_folder_with_marks_blanks_and_quotes_is_no_pattern(tmp_path: Path) -> None:
+    from vinetrack.pipeline.workflow import path_problems
+
+    assert path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []

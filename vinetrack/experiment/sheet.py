@@ -136,10 +136,12 @@ def _judge_name(row: Row) -> None:
     """Give a row without a usable name one that can stand in files and messages."""
     allowed = "letters, digits, _ and -"
     given = row.name
-    if given and re.fullmatch(r"[A-Za-z0-9_-]+", given, re.ASCII) and len(given) <= LONGEST_NAME:
+    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]*", given, re.ASCII) and len(given) <= LONGEST_NAME:
         return
     row.name = f"line-{row.line}"
     message = "is blank" if not given else "is too long" if len(given) > LONGEST_NAME else "is no name for a trial"
+    if given.startswith("-"):
+        message = "begins with a hyphen, as options of commands do"
     remedy = f"at most {LONGEST_NAME} characters, no blanks or dots; it names files"
     row.add(message, "trial", value=given, allowed=allowed, remedy=remedy)
 

@@ -53,12 +53,13 @@ def check_folder(folder: Path) -> Checked:
     """
     from vinetrack.experiment.folder import check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
+    from vinetrack.pipeline.workflow import path_problems
     from vinetrack.planning.pressure_plausibility import pressure_problems
     from vinetrack.video.recording_facts import facts_entry, facts_rows
     from vinetrack.video.survey import Surveyor
 
     surveyor = Surveyor()
-    problems = [*check_experiment(folder, surveyor), *model_problems(folder)]
+    problems = [*path_problems(folder.absolute()), *check_experiment(folder, surveyor), *model_problems(folder)]
     try:
         experiment = read_experiment(folder, strict=False)
     except ExperimentError:

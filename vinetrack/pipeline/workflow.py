@@ -9,6 +9,7 @@ import atexit
 import difflib
 import json
 import os
+import re
 import shlex
 import sys
 from collections.abc import Iterable, Mapping
@@ -206,7 +207,8 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     is_virtual = nature is not None
     experiment = read_experiment(find_experiment(folder))
     results = Path(settings.results) if settings.results else Path("results") / experiment.name
-    _refuse_braces(folder, results)
+    if problems := path_problems(folder, results):
+        raise ExperimentError(problems)
     refuse_shared_results(results, folder)
     trials = tuple(name for name in experiment.names if name not in experiment.left_out)
     files = (path for trial in experiment.trials for path in (trial.track, trial.video, trial.pressure_trace))
@@ -216,7 +218,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     target = getattr(experiment.settings.calibration, "image", None)
     targets = [folder / target] if target is not None and (is_virtual or is_readable(folder / target)) else []
     inputs = dict.fromkeys([*shared, *targets, *present])
-    watched = tuple(path for path in inputs if not _has_brace(path))
+    watched = tuple(path for path in inputs if not _is_pattern(path))
     filmed = {
         trial.name: tuple(
             path.as_posix()
@@ -297,22 +299,35 @@ def claim_results(results: Path, experiment: Path) -> None:
     write_json(results / CLAIM, {"experiment": experiment.absolute().as_posix()})
 
 
-def _has_brace(path: Path) -> bool:
-    """Whether Snakemake would take part of the path for a wildcard; it knows no way to write a brace."""
-    return "{" in str(path) or "}" in str(path)
+def _is_pattern(path: Path) -> bool:
+    """Whether Snakemake would take part of the path for a wildcard or a variable; it has no way to write such marks."""
+    return re.search(r"[{}]|<\w+>", str(path)) is not None
 
 
-def _refuse_braces(*folders: Path) -> None:
-    for folder in folders:
-        if _has_brace(folder):
-            remedy = "rename the folder, or run the stages one by one with vinetrack"
-            message = "has a brace in its path, which Snakemake cannot read"
-            raise ExperimentError([Problem(message=message, file=str(folder), remedy=remedy)])
+def path_problems(*folders: Path) -> list[Problem]:
+    """What is wrong with the names of folders, which Snakemake would say in its own words.
+
+    Parameters
+    ----------
+    folders : of an experiment or of results.
+
+    Returns
+    -------
+    problems : an error for each that has braces or a word in angle brackets in its path.
+    """
+    return [
+        Problem(
+            message="has a brace or a word in < > in its path, which Snakemake cannot read", file=str(folder),
+            remedy="rename the folder, or run the stages one by one with vinetrack",
+        )
+        for folder in folders
+        if _is_pattern(folder)
+    ]  # fmt: skip
 
 
 def _fingerprint(inputs: Iterable[Path]) -> str:
     """Size and time of the inputs that Snakemake cannot watch, so that a change of them is seen all the same."""
-    stats = [(path.name, path.stat()) for path in inputs if _has_brace(path) and path.exists()]
+    stats = [(path.name, path.stat()) for path in inputs if _is_pattern(path) and path.exists()]
     return ";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats)
 
 
