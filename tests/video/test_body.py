@@ -11,7 +11,7 @@ import pytest
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
-from vinetrack.video.body import track_body
+from vinetrack.video.body import hops_about, track_body
 from vinetrack.video.frames import Frames, Recording, RecordingError, Region
 from vinetrack.video.strip import cut_strip
 from vinetrack.video.track import track_frames
@@ -92,6 +92,54 @@ def test_the_end_of_the_way_is_told_by_the_frame_of_the_recording():
     later = replace(BALL, frames_used=(20, len(there_and_back) - 1))
     notes = track_frames(in_memory(there_and_back), later, RATE).track.notes
     assert any(f"turns back after frame {impact}:" in note for note in notes)
+
+
+def test_places_that_hop_between_bodies_are_no_motion():
+    number = np.arange(30.0)
+    seen = np.ones(30, dtype=bool)
+    fall = 0.3 * number**2
+    assert not hops_about(fall + np.random.default_rng(309).normal(0, 0.1, 30), seen)
+    neighbour = fall + 25
+    turns = np.random.default_rng(310).random(30) < 0.5
+    assert hops_about(np.where(turns, neighbour, fall), seen)
+
+
+def test_a_bounce_or_a_stop_is_no_hop():
+    number = np.arange(40.0)
+    seen = np.ones(40, dtype=bool)
+    assert not hops_about(np.minimum(9 * number, 180), seen)
+    assert not hops_about(180 - np.abs(9 * number - 180), seen)
+
+
+def tipping_block(seed, spin_deg, n=130):
+    """A marked block that slides, tips over at column 330 and falls out of the picture; its column, and its angle."""
+    rng = np.random.default_rng(seed)
+    shape = (160, 520)
+    backdrop = 70 + cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), 3) * 40
+    marks = cv2.GaussianBlur(rng.standard_normal((34, 60)).astype(np.float32), (0, 0), 3)
+    drawn, cover = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    drawn[63:97, 30:90], cover[63:97, 30:90] = 165 + 25 * marks / marks.std(), 1
+    column = 60 + 0.06 * np.clip(np.arange(n) - 10, 0, None) ** 2
+    beyond = np.clip(np.arange(n) - int(np.argmax(column > 330)), 0, None)
+    frames = np.empty((n, *shape), np.uint8)
+    for i in range(n):
+        turn = cv2.getRotationMatrix2D((60, 80), -spin_deg * float(beyond[i]), 1.0)
+        turn[:, 2] += column[i] - 60, 0.15 * beyond[i] ** 2
+        here = cv2.warpAffine(cover, turn, shape[::-1])
+        picture = backdrop * (1 - here) + cv2.warpAffine(drawn, turn, shape[::-1])
+        picture = cv2.GaussianBlur(picture, (0, 0), 0.8) + rng.normal(0, 2, shape)
+        frames[i] = np.clip(np.rint(picture), 0, 255)
+    return frames, column, spin_deg * beyond
+
+
+def test_a_block_that_tips_over_ends_its_motion():
+    frames, column, angle_deg = tipping_block(311, 6.0)
+    track = track_frames(in_memory(frames), BALL, RATE).track
+    sliding = (angle_deg == 0) & (column > 70)
+    assert track.usable[sliding].all()
+    assert (track.edge_px - column)[sliding].std() < 0.15
+    assert not track.usable[angle_deg > 45].any()
+    assert any("not recognised after frame" in note for note in track.notes)
 
 
 def test_a_body_that_is_gone_is_lost():

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vinetrack.core.records import Trial
+from vinetrack.core.records import Track, Trial
 from vinetrack.video.axis import Axis
-from vinetrack.video.frames import read_frames
+from vinetrack.video.frames import RecordingError, read_frames
 from vinetrack.video.track import track_recording
 
 FOLDER = os.environ.get("VINETRACK_REAL_DATA", "")
@@ -59,6 +59,33 @@ def test_growing_vine_is_followed_to_the_wall(axis):
     assert np.nanmin(x) < 55
     assert np.nanmax(x) > 210
     assert any("it met a wall" in note for note in track.notes)
+
+
+CUP_COLUMN = {1: 180.0, 2: 191.0, 3: 204.0, 5: 228.0, 6: 240.0, 7: 251.0, 8: 263.0}
+"""Where in the picture cups of 6 px fall side by side, px."""
+
+
+def cup(number: int, width_px: float) -> Track:
+    trial = Trial(name="cup", video=REAL / "falling_cups" / "frames", capture_fps=10.101, m_per_px=1.0, travel_ratio=1)
+    column = CUP_COLUMN[number]
+    return track_recording(trial, Axis((column, 15.0), (column, 238.0), width_px)).track
+
+
+@pytest.mark.parametrize("number", [2, 5, 6, 7, 8])
+def test_a_cup_among_others_is_followed_until_it_leaves_the_picture(number):
+    measured = np.loadtxt(REAL / "falling_cups" / f"cup{number}.csv", delimiter=",", skiprows=1)[:, 1] / 0.0114988
+    track = cup(number, 10.0)
+    assert not track.usable[len(measured) :].any()
+    used = np.flatnonzero(track.usable)
+    assert len(used) >= 8
+    off = track.edge_px[used] - measured[used]
+    assert np.abs(off - np.median(off)).max() < 1.5
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_an_axis_so_wide_that_no_cup_can_be_told_from_others_is_refused(number):
+    with pytest.raises(RecordingError):
+        cup(number, 60.0)
 
 
 def test_the_picture_that_is_not_a_frame_is_left_out():
