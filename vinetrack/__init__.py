@@ -31,6 +31,7 @@ _HOMES = {
     "load": "vinetrack.interface.loaded",
     "make_model": "vinetrack.dynamics.model",
     "planned_trial": "vinetrack.experiment.planned",
+    "power": "vinetrack.interface.calls",
     "predict": "vinetrack.inference.fit",
     "predict_vine": "vinetrack.planning.prediction",
     "predictive_inputs": "vinetrack.planning.input_sources",

@@ -20,6 +20,7 @@ from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.explore_commands import register as register_explore
 from vinetrack.cli.output import MORE, JsonFile, tell
+from vinetrack.cli.power_commands import register as register_power
 from vinetrack.cli.run_commands import register as register_run
 from vinetrack.cli.setup_commands import register as register_setup
 
@@ -158,6 +159,7 @@ def _overlays(
 
 
 register_diagnose(app)
+register_power(app)
 register_design(app)
 
 

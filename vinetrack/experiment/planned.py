@@ -85,7 +85,7 @@ def planned_trial(
     return _assembled(table, settings, None, needed, shown)
 
 
-def planned_sheet(path: Path) -> PlannedTrials:
+def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     """The conditions of an experiment folder, or of a sheet by itself, whether filmed or not.
 
     Rows of the same nominal settings are one condition, named after the first; rows with `use: no` are passed over.
@@ -93,10 +93,11 @@ def planned_sheet(path: Path) -> PlannedTrials:
     Parameters
     ----------
     path : an experiment's folder, or a sheet.
+    every_row : whether replicates are kept, a trial for each row.
 
     Returns
     -------
-    planned : a trial for each condition, and warnings.
+    planned : a trial for each condition, or for each row, and warnings.
 
     Raises
     ------
@@ -117,7 +118,11 @@ def planned_sheet(path: Path) -> PlannedTrials:
     if not table.rows:
         raise ExperimentError([Problem(message="has no rows", file=file.name, remedy="write one row a trial")])
     header = [*converted, *_judge_header(table, settings, file.name)]
-    return _assembled(table, settings, file.parent, NEEDED, lambda problem: replace(problem, file=file.name), header)
+
+    def shown(problem: Problem) -> Problem:
+        return replace(problem, file=file.name)
+
+    return _assembled(table, settings, file.parent, NEEDED, shown, header, every_row=every_row)
 
 
 def _judge_header(table: Table, settings: ExperimentSettings, file: str) -> list[Problem]:
@@ -158,6 +163,8 @@ def _assembled(
     needed: Sequence[str],
     shown: Shown,
     header: Sequence[Problem] = (),
+    *,
+    every_row: bool = False,
 ) -> PlannedTrials:
     """Read, judge and name the rows; refuse them all if one has a fault."""
     rows = [row for i in range(len(table.rows)) if (row := read_row(table, i, settings)).in_use]
@@ -168,8 +175,9 @@ def _assembled(
     if any(problem.severity == "error" for problem in problems) or not rows:
         nothing = [] if rows else [shown(Problem(message="has no trial in use", remedy="take `use: no` off one"))]
         raise ExperimentError([*problems, *nothing])
-    trials = [_trial(row, settings) for row in rows]
-    return PlannedTrials(_one_a_condition(with_names(trials)), settings, folder, tuple(_once(problems)))
+    trials = with_names([_trial(row, settings) for row in rows])
+    kept = tuple(trials) if every_row else _one_a_condition(trials)
+    return PlannedTrials(kept, settings, folder, tuple(_once(problems)))
 
 
 def _judge(row: Row, needed: Sequence[str]) -> None:

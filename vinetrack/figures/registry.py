@@ -30,7 +30,7 @@ class RegisteredFigure:
     ----------
     name : of its files `figures/<name>.<format>` and of its caption.
     section : part of the page that it stands in: `damping`, `model`, `paper`, `trials`, or one of the diagnosis
-        (`verdict`, `where`, `candidates`, `tied`, `drift`).
+        (`verdict`, `where`, `candidates`, `tied`, `power`, `drift`).
     label : its name in Snakemake's report.
     title : its heading on the page.
     data : file of the results folder that holds its numbers; blank where the page makes a table for it alone.
@@ -83,6 +83,7 @@ _ALL = (
     RegisteredFigure("missing_force", "where", "The missing force", "The missing force"),
     RegisteredFigure("candidates", "candidates", "Candidates", "What would explain it"),
     RegisteredFigure("cosines", "tied", "Tied candidates", "Candidates that these trials cannot tell apart"),
+    RegisteredFigure("power", "power", "What could be seen", "What these trials could have seen"),
     RegisteredFigure("drift", "drift", "Drift of parameters", "Parameters that change with a condition"),
     RegisteredFigure(
         "paper_fig4", "paper", "Fig. 4, position", "Fig. 4: the leading edge with the payload", "paper_motions.csv"
@@ -155,6 +156,7 @@ def _drawing(name: str) -> Callable[..., Figure]:
         model_comparison,
         overview,
         paper_figures,
+        power_figures,
         size_figures,
         strip_figure,
         trial_motion,
@@ -176,6 +178,7 @@ def _drawing(name: str) -> Callable[..., Figure]:
         "missing_force": misfit_figures.draw_missing_force,
         "candidates": candidate_figures.draw_candidates,
         "cosines": candidate_figures.draw_cosines,
+        "power": power_figures.draw_power,
         "drift": candidate_figures.draw_drift,
         "paper_fig4": paper_figures.draw_paper_position,
         "paper_table2": paper_figures.draw_paper_rms,

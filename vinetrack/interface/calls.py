@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -10,11 +11,14 @@ import pandas as pd
 from vinetrack.diagnosis.compare import Comparison
 from vinetrack.diagnosis.compare import compare as compare_pairs
 from vinetrack.diagnosis.diagnose import diagnose as diagnose_pairs
+from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.dynamics.model import Model, make_model
+from vinetrack.experiment.folder import Experiment
 from vinetrack.inference.fit import fit as fit_pairs
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
+from vinetrack.interface.loaded import LoadedResults
 from vinetrack.interface.sources import Source, TrialSource, read_source
 
 
@@ -96,6 +100,49 @@ def diagnose(source: Fit | Source, **options: Any) -> Diagnosis:
     if given.experiment is None:
         return diagnose_pairs(given.pairs, **options)
     return diagnose_pairs(given.experiment, tracks=given.tracks, **options)
+
+
+def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
+    """Ask what trials can see: detectable sizes of every effect, what each is taken for, the rate of false alarms.
+
+    Parameters
+    ----------
+    source : a fit; or a results folder, an experiment's folder, a sheet without recordings, loaded results, a frame of
+        tracks, or pairs of trial and track.
+    *effects : names, or `name=size` in the unit of the parameter; all where none is given.
+    **options
+        Of `vinetrack.pipeline.power_stage.PowerAsked`: `noise_mm`, `noise_correlation`, `spread_P` and `spread_B`
+        (relative), `capture_fps`, `B`, `n`; and `simulate`, `jobs`, `first_seed`, `answers` for complete diagnoses of
+        simulated campaigns.
+
+    Returns
+    -------
+    Power
+
+    Raises
+    ------
+    FitError
+        If there is nothing to fit.
+    ExperimentError, ResultsError
+        If the source cannot be read, or there is no such effect.
+
+    Examples
+    --------
+    >>> import vinetrack as vt
+    >>> power = vt.power(vt.example_tracks(), "leak")
+    >>> round(power["leak"].probability_at(1.0), 2)
+    1.0
+    """
+    from vinetrack.pipeline.power_stage import PowerAsked, power_of_target
+
+    if isinstance(source, LoadedResults):
+        source = source.folder
+    if isinstance(source, (str, Path)):
+        return power_of_target(PowerAsked(Path(source), effects, **options))
+    if isinstance(source, Experiment):
+        return power_of_target(PowerAsked(source.folder, effects, **options))
+    given = source if isinstance(source, Fit) else read_source(source).pairs
+    return power_of_target(PowerAsked(Path("trials"), effects, **options), given)
 
 
 def compare(fitted: Fit | Source, source: Source | None = None, **options: Any) -> Comparison:

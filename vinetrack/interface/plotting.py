@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.diagnosis.compare import Comparison
+from vinetrack.diagnosis.power import Power
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.figures.registry import draw
 from vinetrack.inference.fit_result import Fit
@@ -29,7 +30,7 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
 
     Parameters
     ----------
-    shown : loaded results, a fit, a comparison or a diagnosis.
+    shown : loaded results, a fit, a comparison, a diagnosis or a power.
     name : of the figure; blank for the one that says most about the object.
     trial : for figures of one trial.
 
@@ -55,6 +56,8 @@ def figure_of(shown: Any, name: str = "", *, trial: str = "") -> Figure:
         from vinetrack.interface.calls import compare
 
         shown = compare(shown)
+    if isinstance(shown, Power):
+        return _drawn({"power": (shown,)}, name or "power")
     inputs = _of_comparison(shown) if isinstance(shown, Comparison) else _of_diagnosis(shown)
     return _drawn(inputs, name or next(iter(inputs), "none"))
 

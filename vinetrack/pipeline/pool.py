@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import TypeVar
 
 from vinetrack.core.terminal import progress
@@ -44,8 +44,41 @@ def map_trials(
     if n_workers < 2 or len(items) < SMALLEST_POOL:
         yield from progress(map(function, items), label, total=len(items))
         return
-    # Workers that start as copies are ready at once; where the system cannot copy, they import what they need.
-    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
     chunk = max(len(items) // (8 * n_workers), 1)
-    with ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context(method)) as pool:
+    with _pool(n_workers) as pool:
         yield from progress(pool.map(function, items, chunksize=chunk), label, total=len(items))
+
+
+def as_they_come(function: Callable[[Item], Answer], items: Sequence[Item], n_workers: int) -> Iterator[Answer]:
+    """Yield `function(item)` of every item as soon as it is there, in any order.
+
+    `function` and items travel to other processes, so both must be picklable.
+
+    Parameters
+    ----------
+    function : callable
+        Applied to each item.
+    items : sequence
+        Arguments.
+    n_workers : int
+        Number of processes; below 2 all is done in this one.
+
+    Yields
+    ------
+    Answer
+    """
+    if n_workers < 2 or len(items) < 2:
+        yield from map(function, items)
+        return
+    with _pool(n_workers) as pool:
+        futures = [pool.submit(function, argument) for argument in items]
+        try:
+            yield from (future.result() for future in as_completed(futures))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _pool(n_workers: int) -> ProcessPoolExecutor:
+    """Processes that start as copies are ready at once; where the system cannot copy, they import what they need."""
+    method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
+    return ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context(method))

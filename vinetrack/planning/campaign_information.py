@@ -51,12 +51,17 @@ at twice fast vines drop out."""
 
 @dataclass(frozen=True)
 class FilmingPlan:
-    """What a campaign is filmed with: frames a second, noise of a position, m, and its lag-one correlation."""
+    """What a campaign is filmed with: frames a second, noise of a position, m, and its lag-one correlation.
+
+    Recordings end with the growth, at twice `longest_s` where that does not end, and `stops_s` after release at the
+    latest.
+    """
 
     capture_fps: float
     noise_m: float
     noise_correlation: float = 0.0
     longest_s: float = 4.0
+    stops_s: float = math.inf
 
 
 @dataclass(frozen=True)

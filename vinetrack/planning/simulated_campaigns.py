@@ -90,7 +90,12 @@ def simulate_campaign(
 
 
 def make(
-    model: Model, trials: Sequence[Trial], camera: FilmingPlan, spreads: tuple[float, float], draw: np.random.Generator
+    model: Model,
+    trials: Sequence[Trial],
+    camera: FilmingPlan | Sequence[FilmingPlan],
+    spreads: tuple[float, float],
+    draw: np.random.Generator,
+    host: Model | None = None,
 ) -> list[tuple[Trial, Track]]:
     """Sheet and tracks of one campaign: what the sheet states, and what a camera would have seen.
 
@@ -101,10 +106,12 @@ def make(
     ----------
     model : the truth, with B by vine.
     trials : trials of the campaign.
-    camera : frame rate, noise and longest recording.
+    camera : frame rate, noise and longest recording; one for all, or one for each trial.
     spreads : (float, float)
         Relative between-trial standard deviations of pressure and B.
     draw : numpy.random.Generator
+    host : Model, optional
+        A larger model whose compiled form serves this one.
 
     Returns
     -------
@@ -115,8 +122,9 @@ def make(
         trial if math.isfinite(trial.position_systematic_m) else replace(trial, position_systematic_m=0.0)
         for trial in trials
     ]
-    frame_s = 1 / camera.capture_fps
     count = len(trials)
+    cameras = [camera] * count if isinstance(camera, FilmingPlan) else list(camera)
+    frames_s = np.array([1 / of_trial.capture_fps for of_trial in cameras])
     pressures = 1 + spreads[0] * draw.standard_normal(count)
     misread = {vine: draw.standard_normal() for vine in dict.fromkeys(trial.vine for trial in trials)}
     true = [
@@ -129,16 +137,23 @@ def make(
     ]
     theta = np.array([model.parameters_for(trial.vine) for trial in trials])
     theta[:, model.parameter_names.index(DAMPING)] *= np.exp(spreads[1] * draw.standard_normal(count))
-    ends = simulate_many(model, true, [np.array([0.0, 2 * camera.longest_s])] * count, parameters=theta)
-    until = [end.end_time_s if end.status == "ended" else 2 * camera.longest_s for end in ends]
-    release = (REST_FRAMES - draw.uniform(size=count)) * frame_s
-    counts = [REST_FRAMES + int(end * camera.capture_fps) for end in until]
-    times: list[Floats] = [np.arange(frames, dtype=float) * frame_s for frames in counts]
+    longest_s = [2 * of_trial.longest_s for of_trial in cameras]
+    last = [np.array([0.0, end_s]) for end_s in longest_s]
+    ends = simulate_many(model, true, last, parameters=theta, host=host)
+    until = [
+        min(end.end_time_s if end.status == "ended" else longest, of_trial.stops_s)
+        for end, longest, of_trial in zip(ends, longest_s, cameras, strict=True)
+    ]
+    release = (REST_FRAMES - draw.uniform(size=count)) * frames_s
+    counts = [REST_FRAMES + int(end * of_trial.capture_fps) for end, of_trial in zip(until, cameras, strict=True)]
+    times: list[Floats] = [
+        np.arange(frames, dtype=float) * frame_s for frames, frame_s in zip(counts, frames_s, strict=True)
+    ]
     since = [time_s - begin for time_s, begin in zip(times, release.tolist(), strict=True)]
-    moved = simulate_many(model, true, since, parameters=theta)
+    moved = simulate_many(model, true, since, parameters=theta, host=host)
     return [
-        (trial, _track(time_s, trajectory.observed_position_m, camera, draw))
-        for trial, time_s, trajectory in zip(trials, times, moved, strict=True)
+        (trial, _track(time_s, trajectory.observed_position_m, of_trial, draw))
+        for trial, time_s, trajectory, of_trial in zip(trials, times, moved, cameras, strict=True)
     ]
 
 

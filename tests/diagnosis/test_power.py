@@ -1,0 +1,207 @@
+"""What trials can see: detectable sizes, what effects are taken for, rates of simulated campaigns."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import vinetrack as vt
+from vinetrack.core.records import Trial
+from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_questions
+from vinetrack.diagnosis.expected_scores import score_ratio
+from vinetrack.diagnosis.linear_power import power_of, spread_widening
+from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests
+from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
+from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
+from vinetrack.narrative.power_text import effect_sentence, frequency
+from vinetrack.planning.campaign_information import FilmingPlan
+
+CAMERA = FilmingPlan(500.0, 1e-4)
+CANDIDATES = ("air_drag", "area_scale", "leak", "length_scale", "pressure_gain", "tail_friction", "static_yield")
+
+
+def planned(replicates: int, spreads: tuple[float, float] = (0.01, 0.03)) -> CampaignDesign:
+    """Three pressures of one vine, so many times each."""
+    trials: list[Trial] = []
+    for pressure in ("14", "24", "34"):
+        texts = {"diameter_mm": "24", "thickness_um": "200", "length_mm": "200", "pressure_kPa": pressure}
+        trial = vt.planned_trial({**texts, "yield_pressure_kPa": "3"}).trials[0]
+        trials += [replace(trial, name=f"P{pressure}_{k}", position_systematic_m=0.0) for k in range(replicates)]
+    count = len(trials)
+    model = vt.predictive_inputs(trials[0]).model
+    return CampaignDesign(
+        model, tuple(trials), (CAMERA,) * count, spreads, (math.nan,) * count, (False,) * count, CANDIDATES
+    )
+
+
+@pytest.fixture(scope="module")
+def six() -> MisfitTests:
+    return planned_questions(planned(2))[0]
+
+
+@pytest.fixture(scope="module")
+def power(six: MisfitTests) -> Power:
+    return power_of(six, {"payload_drag": "no payload"})
+
+
+def place_of(questions: MisfitTests, name: str) -> int:
+    return questions.answers.effects.index(name)
+
+
+def test_a_campaign_without_noise_sounds_no_alarm(six: MisfitTests) -> None:
+    assert six.possible.max() < 0.3 * six.threshold
+
+
+def test_sizes_follow_the_normal_distribution_about_the_threshold(six: MisfitTests, power: Power) -> None:
+    # Fewer trials than a scatter can be told from: only the noise model decides.
+    sigma = six.scores.plain_sigma[place_of(six, "tail_friction")]
+    entry = power["tail_friction"]
+    assert (entry.size_at(0.9) - entry.size_at(0.5)) / sigma == pytest.approx(norm.ppf(0.9), abs=0.06)
+    assert entry.size_at(0.5) / sigma >= six.threshold - 0.1
+
+
+def test_scatter_that_the_fit_estimates_takes_up_a_part_of_an_effect(six: MisfitTests) -> None:
+    held = spread_widening(six)
+    assert held[0] == pytest.approx(np.ones(held.shape[1]))
+    many = planned_questions(planned(4))[0]
+    widening = spread_widening(many)
+    assert widening.max() > 1.2
+    assert np.all(np.diff(widening, axis=0) > -1e-9)
+
+
+def test_four_times_the_trials_halve_the_size(power: Power) -> None:
+    # Where scatter of trials alone is in the way, and positions are known as good as exactly.
+    few = power_of(planned_questions(planned(4))[0])["leak"].size_at(0.5)
+    many = power_of(planned_questions(planned(16))[0])["leak"].size_at(0.5)
+    assert few / many == pytest.approx(2.0, rel=0.25)
+    assert power["leak"].size_at(0.5) > few
+
+
+def test_more_scatter_hides_more() -> None:
+    calm = power_of(planned_questions(planned(3, (0.002, 0.006)))[0])
+    usual = power_of(planned_questions(planned(3))[0])
+    assert usual["pressure_gain"].size_at(0.9) > 1.5 * calm["pressure_gain"].size_at(0.9)
+
+
+def test_two_effects_that_do_the_same_are_taken_for_each_other(power: Power) -> None:
+    # A diameter and a pressure that are off by a part act alike but for the film's mass.
+    assert next(iter(power["area_scale"].taken_for)) == "pressure_gain"
+    assert next(iter(power["pressure_gain"].taken_for)) == "area_scale"
+
+
+def test_an_effect_too_weak_for_these_trials_is_not_visible(power: Power) -> None:
+    assert not power["air_drag"].is_visible
+    assert power["leak"].is_visible
+
+
+def test_what_cannot_act_is_said_with_a_reason(power: Power) -> None:
+    assert set(power.not_testable) == {"payload_drag", "static_yield"}
+
+
+def test_false_alarms_add_up_over_the_tests(power: Power) -> None:
+    assert FIRST_LEVEL < power.false_alarm_rate < 2 * FIRST_LEVEL
+
+
+def test_a_sheet_that_states_days_has_one_more_test() -> None:
+    design = planned(2)
+    dated = replace(design, trials=tuple(replace(trial, day=trial.name[-1]) for trial in design.trials))
+    rates = power_of(planned_questions(dated)[0]).false_alarms
+    assert rates["specimens, days or the order of trials"] == FIRST_LEVEL
+
+
+def test_a_small_size_has_the_score_of_linear_theory(six: MisfitTests, power: Power) -> None:
+    k = place_of(six, "leak")
+    assert score_ratio(six, k, 0.3 * power["leak"].size_at(0.5)) == pytest.approx(1.0, abs=0.03)
+
+
+def test_power_survives_its_file(power: Power) -> None:
+    again = Power.from_json(json.loads(json.dumps(power.to_json())))
+    assert again == power
+    assert again.to_json() == power.to_json()
+
+
+def test_intervals_of_n_are_those_of_the_fit(six: MisfitTests, power: Power) -> None:
+    number = six.fit["n"]
+    widths = {width.name: width.half_width for width in power.numbers}
+    assert widths["n"] == pytest.approx((number.high - number.low) / 2)
+    B = six.fit["B"]
+    assert widths["B"] == pytest.approx((B.high - B.low) / 2 / B.value)
+
+
+def entry(**changes: object) -> EffectPower:
+    sizes = tuple(1 + 0.1 * norm.ppf(PROBABILITIES))
+    given = EffectPower("air_drag", "physical", "air_drag.C_D", "C_D", "1", 0.0, 0.0, 3.0, sizes, {"inlet_loss": 0.26})
+    return replace(given, **changes)  # type: ignore[arg-type]
+
+
+def test_probabilities_are_read_back_from_sizes() -> None:
+    for probability in (0.1, 0.5, 0.9):
+        assert entry().probability_at(entry().size_at(probability)) == pytest.approx(probability)
+    assert (entry().probability_at(0.1), entry().probability_at(3.0)) == (0.0, 1.0)
+
+
+def test_a_size_that_no_trial_shows_is_infinite() -> None:
+    blind = entry(sizes=(math.inf,) * len(PROBABILITIES))
+    assert (blind.size_at(0.5), blind.probability_at(3.0), blind.is_visible) == (math.inf, 0.0, False)
+
+
+def test_the_sentence_of_an_effect() -> None:
+    assert effect_sentence(entry(), 24) == (
+        "These 24 trials show C_D of air drag beyond 1.1 nine times in ten; short of 0.87 hardly ever; "
+        "it would be called inlet loss one time in four."
+    )
+
+
+def test_the_sentence_of_an_effect_that_is_too_weak() -> None:
+    text = effect_sentence(entry(largest=0.5), 24)
+    assert text == "These 24 trials hardly ever show C_D of air drag, even at its largest plausible size, 0.50."
+
+
+@pytest.mark.parametrize(
+    ("probability", "words"), [(0.93, "nine times in ten"), (0.5, "every other time"), (0.26, "one time in four")]
+)
+def test_probabilities_in_words(probability: float, words: str) -> None:
+    assert frequency(probability) == words
+
+
+def test_the_exact_interval_of_a_rate() -> None:
+    # Clopper and Pearson's for nine of ten, from the quantiles of the beta distribution.
+    assert Rate(9, 10).interval == pytest.approx((0.5550, 0.9975), abs=1e-4)
+    assert Rate(0, 0).interval == (0.0, 1.0)
+
+
+def answer(seed: int, verdict: str, answer_set: tuple[str, ...] = (), **more: object) -> SimulatedAnswer:
+    return SimulatedAnswer("leak", 0.5, seed, verdict, answer_set, **more)  # type: ignore[arg-type]
+
+
+def test_answers_are_counted() -> None:
+    answers = [
+        answer(0, "missing", ("leak",)),
+        answer(1, "ambiguous", ("supply_refill", "leak")),
+        answer(2, "missing", ("supply_refill",)),
+        answer(3, "adequate"),
+        answer(4, "", failed="FitError: none"),
+    ]
+    rates = rates_of(answers, 0.9)
+    assert (rates.detections, rates.alarms, rates.failed) == (Rate(2, 4), Rate(3, 4), 1)
+    assert rates.to_json()["rate"] == 0.5
+
+
+def test_a_simulated_campaign_is_diagnosed_with_its_effect() -> None:
+    found = simulated_answer(planned(2, (0.002, 0.006)), "leak", 0.02, 3)
+    assert found.failed == ""
+    assert found.is_found
+
+
+def test_the_design_of_a_fit_films_as_long_as_its_trials() -> None:
+    questions, _ = planned_questions(planned(1))
+    design = design_of_fit(questions.fit)
+    for camera, trial in zip(design.cameras, questions.fit.trials, strict=True):
+        assert camera.stops_s == pytest.approx(trial.time_s[-1] - trial.release_s)
+        assert camera.capture_fps == pytest.approx(500.0)
+    assert design.spreads == (0.01, 0.03)

@@ -1,0 +1,123 @@
+"""`vinetrack power` on a sheet that nobody has filmed, and answers that an earlier run has kept."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from vinetrack.cli.main import app
+from vinetrack.core.problems import ExperimentError
+from vinetrack.diagnosis.campaign_power import CampaignDesign
+from vinetrack.diagnosis.simulated_power import SimulatedAnswer
+from vinetrack.figures.registry import draw
+from vinetrack.pipeline import power_stage
+from vinetrack.pipeline.power_stage import PowerAsked, fingerprint, kept_answers, power_of_target
+
+SHEET = (
+    "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
+    "a1,24,200,200,14,3\na2,24,200,200,14,3\nb1,24,200,200,34,3\nb2,24,200,200,34,3\n"
+)
+SETTINGS = "candidates: [leak, air_drag, payload_drag]\n"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("planned")
+    (path / "trials.csv").write_text(SHEET)
+    (path / "experiment.yaml").write_text(SETTINGS)
+    return path
+
+
+def test_a_sheet_without_recordings_says_what_was_guessed(folder: Path) -> None:
+    power = power_of_target(PowerAsked(folder, noise_mm=0.2))
+    origins = {entry.name: (entry.value, entry.origin) for entry in power.inputs}
+    assert power.n_trials == 4
+    assert origins["noise of a position"] == ("0.2 mm, correlation 0.00", "stated")
+    assert origins["spread of B from trial to trial"][1].startswith("guess")
+    assert origins["frame rate"][1] == "guess"
+    assert [entry.effect for entry in power.effects] == ["leak", "air_drag"]
+    assert list(power.not_testable) == ["payload_drag"]
+
+
+def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> None:
+    file, figure = tmp_path / "power.json", tmp_path / "power.png"
+    arguments = ["power", str(folder), "--effect", "leak", "--json", str(file), "--figure", str(figure)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    content = json.loads(file.read_text())
+    (leak,) = content["effects"]
+    assert 0 < leak["size_50"] < leak["size_90"]
+    assert "nine times in ten" in result.output
+    assert figure.stat().st_size > 10_000
+
+
+def test_an_effect_that_is_no_candidate_is_refused(folder: Path) -> None:
+    with pytest.raises(ExperimentError, match="leak"):
+        power_of_target(PowerAsked(folder, ("leek",)))
+
+
+def test_kept_answers_are_not_simulated_again(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked_for: list[tuple[str, int]] = []
+
+    def answered(design: CampaignDesign, effect: str, value: float, seed: int) -> SimulatedAnswer:  # noqa: ARG001
+        asked_for.append((effect, seed))
+        verdict, names = ("missing", ("leak",)) if effect and seed % 2 else ("adequate", ())
+        return SimulatedAnswer(effect, value, seed, verdict, names, (), 1.0)
+
+    monkeypatch.setattr(power_stage, "simulated_answer", answered)
+    asked = PowerAsked(folder, ("leak=0.01",), simulate=2, answers=tmp_path / "answers.csv")
+    first = power_of_target(asked)
+    assert sorted(asked_for) == [("", 1), ("", 2), ("leak", 1), ("leak", 2)]
+    asked_for.clear()
+    again = power_of_target(replace(asked, simulate=3))
+    assert sorted(asked_for) == [("", 3), ("leak", 3)]
+    nothing, leak = again.simulated
+    assert (nothing.alarms.count, nothing.alarms.campaigns) == (0, 3)
+    assert (leak.detections.count, leak.value, leak.named) == (2, pytest.approx(0.01), (("leak", 2),))
+    assert first.simulated[1].detections.campaigns == 2
+
+
+def test_answers_about_another_design_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "answers.csv"
+    path.write_text(
+        "design,effect,value,seed,verdict,answer_set,effects,seconds,failed\n"
+        "abc,,,1,adequate,,,1.0,\nabc,leak,0.5,1,ambiguous,leak|air_drag,,2.0,\nother,,,1,missing,leak,leak,1.0,\nabc,le"
+    )
+    null, leak = kept_answers(path, "abc")
+    assert (null.effect, math.isnan(null.value), null.answer_set) == ("", True, ())
+    assert (leak.value, leak.answer_set, leak.is_found) == (0.5, ("leak", "air_drag"), True)
+
+
+def test_a_fingerprint_changes_with_the_scatter(folder: Path) -> None:
+    from vinetrack.experiment.planned import planned_sheet
+    from vinetrack.planning.campaign_information import FilmingPlan
+
+    trials = planned_sheet(folder, every_row=True).trials
+    assert [trial.name for trial in trials] == ["a1", "a2", "b1", "b2"]
+    import vinetrack as vt
+
+    count = len(trials)
+    design = CampaignDesign(
+        vt.base_model(),
+        trials,
+        (FilmingPlan(500.0, 1e-4),) * count,
+        (0.01, 0.03),
+        (math.nan,) * count,
+        (False,) * count,
+    )
+    assert fingerprint(design) == fingerprint(replace(design))
+    assert fingerprint(design) != fingerprint(replace(design, spreads=(0.01, 0.02)))
+
+
+def test_the_map_has_a_row_for_every_effect(folder: Path) -> None:
+    power = power_of_target(PowerAsked(folder))
+    ax, told = draw("power", power).axes[:2]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["leak, 1/τ", "air drag, C_D"]
+    texts = {text.get_text() for text in told.texts}
+    assert "3.0" in texts
+    assert {"found\n50 %", "found\n90 %"} <= texts

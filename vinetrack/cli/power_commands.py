@@ -1,0 +1,131 @@
+"""The command `vinetrack power`: what trials can see, before they are filmed and after."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vinetrack.cli.design_options import INPUTS, OUT, FigurePath, LogPath
+from vinetrack.cli.output import MORE, tell
+
+SIMULATION = "Simulation"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        The command line.
+    """
+    app.command("power", rich_help_panel=MORE)(_power)
+
+
+def _power(
+    target: Annotated[
+        Path,
+        typer.Argument(help="A results folder, an experiment, or a sheet without recordings.", metavar="TARGET"),
+    ],
+    effects: Annotated[
+        list[str] | None,
+        typer.Option("--effect", metavar="NAME[=SIZE]", show_default=False,
+                     help="Tell of this effect alone; with --simulate at this size. May be repeated."),
+    ] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option("--noise-mm", min=1e-5, max=50, rich_help_panel=INPUTS, show_default=False,
+                     help="Noise of a position; from the fit, or 0.1 without one."),
+    ] = None,
+    correlation: Annotated[
+        float | None,
+        typer.Option("--noise-correlation", min=-0.5, max=0.98, rich_help_panel=INPUTS, show_default=False,
+                     help="Of the noise, from frame to frame."),
+    ] = None,
+    scatter_B: Annotated[
+        float | None,
+        typer.Option("--scatter-B", min=0, max=50, rich_help_panel=INPUTS, show_default=False,
+                     help="Of B from trial to trial, per cent; from the fit, or 3 without one."),
+    ] = None,
+    scatter_P: Annotated[
+        float | None,
+        typer.Option("--scatter-P", min=0, max=20, rich_help_panel=INPUTS, show_default=False,
+                     help="Of pressure from trial to trial, per cent; from the fit, or 1 without one."),
+    ] = None,
+    capture_fps: Annotated[
+        float | None,
+        typer.Option("--capture-fps", min=1, max=1e6, rich_help_panel=INPUTS, show_default=False,
+                     help="Frames a second, of a sheet without recordings."),
+    ] = None,
+    B: Annotated[
+        float | None,
+        typer.Option("--B", min=1e-9, rich_help_panel=INPUTS, show_default=False,
+                     help="Damping coefficient of a sheet without recordings, N·(s/m)ⁿ; guessed if not given."),
+    ] = None,
+    n: Annotated[
+        float | None,
+        typer.Option("--n", min=0, max=2, rich_help_panel=INPUTS, show_default=False, help="Damping exponent."),
+    ] = None,
+    simulate: Annotated[
+        int,
+        typer.Option("--simulate", min=0, max=100_000, rich_help_panel=SIMULATION,
+                     help="Campaigns to simulate and diagnose: with nothing missing, and with every --effect."),
+    ] = 0,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, rich_help_panel=SIMULATION, help="Processes.")] = 2,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, rich_help_panel=SIMULATION, help="Of the first simulated campaign.")
+    ] = 1,
+    answers: Annotated[
+        Path | None,
+        typer.Option("--answers", metavar="FILE", rich_help_panel=SIMULATION, show_default=False,
+                     help="CSV that keeps the answers; what it has is not simulated again."),
+    ] = None,
+    experiment: Annotated[
+        Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
+    ] = None,
+    figure: FigurePath = None,
+    json_file: Annotated[
+        Path | None,
+        typer.Option("--json", metavar="FILE", help="Write it as JSON to this file, - for the terminal.",
+                     rich_help_panel=OUT, show_default=False),
+    ] = None,
+    log: LogPath = None,
+) -> None:  # fmt: skip
+    """What these trials can see: detectable sizes of every effect, what each is taken for, false alarms."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.pipeline.power_stage import PowerAsked, power_of_target
+        from vinetrack.pipeline.prediction_inputs import check_figure, write_figure
+
+        check_figure(figure)
+        power = power_of_target(
+            PowerAsked(
+                target=target,
+                effects=tuple(effects or ()),
+                noise_mm=_or_nan(noise),
+                noise_correlation=_or_nan(correlation),
+                spread_P=_or_nan(scatter_P) / 100,
+                spread_B=_or_nan(scatter_B) / 100,
+                capture_fps=_or_nan(capture_fps),
+                B=_or_nan(B),
+                n=_or_nan(n),
+                simulate=simulate,
+                jobs=jobs,
+                first_seed=seed,
+                answers=answers,
+                experiment=experiment,
+            )
+        )
+        lines = str(power).splitlines()
+        if figure is not None:
+            write_figure(power.plot(), figure)
+            lines.append(f"Figure: {figure}")
+        tell(lines, power.to_json(), json_file)
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -1,0 +1,213 @@
+"""The power of a campaign: of trials that were fitted, or of a design that nobody has filmed.
+
+The second is made in the computer without noise, and questioned with the noise and scatter that are expected of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vinetrack.core.records import Track, Trial
+from vinetrack.diagnosis.candidates import candidates_of, host_for, shapes_of, testable
+from vinetrack.diagnosis.linear_power import power_of
+from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.power import Power, PowerInput
+from vinetrack.dynamics.model import Model
+from vinetrack.inference.fit import fit
+from vinetrack.inference.fit_result import Fit
+from vinetrack.planning.campaign_information import FilmingPlan
+from vinetrack.planning.simulated_campaigns import make
+
+NOISELESS = 1e-3
+"""Part of the stated noise that the campaign without noise has. Chosen: the noise of a track is estimated, and must not
+be 0; a thousandth moves no number by more than a thousandth of its error."""
+
+
+def fit_power(fitted: Fit, candidates: Sequence[str] | None = None, inputs: Sequence[PowerInput] = ()) -> Power:
+    """Work out what the trials of a fit can see of the effects that are not in its model.
+
+    Parameters
+    ----------
+    fitted : of the trials; from a host of the candidates, no kernel is compiled anew.
+    candidates : sequence of str, optional
+        Names of effects; the catalogue where None.
+    inputs : sequence of PowerInput
+        What the power rests on, with its origin; noise and between-trial spreads of the fit where empty.
+
+    Returns
+    -------
+    Power
+    """
+    questioned = candidates_of(fitted.model, candidates, fitted.model.user_effects)
+    effects, blind = testable(questioned, fitted.predictor.data)
+    return power_of(misfit_tests(fitted, effects, FIRST_LEVEL), blind, inputs, curved=True)
+
+
+def design_power(design: CampaignDesign, inputs: Sequence[PowerInput] = ()) -> Power:
+    """Work out what a campaign that nobody has filmed could see.
+
+    Parameters
+    ----------
+    design : of the campaign.
+    inputs : sequence of PowerInput
+        What its noise and scatter are, and where that is from.
+
+    Returns
+    -------
+    Power
+
+    Raises
+    ------
+    FitError
+        If no trial of the design can be fitted.
+    """
+    questions, blind = planned_questions(design)
+    return power_of(questions, blind, inputs, curved=True)
+
+
+@dataclass(frozen=True)
+class CampaignDesign:
+    """What a campaign is simulated from: the true model with its values, trials, cameras, between-trial spreads.
+
+    `cameras`, `tracker_sigma_m` and `has_trace` are of each trial: how it is filmed, the error that its tracker states
+    (NaN for positions measured elsewhere), and whether its pressure is measured. `candidates` are names of effects,
+    the catalogue where None.
+    """
+
+    model: Model
+    trials: tuple[Trial, ...]
+    cameras: tuple[FilmingPlan, ...]
+    spreads: tuple[float, float]
+    tracker_sigma_m: tuple[float, ...]
+    has_trace: tuple[bool, ...]
+    candidates: tuple[str, ...] | None = None
+
+    @property
+    def to_fit(self) -> Model:
+        """The model without the values that a fit finds."""
+        held = [f"{effect.name}.{parameter.name}" for effect in self.model for parameter in effect.parameters
+                if parameter.held]  # fmt: skip
+        return replace(self.model, values={key: self.model.values[key] for key in held if key in self.model.values})
+
+    def with_effect(self, name: str, value: float) -> CampaignDesign:
+        """The same design with an effect in the true model that the fitted one lacks.
+
+        Parameters
+        ----------
+        name : of the effect.
+        value : of its first parameter, SI.
+
+        Returns
+        -------
+        CampaignDesign
+            Its further parameters stand at the middle of what is plausible, as linear theory has them.
+        """
+        model = self.model + name
+        effect = next(effect for effect in model if effect.name == name)
+        if not effect.parameters:
+            return replace(self, model=model)
+        small = [shape for shape in shapes_of(effect) if not shape.whole] or shapes_of(effect)
+        values = (value, *small[len(small) // 2].other_values)
+        names = [f"{name}.{parameter.name}" for parameter in effect.parameters]
+        return replace(self, model=model.with_values(dict(zip(names, values, strict=True))))
+
+
+def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> CampaignDesign:
+    """The design that a fit's trials are an instance of: its model for the truth, noise and spreads as it found them.
+
+    Parameters
+    ----------
+    fitted : of a campaign.
+    candidates : sequence of str, optional
+        Names of the effects that a diagnosis would ask about.
+
+    Returns
+    -------
+    CampaignDesign
+    """
+    data = fitted.predictor.data
+    variance = fitted.state.variance / (1 - fitted.state.rho**2)
+    cameras = [
+        FilmingPlan(
+            capture_fps=1 / trial_data.frame_s,
+            noise_m=math.sqrt(float(variance[i])),
+            noise_correlation=float(fitted.state.rho),
+            longest_s=float(trial_data.time_s[-1] - trial_data.time_s[0]),
+            stops_s=float(trial_data.time_s[-1]) - fitted.trials[i].release_s,
+        )
+        for i, trial_data in enumerate(data)
+    ]
+    trials = [replace(trial_data.trial, position_systematic_m=trial_data.position_systematic_m) for trial_data in data]
+    pressure, damping = fitted.state.spread
+    return CampaignDesign(
+        model=fitted.model,
+        trials=tuple(trials),
+        cameras=tuple(cameras),
+        spreads=(float(pressure), float(damping)),
+        tracker_sigma_m=tuple(trial_data.tracker_sigma_m for trial_data in data),
+        has_trace=tuple(trial_data.trace is not None for trial_data in data),
+        candidates=None if candidates is None else tuple(candidates),
+    )
+
+
+def planned_questions(design: CampaignDesign) -> tuple[MisfitTests, dict[str, str]]:
+    """Hold a campaign without noise against all candidates, with the noise and spreads of its design.
+
+    Parameters
+    ----------
+    design : of a campaign that nobody has filmed.
+
+    Returns
+    -------
+    questions : MisfitTests
+        Its scores are zero but for rounding; its information is what the campaign would have.
+    not_testable : dict
+        Reasons by name of the candidates that the sheet does not let act.
+
+    Raises
+    ------
+    FitError
+        If no trial of the design can be fitted.
+    """
+    questioned = candidates_of(design.model, design.candidates, design.model.user_effects)
+    host = host_for(design.model, questioned)
+    quiet = [replace(camera, noise_m=NOISELESS * camera.noise_m, noise_correlation=0.0) for camera in design.cameras]
+    exact = [replace(trial, yield_pressure_sigma_Pa=0.0) for trial in design.trials]
+    made = make(design.model, exact, quiet, (0.0, 0.0), np.random.default_rng(0), host)
+    pairs = [
+        (replace(trial, yield_pressure_sigma_Pa=planned.yield_pressure_sigma_Pa), track)
+        for planned, (trial, track) in zip(design.trials, made, strict=True)
+    ]
+    noise_m = math.sqrt(float(np.mean([camera.noise_m**2 for camera in design.cameras])))
+    noise = (noise_m, design.cameras[0].noise_correlation)
+    fitted = fit(
+        design.to_fit, as_measured(design, pairs), spreads=design.spreads, noise=noise, host=host, profile=False,
+        thorough=False,
+    )  # fmt: skip
+    effects, blind = testable(questioned, fitted.predictor.data)
+    return misfit_tests(fitted, effects, FIRST_LEVEL), blind
+
+
+def as_measured(design: CampaignDesign, pairs: Sequence[tuple[Trial, Track]]) -> list[tuple[Trial, Track]]:
+    """Give tracks the error that a tracker states, and the pressure where the campaign measures it.
+
+    Parameters
+    ----------
+    design : of the campaign.
+    pairs : sequence of (Trial, Track)
+        Of its trials, in order.
+
+    Returns
+    -------
+    list of (Trial, Track)
+    """
+    measured = []
+    for (trial, track), sigma_m, has_trace in zip(pairs, design.tracker_sigma_m, design.has_trace, strict=True):
+        stated = np.full(track.time_s.size, sigma_m)
+        pressure = np.full(track.time_s.size, trial.pressure_Pa) if has_trace else None
+        measured.append((trial, replace(track, lead_position_sigma_m=stated, pressure_Pa=pressure)))
+    return measured

@@ -1,0 +1,338 @@
+"""What a campaign can see: detectable sizes of every candidate, what each is taken for, and the rate of false alarms.
+
+Written by `vinetrack.diagnosis.linear_power`; read by the terminal, the report and `diagnosis.json`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinetrack.core.notebook import plot
+from vinetrack.core.numbers import or_nan
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+STATED_95 = 0.95
+"""Confidence of the intervals of rates; a convention."""
+
+PROBABILITIES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
+"""Probabilities at which detectable sizes are tabulated. Chosen: between them a normal distribution function is linear
+to 1 %."""
+
+
+@dataclass(frozen=True)
+class EffectPower:
+    """Detectable sizes of one effect.
+
+    `sizes` are values of the parameter, SI, at which the effect is found with `PROBABILITIES`; infinite where no size
+    is. `largest` is the end of its plausible range that lies farthest from absence, `least` the other where absence is
+    not plausible, else `zero`, the value at which the effect vanishes. `taken_for` maps other candidates to the
+    probability that theirs is the highest score, `named_alone` is the probability that no other candidate comes within
+    the answer set, both among campaigns that sound an alarm at the size found with 90 %.
+    """
+
+    effect: str
+    kind: str
+    parameter: str
+    symbol: str
+    unit: str
+    zero: float
+    least: float
+    largest: float
+    sizes: tuple[float, ...]
+    taken_for: Mapping[str, float] = field(default_factory=dict)
+    named_alone: float = math.nan
+
+    def size_at(self, probability: float) -> float:
+        """The value of the parameter at which the effect is found with this probability.
+
+        Parameters
+        ----------
+        probability : float
+            Between the first and the last of `PROBABILITIES`.
+
+        Returns
+        -------
+        float
+            SI; infinite where no size is.
+        """
+        if not np.isfinite(self.sizes).all():
+            return math.inf
+        return float(np.interp(probability, PROBABILITIES, self.sizes))
+
+    def probability_at(self, value: float) -> float:
+        """The probability with which the effect is found at a value of its parameter.
+
+        Parameters
+        ----------
+        value : float
+            SI, on the side of `zero` that the sizes lie on.
+
+        Returns
+        -------
+        float
+            0 below and 1 above the tabulated sizes.
+        """
+        if not np.isfinite(self.sizes).all():
+            return 0.0
+        away = np.abs(np.array(self.sizes) - self.zero)
+        return float(np.interp(abs(value - self.zero), away, PROBABILITIES, left=0.0, right=1.0))
+
+    @property
+    def is_visible(self) -> bool:
+        """Whether its largest plausible size is found at least every other time."""
+        return self.probability_at(self.largest) >= 0.5
+
+    def to_json(self) -> dict[str, Any]:
+        """As an entry of `power.effects`."""
+        return {
+            "effect": self.effect,
+            "kind": self.kind,
+            "parameter": self.parameter,
+            "symbol": self.symbol,
+            "unit": self.unit,
+            "zero": self.zero,
+            "least_plausible": self.least,
+            "largest_plausible": self.largest,
+            "size_50": self.size_at(0.5),
+            "size_90": self.size_at(0.9),
+            "found_at_largest_plausible": self.probability_at(self.largest),
+            "probabilities": list(PROBABILITIES),
+            "sizes": list(self.sizes),
+            "taken_for": dict(self.taken_for),
+            "named_alone": self.named_alone,
+        }
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> EffectPower:
+        """Read what `to_json` wrote.
+
+        Parameters
+        ----------
+        entry : of `power.effects`.
+
+        Returns
+        -------
+        EffectPower
+        """
+        return cls(
+            **{key: str(entry.get(key) or "") for key in ("effect", "kind", "parameter", "symbol", "unit")},
+            zero=or_nan(entry.get("zero")),
+            least=or_nan(entry.get("least_plausible")),
+            largest=or_nan(entry.get("largest_plausible")),
+            sizes=tuple(math.inf if size is None else float(size) for size in entry.get("sizes") or ()),
+            taken_for={str(name): or_nan(value) for name, value in (entry.get("taken_for") or {}).items()},
+            named_alone=or_nan(entry.get("named_alone")),
+        )
+
+
+@dataclass(frozen=True)
+class NumberWidth:
+    """Half the width of the 95 % interval of a fitted number: of B relative to it, of n absolute."""
+
+    name: str
+    vine: str
+    value: float
+    half_width: float
+
+    @property
+    def is_relative(self) -> bool:
+        """Whether the half width is a part of the value."""
+        return self.name == "B"
+
+
+@dataclass(frozen=True)
+class PowerInput:
+    """A number that the power was worked out with, in words, and where it is from: the fit, stated, or guessed."""
+
+    name: str
+    value: str
+    origin: str
+
+
+@dataclass(frozen=True)
+class Rate:
+    """How often something happened in simulated campaigns, with the exact binomial interval of 95 %.
+
+    Clopper & Pearson, Biometrika 26, 404 (1934).
+    """
+
+    count: int
+    campaigns: int
+
+    @property
+    def value(self) -> float:
+        """Observed rate; NaN where there is no campaign."""
+        return self.count / self.campaigns if self.campaigns else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Ends of the interval of 95 %; 0 and 1 where there is no campaign."""
+        from scipy.stats import binomtest
+
+        if not self.campaigns:
+            return 0.0, 1.0
+        exact = binomtest(self.count, self.campaigns).proportion_ci(STATED_95, method="exact")
+        return float(exact.low), float(exact.high)
+
+
+@dataclass(frozen=True)
+class SimulatedRates:
+    """What complete diagnoses of campaigns with one effect at one size said; a null where `effect` is blank.
+
+    `detections` counts those in which the effect was found, `promised` is the probability of that by linear theory (of
+    a false alarm, where nothing is missing), `named` counts what was named, most frequent first.
+    """
+
+    effect: str
+    value: float
+    promised: float
+    alarms: Rate
+    detections: Rate
+    named: tuple[tuple[str, int], ...]
+    failed: int
+
+    def to_json(self) -> dict[str, object]:
+        """As an entry of `simulated`."""
+        counted = self.detections if self.effect else self.alarms
+        return {
+            "effect": self.effect,
+            "value": None if math.isnan(self.value) else self.value,
+            "promised": self.promised,
+            "rate": counted.value,
+            "interval_95": list(counted.interval),
+            "campaigns": counted.campaigns,
+            "alarms": self.alarms.count,
+            "named": dict(self.named),
+            "failed": self.failed,
+        }
+
+
+@dataclass(frozen=True)
+class Power:
+    """What the trials of a campaign can see of every candidate. Printed, it is what a person reads on the terminal.
+
+    `threshold` is the score, in standard errors, that the best of all candidates must exceed. `false_alarms` maps each
+    test to the chance at which it takes nothing for something; they add up at most. `not_testable` maps other
+    candidates to the reason why they cannot be seen. `wary` tells why the sizes are not to be trusted, blank where
+    they are. `simulated` are rates of complete diagnoses, where campaigns were simulated.
+    """
+
+    n_trials: int
+    threshold: float
+    false_alarms: Mapping[str, float]
+    effects: tuple[EffectPower, ...] = ()
+    not_testable: Mapping[str, str] = field(default_factory=dict)
+    numbers: tuple[NumberWidth, ...] = ()
+    inputs: tuple[PowerInput, ...] = ()
+    model: tuple[str, ...] = ()
+    wary: str = ""
+    simulated: tuple[SimulatedRates, ...] = ()
+
+    @property
+    def false_alarm_rate(self) -> float:
+        """Upper bound of the chance that anything is said to be missing where nothing is: the sum over all tests."""
+        return float(sum(self.false_alarms.values()))
+
+    def __getitem__(self, name: str) -> EffectPower:
+        """The power for an effect, by its name.
+
+        Raises
+        ------
+        KeyError
+            If the effect is not among those that the trials could show.
+        """
+        return {entry.effect: entry for entry in self.effects}[name]
+
+    def of_effects(self, names: Sequence[str]) -> Power:
+        """The same for some effects alone.
+
+        Parameters
+        ----------
+        names : of effects; all where empty.
+
+        Returns
+        -------
+        Power
+        """
+        from dataclasses import replace
+
+        if not names:
+            return self
+        return replace(
+            self,
+            effects=tuple(entry for entry in self.effects if entry.effect in names),
+            not_testable={name: why for name, why in self.not_testable.items() if name in names},
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As `power` of `diagnosis.json`; sizes in SI units."""
+        from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence
+
+        return {
+            "n_trials": self.n_trials,
+            "model": list(self.model),
+            "threshold_sigma": self.threshold,
+            "false_alarm_rate": self.false_alarm_rate,
+            "false_alarms": dict(self.false_alarms),
+            "effects": [entry.to_json() for entry in self.effects],
+            "not_testable": dict(self.not_testable),
+            "numbers": [vars(number) for number in self.numbers],
+            "inputs": [vars(entry) for entry in self.inputs],
+            "wary": self.wary,
+            "simulated": [rates.to_json() for rates in self.simulated],
+            "in_words": [false_alarm_sentence(self), *could_have_seen(self)],
+        }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Power:
+        """Read what `to_json` wrote.
+
+        Parameters
+        ----------
+        content : `power` of `diagnosis.json`.
+
+        Returns
+        -------
+        Power
+        """
+        return cls(
+            n_trials=int(content.get("n_trials") or 0),
+            threshold=or_nan(content.get("threshold_sigma")),
+            false_alarms={str(name): or_nan(rate) for name, rate in (content.get("false_alarms") or {}).items()},
+            effects=tuple(EffectPower.from_json(entry) for entry in content.get("effects") or ()),
+            not_testable=dict(content.get("not_testable") or {}),
+            numbers=tuple(
+                NumberWidth(str(e["name"]), str(e["vine"]), or_nan(e["value"]), or_nan(e["half_width"]))
+                for e in content.get("numbers") or ()
+            ),
+            inputs=tuple(PowerInput(**entry) for entry in content.get("inputs") or ()),
+            model=tuple(content.get("model") or ()),
+            wary=str(content.get("wary") or ""),
+        )
+
+    def plot(self, name: str = "power", **options: Any) -> Figure:
+        """Return the map of effects against size.
+
+        Parameters
+        ----------
+        name : of the figure.
+        **options
+            Passed on to the drawing.
+
+        Returns
+        -------
+        Figure
+        """
+        return plot(self, name, **options)
+
+    def __str__(self) -> str:
+        from vinetrack.narrative.power_text import power_lines
+
+        return "\n".join(power_lines(self))

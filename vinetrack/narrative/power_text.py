@@ -1,0 +1,279 @@
+"""The power of a campaign in sentences: what it would have shown, what not, and how often it raises a false alarm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from vinetrack.core.numbers import number
+from vinetrack.core.units import display_unit
+from vinetrack.narrative.verdict_summary import joined, listed, plain
+
+if TYPE_CHECKING:
+    from vinetrack.diagnosis.power import EffectPower, NumberWidth, Power
+
+HARDLY_EVER = 0.1
+"""Probability below which an effect is found "hardly ever". Chosen: one campaign in ten; with one in twenty the size
+that is named is smaller by a tenth."""
+
+MOST_TOLD = 4
+"""Effects that are told of in sentences. Chosen: the table above them has all; twice as many would not be read."""
+
+_IN_WORDS = (
+    (0.95, "nearly always"), (0.85, "nine times in ten"), (0.71, "three times in four"), (0.6, "two times in three"),
+    (0.42, "every other time"), (0.29, "one time in three"), (0.22, "one time in four"), (0.17, "one time in five"),
+    (0.07, "one time in ten"), (0.0, "one time in twenty"),
+)  # fmt: skip
+
+
+def frequency(probability: float) -> str:
+    """Return a probability as people say it.
+
+    Parameters
+    ----------
+    probability : 0 to 1.
+
+    Returns
+    -------
+    str
+
+    >>> frequency(0.27), frequency(0.9)
+    ('one time in four', 'nine times in ten')
+    """
+    return next(words for least, words in _IN_WORDS if probability >= least)
+
+
+def percent(rate: float) -> str:
+    """Return a rate in per cent, two digits.
+
+    Parameters
+    ----------
+    rate : 0 to 1.
+
+    Returns
+    -------
+    str
+    """
+    return f"{number(100 * rate, 2)} %"
+
+
+def size_text(power: EffectPower, value: float) -> str:
+    """Return a value of the effect's parameter in its display unit, two digits; "–" where there is none.
+
+    Parameters
+    ----------
+    power : of the effect.
+    value : SI.
+
+    Returns
+    -------
+    str
+    """
+    if not math.isfinite(value):
+        return "–"
+    unit, factor = display_unit(power.unit)
+    return f"{number(factor * value, 2)} {unit}".strip()
+
+
+def effect_sentence(power: EffectPower, n_trials: int) -> str:
+    """Return what the trials show of one effect, in a sentence.
+
+    Parameters
+    ----------
+    power : of the effect.
+    n_trials : how many trials there are.
+
+    Returns
+    -------
+    str
+    """
+    trials = f"these {n_trials} trials" if n_trials != 1 else "this trial"
+    show = "show" if n_trials != 1 else "shows"
+    name = f"{power.symbol} of {plain(power.effect)}"
+    top, seen = size_text(power, power.largest), power.probability_at(power.largest)
+    at_90, at_few = power.size_at(0.9), power.size_at(HARDLY_EVER)
+    beyond = "beyond" if power.largest > power.zero else "below"
+    within = "short of" if power.largest > power.zero else "above"
+    if seen < HARDLY_EVER:
+        text = f"{trials} hardly ever {show} {name}, even at its largest plausible size, {top}"
+    elif seen < 0.9:
+        text = f"{trials} {show} {name} {frequency(seen)} at its largest plausible size, {top}"
+    elif power.least != power.zero and power.probability_at(power.least) >= 0.9:
+        text = f"{trials} {show} {name} at any plausible size ({size_text(power, at_90)} nine times in ten)"
+    else:
+        text = (
+            f"{trials} {show} {name} {beyond} {size_text(power, at_90)} nine times in ten; "
+            f"{within} {size_text(power, at_few)} hardly ever"
+        )
+    if power.taken_for and seen >= HARDLY_EVER:
+        taken = ", ".join(f"{plain(other)} {frequency(rate)}" for other, rate in list(power.taken_for.items())[:2])
+        text += f"; it would be called {taken}"
+    return text[0].upper() + text[1:] + "."
+
+
+def false_alarm_sentence(power: Power) -> str:
+    """Return how often such trials say that something is missing where nothing is.
+
+    Parameters
+    ----------
+    power : of the trials.
+
+    Returns
+    -------
+    str
+    """
+    return (
+        f"Where nothing is missing, such trials raise a false alarm in at most {percent(power.false_alarm_rate)} of "
+        "campaigns, if noise and scatter are as the fit holds them."
+    )
+
+
+def could_have_seen(power: Power) -> list[str]:
+    """Return what the trials would have shown nine times in ten and what not even at its largest plausible size.
+
+    Parameters
+    ----------
+    power : of the trials.
+
+    Returns
+    -------
+    list of str
+        At most three sentences.
+    """
+    if power.wary:
+        return [f"What they could have seen is not worked out: {power.wary}."]
+    physical = [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
+    seen = [entry for entry in physical if entry.probability_at(entry.largest) >= 0.9]
+    at_times = [entry for entry in physical if HARDLY_EVER <= entry.probability_at(entry.largest) < 0.9]
+    never = [entry.effect for entry in physical if entry.probability_at(entry.largest) < HARDLY_EVER]
+    lines = []
+    if seen:
+        sizes = "; ".join(
+            f"{plain(entry.effect)} from {entry.symbol} = {size_text(entry, entry.size_at(0.9))}" for entry in seen
+        )
+        lines.append(f"Found nine times in ten: {sizes}.")
+    if at_times:
+        parts = [
+            f"{plain(entry.effect)} ({frequency(entry.probability_at(entry.largest))} at "
+            f"{entry.symbol} = {size_text(entry, entry.largest)})"
+            for entry in at_times
+        ]
+        lines.append(f"Found at times, at the largest plausible size: {joined(parts)}.")
+    blind = [*never, *(name for name in power.not_testable if name not in never)]
+    if blind:
+        lines.append(f"Could not have been seen: {listed(blind)}.")
+    return lines
+
+
+def width_text(width: NumberWidth) -> str:
+    """Return the half width of the 95 % interval of a number.
+
+    Parameters
+    ----------
+    width : of n or a B.
+
+    Returns
+    -------
+    str
+    """
+    title = f"{width.name} ({width.vine})" if width.vine else width.name
+    half = percent(width.half_width) if width.is_relative else number(width.half_width, 2)
+    return f"{title} ± {half}"
+
+
+def power_rows(effects: Sequence[EffectPower]) -> list[tuple[str, str, str, str, str, str, str]]:
+    """Return a row an effect: name, symbol, sizes found with 50 and 90 %, largest plausible, found there, taken for.
+
+    Parameters
+    ----------
+    effects : of the trials.
+
+    Returns
+    -------
+    list of tuple of str
+    """
+    rows = []
+    for entry in effects:
+        taken = ", ".join(f"{plain(other)} {percent(rate)}" for other, rate in list(entry.taken_for.items())[:3])
+        rows.append(
+            (
+                plain(entry.effect),
+                entry.symbol,
+                size_text(entry, entry.size_at(0.5)),
+                size_text(entry, entry.size_at(0.9)),
+                size_text(entry, entry.largest),
+                percent(entry.probability_at(entry.largest)),
+                taken or "–",
+            )
+        )
+    return rows
+
+
+HEAD = ("effect", "", "found 50 %", "found 90 %", "largest plausible", "found there", "taken for (at 90 %)")
+
+
+def power_lines(power: Power) -> list[str]:
+    """Return what `vinetrack power` prints.
+
+    Parameters
+    ----------
+    power : of the trials.
+
+    Returns
+    -------
+    list of str
+    """
+    lines = [f"What {power.n_trials} trials can show of effects beside {' + '.join(power.model)}"]
+    lines += [f"  {entry.name}: {entry.value} ({entry.origin})" for entry in power.inputs]
+    if power.wary:
+        lines.append(f"! {power.wary}")
+    rows = [HEAD, *power_rows(sorted(power.effects, key=lambda entry: (not entry.is_visible, entry.effect)))]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(HEAD))]
+    lines += [
+        ("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))).rstrip() for row in rows
+    ]
+    lines += [f"  not testable: {plain(name)}: {why}" for name, why in power.not_testable.items()]
+    lines += [effect_sentence(entry, power.n_trials) for entry in _told(power)]
+    lines += [false_alarm_sentence(power)]
+    if power.numbers:
+        lines.append(f"95 % intervals: {', '.join(map(width_text, power.numbers))}.")
+    return lines + simulated_lines(power)
+
+
+def _told(power: Power) -> list[EffectPower]:
+    """The effects that are told of in a sentence each: few, else those hardest to see among the visible ones."""
+    if len(power.effects) <= MOST_TOLD:
+        return list(power.effects)
+    physical = [entry for entry in power.effects if entry.kind == "physical"]
+    return sorted(physical, key=lambda entry: entry.probability_at(entry.largest))[:MOST_TOLD]
+
+
+def simulated_lines(power: Power) -> list[str]:
+    """Return what complete diagnoses of simulated campaigns said, beside what linear theory promises.
+
+    Parameters
+    ----------
+    power : of the trials.
+
+    Returns
+    -------
+    list of str
+        Empty where no campaign was simulated.
+    """
+    lines = []
+    for rates in power.simulated:
+        counted = rates.detections if rates.effect else rates.alarms
+        low, high = counted.interval
+        rate = f"{counted.count} of {counted.campaigns} ({percent(low)} to {percent(high)} with 95 % confidence)"
+        named = ", ".join(f"{names} {count}" for names, count in rates.named[:4])
+        if rates.effect:
+            entry = power[rates.effect]
+            what = f"{plain(rates.effect)} at {entry.symbol} = {size_text(entry, rates.value)}: found in {rate}, "
+            what += f"{percent(rates.promised)} by linear theory"
+        else:
+            what = f"nothing missing: a false alarm in {rate}, at most {percent(rates.promised)} by the tests' levels"
+        lines.append(
+            what + (f"; named: {named}" if named else "") + (f"; no verdict: {rates.failed}" if rates.failed else "")
+        )
+    return ["Simulated campaigns, diagnosed from beginning to end:", *(f"  {line}" for line in lines)] if lines else []

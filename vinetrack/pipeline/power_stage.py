@@ -1,0 +1,402 @@
+"""The command `vinetrack power`: what the trials of a sheet, an experiment or a results folder can see."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vinetrack.core.problems import ExperimentError, Problem
+from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, design_power, fit_power
+from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
+from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
+from vinetrack.experiment.provenance import PROVENANCE
+from vinetrack.pipeline.pool import as_they_come
+from vinetrack.planning.campaign_information import FilmingPlan, joint_model
+
+if TYPE_CHECKING:
+    from vinetrack.core.records import Track, Trial
+    from vinetrack.effects import Effect
+    from vinetrack.experiment.planned import PlannedTrials
+    from vinetrack.inference.fit_data import Pairs
+    from vinetrack.inference.fit_result import Fit
+
+GUESSED_NOISE_MM, GUESSED_FPS = 0.1, 1069.0
+"""Noise of a position and frame rate where nothing states them. Chosen: the defaults of `vinetrack design campaign`; at
+half the noise, effects that noise hides are seen at half the size, those that scatter hides are not."""
+
+
+@dataclass(frozen=True)
+class PowerAsked:
+    """What stands on the command line; NaN and None where nothing is said. Spreads are relative.
+
+    `effects` are names, or `name=size` in the unit of the parameter; with `simulate`, campaigns are made with them.
+    """
+
+    target: Path
+    effects: tuple[str, ...] = ()
+    noise_mm: float = math.nan
+    noise_correlation: float = math.nan
+    spread_P: float = math.nan
+    spread_B: float = math.nan
+    capture_fps: float = math.nan
+    B: float = math.nan
+    n: float = math.nan
+    simulate: int = 0
+    jobs: int = 1
+    first_seed: int = 1
+    answers: Path | None = None
+    experiment: Path | None = None
+
+
+@dataclass(frozen=True)
+class _Campaign:
+    """The power of a campaign by linear theory, and the design to simulate it from."""
+
+    power: Power
+    design: CampaignDesign
+
+
+def power_of_target(asked: PowerAsked, given: Fit | Pairs | None = None) -> Power:
+    """Work out what the trials can see, by linear theory and, where asked for, by complete diagnoses.
+
+    Parameters
+    ----------
+    asked : what stands on the command line.
+    given : optional
+        A fit, or pairs of trial and track, in place of the target.
+
+    Returns
+    -------
+    Power
+
+    Raises
+    ------
+    ExperimentError, ResultsError, EffectError, FitError
+        If the trials cannot be read or fitted, or an effect is unknown.
+    """
+    from vinetrack.core.terminal import waiting
+
+    with waiting("working out what the trials can see"):
+        campaign = _campaign(asked) if given is None else _given(asked, given)
+    names = [text.partition("=")[0] for text in asked.effects]
+    power = campaign.power
+    for name in names:
+        if name not in power.not_testable and name not in {entry.effect for entry in power.effects}:
+            _refuse(name, power)
+    if asked.simulate:
+        power = replace(power, simulated=tuple(_simulated(asked, campaign)))
+    return power.of_effects(names)
+
+
+def _refuse(name: str, power: Power) -> None:
+    """Say that no such effect was asked about."""
+    import difflib
+
+    known = [*(entry.effect for entry in power.effects), *power.not_testable]
+    close = difflib.get_close_matches(name, known, 1, 0.6)
+    remedy = f"did you mean {close[0]}?" if close else f"there are {', '.join(sorted(known))}"
+    in_model = name in power.model
+    words = "is in the model already" if in_model else "is no candidate of these trials"
+    raise ExperimentError([Problem(message=words, column="--effect", value=name, remedy=remedy)])
+
+
+def _campaign(asked: PowerAsked) -> _Campaign:
+    """Of trials that were measured, where there are any; else of the sheet."""
+    from vinetrack.experiment.folder import read_experiment
+    from vinetrack.experiment.planned import planned_sheet
+
+    if (asked.target / PROVENANCE).exists():
+        return _measured_results(asked)
+    if asked.target.is_dir():
+        try:
+            read = read_experiment(asked.target)
+        except ExperimentError:
+            read = None  # a sheet whose recordings do not exist yet is judged as a plan below
+        if read is not None and any(trial.track is not None for trial in read.trials):
+            from vinetrack.effects import own_effects
+            from vinetrack.inference.fit_data import pairs_of
+
+            user_effects = dict(own_effects([read.folder / path for path in read.settings.effects]))
+            pairs, _ = pairs_of(read)
+            return _fitted(asked, pairs, read.settings.model, user_effects, read.settings.candidates)
+    return _planned(asked, planned_sheet(asked.target, every_row=True))
+
+
+def _given(asked: PowerAsked, given: Fit | Pairs) -> _Campaign:
+    """Of trials in memory: as they were fitted, or fitted with the base model."""
+    from vinetrack.effects import BASE_EFFECTS
+    from vinetrack.inference.fit_result import Fit
+
+    if isinstance(given, Fit):
+        return _Campaign(fit_power(given), design_of_fit(given))
+    return _fitted(asked, list(given), BASE_EFFECTS, {}, None)
+
+
+def _measured_results(asked: PowerAsked) -> _Campaign:
+    from vinetrack.diagnosis.result import ADEQUATE
+    from vinetrack.effects import own_effects
+    from vinetrack.pipeline.model_stage import measured
+    from vinetrack.pipeline.source_experiment import experiment_behind
+    from vinetrack.results.folder_layout import Results
+    from vinetrack.results.stored import read_diagnosis
+
+    results = Results(asked.target)
+    experiment = experiment_behind(asked.target, asked.experiment)
+    diagnosis = read_diagnosis(results)
+    added = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
+    user_effects = dict(own_effects([experiment.folder / path for path in experiment.settings.effects]))
+    names = (*experiment.settings.model, *(name for name in added if name not in experiment.settings.model))
+    return _fitted(asked, measured(experiment, results)[0], names, user_effects, experiment.settings.candidates)
+
+
+def _fitted(
+    asked: PowerAsked,
+    pairs: Sequence[tuple[Trial, Track]],
+    names: Sequence[str],
+    user_effects: Mapping[str, Effect],
+    candidates: Sequence[str] | None,
+) -> _Campaign:
+    """Trials that were measured: noise and scatter from the fit, but for what is stated."""
+    from vinetrack.diagnosis.candidates import candidates_of, host_for
+    from vinetrack.dynamics.model import make_model
+    from vinetrack.inference.fit import fit
+
+    model = make_model(tuple(names), user_effects)
+    host = host_for(model, candidates_of(model, candidates, user_effects))
+    first = fit(model, pairs, host=host, profile=False, thorough=False)
+    stated = _stated_noise(asked, first.noise_m, first.noise_correlation)
+    spreads = _stated_spreads(asked, (float(first.state.spread[0]), float(first.state.spread[1])))
+    inputs: list[PowerInput] = []
+    if stated is not None or spreads is not None:
+        first = fit(model, pairs, spreads=spreads, noise=stated, host=host, profile=False, thorough=False)
+        inputs = _input_rows(
+            first.noise_m, first.noise_correlation, tuple(first.state.spread),
+            ("stated" if stated else "fit", "stated" if spreads else "fit"),
+        )  # fmt: skip
+    return _Campaign(fit_power(first, candidates, inputs), design_of_fit(first, candidates))
+
+
+def _stated_noise(asked: PowerAsked, noise_m: float, correlation: float) -> tuple[float, float] | None:
+    if math.isnan(asked.noise_mm) and math.isnan(asked.noise_correlation):
+        return None
+    return (
+        noise_m if math.isnan(asked.noise_mm) else asked.noise_mm / 1e3,
+        correlation if math.isnan(asked.noise_correlation) else asked.noise_correlation,
+    )
+
+
+def _stated_spreads(asked: PowerAsked, otherwise: tuple[float, float]) -> tuple[float, float] | None:
+    if math.isnan(asked.spread_P) and math.isnan(asked.spread_B):
+        return None
+    return (
+        otherwise[0] if math.isnan(asked.spread_P) else asked.spread_P,
+        otherwise[1] if math.isnan(asked.spread_B) else asked.spread_B,
+    )
+
+
+def _input_rows(
+    noise_m: float, correlation: float, spreads: Sequence[float], origins: tuple[str, str]
+) -> list[PowerInput]:
+    return [
+        PowerInput("noise of a position", f"{1e3 * noise_m:.3g} mm, correlation {correlation:.2f}", origins[0]),
+        PowerInput("spread of pressure from trial to trial", f"{100 * spreads[0]:.2g} %", origins[1]),
+        PowerInput("spread of B from trial to trial", f"{100 * spreads[1]:.2g} %", origins[1]),
+    ]
+
+
+def _planned(asked: PowerAsked, planned: PlannedTrials) -> _Campaign:
+    """Trials that nobody has filmed: B, n and the yield pressure stated, printed or from scaling laws."""
+    from vinetrack.effects import own_effects
+    from vinetrack.inference.parameters import DAMPING, EXPONENT
+    from vinetrack.planning.input_sources import StatedValues, predictive_inputs
+
+    folder, settings = planned.folder or Path(), planned.settings
+    user_effects = dict(own_effects([folder / path for path in settings.effects]))
+    stated = StatedValues(B=asked.B, n=asked.n, model=settings.model, user_effects=user_effects)
+    by_vine = {}
+    for trial in planned.trials:
+        if trial.vine not in by_vine:
+            by_vine[trial.vine] = predictive_inputs(trial, stated)
+    vine_inputs = list(by_vine.values())
+    first = vine_inputs[0]
+    noise = _stated_noise(asked, GUESSED_NOISE_MM / 1e3, 0.0)
+    noise_m, correlation = noise or (GUESSED_NOISE_MM / 1e3, 0.0)
+    spreads = _stated_spreads(asked, first.spreads)
+    trials = tuple(_with_yield(trial, by_vine[trial.vine].trial) for trial in planned.trials)
+    filmed_fps = [asked.capture_fps if math.isfinite(asked.capture_fps) else trial.capture_fps for trial in trials]
+    cameras = tuple(FilmingPlan(fps if math.isfinite(fps) else GUESSED_FPS, noise_m, correlation) for fps in filmed_fps)
+    origins = ("stated" if noise else "guess", "stated" if spreads else "guess: a usual batch of vines")
+    inputs = [
+        *_input_rows(noise_m, correlation, spreads or first.spreads, origins),
+        PowerInput("frame rate", f"{cameras[0].capture_fps:g} /s", _fps_origin(asked, trials)),
+        *(
+            PowerInput(f"{symbol} of {vine}", f"{of_vine.medians[key]:.3g}", of_vine.origins[key])
+            for vine, of_vine in by_vine.items()
+            for symbol, key in (("B", DAMPING), ("n", EXPONENT))
+        ),
+    ]  # fmt: skip
+    design = CampaignDesign(
+        model=joint_model(vine_inputs),
+        trials=trials,
+        cameras=cameras,
+        spreads=spreads or first.spreads,
+        tracker_sigma_m=(math.nan,) * len(trials),
+        has_trace=(False,) * len(trials),
+        candidates=settings.candidates,
+    )
+    return _Campaign(design_power(design, inputs), design)
+
+
+def _fps_origin(asked: PowerAsked, trials: Sequence[Trial]) -> str:
+    if math.isfinite(asked.capture_fps):
+        return "stated"
+    return "sheet" if all(math.isfinite(trial.capture_fps) for trial in trials) else "guess"
+
+
+def _with_yield(trial: Trial, of_vine: Trial) -> Trial:
+    """The trial with the yield pressure that its vine is taken to have, and the usual error of one."""
+    from vinetrack.experiment.schema import COLUMNS
+
+    if math.isfinite(trial.yield_pressure_Pa):
+        return trial
+    usual_Pa = 1e3 * float(COLUMNS["yield_pressure_sigma_kPa"].default)
+    return replace(trial, yield_pressure_Pa=of_vine.yield_pressure_Pa, yield_pressure_sigma_Pa=usual_Pa)
+
+
+def _sizes_of(asked: PowerAsked, campaign: _Campaign) -> list[tuple[str, float, float]]:
+    """Effect, value in SI and promised rate of every kind of campaign that is simulated, the one with nothing first."""
+    from vinetrack.core.units import display_unit
+
+    power = campaign.power
+    wanted = [("", math.nan, power.false_alarm_rate)]
+    for text in asked.effects:
+        name, _, size = text.partition("=")
+        if name in power.not_testable:
+            continue
+        entry = power[name]
+        if not size:
+            sizes = [entry.size_at(0.5), entry.size_at(0.9)]
+        else:
+            try:
+                sizes = [float(size) / display_unit(entry.unit)[1]]
+            except ValueError:
+                remedy = f"write a number in {display_unit(entry.unit)[0] or 'the unit of the parameter'}"
+                problem = Problem(message="is no size", column="--effect", value=text, remedy=remedy)
+                raise ExperimentError([problem]) from None
+        wanted += [(name, value, entry.probability_at(value)) for value in sizes if math.isfinite(value)]
+    return wanted
+
+
+Task = tuple[CampaignDesign, str, float, int]
+COLUMNS_KEPT = ("design", "effect", "value", "seed", "verdict", "answer_set", "effects", "seconds", "failed")
+
+
+def _simulated(asked: PowerAsked, campaign: _Campaign) -> Iterator[SimulatedRates]:
+    """Rates of complete diagnoses; those kept by an earlier run are not made again."""
+    from vinetrack.core.terminal import Progress, progress
+
+    design = campaign.design
+    wanted = _sizes_of(asked, campaign)
+    path = asked.answers or _answers_file(asked.target)
+    mark = fingerprint(design)
+    kept = {(a.effect, _key(a.value), a.seed): a for a in kept_answers(path, mark)}
+    seeds = range(asked.first_seed, asked.first_seed + asked.simulate)
+    tasks: list[Task] = [
+        (design, effect, value, seed)
+        for seed in seeds
+        for effect, value, _ in wanted
+        if (effect, _key(value), seed) not in kept
+    ]
+    total = len(wanted) * asked.simulate
+    bar: Progress[None]
+    with progress(total, "simulating", unit="campaign") as bar:
+        bar.advance(total - len(tasks))
+        for answer in as_they_come(_answer, tasks, asked.jobs):
+            _keep(path, mark, answer)
+            kept[answer.effect, _key(answer.value), answer.seed] = answer
+            bar.advance()
+    for effect, value, promised in wanted:
+        yield rates_of([kept[effect, _key(value), seed] for seed in seeds], promised)
+
+
+def _key(value: float) -> str:
+    """A size as it is written in the file of answers."""
+    return "" if math.isnan(value) else f"{value:.9g}"
+
+
+def _answers_file(target: Path) -> Path:
+    """Where answers are kept: in a results folder, else in the working directory under the name of the target."""
+    if (target / PROVENANCE).exists():
+        return target / "power_answers.csv"
+    name = target.resolve().name if target.is_dir() else target.stem
+    return Path(f"power_answers_{name}.csv")
+
+
+def _answer(task: Task) -> SimulatedAnswer:
+    return simulated_answer(*task)
+
+
+def fingerprint(design: CampaignDesign) -> str:
+    """Return a short text that changes with anything that campaigns are simulated from.
+
+    Parameters
+    ----------
+    design : of the campaigns.
+
+    Returns
+    -------
+    str
+    """
+    parts = (design.model.names, sorted(design.model.values.items(), key=str), design.trials, design.cameras)
+    around = (design.spreads, design.tracker_sigma_m, design.has_trace, design.candidates)
+    return hashlib.sha256(repr((parts, around)).encode()).hexdigest()[:12]
+
+
+def kept_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
+    """Answers that an earlier run has kept about this design; those about others are passed over.
+
+    Parameters
+    ----------
+    path : of the file; it may be absent.
+    mark : fingerprint of the design.
+
+    Returns
+    -------
+    list of SimulatedAnswer
+    """
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
+    return [
+        SimulatedAnswer(
+            effect=row["effect"],
+            value=float(row["value"] or "nan"),
+            seed=int(row["seed"]),
+            verdict=row["verdict"],
+            answer_set=tuple(row["answer_set"].split("|")) if row["answer_set"] else (),
+            effects=tuple(row["effects"].split("|")) if row["effects"] else (),
+            seconds=float(row["seconds"] or "nan"),
+            failed=row["failed"],
+        )
+        for row in rows
+    ]
+
+
+def _keep(path: Path, mark: str, answer: SimulatedAnswer) -> None:
+    """Append one answer; the header stands in a new file."""
+    new = not path.is_file()
+    with path.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        if new:
+            writer.writerow(COLUMNS_KEPT)
+        seconds = "" if math.isnan(answer.seconds) else f"{answer.seconds:.2f}"
+        writer.writerow(
+            [mark, answer.effect, _key(answer.value), answer.seed, answer.verdict, "|".join(answer.answer_set),
+             "|".join(answer.effects), seconds, answer.failed]
+        )  # fmt: skip
