@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack.core.records import Track, Trial
-from vinetrack.diagnosis.candidates import candidates_of, host_for, shapes_of, testable
+from vinetrack.diagnosis.candidates import shapes_of, testable
+from vinetrack.diagnosis.initial_fit import candidates_of, host_for
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
 from vinetrack.diagnosis.power import Power, PowerInput

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.diagnosis.campaign_power import CampaignDesign, as_measured
-from vinetrack.diagnosis.candidates import candidates_of, host_for
 from vinetrack.diagnosis.diagnose import diagnose
+from vinetrack.diagnosis.initial_fit import candidates_of, host_for
 from vinetrack.diagnosis.power import Rate, SimulatedRates
 from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.dynamics.simulate import SimulationError

@@ -143,7 +143,7 @@ def _measured_results(asked: PowerAsked) -> _Campaign:
     from vinetrack.pipeline.model_stage import measured
     from vinetrack.pipeline.source_experiment import experiment_behind
     from vinetrack.results.folder_layout import Results
-    from vinetrack.results.stored import read_diagnosis
+    from vinetrack.results.stored_diagnosis import read_diagnosis
 
     results = Results(asked.target)
     experiment = experiment_behind(asked.target, asked.experiment)
@@ -162,7 +162,7 @@ def _fitted(
     candidates: Sequence[str] | None,
 ) -> _Campaign:
     """Trials that were measured: noise and scatter from the fit, but for what is stated."""
-    from vinetrack.diagnosis.candidates import candidates_of, host_for
+    from vinetrack.diagnosis.initial_fit import candidates_of, host_for
     from vinetrack.dynamics.model import make_model
     from vinetrack.inference.fit import fit
 
