@@ -8,10 +8,12 @@ import shutil
 import socket
 import urllib.request
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from explorer_campaign import SETTINGS, run
 from served import Served
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 from typer.testing import CliRunner
@@ -19,6 +21,8 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.explorer.campaign import Campaign
+from vinetrack.explorer.server import address as where
+from vinetrack.explorer.server import start_server
 
 
 def refused(*arguments: object) -> str:
@@ -88,8 +92,6 @@ def test_without_bokeh_the_page_says_what_to_install(campaign: Campaign, monkeyp
 
 
 async def _origin_of_elsewhere(address: str) -> str:
-    from tornado.httpclient import HTTPClientError, HTTPRequest
-
     request = HTTPRequest(address.replace("http", "ws") + "ws", headers={"Origin": "http://example.org"})
     try:
         (await websocket_connect(request)).close()
@@ -105,13 +107,60 @@ def test_the_server_is_for_this_machine_alone_and_ends_by_ctrl_c(campaign: Campa
             page = answer.read().decode("utf-8")
         assert "vinetrack explorer" in page
         assert "cdn.bokeh.org" not in page
-        port = int(address.rsplit(":", 1)[1].strip("/"))
+        port = urlsplit(address).port
         with pytest.raises(OSError, match="refused"), socket.create_connection((_own_address(), port), timeout=5):
             pass
         assert IOLoop(make_current=False).run_sync(lambda: _origin_of_elsewhere(address)) == "403"
         assert served.interrupt() == 0
     assert served.lines[-1] == "Explorer ended."
     assert not [line for line in served.lines if "Traceback" in line or "WARNING" in line]
+
+
+async def _answers(address: str, host: str) -> int:
+    client = AsyncHTTPClient()
+    return (await client.fetch(HTTPRequest(address, headers={"Host": host}), raise_error=False)).code
+
+
+async def _answers_socket(address: str, host: str) -> int:
+    request = HTTPRequest(address.replace("http", "ws") + "ws", headers={"Host": host, "Origin": f"http://{host}"})
+    try:
+        (await websocket_connect(request)).close()
+    except HTTPClientError as error:
+        return error.code
+    return 101
+
+
+@pytest.fixture
+def bare_server():
+    """A server whose page nobody opens."""
+    server = start_server(None, 0)
+    yield server
+    server.stop()
+
+
+@pytest.mark.parametrize("route", ["", "autoload.js?bokeh-autoload-element=a", "static/js/bokeh.min.js", "metadata"])
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1", "localhost.evil.example:{port}"])
+def test_no_route_answers_under_another_name(bare_server, route: str, host: str) -> None:
+    name = host.format(port=bare_server.port)
+    assert bare_server.io_loop.run_sync(lambda: _answers(where(bare_server) + route, name)) == 403
+
+
+def test_no_socket_answers_under_another_name(bare_server) -> None:
+    name = f"evil.example:{bare_server.port}"
+    assert bare_server.io_loop.run_sync(lambda: _answers_socket(where(bare_server), name)) == 403
+
+
+@pytest.mark.parametrize("route", ["/", "/autoload.js?bokeh-autoload-element=a", "/ws", "/static/js/bokeh.min.js"])
+def test_nothing_answers_without_the_secret_of_the_address(bare_server, route: str) -> None:
+    own = f"127.0.0.1:{bare_server.port}"
+    assert bare_server.io_loop.run_sync(lambda: _answers(f"http://{own}{route}", own)) == 404
+
+
+@pytest.mark.parametrize("name", ["localhost", "127.0.0.1"])
+def test_the_two_names_of_this_machine_are_answered(bare_server, name: str) -> None:
+    host = f"{name}:{bare_server.port}"
+    route = "static/js/bokeh.min.js"
+    assert bare_server.io_loop.run_sync(lambda: _answers(where(bare_server) + route, host)) == 200
 
 
 def _own_address() -> str:

@@ -34,7 +34,9 @@ def ask(
 ) -> tuple[int, bytes, str]:
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=120)
     data = None if body is None else json.dumps(body)
-    connection.request("GET" if body is None else "POST", path, data, headers or (OURS if body is not None else {}))
+    connection.request(
+        "GET" if body is None else "POST", server.secret + path, data, headers or (OURS if body is not None else {})
+    )
     answer = connection.getresponse()
     made = answer.status, answer.read(), answer.getheader("Content-Type") or ""
     connection.close()
@@ -100,6 +102,20 @@ def test_a_file_that_changed_meanwhile_is_not_overwritten(server: SetupServer, c
 def test_a_page_from_elsewhere_gets_nothing(server: SetupServer, clips: Path, headers: dict[str, str]) -> None:
     assert ask(server, "/api/save", sent(clips), headers)[0] == 403
     assert not (clips / "trials.csv").exists()
+
+
+@pytest.mark.parametrize("path", ["/", "/setup.js", "/api/state", "/api/frame?recording=a.mp4&frame=0"])
+def test_no_route_is_served_under_another_name(server: SetupServer, path: str) -> None:
+    assert ask(server, path, headers={"Host": f"evil.example:{server.server_port}"})[0] == 403
+
+
+def test_nothing_is_served_without_the_secret_of_the_address(server: SetupServer) -> None:
+    assert len(server.secret) > 20
+    assert ask(server, "/api/state")[0] == 200
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
+    connection.request("GET", "/api/state")
+    assert connection.getresponse().status == 403
+    connection.close()
 
 
 def test_a_request_without_the_header_changes_nothing(server: SetupServer, clips: Path) -> None:

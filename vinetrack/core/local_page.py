@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 import signal
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
@@ -13,11 +14,38 @@ LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 5070, 30
 """Chosen: free of well-known services; 30 pages on one machine, then any free port."""
 
+TOKEN_BYTES = 16
+"""Chosen: 128 bits, which nobody guesses; half would do."""
+
 Server = TypeVar("Server")
 
 
 class PageError(UserError, RuntimeError):
     """The page cannot be served; one sentence with a remedy."""
+
+
+def secret_path() -> str:
+    """A random first part of a page's address, so that only who was told the address can ask for anything.
+
+    Returns
+    -------
+    path, with a slash before and none behind it.
+    """
+    return f"/{secrets.token_urlsafe(TOKEN_BYTES)}"
+
+
+def own_hosts(port: int) -> frozenset[str]:
+    """Names under which a page of this machine is asked for; another name that leads here is somebody else's page.
+
+    Parameters
+    ----------
+    port : of the server.
+
+    Returns
+    -------
+    what the header `Host` of a request may say.
+    """
+    return frozenset({f"{LOOPBACK}:{port}", f"localhost:{port}"})
 
 
 def on_a_free_port(serve: Callable[[int], Server], port: int | None) -> Server:

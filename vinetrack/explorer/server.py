@@ -8,13 +8,15 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable
+from typing import Any
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
 from bokeh.document import Document
 from bokeh.server.server import Server
+from tornado.web import ErrorHandler
 
-from vinetrack.core.local_page import LOOPBACK, ended_by_signals, on_a_free_port
+from vinetrack.core.local_page import LOOPBACK, ended_by_signals, on_a_free_port, own_hosts, secret_path
 from vinetrack.explorer.fitting import BackgroundFit
 
 QUIET = ("bokeh", "tornado")
@@ -71,18 +73,37 @@ def _serve(ground: BackgroundFit, port: int) -> Server:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind((LOOPBACK, port))
         free_port = int(probe.getsockname()[1])
+    hosts = own_hosts(free_port)
     server = Server(
         {"/": application(ground)},
+        prefix=secret_path(),
         address=LOOPBACK,
         port=free_port,
-        allow_websocket_origin=[f"{LOOPBACK}:{free_port}", f"localhost:{free_port}"],
+        allow_websocket_origin=sorted(hosts),
         keep_alive_milliseconds=KEEP_ALIVE_MS,
         check_unused_sessions_milliseconds=5_000,
         unused_session_lifetime_milliseconds=10_000,
         use_index=False,
     )
+    _refuse_other_hosts(server, hosts)
     server.start()
     return server
+
+
+def _refuse_other_hosts(server: Server, hosts: frozenset[str]) -> None:
+    """Answer 403, on every route and to the socket, to whoever asks under another name than this machine's own.
+
+    Bokeh looks at the origin of a socket alone: a name elsewhere that is made to lead here has a fitting origin.
+    """
+    tornado = server._tornado
+    routed = tornado.find_handler
+
+    def find_handler(request: Any, **given: Any) -> Any:
+        if request.host in hosts:
+            return routed(request, **given)
+        return tornado.get_handler_delegate(request, ErrorHandler, {"status_code": 403})
+
+    tornado.find_handler = find_handler
 
 
 def address(server: Server) -> str:
@@ -96,7 +117,7 @@ def address(server: Server) -> str:
     -------
     str
     """
-    return f"http://{LOOPBACK}:{server.port}/"
+    return f"http://{LOOPBACK}:{server.port}{server.prefix}/"
 
 
 def serve(ground: BackgroundFit, say: Callable[[str], None], port: int | None = None, *, browser: bool = True) -> None:

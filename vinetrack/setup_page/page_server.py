@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from vinetrack.core.local_page import LOOPBACK, ended_by_signals, on_a_free_port
+from vinetrack.core.local_page import LOOPBACK, ended_by_signals, on_a_free_port, own_hosts, secret_path
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.experiment.corrections import corrections_text
 from vinetrack.setup_page.clip_views import ClipStore, jpeg, track_row, warm_up
@@ -44,13 +44,14 @@ class SetupServer(ThreadingHTTPServer):
     def __init__(self, folder: Path, port: int) -> None:
         super().__init__((LOOPBACK, port), _Handler)
         self.folder = folder
+        self.secret = secret_path()
         self.clips = ClipStore(folder)
         self.tracking = threading.Lock()
 
     @property
     def address(self) -> str:
         """Where the page is."""
-        return f"http://{LOOPBACK}:{self.server_port}/"
+        return f"http://{LOOPBACK}:{self.server_port}{self.secret}/"
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -66,7 +67,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Files of the page, frames and pictures."""
         if not self._is_for_us():
             return
-        url = urlsplit(self.path)
+        url = urlsplit(self.path.removeprefix(self.server.secret))
         asked = {key: values[0] for key, values in parse_qs(url.query).items()}
         if url.path in ("/", "/setup.css") or url.path.endswith(".js"):
             self._send_file("setup.html" if url.path == "/" else url.path.lstrip("/"))
@@ -97,7 +98,7 @@ class _Handler(BaseHTTPRequestHandler):
             "/api/track": self._track,
             "/api/save": self._save,
         }
-        chosen = answers.get(self.path)
+        chosen = answers.get(self.path.removeprefix(self.server.secret))
         self._answer(None if chosen is None else lambda: chosen(json.loads(body)))
 
     def _check(self, content: dict[str, Any]) -> dict[str, Any]:
@@ -118,11 +119,11 @@ class _Handler(BaseHTTPRequestHandler):
         return {"written": written, "stamp": files_stamp(folder)}
 
     def _is_for_us(self) -> bool:
-        """Whether the request names this server: a name elsewhere that leads here is refused."""
-        port = self.server.server_port
-        hosts = {f"{LOOPBACK}:{port}", f"localhost:{port}"}
+        """Whether the request names this server and its secret: a name elsewhere that leads here is refused."""
+        hosts = own_hosts(self.server.server_port)
         origin = self.headers.get("Origin")
-        if self.headers.get("Host") in hosts and (origin is None or origin in {f"http://{host}" for host in hosts}):
+        ours = self.headers.get("Host") in hosts and (origin is None or origin in {f"http://{host}" for host in hosts})
+        if ours and self.path.startswith(f"{self.server.secret}/"):
             return True
         self.close_connection = True
         self._send(HTTPStatus.FORBIDDEN, b"", "text/plain")
