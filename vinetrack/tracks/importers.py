@@ -13,6 +13,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.core.tables import Table, TableError, parse_table, read_text
+from vinetrack.tracks.body_end import flag_end_of_body
 from vinetrack.tracks.physics_tracker import is_export_header, read_export, read_project
 from vinetrack.tracks.track_checks import FEWEST_POINTS, TrackError, check_pressure, check_times, new_track
 
@@ -42,6 +43,8 @@ def load_track(trial: Trial) -> Track:
     if trial.track is None:
         raise TrackError("is blank: this trial has a video, not a track")
     track = read_track(trial.track, point_mass=trial.point_mass, frames_used=trial.frames_used)
+    if trial.travel_ratio == 1 and trial.frames_used is None:
+        track = flag_end_of_body(track)
     if trial.pressure_trace is None:
         return track
     try:
