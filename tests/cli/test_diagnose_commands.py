@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 
 import pytest
+from explorer_campaign import FEW_CANDIDATES
 from hidden_truth import sheet
 from typer.testing import CliRunner
 
@@ -34,7 +35,7 @@ def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pressure_scatter=0.005,
         seed=7200,
     )
-    write_experiment(grow(trials, nature), folder, "chamber_l: 3.7\n")
+    write_experiment(grow(trials, nature), folder, "chamber_l: 3.7\n" + FEW_CANDIDATES)
     return folder
 
 

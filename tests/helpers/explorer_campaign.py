@@ -22,6 +22,12 @@ from vinetrack.results.folder_layout import Results
 
 DEMO_SHEET = Path(__file__).parents[2] / "data" / "demo" / "trials.csv"
 SETTINGS = "# what all trials share\ncapture_fps: 1069\nyield_pressure_kPa: 3   # from a slow ramp\nchamber_l: 2\n"
+FEW_CANDIDATES = (
+    "candidates: [reservoir_depletion, supply_refill, tail_friction, air_drag, length_scale, inlet_loss, trace_clock]\n"
+)
+"""For tests of what is made of a diagnosis; the last two these trials cannot show. What the whole catalogue does to a
+verdict, `tests/diagnosis` asks."""
+
 SMALL = ("d24_24kPa_1", "d24_24kPa_2", "d24_36kPa_1", "d24_36kPa_2", "d24_20g_48kPa_1", "d24_20g_48kPa_2")
 
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from explorer_campaign import SMALL, make_experiment, make_results, run
+from explorer_campaign import FEW_CANDIDATES, SETTINGS, SMALL, make_experiment, make_results, run
 
 
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`results/demo` of six trials of one vine: three conditions, two replicates each, with figures and report."""
     folder = tmp_path_factory.mktemp("small_run")
-    experiment, results = make_experiment(folder / "demo", SMALL), folder / "results" / "demo"
+    experiment = make_experiment(folder / "demo", SMALL, SETTINGS + FEW_CANDIDATES)
+    results = folder / "results" / "demo"
     make_results(experiment, results)
     run("diagnosis", experiment, results)
     run("figures", experiment, results, "--of", "campaign")
