@@ -22,6 +22,7 @@ from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.problems import UserError
 from vinetrack.core.terminal import table
 from vinetrack.effects._base import HOOKS, KINDS, Effect, Parameter, Worked
+from vinetrack.effects._first_run import first_run
 
 
 class EffectError(UserError, ValueError):
@@ -80,6 +81,8 @@ def load_effect(path: Path | str) -> Effect:
     'air_drag'
     """
     path = Path(path)
+    if refusal := first_run(path):
+        raise EffectError(f"{path}: {refusal}.")
     module = _load_module(path)
     text = (module.__doc__ or "").strip()  # not `getdoc`: where only the formula follows, it would lose its indent
     functions = {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))}

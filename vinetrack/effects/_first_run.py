@@ -1,0 +1,63 @@
+"""A user's own effects are programs: each is named before it runs the first time, and remembered by what is in it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import sys
+from pathlib import Path
+
+CATALOGUE = Path(__file__).resolve().parents[1]
+"""Files of the package itself need no naming."""
+POLICY = "VINETRACK_OWN_EFFECTS"
+"""Variable of the environment: `known` refuses own effects that never ran here."""
+
+
+def memory_file() -> Path:
+    """Where this user's effects that have run are remembered.
+
+    Returns
+    -------
+    path, in the folder of the system for the state of programs.
+    """
+    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(state) / "vinetrack" / "own_effects.json"
+
+
+def first_run(path: Path) -> str:
+    """Name an own effect that has not run before, on standard error, and remember it.
+
+    Parameters
+    ----------
+    path : of the effect's file.
+
+    Returns
+    -------
+    why it must not run; blank where it may.
+    """
+    path = path.resolve()
+    if path.is_relative_to(CATALOGUE) or not path.is_file():
+        return ""
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    known = _known()
+    if digest in known:
+        return ""
+    if os.environ.get(POLICY) == "known":
+        return f"has never run here (sha256 {digest}), and {POLICY} is `known`: read it, then run it once without that"
+    print(f"{path} (sha256 {digest}) runs for the first time: it is a program with your rights.", file=sys.stderr)
+    with contextlib.suppress(OSError):
+        from vinetrack.core.tables import write_json
+
+        write_json(memory_file(), known | {digest: str(path)})
+    return ""
+
+
+def _known() -> dict[str, str]:
+    """Effects that have run, by the SHA-256 of their files; none where that cannot be read."""
+    try:
+        known = json.loads(memory_file().read_text(encoding="utf-8"))
+    except (OSError, ValueError, RuntimeError):
+        return {}
+    return known if isinstance(known, dict) else {}
