@@ -13,7 +13,9 @@ EDGE_PX = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full
 
 def verdict(first_moving: int = 10, last_moving: int = 49) -> Judgement:
     slot = np.arange(EDGE_PX.size)
-    return Judgement(np.full(slot.size, "", dtype="<U64"), slot, (), first_moving, last_moving)
+    unseen = np.zeros(slot.size, dtype=bool)
+    flag = np.full(slot.size, "", dtype="<U64")
+    return Judgement(flag, slot, (), first_moving, last_moving, None, unseen, np.zeros(slot.size))
 
 
 @pytest.mark.parametrize(("length_px", "grown"), [(400, True), (405, True), (395, True), (430, False), (370, False)])
