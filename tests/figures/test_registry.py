@@ -22,7 +22,7 @@ def test_a_figure_that_is_not_registered_is_an_error() -> None:
 
 
 def test_a_figure_is_of_the_campaign_of_the_paper_or_of_one_trial() -> None:
-    assert set(CAMPAIGN_FIGURES) | set(PAPER_FIGURES) | {"trial_motion", "strip", "overlay"} == set(FIGURES)
+    assert set(CAMPAIGN_FIGURES) | set(PAPER_FIGURES) | {"power", "trial_motion", "strip", "overlay"} == set(FIGURES)
     assert set(DIAGNOSIS_FIGURES) < set(CAMPAIGN_FIGURES)
 
 

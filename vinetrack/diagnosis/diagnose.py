@@ -21,6 +21,7 @@ from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.contradictions import contradictions
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, weights_of
+from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -214,7 +215,8 @@ def _conclude(fit: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, s
     lacking = [name for name, why in blind.items() if "`" in why]
     if lacking and any(step.verdict == UNEXPLAINED for step in rounds):
         explanation += f" Not tried, because the sheet does not say what they need: {joined(lacking)}."
-    return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits))
+    power = power_of(findings[-1].questions, blind, first=findings[0].questions)
+    return Diagnosis(rounds=rounds, effects=tuple(added), explanation=explanation, fits=tuple(fits), power=power)
 
 
 def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
@@ -374,7 +376,9 @@ def _artefact_first(result: Diagnosis, dropped: Sequence[str]) -> Diagnosis:
         fit=first.fit,
     )
     note = f"With the times put right: {result.verdict}. {result.explanation}"
-    return Diagnosis(rounds=(artefact,), effects=(), explanation=words, fits=result.fits[:1], notes=(note,))
+    return Diagnosis(
+        rounds=(artefact,), effects=(), explanation=words, fits=result.fits[:1], notes=(note,), power=result.power
+    )
 
 
 def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:

@@ -80,6 +80,7 @@ def power_of(
     inputs: Sequence[PowerInput] = (),
     *,
     curved: bool = False,
+    first: MisfitTests | None = None,
 ) -> Power:
     """Work out what the trials of a fit can see of every candidate.
 
@@ -93,6 +94,8 @@ def power_of(
     curved : bool
         Whether scores are expected of a fit to noise-free trajectories with the effect in, a tenth of a second each;
         in proportion to the size where not.
+    first : MisfitTests, optional
+        Of the first model of a diagnosis, where effects were added to it: its tests decide whether an alarm is raised.
 
     Returns
     -------
@@ -111,7 +114,7 @@ def power_of(
     return Power(
         n_trials=len(questions.fit.trials),
         threshold=questions.threshold,
-        false_alarms=_false_alarms(questions),
+        false_alarms=_false_alarms(first or questions),
         effects=tuple(effects),
         not_testable={**(not_testable or {}), **silent},
         numbers=_widths(questions.fit),

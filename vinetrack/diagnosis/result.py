@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.notebook import html_table, plot
 from vinetrack.core.numbers import or_nan
+from vinetrack.diagnosis.power import Power
 from vinetrack.inference.fit_result import Fit, Number
 
 if TYPE_CHECKING:
@@ -185,7 +186,8 @@ class Diagnosis:
     a drifting parameter, `ladder` the errors before and after (None where not computed), `next_experiment` what
     to do now where something is tied; `failure` tells where the first model fails, `force_table` what force it lacks.
     One that was read back has no `fits` but the numbers of the last model in `stored_parameters`; `refused` is the
-    reason why no diagnosis could be made, blank where one was: there are no rounds then.
+    reason why no diagnosis could be made, blank where one was: there are no rounds then. `power` is what these trials
+    could have seen beside the last model.
     """
 
     rounds: tuple[Round, ...]
@@ -202,6 +204,7 @@ class Diagnosis:
     force_table: pd.DataFrame | None = None
     stored_parameters: tuple[Number, ...] = ()
     refused: str = ""
+    power: Power | None = None
 
     @property
     def verdict(self) -> str:
@@ -287,6 +290,7 @@ class Diagnosis:
             "missing_force": None if self.missing_force is None else dict(self.missing_force),
             "notes": list(self.notes),
             "refused": self.refused or None,
+            "power": None if self.power is None else self.power.to_json(),
         }
 
     @classmethod
@@ -319,6 +323,7 @@ class Diagnosis:
             notes=tuple(str(note) for note in content.get("notes") or ()),
             stored_parameters=tuple(Number.from_json(stored) for stored in content.get("parameters") or ()),
             refused=str(content.get("refused") or ""),
+            power=Power.from_json(content["power"]) if content.get("power") else None,
         )
 
     def plot(self, name: str = "", **options: Any) -> Figure:

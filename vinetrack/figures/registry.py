@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 CAPTIONS = Path(__file__).parents[1] / "report" / "captions"
 """Folder of the captions; Snakemake would look for a relative one beside the file of the rule."""
 
-_CATEGORIES = {"damping": "Experiment", "model": "Experiment", "trials": "Trials", "paper": "Beside the paper"}
+_CATEGORIES = {
+    "damping": "Experiment",
+    "model": "Experiment",
+    "trials": "Trials",
+    "paper": "Beside the paper",
+    "power": "Power",
+}
 """Category in Snakemake's report of each section of the page; all other sections are of the diagnosis."""
 
 
@@ -116,7 +122,9 @@ _ALL = (
 FIGURES = {figure.name: figure for figure in _ALL}
 """All figures by name, in the order of the page."""
 
-CAMPAIGN_FIGURES = {name: figure for name, figure in FIGURES.items() if figure.section not in ("paper", "trials")}
+CAMPAIGN_FIGURES = {
+    name: figure for name, figure in FIGURES.items() if figure.section not in ("paper", "power", "trials")
+}
 """Figures of a whole experiment."""
 
 PAPER_FIGURES = {name: figure for name, figure in FIGURES.items() if figure.section == "paper"}

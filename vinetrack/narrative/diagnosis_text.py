@@ -20,6 +20,7 @@ from vinetrack.diagnosis.result import (
     Round,
 )
 from vinetrack.narrative.between_text import difference_headline, trials_differ
+from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence, power_brief
 from vinetrack.narrative.verdict_summary import joined, sizes
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     if not diagnosis.rounds:
         return diagnosis.explanation
     lines = [f"{diagnosis.verdict}: {_headline(diagnosis)}", "", diagnosis.explanation]
+    if diagnosis.power is not None:
+        lines += ["", false_alarm_sentence(diagnosis.power), *could_have_seen(diagnosis.power)]
     for step in diagnosis.rounds:
         if step.ranking:
             lines += ["", f"{' + '.join(step.model)}: {step.verdict}", *_ranking(step)]
@@ -81,7 +84,8 @@ def _headline(diagnosis: Diagnosis) -> str:
         if trials_differ(diagnosis.answer_set):
             return f"trials differ, the physics holds: {difference_headline(diagnosis.answer_set)}"
         return f"{_HEADLINES[diagnosis.verdict]}: {joined(list(diagnosis.answer_set), 'or')}"
-    return _HEADLINES[diagnosis.verdict]
+    beside = f" ({power_brief(diagnosis.power)})" if diagnosis.power is not None else ""
+    return _HEADLINES[diagnosis.verdict] + beside
 
 
 def _ranking(step: Round) -> list[str]:

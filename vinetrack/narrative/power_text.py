@@ -129,6 +129,27 @@ def false_alarm_sentence(power: Power) -> str:
     )
 
 
+def power_brief(power: Power) -> str:
+    """Return what must stand beside a verdict, in one clause: false alarms, and how many effects would have been found.
+
+    Parameters
+    ----------
+    power : of the trials.
+
+    Returns
+    -------
+    str
+    """
+    alarms = f"false alarms in at most {percent(power.false_alarm_rate)} of such campaigns"
+    if power.wary or not power.effects:
+        return alarms
+    seen = sum(entry.probability_at(entry.largest) >= 0.9 for entry in power.effects)
+    total = len(power.effects) + len(power.not_testable)
+    return (
+        f"{alarms}; {seen} of {total} effects would have been found nine times in ten at their largest plausible size"
+    )
+
+
 def could_have_seen(power: Power) -> list[str]:
     """Return what the trials would have shown nine times in ten and what not even at its largest plausible size.
 

@@ -179,6 +179,7 @@ def facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
         _significance(diagnosis),
         *_sizes(diagnosis),
         _upper_limits(diagnosis),
+        _false_alarms(diagnosis),
         *_errors(ladder),
         *_exponent(diagnosis),
     ]
@@ -311,6 +312,16 @@ def _upper_limits(diagnosis: Diagnosis) -> Fact | None:
     if diagnosis.verdict != "adequate" or not bounded:
         return None
     return Fact("Upper limits", f"{len(bounded)} candidates", "the largest undetected size of each is listed below")
+
+
+def _false_alarms(diagnosis: Diagnosis) -> Fact | None:
+    """How often such trials say that something is missing where nothing is, and what they would have shown."""
+    if diagnosis.power is None:
+        return None
+    from vinetrack.narrative.power_text import power_brief
+
+    alarms, _, shown = power_brief(diagnosis.power).partition("; ")
+    return Fact("False alarms", alarms.removeprefix("false alarms in ").partition(" of such")[0], shown)
 
 
 def _errors(ladder: pd.DataFrame | None) -> list[Fact]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.tables import write_csv, write_json
+from vinetrack.narrative.power_text import power_brief
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
@@ -289,4 +290,5 @@ def diagnosis_lines(folder: Path) -> list[str]:
         raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
     if not diagnosis.verdict:
         return [diagnosis.explanation]
-    return [f"{diagnosis.verdict}: {diagnosis.explanation}", *(f"! {note}" for note in diagnosis.notes)]
+    beside = f" ({power_brief(diagnosis.power)})" if diagnosis.power is not None else ""
+    return [f"{diagnosis.verdict}{beside}: {diagnosis.explanation}", *(f"! {note}" for note in diagnosis.notes)]
