@@ -112,11 +112,11 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
         rival = without(fit, _best_of(tried).fit)
         if rival.log_likelihood > fit.log_likelihood + NO_BETTER:
             return select_effects(rival, effects, report, again=again + 1)
-    bent = questions.far_off or scatters_much(fit)
-    alone = None if bent else _alone(questions, search, tried)
+    alone = None if _leaves_room(tried) else _alone(questions, search, tried)
     if alone is not None:
         return alone
-    # Linear promises choose well near the truth, not far from it: there, and before `unexplained`, all are fitted.
+    # Linear promises choose well near the truth, not far from it. Where the best of those they chose leaves room for a
+    # better one, and before `unexplained`, all are fitted.
     search.singles(all_of_them=True)
     tried = [*search.fit_in_full(all_of_them=True), *between]
     alone = _alone(questions, search, tried)
@@ -134,6 +134,17 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
         return [SelectionStep(verdict, questions, tried=tuple(tried), search=search)]
     report("two effects together")
     return _together(questions, search, tried, effects, report)
+
+
+def _leaves_room(tried: Sequence[LikelihoodRatio]) -> bool:
+    """Whether the best hypothesis may stand for a better one: it is far off, or bends the trials until they fit.
+
+    One that leaves the noise of the tracks, and trials that scatter no more than care allows, has taken all there is.
+    """
+    if not tried:
+        return True
+    best = _best_of(tried).fit
+    return best.chi2_per_dof > FAR_OFF or scatters_much(best)
 
 
 def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:

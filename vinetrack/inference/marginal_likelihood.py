@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.inference.mixed_effects import (
     LEAST_SPREAD,
+    SILENT,
     FitState,
     MixedProblem,
     bounded_solve,
@@ -156,7 +157,7 @@ def deviance(
     float
     """
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
-    moves = problem.free & (np.diag(information) > 0)
+    moves = problem.free & (np.diag(information) > SILENT)
     if ((state.theta <= problem.lower) | (state.theta >= problem.upper)).any():
         # What would rather lie beyond its bound must not be credited with what it would explain there.
         step = bounded_solve(information, slope, problem, state.theta)
