@@ -10,6 +10,7 @@ import pytest
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.compare import position_errors
 from vinetrack.diagnosis.replicates import align_replicates, replicates_of
+from vinetrack.inference.fit_data import VagueRest
 from vinetrack.inference.fit_result import TrialFit
 
 STEP_S = 1e-3
@@ -101,6 +102,20 @@ def test_a_track_that_begins_in_motion_is_laid_on_one_that_shows_its_rest():
     aligned = align_replicates([one, late])
     assert aligned.floor_m < 2e-5
     assert aligned.release_s[1] - aligned.release_s[0] == pytest.approx(0.2, abs=5e-4)
+
+
+@pytest.mark.parametrize("vague", [True, False])
+def test_motions_of_different_speed_are_not_slid_to_where_they_agree(vague):
+    # Two motions 14 % apart in speed over 0.26 m: with the release at its best they are off by 0.14 · 0.26 m / √24 =
+    # 7 mm, less what the bend at the start makes up for. Without a rest the origin is free too: the little that they
+    # bend is then all that is left, but it is no tenth of a millimetre.
+    trials = [grown("slow", speed=0.93, rest=0), grown("fast", speed=1.07, rest=0)]
+    if vague:
+        trials = [replace(trial, vague_rest=VagueRest(release_s=0.0, origin_m=0.0, sigma_m=3e-4)) for trial in trials]
+    aligned = align_replicates(trials)
+    both = aligned.present > 1
+    assert np.count_nonzero(both) > 0.79 * 151
+    assert aligned.floor_m > (5e-3 if vague else 1e-3)
 
 
 def test_its_error_is_that_of_a_standard_deviation_known_from_so_many_replicates():

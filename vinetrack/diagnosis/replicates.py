@@ -1,9 +1,9 @@
 """Replicates of one condition: laid over each other, what they differ by, and a model beside them.
 
-Every trial of a condition has a release of its own, and an origin where its rest was not filmed; those two are what a
-model may shift too. They are found by Gauss–Newton steps towards the mean of all until nothing moves. No model enters,
-so the same recordings differ by the same amount whatever model they are compared with: the floor that no model can go
-below.
+Every trial of a condition has a release of its own, and an origin where its rest was not filmed, not even behind a
+door; those two are what a model may shift too. They are found by Gauss–Newton steps towards the mean of all until
+nothing moves. No model enters, so the same recordings differ by the same amount whatever model they are compared with:
+the floor that no model can go below.
 """
 
 from __future__ import annotations
@@ -37,9 +37,16 @@ LARGEST_STEP_FRAMES = 2.0
 """Of a round: farther away the motion's speed is another. Chosen: at half alignment takes twice as many rounds, at
 twice it may overshoot a steep start."""
 
+LEAST_OVERLAP = 0.8
+"""Part of the shorter motion in which it must lie beside the longer one, where no rest says when it began. Motions of
+different speed agree best where they hardly overlap: without this, replicates that differ by 14 % in speed were slid
+apart until the 10 mm in which they were equally fast gave a floor of 0.05 mm. Chosen: tracks that begin in motion begin
+within a fifth of their length of each other; at 0.6 the floor may be half too small, at 0.9 a clip begun late is
+misaligned."""
+
 COARSE_SHIFTS = 201
-"""Shifts in time that are tried for a track that begins in motion, over ± the duration of the shorter track. Chosen: a
-hundredth of the duration, which the rounds then refine."""
+"""Shifts in time that are tried for a track that begins in motion. Chosen: steps of a hundredth of the duration, which
+the rounds then refine."""
 
 
 @dataclass(frozen=True)
@@ -134,34 +141,34 @@ def align_replicates(trials: Sequence[TrialFit]) -> Alignment:
     Alignment
     """
     rests = [frames_at_rest(trial) for trial in trials]
-    release_s = np.array([trial.time_s[max(n - 1, 0)] for trial, n in zip(trials, rests, strict=True)])
-    origin_m = np.array(
-        [float(np.mean(trial.lead_position_m[: max(n, 1)])) for trial, n in zip(trials, rests, strict=True)]
-    )
+    release_s, origin_m = (np.array(values) for values in zip(*map(_begin, trials, rests), strict=True))
+    seen = np.array([n > 0 or trial.vague_rest is not None for trial, n in zip(trials, rests, strict=True)])
     longest = int(np.argmax([trial.time_s[-1] - at for trial, at in zip(trials, release_s, strict=True)]))
     reference = _reference(trials[longest], float(release_s[longest]), float(origin_m[longest]))
     for i, trial in enumerate(trials):
-        if i != longest and min(rests[i], rests[longest]) == 0:
+        if i != longest and not (seen[i] and seen[longest]):
             release_s[i], origin_m[i] = _coarse(trial, reference)
     frame_s = np.array([float(np.median(np.diff(trial.time_s))) for trial in trials])
     begin_s = min(trial.time_s[0] - at for trial, at in zip(trials, release_s, strict=True))
     end_s = float(reference.since_s[-1])
     time_s = begin_s + frame_s.min() * np.arange(math.floor((end_s - begin_s) / frame_s.min() + 1e-6) + 1)
     speed_m_s = np.gradient(reference.at(time_s), time_s)
-    at_rest = np.array([n >= FEWEST_AT_REST for n in rests])
+    at_rest = np.array(
+        [n >= FEWEST_AT_REST or trial.vague_rest is not None for trial, n in zip(trials, rests, strict=True)]
+    )
+    earliest_s, latest_s = np.array([_within_reach(trial, reference) for trial in trials]).T
     for _ in range(MOST_ROUNDS):
         deviation_m, present = _deviations(trials, reference, time_s, release_s, origin_m)
         later_s, higher_m = _shifts(deviation_m, speed_m_s, at_rest)
         later_s = np.clip(later_s, -LARGEST_STEP_FRAMES * frame_s, LARGEST_STEP_FRAMES * frame_s)
         # Only differences of releases matter: all together would run away from the clock of the reference.
         later_s -= later_s.mean()
-        release_s, origin_m = release_s + later_s, origin_m + higher_m
+        moved_s = np.where(seen, release_s + later_s, np.clip(release_s + later_s, earliest_s, latest_s))
+        later_s, release_s, origin_m = moved_s - release_s, moved_s, origin_m + higher_m
         if np.all(np.abs(later_s) < SETTLED_FRAMES * frame_s):
             break
     deviation_m, present = _deviations(trials, reference, time_s, release_s, origin_m)
-    moves_s = min(
-        float(trial.time_s[max(n - 1, 0)]) - at for trial, n, at in zip(trials, rests, release_s, strict=True)
-    )
+    moves_s = min(_begin(trial, n)[0] - at for trial, n, at in zip(trials, rests, release_s, strict=True))
     return Alignment(time_s, deviation_m, present.astype(float), release_s, origin_m, moves_s - 1e-9)
 
 
@@ -199,11 +206,24 @@ def _reference(trial: TrialFit, release_s: float, origin_m: float) -> _Reference
     return _Reference(trial.time_s - release_s, y - origin_m)
 
 
+def _begin(trial: TrialFit, n_rest: int) -> tuple[float, float]:
+    """When a trial begins to move, s, and from where, m, by its rest; its first frame where no rest was seen."""
+    if n_rest == 0 and trial.vague_rest is not None:
+        return trial.vague_rest.release_s, trial.vague_rest.origin_m
+    return float(trial.time_s[max(n_rest - 1, 0)]), float(np.mean(trial.lead_position_m[: max(n_rest, 1)]))
+
+
+def _within_reach(trial: TrialFit, reference: _Reference) -> tuple[float, float]:
+    """Earliest and latest release, s, with which a trial lies beside enough of the reference."""
+    first_s, last_s = float(trial.time_s[0]), float(trial.time_s[-1])
+    begin_s, end_s = float(reference.since_s[0]), float(reference.since_s[-1])
+    needed_s = LEAST_OVERLAP * min(last_s - first_s, end_s - begin_s)
+    return needed_s + first_s - end_s, last_s - begin_s - needed_s
+
+
 def _coarse(trial: TrialFit, reference: _Reference) -> tuple[float, float]:
     """Release and origin of a track that begins in motion, from where its shape lies nearest to the reference."""
-    length_s = float(trial.time_s[-1] - trial.time_s[0])
-    whole_s = float(reference.since_s[-1] - reference.since_s[0])
-    tried_s = trial.time_s[0] - reference.since_s[0] + min(length_s, whole_s) * np.linspace(-1, 1, COARSE_SHIFTS)
+    tried_s = np.linspace(*_within_reach(trial, reference), COARSE_SHIFTS)
     left = np.array([trial.lead_position_m - reference.at(trial.time_s - at) for at in tried_s])
     best = int(np.argmin(left.std(axis=1)))
     return float(tried_s[best]), float(left[best].mean())
