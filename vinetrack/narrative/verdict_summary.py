@@ -221,7 +221,8 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
     tried = sum(row.status != "not testable here" for row in ranking)
     note = f"of {tried} candidates tested" if tried > 1 else "the only candidate"
     note = f"{len(inside)} of {tried} candidates fit equally well" if len(inside) > 1 else note
-    rival = max(others, key=_gain, default=None)
+    # One that holds the answer as a limit fits as well by construction, and is no rival.
+    rival = max([row for row in others if not row.plausible or not row.reason], key=_gain, default=None)
     if rival is not None:
         behind = best.delta_chi2 - rival.delta_chi2
         # An implausible candidate, or one predicted and not fitted, may have the larger Δχ².

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinetrack.core.numbers import with_error
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.narrative.power_text import power_brief
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
@@ -291,4 +292,22 @@ def diagnosis_lines(folder: Path) -> list[str]:
     if not diagnosis.verdict:
         return [diagnosis.explanation]
     beside = f" ({power_brief(diagnosis.power)})" if diagnosis.power is not None else ""
-    return [f"{diagnosis.verdict}{beside}: {diagnosis.explanation}", *(f"! {note}" for note in diagnosis.notes)]
+    return [
+        f"{diagnosis.verdict}{beside}: {diagnosis.explanation}",
+        *_damping_line(diagnosis),
+        *(f"! {note}" for note in diagnosis.notes),
+    ]
+
+
+def _damping_line(diagnosis: Diagnosis) -> list[str]:
+    """The damping law of the model in the end, F = B·ẋⁿ, in a line; none where that model has no such law."""
+    numbers = [number for number in diagnosis.parameters if number.key in ("eversion_damping.B", "eversion_damping.n")]
+    if not numbers:
+        return []
+    parts = [
+        f"{number.symbol}{f' ({number.vine})' if number.vine else ''} = {with_error(number.value, number.sigma)}"
+        f"{f' {number.unit}' if number.unit != '1' else ''}"
+        for number in sorted(numbers, key=lambda number: number.key != "eversion_damping.n")
+    ]
+    with_effects = f" with {' + '.join(diagnosis.effects)} in the model" if diagnosis.effects else ""
+    return [f"F = B·ẋⁿ{with_effects}: {', '.join(parts)}; ± is one standard error"]

@@ -155,6 +155,8 @@ def guess_columns(recordings: Sequence[str]) -> list[dict[str, str]]:
 
     >>> guess_columns(["videos/d12_24kPa_1.mp4", "d24-20g-2p5psi.mp4"])
     [{'diameter_mm': '12', 'pressure_kPa': '24'}, {'diameter_mm': '24', 'payload_g': '20', 'pressure_kPa': '17.2369'}]
+    >>> guess_columns(["tuesday 12 mm 24 kPa 20 g a.mp4"])
+    [{'diameter_mm': '12', 'pressure_kPa': '24', 'payload_g': '20'}]
     """
     read = [_guess(recording) for recording in recordings]
     units: dict[str, set[str]] = {}
@@ -172,13 +174,18 @@ def guess_columns(recordings: Sequence[str]) -> list[dict[str, str]]:
     return out
 
 
+_UNITS = "|".join(sorted(_BY_UNIT, key=len, reverse=True))
+_APART = re.compile(rf"(?<![A-Za-z0-9])(\d+(?:[.p]\d+)?)[_\s]+({_UNITS})(?![A-Za-z0-9])", re.IGNORECASE)
+"""A number and its unit with a blank between, `24 kPa`."""
+
+
 def _guess(recording: str) -> dict[str, str]:
     """Cells by column, or by quantity in another unit."""
     cells: dict[str, str] = {}
     parts = [*PurePosixPath(recording).parts[:-1], _stem(recording)]
     for part in parts:
         of_part: dict[str, str] = {}
-        for word in re.split(r"[_\s,;+-]+", part):
+        for word in re.split(r"[_\s,;+-]+", _APART.sub(r"\1\2", part)):
             match = _WORD.fullmatch(word)
             column = _column_of(match, of_part) if match else ""
             if match and column:

@@ -178,6 +178,8 @@ def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
     """A table for the terminal, a line a recording, sizes of the picture beside those of the sheet.
 
+    `down` is the growth angle from straight down as the sheet has it: no picture tells it.
+
     Parameters
     ----------
     facts, trials : of the same recordings, in the same order.
@@ -196,13 +198,14 @@ def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
         "scale",
         "picture",
         "axis",
+        "down",
         "tube",
         "sheet",
         "growth",
         "sheet",
     )
-    units = ("", "", "1/s", "1/s", "s", "mm/px", "mm", "px", "mm", "mm", "mm", "mm")
-    return table(rows, head, units, align="<>>>>>><>>>>")
+    units = ("", "", "1/s", "1/s", "s", "mm/px", "mm", "px", "°", "mm", "mm", "mm", "mm")
+    return table(rows, head, units, align="<>>>>>><>>>>>")
 
 
 def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
@@ -235,6 +238,7 @@ def _cells(facts: RecordingFacts, trial: Trial) -> tuple[str, ...]:
         number(facts.mm_per_px, 4),
         number(facts.picture_mm),
         axis,
+        f"{math.degrees(trial.growth_angle_rad):g}",
         number(facts.tube_width_mm),
         number(1e3 * trial.diameter_m),
         number(facts.growth_mm),
