@@ -12,6 +12,7 @@ import pytest
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
+from vinetrack.diagnosis import diagnose
 from vinetrack.diagnosis.compare import compare
 from vinetrack.diagnosis.ladder import (
     LADDER_COLUMNS,
@@ -23,6 +24,7 @@ from vinetrack.diagnosis.ladder import (
     left_out,
     moved,
 )
+from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, Nature, grow
@@ -116,7 +118,10 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pai
     table = ladder([found], [""])
     assert len(left_out(found).not_predicted) == 3
     assert math.isfinite(table["rms_left_out_m"].iloc[0])
-    assert any("left-out conditions leaves out 3 trials" in note and "24mm" in note for note in table.attrs["notes"])
+    assert any("left-out conditions is without 3 trials" in note and "24mm" in note for note in table.attrs["notes"])
+    # The reader sees an error in sample of all trials beside one without them: a diagnosis says so.
+    told = diagnose._with_ladder(Diagnosis(rounds=(), effects=(), explanation="", fits=(found,)), lambda _: None)
+    assert told.notes == tuple(table.attrs["notes"])
 
 
 def test_of_a_single_condition_nothing_can_be_left_out(pairs: Pairs) -> None:

@@ -387,7 +387,8 @@ def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:
 
     report("errors before and after")
     try:
-        return replace(result, ladder=ladder(result.fits, ("", *result.effects)))
+        table = ladder(result.fits, ("", *result.effects))
+        return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
         return replace(result, notes=(*result.notes, f"The ladder of errors could not be made: {error}"))
 

@@ -233,7 +233,7 @@ def _notes(what: str, errors: Errors) -> list[str]:
     for reason in errors.not_predicted.values():
         reasons[reason] = reasons.get(reason, 0) + 1
     return [
-        f"The error on {what} leaves out {count} trial{'s' if count > 1 else ''}: {reason}."
+        f"The error on {what} is without {count} trial{'s' if count > 1 else ''}, unlike that in sample: {reason}"
         for reason, count in reasons.items()
     ]
 
