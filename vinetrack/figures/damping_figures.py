@@ -171,8 +171,8 @@ _MAX_VINES = 40
 def draw_exponents(damping: dict[str, Any], published: dict[str, Any] | None = None) -> Figure:
     """Draw n and B with their 95 % intervals, B as deviation from its best estimate.
 
-    Thick bars come from resampling whole trials; thin ones add the stated error of the yield pressure, which all trials
-    of a vine share and no resampling shows.
+    Thick bars come from resampling whole trials, or from Student's t where they are too few; thin ones add the stated
+    error of the yield pressure, which all trials of a vine share and no resampling shows.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def _finish_exponents(left: Axes, right: Axes, best: dict[str, dict[str, Any]]) 
     right.set_yticks(range(len(best)), labels, fontsize=9)
     right.tick_params(axis="y", length=0)
     right.grid(axis="y", visible=False)
-    title = "thick: 95 % by resampling trials; thin: with\nthe yield pressure's stated error; B in N·(s/m)ⁿ"
+    title = "thick: 95 % by the scatter of trials; thin: with\nthe yield pressure's stated error; B in N·(s/m)ⁿ"
     right.set_title(title, fontsize=9, fontweight="normal")
     left.locator_params(axis="x", nbins=5)
 
