@@ -146,7 +146,8 @@ def picture_entries() -> list[Entry]:
         for name, field in model.model_fields.items():
             if name != "kind":
                 meaning = _PICTURE_MEANINGS[name]
-                unit = UNITS[split_unit(name)[1]].text if name.endswith("_mm") else "px" if name.endswith("_px") else ""
+                ends = {"_per_px": "mm/px", "_mm": "mm", "_px": "px"}
+                unit = next((text for end, text in ends.items() if name.endswith(end)), "")
                 of_kind = f" (kind: {kind})" if kind else ""
                 default = "required" if field.is_required() else "by the motion"
                 entries.append(Entry(f"{prefix}.{name}{of_kind}", unit, default, _allowed(field), *meaning))
@@ -208,7 +209,7 @@ def _allowed(field: FieldInfo) -> str:
     if choices:
         return ", ".join(dict.fromkeys(choices))
     bounds = [(name, getattr(rule, name)) for rule in _rules(field) for name in _BOUNDS if hasattr(rule, name)]
-    return ", ".join(f"{_BOUNDS[name]} {value:g}" for name, value in bounds)
+    return ", ".join(dict.fromkeys(f"{_BOUNDS[name]} {value:g}" for name, value in bounds))
 
 
 def _rules(field: FieldInfo) -> list[Any]:
