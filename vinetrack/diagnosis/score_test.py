@@ -26,7 +26,6 @@ from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect
 from vinetrack.diagnosis.initial_fit import probe
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
-    SILENT,
     FitState,
     cross_products,
     cross_products_vector,
@@ -123,7 +122,8 @@ def products_of(fit: Fit, answers: EffectSensitivities, systematics: Sequence[Fl
     -------
     Products
     """
-    columns = fit.solution.columns
+    state = fit.solution.state
+    columns = fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
     grams = np.stack(
         [
             products(np.column_stack([trial_effects, more, systematic]), trial_data.first, trial_data.relative_sd)
@@ -161,7 +161,7 @@ def _projected(fit: Fit, sums: Products, state: FitState) -> tuple[Floats, Float
     cross = np.zeros((size + 1, asked))
     np.add.at(cross, problem.index, blocks[:, X, C])
     cross = cross[:size]
-    moving = np.flatnonzero(problem.free & (np.diag(square) > SILENT) & ~_pressed(fit))
+    moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(fit))
     inverse = inverse_among(square, moving)
     return blocks, cross, inverse @ cross, inverse @ slope, moving
 

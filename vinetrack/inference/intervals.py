@@ -17,12 +17,16 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.marginal_likelihood import Marginal, deviance, marginal, normal_equations
-from vinetrack.inference.mixed_effects import SILENT, FitState, MixedProblem
+from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import FixedTerms, Solution, solve
 from vinetrack.inference.sensitivity import Predictor
 
 SINGULAR = 1e-10
 """Smallest eigenvalue of an information matrix of unit diagonal at which two numbers can still be told apart."""
+
+SILENT = 1e-6
+"""Information below which a number moves no trajectory: χ² would change by this for the whole scale of the number.
+Chosen far below anything of weight: a Δχ² of 1e-6 is an interval of a thousand scales."""
 
 NEAR_A_BOUND = 3.5
 """Standard errors within which a bound makes the interval a profile. Derived: beyond 3.5 the normal interval of 95 %

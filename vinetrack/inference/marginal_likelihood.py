@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.inference.mixed_effects import (
     LEAST_SPREAD,
-    SILENT,
     FitState,
     MixedProblem,
     bounded_solve,
@@ -157,7 +156,7 @@ def deviance(
     float
     """
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
-    moves = problem.free & (np.diag(information) > SILENT)
+    moves = problem.free & (np.diag(information) > 0)
     if ((state.theta <= problem.lower) | (state.theta >= problem.upper)).any():
         # What would rather lie beyond its bound must not be credited with what it would explain there.
         step = bounded_solve(information, slope, problem, state.theta)
@@ -223,7 +222,8 @@ def estimate_spreads(
     def at(logs: Floats) -> tuple[float, float]:
         spread = list(state.spread)
         for k, value in zip(which, logs, strict=True):
-            spread[k] = float(np.clip(math.exp(value), LEAST_SPREAD, LARGEST_SPREAD[k]))
+            # Clipped before the exponential: on a flat likelihood the simplex walks as far as it likes.
+            spread[k] = math.exp(float(np.clip(value, math.log(LEAST_SPREAD), math.log(LARGEST_SPREAD[k]))))
         return spread[0], spread[1]
 
     def cost(logs: Floats) -> float:

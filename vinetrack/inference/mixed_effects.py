@@ -49,11 +49,6 @@ LEAST_SPREAD = 1e-5
 """Least between-trial standard deviation. Chosen far below what any rig repeats, so that its logarithm stays
 finite."""
 
-SILENT = 1e-6
-"""Information below which a number moves no trajectory: χ² would change by this for the whole scale of the number.
-Such a number stays where it is: its column is rounding, and a step along it, millions of scales long, promises what no
-trajectory keeps. Chosen far below anything of weight: a Δχ² of 1e-6 is an interval of a thousand scales."""
-
 SPREAD_COLUMNS = (PRESSURE, DAMPING_DEVIATION)
 
 
@@ -288,7 +283,7 @@ def bounded_solve(square: Floats, slope: Floats, problem: MixedProblem, theta: F
     -------
     array, shape (n_free,)
     """
-    moving = problem.free & (np.diag(square) > SILENT)
+    moving = problem.free & (np.diag(square) > 0)
     step = np.zeros_like(slope)
     for _ in range(slope.size + 1):
         step[:] = 0.0

@@ -33,7 +33,6 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_problem import floor
 from vinetrack.inference.marginal_likelihood import estimate_noise
 from vinetrack.inference.mixed_effects import (
-    SILENT,
     FitState,
     MixedProblem,
     inverse_among,
@@ -155,7 +154,7 @@ def _weighed(solution: Solution, shared: int) -> Pooled:
     information, scores = trial_information(solution)
     total = information.sum(axis=0) + np.diag(problem.prior_precision)
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
-    live = np.flatnonzero(problem.free & inside & (np.diag(total) > SILENT))
+    live = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
     root = _typical_root(inverse_among(total, live), information, shared)
     values, vectors = np.linalg.eigh(information)
     half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]

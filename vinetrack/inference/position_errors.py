@@ -16,10 +16,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.fit_problem import floor
-from vinetrack.inference.marginal_likelihood import deviance, estimate_noise, estimate_spreads, marginal
+from vinetrack.inference.intervals import SILENT
+from vinetrack.inference.marginal_likelihood import (
+    deviance,
+    estimate_noise,
+    estimate_spreads,
+    marginal,
+    normal_equations,
+)
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_step
 from vinetrack.inference.optimiser import SETTLED_SPREAD, FixedTerms, Solution, variances_moved
 from vinetrack.inference.sensitivity import ORIGIN, Predictor
@@ -117,16 +125,21 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
         for columns, shape in zip(solution.columns, shapes, strict=True)
     ]
     held = held or FixedTerms()
-    problem = with_shapes(solution.problem, count)
+    still = replace(solution.problem, free=solution.problem.free & _moves(solution))
+    problem = with_shapes(still, count)
     start = replace(solution.state, theta=np.concatenate([solution.state.theta, np.zeros(count)]))
     state, grams, moved, level = _iterated(predictor, solution, wide, problem, start, held)
     # A fit far off is not at its minimum, and a straight line promises more than there is: that part is the same
     # without the shapes, and is not theirs.
-    bare = _iterated(predictor, solution, solution.columns, solution.problem, solution.state, held)[3]
+    bare = _iterated(predictor, solution, solution.columns, still, solution.state, held)[3]
     left = [values[:, -1] - values[:, :-1] @ change for values, change in zip(wide, moved, strict=True)]
     return SmoothErrors(
         solution=replace(
-            solution, state=state, problem=problem, grams=grams, columns=tuple(_with_residual(wide, left))
+            solution,
+            state=state,
+            problem=with_shapes(solution.problem, count),
+            grams=grams,
+            columns=tuple(_with_residual(wide, left)),
         ),
         gain=max(level - bare, 0.0),
         whitened=tuple(
@@ -135,6 +148,17 @@ def smooth_errors(predictor: Predictor, solution: Solution, held: FixedTerms | N
         ),
         displacement_m=tuple(shape @ state.theta[-count:] for shape in shapes),
     )
+
+
+def _moves(solution: Solution) -> NDArray[np.bool_]:
+    """Free numbers that move some trajectory.
+
+    The column of one that does not is rounding. A step along it is millions of scales long and promises a likelihood
+    that no trajectory keeps; columns that stay would let it be taken.
+    """
+    part = marginal(solution.grams, solution.problem, solution.state)
+    information = normal_equations(part, solution.problem, solution.state, solution.state.spread)[0]
+    return np.asarray(np.diag(information) > SILENT)
 
 
 def _iterated(

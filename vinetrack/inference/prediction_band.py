@@ -32,7 +32,7 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.intervals import student
-from vinetrack.inference.mixed_effects import SILENT, FitState, inverse_among, spreads
+from vinetrack.inference.mixed_effects import FitState, inverse_among, spreads
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.pooling import pool, trial_information
@@ -203,7 +203,7 @@ def _left_out(basis: _Basis, trial_data: FitTrial, i: int, weigh: float) -> tupl
     total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
     others = total - basis.information[i]
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
-    free = np.flatnonzero(problem.free & inside & (np.diag(total) > SILENT))
+    free = np.flatnonzero(problem.free & inside & (np.diag(total) > 0))
     felt = free[np.diag(basis.information[i])[free] > 0]
     if len(basis.scores) < 2 or (np.diag(others)[felt] <= TOLD_BY_OTHERS * np.diag(total)[felt]).any():
         return None
@@ -280,7 +280,7 @@ def _covariance(fit: Fit, basis: _Basis) -> Floats:
     problem = basis.solution.problem
     total = basis.information.sum(axis=0) + np.diag(problem.prior_precision)
     count = len(fit.numbers)
-    plain = inverse_among(total, np.flatnonzero(problem.free & (np.diag(total) > SILENT)))[:count, :count]
+    plain = inverse_among(total, np.flatnonzero(problem.free & (np.diag(total) > 0)))[:count, :count]
     held = fit.predictor.layout.free
     sigma = np.array(
         [n.sigma / (n.value if free.logarithmic else free.scale) for n, free in zip(fit.numbers, held, strict=True)]

@@ -15,7 +15,7 @@ import numpy as np
 from vinetrack.core.records import Floats, Trial
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.intervals import Precision
-from vinetrack.inference.mixed_effects import SILENT, cross_products, inverse_among, trial_effects_eliminated
+from vinetrack.inference.mixed_effects import cross_products, inverse_among, trial_effects_eliminated
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.pooling import Pooled, trial_information
 from vinetrack.inference.sensitivity import OWN, Predictor
@@ -230,7 +230,7 @@ def _sandwich(predictor: Predictor, solution: Solution, systematics: Sequence[Fl
     blocks = trial_effects_eliminated(grams, p, problem, state)
     square = cross_products(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
     inside = (state.theta > problem.lower) & (state.theta < problem.upper)
-    live = np.flatnonzero(problem.free & inside & (np.diag(square) > SILENT))
+    live = np.flatnonzero(problem.free & inside & (np.diag(square) > 0))
     plain = inverse_among(square, live)
     single = _scores(blocks[:, :p, p], problem.index, size)
     trials = len(blocks)

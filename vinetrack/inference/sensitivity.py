@@ -40,6 +40,10 @@ curvature."""
 RELEASE_STEP_FRAMES = 0.1
 """Chosen: a tenth of a frame, in which no trajectory bends."""
 
+MOST_CONTINUED = 3.0
+"""Times the delay that a step makes over which a trajectory is continued past its end. Derived: one for motions that
+keep their speed to the end; three allows for one that slows down to a third."""
+
 PAYLOAD_COLUMN = TrialInputs._fields.index("payload_mass")
 DAMPING_STEP = 1e-3
 """Relative step of B. Derived as AIMED_RESPONSE is: its answer is of the order of the step."""
@@ -218,10 +222,14 @@ class Predictor:
     def _residual(self, i: int, moved: Trajectory, trial_effects: Floats) -> Floats:
         return self.data[i].lead_position_m - trial_effects[i, ORIGIN] - moved.observed_position_m
 
-    def linearise(self, theta: Floats, trial_effects: Floats, *, own_only: bool = False) -> list[Floats]:
+    def linearise(
+        self, theta: Floats, trial_effects: Floats, *, own_only: bool = False, past_end: bool = False
+    ) -> list[Floats]:
         """Columns [own numbers, keys of the layout, residual] of every trial, shape (n_points, 4 + n_keys + 1).
 
-        `own_only` leaves the columns of the keys empty, but for B.
+        `own_only` leaves the columns of the keys empty, but for B. `past_end` takes derivatives as `position_change`
+        does, for tests that hold columns against each other; an iteration wants what a step really changes, the jump
+        at the end of growth included, and settles in other places without it.
 
         Parameters
         ----------
@@ -230,6 +238,8 @@ class Predictor:
         trial_effects : array, shape (n_trials, 4)
         own_only : bool
             Leave the columns of the keys empty, but for B.
+        past_end : bool
+            Run trajectories on past the end of growth. The steps of later calls are not adapted then.
 
         Returns
         -------
@@ -251,10 +261,11 @@ class Predictor:
             columns[i][:, -1] = self._residual(i, moved[i], trial_effects)
         for job, (place, step), other in zip(jobs, moves, moved, strict=True):
             if place >= 0:
-                columns[job.trial][:, place] = position_change(moved[job.trial], other) / step
+                change = position_change if past_end else _clipped_change
+                columns[job.trial][:, place] = change(moved[job.trial], other) / step
         self._share_damping(columns)
         self._share_deviations(columns)
-        if not own_only:
+        if not (own_only or past_end):
             self._adapt(columns)
         return columns
 
@@ -337,6 +348,15 @@ class Predictor:
             self.pressure_step[i] = _step(float(answers[i, PRESSURE]), float(self.pressure_step[i]))
 
 
+def _clipped_change(plain: Trajectory, moved: Trajectory) -> Floats:
+    """How far positions move, ended where the growth ends; behind that nothing that only delays the end moves them."""
+    change = moved.observed_position_m - plain.observed_position_m
+    if plain.status == "ended":
+        over = plain.time_s > plain.end_time_s
+        change[over] = change[-1] if moved.status == "ended" else 0.0
+    return np.asarray(change)
+
+
 def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
     """How far the observed positions of a trial answer to a small step, m, shape (n_points,).
 
@@ -360,9 +380,14 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
     plain_end_s, moved_end_s = (each.end_time_s if each.status == "ended" else math.inf for each in (plain, moved))
     over = plain.time_s > plain_end_s
     early = ~over & (plain.time_s > moved_end_s)
-    if early.any():
-        last = int(np.argmax(early)) - 1
-        if last >= 0:
+    last = int(np.argmax(early)) - 1
+    if early.any() and last >= 0:
+        # A step small enough ends growth earlier by what it moves over the speed; where the unmoved motion takes longer
+        # it is another one, such as a stop before the end, and is not continued.
+        speed_m_s = max(float(plain.lead_velocity_m_s[last]), 1e-9)
+        reach_s = plain.time_s[last] + MOST_CONTINUED * abs(float(change[last])) / speed_m_s
+        early &= plain.time_s <= reach_s + 2 * (plain.time_s[1] - plain.time_s[0])
+        if early.any():
             faster = moved.lead_velocity_m_s[last] - plain.lead_velocity_m_s[last]
             change[early] = change[last] + faster * (plain.time_s[early] - plain.time_s[last])
     if over.any():

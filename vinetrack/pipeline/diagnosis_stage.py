@@ -291,9 +291,10 @@ def diagnosis_lines(folder: Path) -> list[str]:
         raise ResultsError(f"{folder} has no diagnosis: run snakemake, or vinetrack diagnose {folder}")
     if not diagnosis.verdict:
         return [diagnosis.explanation]
-    beside = f" ({power_brief(diagnosis.power)})" if diagnosis.power is not None else ""
+    beside = power_brief(diagnosis.power) if diagnosis.power is not None else ""
     return [
-        f"{diagnosis.verdict}{beside}: {diagnosis.explanation}",
+        f"{diagnosis.verdict}: {diagnosis.explanation}",
+        *([f"{beside[0].upper()}{beside[1:]}"] if beside else []),
         *_damping_line(diagnosis),
         *(f"! {note}" for note in diagnosis.notes),
     ]

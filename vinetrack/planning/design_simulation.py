@@ -52,7 +52,9 @@ class PartlyLinear(Predictor):
         self.new = Predictor(new_layout, new, old.host)
         self.new.steps = old.steps.copy()
 
-    def linearise(self, theta: Floats, trial_effects: Floats, *, own_only: bool = False) -> list[Floats]:
+    def linearise(
+        self, theta: Floats, trial_effects: Floats, *, own_only: bool = False, past_end: bool = False
+    ) -> list[Floats]:
         """Residuals and sensitivities, as `Predictor.linearise`; those of the old trials with constant sensitivities.
 
         Parameters
@@ -63,6 +65,8 @@ class PartlyLinear(Predictor):
             Release, origin and deviations of each trial.
         own_only : bool
             Sensitivities of the new trials to trial effects alone.
+        past_end : bool
+            Run trajectories of the new trials on past the end of growth.
 
         Returns
         -------
@@ -71,7 +75,7 @@ class PartlyLinear(Predictor):
         """
         moved = self.residuals_of_old(theta, trial_effects)
         columns = [np.column_stack([known[:, :-1], r]) for known, r in zip(self.known, moved, strict=True)]
-        return columns + self.new.linearise(theta, trial_effects[self.old :], own_only=own_only)
+        return columns + self.new.linearise(theta, trial_effects[self.old :], own_only=own_only, past_end=past_end)
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted positions of all trials, m.
