@@ -111,21 +111,20 @@ def _growth_bases(pressure_Pa: Floats, growth_m: Floats) -> list[Floats]:
     reach = min(pressure_Pa.size // 4, MOST_SHIFTED)
     coarse = range(-reach, reach + 1, COARSE)
 
-    def basis(shift: int, bent: int, along: int) -> Floats:
-        place = np.clip(np.arange(growth_m.size) + shift, 0, growth_m.size - 1)
-        t, g = np.linspace(-1, 1, growth_m.size), (growth_m[place] - growth_m[0]) / np.ptp(growth_m)
-        powers = [t**k for k in range(bent + 1)] + [g**k for k in range(1, along + 1)]
-        return np.asarray(np.linalg.qr(np.column_stack(powers))[0])
-
     every = max(growth_m.size // ENOUGH, 1)
 
+    def columns(shift: int, bent: int, along: int) -> Floats:
+        place = np.clip(np.arange(growth_m.size) + shift, 0, growth_m.size - 1)
+        t, g = np.linspace(-1, 1, growth_m.size), (growth_m[place] - growth_m[0]) / np.ptp(growth_m)
+        return np.column_stack([t**k for k in range(bent + 1)] + [g**k for k in range(1, along + 1)])
+
     def explained(shift: int) -> float:
-        few = np.linalg.qr(basis(shift, 1, 2)[::every])[0]
+        few = np.linalg.qr(columns(shift, 1, 2)[::every])[0]
         return float(np.sum((few.T @ pressure_Pa[::every]) ** 2))
 
     best = max(coarse, key=explained)
     best = max(range(best - COARSE, best + COARSE + 1), key=explained)
-    return [basis(best, bent, along) for bent, along in ALONG_GROWTH]
+    return [np.linalg.qr(columns(best, bent, along))[0] for bent, along in ALONG_GROWTH]
 
 
 def _is_noise(residual_Pa: Floats, sigma: float, fitted: int, slow: Floats) -> bool:

@@ -376,10 +376,9 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
     -------
     array, shape (n_points,), m
     """
-    change = moved.observed_position_m - plain.observed_position_m
+    change = _clipped_change(plain, moved)
     plain_end_s, moved_end_s = (each.end_time_s if each.status == "ended" else math.inf for each in (plain, moved))
-    over = plain.time_s > plain_end_s
-    early = ~over & (plain.time_s > moved_end_s)
+    early = (plain.time_s <= plain_end_s) & (plain.time_s > moved_end_s)
     last = int(np.argmax(early)) - 1
     if early.any() and last >= 0:
         # A step small enough ends growth earlier by what it moves over the speed; where the unmoved motion takes longer
@@ -390,9 +389,7 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
         if early.any():
             faster = moved.lead_velocity_m_s[last] - plain.lead_velocity_m_s[last]
             change[early] = change[last] + faster * (plain.time_s[early] - plain.time_s[last])
-    if over.any():
-        change[over] = moved.observed_position_m[-1] - plain.observed_position_m[-1] if moved.status == "ended" else 0.0
-    return np.asarray(change)
+    return change
 
 
 def _step(answer: float, before: float) -> float:
