@@ -18,7 +18,7 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.score_test import products_of, scores_of
+from vinetrack.diagnosis.score_test import fit_columns, products_of, scores_of
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import Fit
@@ -57,7 +57,7 @@ def score_ratio(questions: MisfitTests, place: int, size: float) -> float:
         return 1.0
     if shape.effect.name in answers.silent or not answers.shapes:
         return 1.0
-    scores = scores_of(after, products_of(after, answers, systematics))
+    scores = scores_of(after, products_of(after, fit_columns(after), answers, systematics))
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
 
 

@@ -17,6 +17,7 @@ from vinetrack.diagnosis.score_test import (
     Scores,
     Structure,
     family_threshold,
+    fit_columns,
     linear_gains,
     products_of,
     scores_of,
@@ -281,5 +282,7 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTes
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect)]
     answers = effect_sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials)
-    sums = products_of(fit, answers, systematics)
-    return MisfitTests(fit, effects, answers, sums, scores_of(fit, sums), structure_of(fit, systematics), level)
+    columns = fit_columns(fit)
+    sums = products_of(fit, columns, answers, systematics)
+    structure = structure_of(fit, columns, systematics)
+    return MisfitTests(fit, effects, answers, sums, scores_of(fit, sums), structure, level)

@@ -108,12 +108,31 @@ class Scores:
         return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
 
 
-def products_of(fit: Fit, answers: EffectSensitivities, systematics: Sequence[Floats]) -> Products:
-    """All sums of products that the tests need; `systematics` are those of `doubts_of`.
+def fit_columns(fit: Fit) -> list[Floats]:
+    """Columns of a fit's own numbers and residual, with derivatives as those of the candidates are taken.
 
     Parameters
     ----------
     fit : the fit that is questioned.
+
+    Returns
+    -------
+    list of arrays, shape (n_points, 4 + n_keys + 1)
+        As `Predictor.linearise`, past the end of growth.
+    """
+    state = fit.solution.state
+    return fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
+
+
+def products_of(
+    fit: Fit, columns: Sequence[Floats], answers: EffectSensitivities, systematics: Sequence[Floats]
+) -> Products:
+    """All sums of products that the tests need.
+
+    Parameters
+    ----------
+    fit : the fit that is questioned.
+    columns : its own, from `fit_columns`.
     answers : how positions answer to the candidates.
     systematics : sequence of arrays, shape (n_points, n_systematics), m
         From `vinetrack.inference.systematics`.
@@ -122,8 +141,6 @@ def products_of(fit: Fit, answers: EffectSensitivities, systematics: Sequence[Fl
     -------
     Products
     """
-    state = fit.solution.state
-    columns = fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
     grams = np.stack(
         [
             products(np.column_stack([trial_effects, more, systematic]), trial_data.first, trial_data.relative_sd)
@@ -343,7 +360,7 @@ class Structure:
     loudest: float = 1.0
 
 
-def structure_of(fit: Fit, systematics: Sequence[Floats]) -> Structure:
+def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Sequence[Floats]) -> Structure:
     """Whether anything that a smooth force could explain is left beside a fit.
 
     All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
@@ -351,6 +368,7 @@ def structure_of(fit: Fit, systematics: Sequence[Floats]) -> Structure:
     Parameters
     ----------
     fit : the fit that is questioned.
+    columns : its own, from `fit_columns`.
     systematics : sequence of arrays, shape (n_points, n_systematics), m
         From `vinetrack.inference.systematics`.
 
@@ -364,7 +382,7 @@ def structure_of(fit: Fit, systematics: Sequence[Floats]) -> Structure:
     answers = effect_sensitivities(fit, _probe_shapes(fit))
     if not answers.shapes:
         return Structure(0.0, 0, 1.0, 0.0)
-    scores = scores_of(fit, products_of(fit, answers, systematics))
+    scores = scores_of(fit, products_of(fit, columns, answers, systematics))
     root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
     live = np.diag(scores.information) > 0
     information = (scores.information / root[:, None] / root)[np.ix_(live, live)]
