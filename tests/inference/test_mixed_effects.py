@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -123,7 +124,7 @@ def one_way(n_trials: int, count: int, spread: float, seed: int) -> tuple[Soluti
     grams = all_products(columns, [np.arange(count) == 0] * n_trials)
     frame = frame_of(n_trials, count, 1)
     state = state_of(n_trials, 1, 0.3, rho=0.0, sigma=0.01)
-    found = estimate_spreads(marginal(grams, frame, state), frame, state, (False, True), search=True)
+    found = estimate_spreads(marginal(grams, frame, state), frame, state, (False, True))
     state = FitState(state.theta, state.trial_effects, found, 0.0, state.variance)
     return Solution(state, frame, grams, (), (False, True), True, 1), means
 
@@ -132,6 +133,24 @@ def test_the_spread_of_a_one_way_layout_is_that_of_the_analysis_of_variance() ->
     solution, means = one_way(12, 25, 0.05, seed=4)
     expected = math.sqrt(means.var(ddof=1) - 0.01**2 / 25)
     assert solution.state.spread[1] == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize("start", [(0.04, 1e-3), (0.04, 0.1), (1e-3, 0.1), (1e-5, 1e-5)])
+def test_two_spreads_are_found_from_wherever_the_fit_stands(start: tuple[float, float]) -> None:
+    # Pressure and B move a trial alike but for a tenth, so that one can stand for the other.
+    n_trials, count, draw = 24, 40, np.random.default_rng(31)
+    slope, bend = np.linspace(0, 1, count), np.linspace(-1, 1, count) ** 2
+    columns = []
+    for deviations in draw.standard_normal((n_trials, 2)) * (0.004, 0.02):
+        own = np.column_stack([0 * slope, 0 * slope, slope + 0.1 * bend, -0.4 * slope])
+        seen = own[:, 2:] @ deviations + 1e-4 * draw.standard_normal(count)
+        columns.append(np.column_stack([own, slope, seen]))
+    frame = replace(frame_of(n_trials, count, 1), feels=np.ones((n_trials, 2), dtype=bool))
+    state = replace(state_of(n_trials, 1, 0.0, rho=0.0, sigma=1e-4), spread=start)
+    part = marginal(all_products(columns, [np.arange(count) == 0] * n_trials), frame, state)
+    pressure, damping = estimate_spreads(part, frame, state, (True, True))
+    assert pressure == pytest.approx(0.004, rel=0.4)
+    assert damping == pytest.approx(0.02, rel=0.4)
 
 
 def test_the_error_of_a_common_level_is_that_of_a_mean_of_trials() -> None:

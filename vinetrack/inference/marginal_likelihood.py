@@ -34,6 +34,10 @@ LARGEST_SPREAD = (0.04, 0.15)
 they pass for whatever the model lacks. Chosen: a batch of vines scatters by a few per cent of B and one per cent of
 pressure; at half real batches are cut short, at twice spreads soak up missing effects."""
 
+SPREAD_GRID = (0.001, 0.004, 0.01, 0.025, 0.06)
+"""Spreads from which the largest likelihood is looked for. Chosen: steps of about 2.5, less than the width of a maximum,
+from below what any batch shows to beyond the largest of pressure."""
+
 LARGEST_CORRELATION = 0.9998
 """Nearly 1: what a wrong model leaves is slow and large, and must not count as thousands of independent points.
 Derived: a correlation time of 5000 frames, longer than any recording."""
@@ -190,11 +194,11 @@ def estimate_spreads(
     estimable: tuple[bool, bool],
     *,
     restricted: bool = True,
-    search: bool = False,
 ) -> tuple[float, float]:
     """Spreads of pressure and B that maximise the restricted (or plain) likelihood; those not estimable stay.
 
-    `search` begins from a grid, else from where the state stands.
+    The likelihood may have two maxima: what pressure takes upon itself, B need not. So the best of a grid and of where
+    the state stands is followed.
 
     Parameters
     ----------
@@ -205,8 +209,6 @@ def estimate_spreads(
         Which of the two are estimated.
     restricted : bool
         Whether the likelihood is the restricted one.
-    search : bool
-        Whether to begin from a grid.
 
     Returns
     -------
@@ -229,12 +231,12 @@ def estimate_spreads(
     def cost(logs: Floats) -> float:
         return deviance(part, problem, state, at(logs), restricted=restricted)
 
-    start = np.log(np.maximum([state.spread[k] for k in which], 1e-3))
-    if search:
-        axes = np.meshgrid(*[np.log([0.001, 0.004, 0.01, 0.025, 0.06])] * len(which), indexing="ij")
-        points = np.column_stack([axis.ravel() for axis in axes])
-        start = points[int(np.argmin([cost(point) for point in points]))]
-    simplex = np.vstack([start, start + 0.4 * np.eye(len(which))])
+    here = np.log(np.maximum([state.spread[k] for k in which], 1e-3))
+    axes = np.meshgrid(*[np.log(SPREAD_GRID)] * len(which), indexing="ij")
+    points = [here, *np.column_stack([axis.ravel() for axis in axes])]
+    start = points[int(np.argmin([cost(point) for point in points]))]
+    # Steps towards smaller spreads: at the largest, a step up would be clipped, and the simplex flat.
+    simplex = np.vstack([start, start - 0.4 * np.eye(len(which))])
     minimum = minimize(
         cost, start, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 5e-3, "fatol": 1e-3}
     )

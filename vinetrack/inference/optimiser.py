@@ -139,10 +139,9 @@ def solve(
     looks, looked, in_vain = MOST_LOOKS, 0, False
     for iteration in range(1, most_iterations + 1):
         near = promised < FAR_OFF or iteration > MOST_EARLY
-        search = early and iteration > EARLY_ITERATIONS and near
-        early = early and not search
+        early = early and not (iteration > EARLY_ITERATIONS and near)
         before = state
-        state = _update_variances(predictor, problem, grams, state, can, held, early=early, search=search)
+        state = _update_variances(predictor, problem, grams, state, can, held, early=early)
         moved = variances_moved(before, state)
         step, own_change, promised = newton_step(grams, problem, state, damping)
         if watch is not None:
@@ -217,7 +216,6 @@ def _update_variances(
     held: FixedTerms,
     *,
     early: bool,
-    search: bool,
 ) -> FitState:
     """Noise and spreads anew; while the trajectories are still far off only the size of what is left."""
     if held.noise is None:
@@ -225,7 +223,7 @@ def _update_variances(
         rho, variance = estimate_noise(grams, problem, state, known)
         state = replace(state, rho=rho, variance=np.maximum(variance, floor(predictor.data)))
     if not early and any(can):
-        spread = estimate_spreads(marginal(grams, problem, state), problem, state, can, search=search)
+        spread = estimate_spreads(marginal(grams, problem, state), problem, state, can)
         state = replace(state, spread=spread)
     return state
 
