@@ -5,11 +5,11 @@ Seeds 11 and 12 score; no number here was tuned on them.
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from counted import trajectories
 from lsoda_vine import (
     B_TRUE,
     FPS,
@@ -210,11 +210,15 @@ def test_a_final_speed_is_compared_at_one_place_and_knows_a_slower_model() -> No
     assert error == pytest.approx(final_m_s(B_TRUE[24.0]) - final_m_s(12.0), rel=0.1)
 
 
-def test_200_trials_take_less_than_ten_seconds_of_processor_time() -> None:
+def test_trajectories_grow_with_the_trials_and_no_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs, _ = small_campaign(seed=12, replicates=2)
     found = vt.fit(vt.base_model(), pairs, profile=False)
-    many = [(replace(trial, name=f"{trial.name}_{k}"), track) for k in range(13) for trial, track in pairs][:200]
-    wide = replace(found, trials=tuple(replace(found.trials[0], trial=trial) for trial, _ in many))
-    begin = time.process_time()
-    assert len(compare(wide, many).trials) == 200
-    assert time.process_time() - begin < 10
+    simulated, counts = trajectories(monkeypatch), []
+    for count in (50, 200):
+        many = [(replace(trial, name=f"{trial.name}_{k}"), track) for k in range(13) for trial, track in pairs][:count]
+        wide = replace(found, trials=tuple(replace(found.trials[0], trial=trial) for trial, _ in many))
+        simulated.clear()
+        assert len(compare(wide, many).trials) == count
+        counts.append(sum(simulated))
+    assert 0 < counts[1] <= 4.2 * counts[0]
+    assert counts[1] < 12 * 200

