@@ -35,8 +35,8 @@ they pass for whatever the model lacks. Chosen: a batch of vines scatters by a f
 pressure; at half real batches are cut short, at twice spreads soak up missing effects."""
 
 SPREAD_GRID = (0.001, 0.004, 0.01, 0.025, 0.06)
-"""Spreads from which the largest likelihood is looked for. Chosen: steps of about 2.5, less than the width of a maximum,
-from below what any batch shows to beyond the largest of pressure."""
+"""Spreads from which the largest likelihood is looked for. Chosen: steps of about 2.5, less than the width of a
+maximum, from below what any batch shows to beyond the largest of pressure."""
 
 LARGEST_CORRELATION = 0.9998
 """Nearly 1: what a wrong model leaves is slow and large, and must not count as thousands of independent points.
