@@ -9,11 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy.linalg import toeplitz
+from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
 from vinetrack.inference.intervals import degrees_of_freedom, precision
 from vinetrack.inference.marginal_likelihood import deviance, estimate_noise, estimate_spreads, marginal
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, cross_products, newton_step
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, bounded_solve, cross_products, newton_step
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
@@ -161,6 +162,33 @@ def test_the_error_of_a_common_level_is_that_of_a_mean_of_trials() -> None:
 def test_degrees_of_freedom_of_a_common_level_are_the_trials_less_one() -> None:
     solution, _ = one_way(12, 25, 0.05, seed=6)
     assert degrees_of_freedom(solution)[0] == pytest.approx(11, rel=0.03)
+
+
+def test_a_step_ends_at_the_first_bound_and_goes_on_along_it() -> None:
+    # ½xᵀHx − gᵀx in the unit square: its minimum (14/3, 7/3) lies outside; on the side x₁ = 1 it is at x₂ = ½.
+    square, slope = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([7.0, 0.0])
+    problem = replace(frame_of(1, 5, 2), lower=np.zeros(2), upper=np.ones(2))
+    step, moving = bounded_solve(square, slope, problem, np.zeros(2))
+    assert step == pytest.approx([1.0, 0.5])
+    assert list(moving) == [False, True]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_bounded_step_lowers_the_sum_of_squares_even_where_two_numbers_are_hardly_told_apart(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    columns = draw.standard_normal((50, 6))
+    columns[:, 5] = columns[:, 4] * (1 + 1e-7 * draw.standard_normal(50))
+    square, slope = columns.T @ columns, columns.T @ draw.standard_normal(50) * 30
+    problem = replace(frame_of(1, 5, 6), lower=np.full(6, -1.0), upper=np.full(6, 2.0))
+    theta = draw.uniform(-1, 2, 6)
+    step, _ = bounded_solve(square, slope, problem, theta)
+    assert np.all(theta + step >= problem.lower - 1e-12)
+    assert np.all(theta + step <= problem.upper + 1e-12)
+    assert step @ (2 * slope - square @ step) > 0
+    # Held against the exact minimum in the box.
+    exact = lsq_linear(columns, 1.0 * columns @ np.linalg.lstsq(square, slope, rcond=None)[0], (-1 - theta, 2 - theta))
+    best = exact.x @ (2 * slope - square @ exact.x)
+    assert step @ (2 * slope - square @ step) > 0.8 * best
 
 
 def test_noise_is_estimated_without_the_bias_of_what_was_fitted() -> None:

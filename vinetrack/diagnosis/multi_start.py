@@ -57,6 +57,9 @@ by as much."""
 FAR_BEYOND = 6.0
 """Times its plausible range. Chosen: twice what CREDIBLE refuses."""
 
+EXPONENTS = (0.2, 0.4, 0.7)
+"""Exponents from which a model is begun again. Chosen: about the published 0.37, each within a factor of two."""
+
 HOPELESS = 0.5
 """A climb goes on where its misfit, on a logarithmic scale, has come at least this far towards the best so far. Chosen
 for time."""
@@ -291,12 +294,29 @@ def from_other_starts(fit: Fit) -> Fit:
     -------
     Fit
     """
-    if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
+    starts = other_exponents(fit)
+    if len(starts) == 1:
         return fit
     slope = SubsetFitter(fit)
     points = sum(trial_data.time_s.size for trial_data in slope.data)
-    starts: list[Start] = [((), {EXPONENT: n}) for n in (0.2, 0.4, 0.7)]
     return _from(slope, starts, slope.here(), LOWER_PER_POINT * points)
+
+
+def other_exponents(fit: Fit) -> list[Start]:
+    """Starts from several exponents n of the damping law; the fit's own numbers alone where n is not free.
+
+    Parameters
+    ----------
+    fit
+        A fitted model.
+
+    Returns
+    -------
+    list of Start
+    """
+    if EXPONENT not in fit.model.parameter_names or EXPONENT in fit.options["fixed"]:
+        return [((), {})]
+    return [((), {EXPONENT: n}) for n in EXPONENTS]
 
 
 def without(fit: Fit, other: Fit) -> Fit:

@@ -7,6 +7,8 @@ fit, so that a likelihood which rises by it is no matter of taste.
 
 from __future__ import annotations
 
+import contextlib
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -14,6 +16,8 @@ from types import MappingProxyType
 import numpy as np
 
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.multi_start import SubsetFitter, best_subset_fit, full_fit, other_exponents
+from vinetrack.diagnosis.trial_effect_tests import scatters_much
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
@@ -81,6 +85,9 @@ def _pushes(fit: Fit, trial: TrialFit) -> bool:
 def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     """The model refitted with tails that may go slack; None where no tail pushes or the fit does not get through.
 
+    A fit that has bent its trials to do without the rule may have bent them until no tail pushes. So where they scatter
+    much the rule is also tried from other exponents, with nothing of the deviations.
+
     Parameters
     ----------
     fit : the fit that is questioned.
@@ -89,14 +96,20 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     -------
     LikelihoodRatio or None
     """
-    if not pushes(fit):
+    taut = any(one.trial.tail_slack != "free" and one.trial.travel_ratio != 1 for one in fit.predictor.data)
+    bent = taut and scatters_much(fit)
+    if not bent and not pushes(fit):
         return None
     data = [
         replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
     ]
-    predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
-    try:
-        after = refit(replace(fit, predictor=predictor), thorough=False)
-    except (FitError, SimulationError, np.linalg.LinAlgError):
+    slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
+    fits = []
+    with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
+        fits.append(refit(slack, thorough=False))
+    if bent and (climb := best_subset_fit(SubsetFitter(slack), other_exponents(slack), math.inf)) is not None:
+        fits += [other for other in (full_fit(slack, climb, afresh=True),) if other is not None]
+    if not fits:
         return None
+    after = max(fits, key=lambda known: known.log_likelihood)
     return likelihood_ratio(fit, (TAIL_SLACK,), after)

@@ -22,7 +22,6 @@ from vinetrack.inference.mixed_effects import (
     cross_products_vector,
     put_back,
     solve_each,
-    solve_scaled,
     spreads,
     trial_effect_prior,
 )
@@ -160,16 +159,12 @@ def deviance(
     float
     """
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
-    moves = problem.free & (np.diag(information) > 0)
-    if ((state.theta <= problem.lower) | (state.theta >= problem.upper)).any():
-        # What would rather lie beyond its bound must not be credited with what it would explain there.
-        step = bounded_solve(information, slope, problem, state.theta)
-        moves &= (step != 0) | ((state.theta > problem.lower) & (state.theta < problem.upper))
-    k = np.flatnonzero(moves)
-    total = square + log_det + part.log_constant
+    # What would rather lie beyond its bound must not be credited with what it would explain there.
+    step, moving = bounded_solve(information, slope, problem, state.theta)
+    total = square + log_det + part.log_constant - float(step @ (2 * slope - information @ step))
+    k = np.flatnonzero(moving)
     if k.size:
         inside = information[np.ix_(k, k)]
-        total -= float(slope[k] @ solve_scaled(inside, slope[k]))
         if restricted:
             total += float(np.linalg.slogdet(inside)[1])
         elif problem.random is not None and problem.random[k].any():

@@ -233,7 +233,7 @@ def newton_step(grams: Floats, problem: MixedProblem, state: FitState, damping: 
     reduced = square * (1 + damping * np.eye(square.shape[0]))
     reduced = reduced - cross_products(np.swapaxes(mixed, 1, 2) @ solved[:, :, :-1], problem)
     reduced_slope = slope - cross_products_vector(np.einsum("nuk,nu->nk", mixed, solved[:, :, -1]), problem)
-    step = bounded_solve(reduced, reduced_slope, problem, state.theta)
+    step, _ = bounded_solve(reduced, reduced_slope, problem, state.theta)
     spread_out = np.append(step, 0.0)[problem.index]
     trial_effect_step = solved[:, :, -1] - np.einsum("nuk,nk->nu", solved[:, :, :-1], spread_out)
     promised = float(step @ slope + np.sum(trial_effect_step * own_slope))
@@ -266,8 +266,10 @@ def trial_effect_step(grams: Floats, problem: MixedProblem, state: FitState, *, 
     return np.asarray(solve_each(square, slope[:, :, None])[:, :, 0])
 
 
-def bounded_solve(square: Floats, slope: Floats, problem: MixedProblem, theta: Floats) -> Floats:
-    """Solve for the numbers that may move; one at its bound that would leave it is held and the rest solved again.
+def bounded_solve(
+    square: Floats, slope: Floats, problem: MixedProblem, theta: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Solve for the numbers that may move; one that would pass a bound is held there and the rest solved again.
 
     Parameters
     ----------
@@ -281,20 +283,30 @@ def bounded_solve(square: Floats, slope: Floats, problem: MixedProblem, theta: F
 
     Returns
     -------
-    array, shape (n_free,)
+    step : array, shape (n_free,)
+    moving : array of bool, shape (n_free,)
+        Numbers that are not held: those that end at a bound are.
     """
     moving = problem.free & (np.diag(square) > 0)
     step = np.zeros_like(slope)
     for _ in range(slope.size + 1):
-        step[:] = 0.0
         k = np.flatnonzero(moving)
-        if k.size:
-            step[k] = solve_scaled(square[np.ix_(k, k)], slope[k])
-        out = moving & (((theta <= problem.lower) & (step < 0)) | ((theta >= problem.upper) & (step > 0)))
-        if not out.any():
+        if not k.size:
             break
-        moving &= ~out
-    return step
+        held = np.flatnonzero(~moving)
+        way = solve_scaled(square[np.ix_(k, k)], slope[k] - square[np.ix_(k, held)] @ step[held]) - step[k]
+        # Only as far as the first bound: every part of the way lowers the sum of squares.
+        here = theta[k] + step[k]
+        room = np.where(way > 0, problem.upper[k] - here, problem.lower[k] - here)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            part = np.where(way == 0, np.inf, np.maximum(room / way, 0.0))
+        first = float(np.min(part))
+        if first >= 1:
+            step[k] += way
+            break
+        step[k] += first * way
+        moving[k[part <= first]] = False
+    return step, moving
 
 
 def solve_scaled(square: Floats, slope: Floats) -> Floats:

@@ -169,22 +169,35 @@ def _iterated(
     state: FitState,
     held: FixedTerms,
 ) -> tuple[FitState, Floats, Floats, float]:
-    """Newton steps on columns that stay: the state, the products there, the way of each trial's unknowns, ln L."""
+    """Newton steps on columns that stay: the state, the products there, the way of each trial's unknowns, ln L.
+
+    Steps are taken as long as they raise ln L. Two numbers that only rounding tells apart may be promised any way along
+    which they cancel; no trajectory is followed here that would refuse it.
+    """
     grams = predictor.products(columns)
     moved = np.zeros((len(grams), grams.shape[-1] - 1))
     state = _variances(predictor, problem, grams, state, solution, held)
+    level = _level(grams, problem, state, solution)
     for _ in range(MOST_STEPS):
         step, own_step, promised = newton_step(grams, problem, state, 0.0)
-        theta = np.clip(state.theta + step, problem.lower, problem.upper)
-        change = np.column_stack([own_step, np.append(theta - state.theta, 0.0)[problem.index]])
-        grams, moved = _moved(grams, change), moved + change
-        before = replace(state, theta=theta, trial_effects=state.trial_effects + own_step)
-        state = _variances(predictor, problem, grams, before, solution, held)
+        change = np.column_stack([own_step, np.append(step, 0.0)[problem.index]])
+        there = _moved(grams, change)
+        before = replace(state, theta=state.theta + step, trial_effects=state.trial_effects + own_step)
+        after = _variances(predictor, problem, there, before, solution, held)
+        reached = _level(there, problem, after, solution)
+        if reached < level - SETTLED:
+            break
+        grams, moved, state, level = there, moved + change, after, reached
         if promised < SETTLED and variances_moved(before, state) < SETTLED_SPREAD:
             break
+    return state, grams, moved, level
+
+
+def _level(grams: Floats, problem: MixedProblem, state: FitState, solution: Solution) -> float:
+    """Marginal ln L at a state, spreads at their best for it."""
     part = marginal(grams, problem, state)
     spread = estimate_spreads(part, problem, state, solution.estimable, restricted=False)
-    return state, grams, moved, -0.5 * deviance(part, problem, state, spread, restricted=False)
+    return -0.5 * deviance(part, problem, state, spread, restricted=False)
 
 
 def _with_residual(columns: Sequence[Floats], residual: Sequence[Floats]) -> list[Floats]:
