@@ -43,7 +43,7 @@ def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_push
     found = fit(vt.base_model(), grown(60.0, "free"), profile=False)
     # As a fit looks that has taken the slack for scatter: no tail pushes, and pressures deviate by their most.
     bent = replace(found, solution=replace(found.solution, state=replace(found.solution.state, spread=(0.04, 0.15))))
-    monkeypatch.setattr("vinetrack.diagnosis.slack_hypothesis.pushes", lambda fit: False)
+    monkeypatch.setattr("vinetrack.diagnosis.slack_hypothesis.pushes", lambda _: False)
     slack = slack_fit(bent)
     assert slack is not None
     assert slack.sigma > 5
