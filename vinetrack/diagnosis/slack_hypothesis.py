@@ -96,7 +96,7 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     -------
     LikelihoodRatio or None
     """
-    taut = any(one.trial.tail_slack != "free" and one.trial.travel_ratio != 1 for one in fit.predictor.data)
+    taut = any(trial.trial.tail_slack != "free" and trial.trial.travel_ratio != 1 for trial in fit.trials)
     bent = taut and scatters_much(fit)
     if not bent and not pushes(fit):
         return None
