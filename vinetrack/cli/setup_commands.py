@@ -1,23 +1,24 @@
-"""The command `vinetrack setup`."""
+"""The commands that begin with recordings alone: `vinetrack setup` and `vinetrack track`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from vinetrack.cli.output import START
+from vinetrack.cli.output import START, JsonFile, as_json, tell
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the command line.
+    """Add the commands to the command line.
 
     Parameters
     ----------
     app : the command line.
     """
     app.command(name="setup", rich_help_panel=START)(setup)
+    app.command(name="track", rich_help_panel=START)(track)
 
 
 def setup(
@@ -52,3 +53,86 @@ def setup(
             from vinetrack.setup_page.setup_command import write_blanks
 
             write_blanks(folder, typer.echo)
+
+
+def track(
+    recording: Annotated[Path, typer.Argument(help="A film, a stack, or a folder of pictures.", metavar="RECORDING")],
+    fps: Annotated[
+        float | None, typer.Option("--fps", min=1e-6, help="Frames a second at capture.", show_default=False)
+    ] = None,
+    exposure_us: Annotated[
+        float | None, typer.Option("--exposure-us", min=0, help="Exposure of a frame, µs.", show_default=False)
+    ] = None,
+    mm_per_px: Annotated[
+        float | None, typer.Option("--mm-per-px", min=1e-9, help="Scale, for positions in metres.", show_default=False)
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("--calibration", metavar="FILE", help="An experiment.yaml whose `calibration:` is the scale."),
+    ] = None,
+    axis: Annotated[
+        str | None, typer.Option("--axis", metavar="x,y:x,y", help="Two points of the growth axis, px.")
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option("--frames", metavar="FROM:TO", help="First and last frame to use, from 0.")
+    ] = None,
+    body: Annotated[bool, typer.Option("--body", help="What moves does so as a whole, such as a ball.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; default RECORDING_track.")
+    ] = None,
+    json_file: JsonFile = None,
+    log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
+) -> None:
+    """The leading edge of one recording, without an experiment: a table, a strip and a clip.
+
+    Parameters
+    ----------
+    recording : a film, a stack, or a folder of pictures.
+    fps : frames a second at capture; None where not known.
+    exposure_us : exposure of a frame, µs; None where not known.
+    mm_per_px : scale, mm/px; None for none.
+    calibration : settings file whose calibration is the scale.
+    axis : two points of the picture, `x,y:x,y`, px.
+    frames : first and last frame to use, `from:to`, counted from 0.
+    body : whether what moves does so as a whole.
+    out : folder to write.
+    json_file : of the option `--json`.
+    log : file for messages and tracebacks; none if None.
+    """
+    from vinetrack.cli.main import _busy, _sentences
+
+    with _sentences(log):
+        from vinetrack.core.numbers import or_nan
+        from vinetrack.pipeline.track_stage import TrackOptions, track_file
+
+        options = TrackOptions(
+            fps=or_nan(fps), exposure_us=or_nan(exposure_us), mm_per_px=or_nan(mm_per_px), calibration=calibration,
+            axis=_cell("axis", axis, "--axis"), frames_used=_cell("frames_used", frames, "--frames"),
+            body=body, out=out,
+        )  # fmt: skip
+        lines: list[str] = []
+        say = lines.append if as_json(json_file) else _say
+        with _busy(f"tracking {recording.name}", log):
+            content = track_file(recording, options, say)
+        tell((), content, json_file)
+
+
+def _say(line: str) -> None:
+    from vinetrack.core.terminal import severity_first
+
+    typer.echo(severity_first(line))
+
+
+def _cell(column: str, text: str | None, option: str) -> Any:
+    """The value of an option that is written as a cell of that column; None where it is not given."""
+    from vinetrack.experiment.cells import CellError, read_cell
+    from vinetrack.experiment.schema import COLUMNS
+
+    if text is None:
+        return None
+    try:
+        return read_cell(COLUMNS[column], text)
+    except CellError as error:
+        raise typer.BadParameter(
+            f"{text!r} {error.message}: {error.allowed or error.remedy}", param_hint=option
+        ) from None

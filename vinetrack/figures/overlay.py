@@ -92,7 +92,7 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
     view : how the picture is laid out.
     picture : the recording's frame in grey levels, uint8 (see `levels`).
     frame : its number, which the edges count by.
-    time_ms : since release.
+    time_ms : since release; NaN where the rate of capture is not known: the frame is written in its place.
     edges : the tracked one first, then those of the models before and after, then that of corrected points.
 
     Returns
@@ -205,6 +205,7 @@ def _numbers(pen: ImageDraw, view: ClipView, edges: list[Edge], frame: int, time
             pen.text((0.6 * width, _row_y(i, line_px)), words, font=font, fill=BAR_INK, anchor="rm")
     before = " (before release)" if time_ms < 0 else ""
     words = f"{time_ms:.1f} ms{before}, {view.slowed:.3g} times slower".replace("-", "−")
+    words = words if math.isfinite(time_ms) else f"frame {frame}"
     pen.text((width - line_px, _row_y(1, line_px)), words, font=font, fill=BAR_MUTED, anchor="rm")
 
 

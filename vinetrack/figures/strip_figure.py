@@ -31,8 +31,8 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
     Parameters
     ----------
     title : name of the trial.
-    tracking : the tracker's result.
-    m_per_px : scale along the axis, for the axis in millimetres.
+    tracking : the tracker's result; where its times are NaN, frames are counted in their place.
+    m_per_px : scale along the axis, for the axis in millimetres; NaN for none.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def draw_strip(title: str, tracking: Tracking, m_per_px: float) -> Figure:
 def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -> None:
     track, strip = tracking.track, tracking.kymograph
     small = shrunk(strip, LARGEST_PX)
-    time_ms = 1e3 * track.time_s
+    time_ms, down = _downwards(tracking)
     dark, light = np.nanpercentile(small, [1, 99])
     half_ms = 0.5 * float(np.median(np.diff(time_ms)))
     extent = (-0.5, strip.shape[1] - 0.5, float(time_ms[-1]) + half_ms, float(time_ms[0]) - half_ms)
@@ -76,7 +76,7 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
         ax.plot(before[by_hand], time_ms[by_hand], "+", color=SKY, markersize=5, markeredgewidth=1.0)
         label = f"corrected by hand, N = {int(by_hand.sum())}"
         ax.plot(edge[by_hand], time_ms[by_hand], "o", color=GREEN, markersize=4, fillstyle="none", label=label)
-    ax.set(xlabel="along the growth axis (px)", ylabel="time (ms)")
+    ax.set(xlabel="along the growth axis (px)", ylabel=down)
     ax.grid(visible=False)
 
     def in_mm(px: Any) -> Any:
@@ -85,10 +85,17 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
     def in_px(mm: Any) -> Any:
         return mm / (1e3 * m_per_px)
 
-    top = ax.secondary_xaxis(-0.21, functions=(in_mm, in_px))
-    top.set_xlabel("along the growth axis (mm)")
+    if np.isfinite(m_per_px):
+        top = ax.secondary_xaxis(-0.21, functions=(in_mm, in_px))
+        top.set_xlabel("along the growth axis (mm)")
     legend_above(ax, 2)
     ax.set_title(title, loc="right", fontsize=10, color=MUTED, fontweight="normal")
+
+
+def _downwards(tracking: Tracking) -> tuple[np.ndarray, str]:
+    """Where every frame stands in the strip, ms or counted, and what that is."""
+    time_s = tracking.track.time_s
+    return (1e3 * time_s, "time (ms)") if np.isfinite(time_s).all() else (np.arange(float(time_s.size)), "frame")
 
 
 def shrunk(picture: np.ndarray, largest_px: int) -> np.ndarray:
@@ -144,4 +151,5 @@ def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -
         ax.plot(ends[:, 0], ends[:, 1], color=SKY if unusable else VERMILLION, linewidth=1.8)
     ax.set_xlim(-0.5, width - 0.5)
     ax.set_ylim(height - 0.5, -0.5)
-    ax.set_title(f"frame {frame}, {1e3 * track.time_s[frame]:.1f} ms", fontsize=9, fontweight="normal", color=INK)
+    at = f", {1e3 * track.time_s[frame]:.1f} ms" if np.isfinite(track.time_s[frame]) else ""
+    ax.set_title(f"frame {frame}{at}", fontsize=9, fontweight="normal", color=INK)

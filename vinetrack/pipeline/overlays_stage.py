@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from vinetrack.core.records import Trial
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import OverlaySettings
-    from vinetrack.figures.overlay import Edge
+    from vinetrack.figures.overlay import ClipView, Edge
+    from vinetrack.video.frames import Recording
 
 log = logging.getLogger(__name__)
 
@@ -246,9 +247,9 @@ def _pictures(
     slowed: float,
     settings: OverlaySettings,
 ) -> Iterator[NDArray[np.uint8]]:
-    from vinetrack.figures.overlay import ClipView, compose, levels
+    from vinetrack.figures.overlay import ClipView
     from vinetrack.video.axis import Axis
-    from vinetrack.video.frames import inspect_recording, iterate_frames
+    from vinetrack.video.frames import inspect_recording
 
     assert trial.video is not None
     recording = inspect_recording(trial.video)
@@ -267,6 +268,30 @@ def _pictures(
     shake_px = shake_along(line, len(track))
     edges = [replace(edge, along_px=edge.along_px + shake_px) for edge in edges]
     time_ms = 1e3 * (track["time_s"].to_numpy(dtype=float) - release_s)
+    yield from draw_over(recording, view, edges, time_ms, shown, stride)
+
+
+def draw_over(
+    recording: Recording, view: ClipView, edges: list[Edge], time_ms: Floats, shown: range, stride: int
+) -> Iterator[NDArray[np.uint8]]:
+    """Draw edges over the frames of a recording.
+
+    Parameters
+    ----------
+    recording : opened.
+    view : how the picture is laid out.
+    edges : what is drawn, px along the axis of the view.
+    time_ms : of every frame since release, shape (n_frames,); NaN where the rate of capture is not known.
+    shown : first and last frame.
+    stride : every how many frames one is shown.
+
+    Yields
+    ------
+    pictures of the clip, RGB, uint8, shape (height, width, 3).
+    """
+    from vinetrack.figures.overlay import compose, levels
+    from vinetrack.video.frames import iterate_frames
+
     low = high = 0.0
     for frame, picture in enumerate(iterate_frames(recording)):
         if frame >= shown.stop:

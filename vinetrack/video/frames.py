@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
+TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
+"""Formats under which FFmpeg takes any text for a picture of its letters. Source: FFmpeg, bintext.c, tty.c."""
+
 DECODER_THREADS = 2
 """Chosen: as many recordings are tracked at once as there are cores; more threads gain nothing then."""
 
@@ -221,6 +224,8 @@ def _inspect_container(path: Path) -> Recording:
 
     try:
         with quiet_log() as complaints, av.open(str(path)) as container:
+            if container.format.name in TEXT_FORMATS:
+                raise RecordingError(f"{path.name}: a text, not a recording; name a film, or a folder of pictures")
             if not container.streams.video:
                 raise RecordingError(f"{path.name}: holds no picture; name a video file")
             stream = container.streams.video[0]
