@@ -4,8 +4,8 @@
 
 Sheets of vines and of falling bodies with one to four trials, tables of positions with steady, accelerating, standing,
 sticking and reversing motion, few points or many, with and without pressure; settings of all sorts. Every stage of
-`vinetrack run` is called in this process. A fault is an exception that is no sentence for a person, or a trial whose
-reason says so. Seeds 21000 to 21499 and 31000 to 31013 were looked at while faults were mended.
+`vinetrack run` is called in this process. A fault is an exception that is no sentence for a person, or a trial, a fit
+or a diagnosis whose reason says so. Seeds 21000 to 21499 and 31000 to 31013 were looked at while faults were mended.
 """
 
 from __future__ import annotations
@@ -137,6 +137,7 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
     from vinetrack.pipeline.damping_stage import fit_law
     from vinetrack.pipeline.diagnosis_stage import diagnose_results
     from vinetrack.pipeline.figures_stage import draw_campaign, draw_trials
+    from vinetrack.pipeline.model_stage import INTERNAL_FAULT as MODEL_FAULT
     from vinetrack.pipeline.model_stage import fit_model
     from vinetrack.pipeline.report_stage import write_report
     from vinetrack.pipeline.tracks_stage import INTERNAL_FAULT, analyse_tracks, gather
@@ -165,7 +166,9 @@ def run_through(folder: Path, results: Path, figures: bool = True) -> list[str]:
         except Exception:
             return [f"{name}: {traceback.format_exc()}"]
     rows = [read_json(Results(results).analysed(name))["row"] for name in read.names if name not in read.left_out]
-    return [f"tracks: {row['trial']}: {row['reason']}" for row in rows if row["reason"] == INTERNAL_FAULT]
+    faults = [f"tracks: {row['trial']}: {row['reason']}" for row in rows if row["reason"] == INTERNAL_FAULT]
+    refused = {path.stem: read_json(path)["refused"] for path in (Results(results).fit, Results(results).diagnosis)}
+    return [*faults, *(f"{stage}: {reason}" for stage, reason in refused.items() if reason == MODEL_FAULT)]
 
 
 def main() -> None:

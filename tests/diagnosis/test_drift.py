@@ -13,6 +13,7 @@ from counted import trajectories
 from grown import Pairs, grown, pairs_of, sheet
 
 import vinetrack as vt
+from vinetrack.diagnosis import drift_along
 from vinetrack.diagnosis.drift import DRIFT_COLUMNS, GROUP_COLUMNS, Drift, drift
 from vinetrack.diagnosis.per_trial_estimates import lay, per_trial_estimates
 from vinetrack.dynamics.model import Model
@@ -72,6 +73,19 @@ def test_b_that_makes_up_for_an_emptying_chamber_grows_along_the_way(depleting: 
     assert rows["significant"].all()
     assert (rows["to_level"] > rows["from_level"]).all()
     assert any("larger in the second half of the growth" in said for said in depleting.sentences)
+
+
+def test_a_trial_that_stands_still_in_one_half_of_its_way_says_nothing_of_b(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = fitted(pairs_of(grown(sheet((4,), replicates=2), 58)))
+    laid = lay(found)
+    values = per_trial_estimates(found, B, laid)
+    halves = drift_along._halves(found, laid, values.trial_effects)
+    spoilt = halves.deviation.copy()
+    spoilt[0, 1] = 1000.0
+    monkeypatch.setattr(drift_along, "_halves", lambda *_: replace(halves, deviation=spoilt))
+    (tested,) = drift_along.along_growth(found, laid, values)
+    assert tested.row["n_trials"] == len(found.trials) - 1
+    assert 0 <= tested.row["change"] < 0.1
 
 
 def test_a_yield_pressure_pulled_from_the_sheet_is_said(depleting: Drift) -> None:

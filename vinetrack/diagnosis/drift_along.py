@@ -31,6 +31,11 @@ LEAST_SCATTER = 2e-3
 """Of the rise of ln B in a single trial: that replicates agree better is taken for chance. Chosen: a tenth of the
 usual scatter of B within a batch."""
 
+LARGEST_STEP = 3.0
+"""Deviation of ln B, a factor of 20, beyond which the linear step of a half says nothing: its trial is passed over.
+Chosen: what builds up along the way is some per cent to a factor of two; a tip that stands still in one half asks for
+e^1000. At half (4.5) and twice (400) the tests of sound trials are the same."""
+
 HALVES = (0.25, 0.75)
 """Middles of the halves, as parts of the growth. Defined by the halves."""
 
@@ -65,7 +70,7 @@ def along_growth(fit: Fit, laid: AlignedTrial, values: PerTrialEstimates) -> Ite
         return
     halves = _halves(fit, laid, values.trial_effects)
     vines = np.array([trial.vine for trial in halves.trials])
-    known = np.isfinite(halves.deviation).all(axis=1)
+    known = (np.abs(halves.deviation) <= LARGEST_STEP).all(axis=1)
     names = list(dict.fromkeys(vines[known]))
     for vine in [*names, *([""] if len(names) > 1 else [])]:
         chosen = np.flatnonzero(known & ((vines == vine) | (vine == "")))
