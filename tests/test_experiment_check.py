@@ -81,6 +81,35 @@ def test_check_looks_at_videos_and_calls_who_can_open_them(folder: Path) -> None
     ]
 
 
+def test_a_misspelt_video_is_answered_with_the_file_that_no_trial_uses(folder: Path) -> None:
+    for name in ("d12_24kPa_1.mp4", "d12_24kPa_2.MP4", "notes.txt"):
+        (folder / name).write_bytes(b"film")
+    rows = "a,d12_24kPa_1.mp4,24,200,280,28,3,\nb,d12_24kP_2.mp4,24,200,280,28,3,\nc,other.avi,24,200,280,28,3,\n"
+    write(folder, f"{HEADER.replace('track', 'video')}\n{rows}", "capture_fps: 1000\n")
+    remedies = {problem.trial: problem.remedy for problem in check_experiment(folder)}
+    assert remedies == {
+        "b": "did you mean d12_24kPa_2.MP4?",
+        "c": "check the path and its upper and lower case",
+    }
+
+
+def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(folder: Path) -> None:
+    for name in "ab":
+        (folder / f"{name}.mp4").write_bytes(b"film")
+    rows = "".join(f"{name},{name}.mp4,24,200,280,28,3,\n" for name in "ab")
+    write(folder, f"{HEADER.replace('track', 'video')}\n{rows}", "capture_fps: 60\n")
+
+    def slow(_experiment: Experiment, trials: list[Trial]) -> list[Problem]:
+        return [Problem(message="is the rate of playback", column="capture_fps", trial=trial.name) for trial in trials]
+
+    found = check_experiment(folder, slow)
+    assert [(problem.file, problem.line, problem.trial) for problem in found] == [
+        ("experiment.yaml", 0, "a"),
+        ("experiment.yaml", 0, "b"),
+    ]
+    assert format_problems(found) == ["error: experiment.yaml, trial a and 1 more: capture_fps is the rate of playback"]
+
+
 def test_check_finds_a_missing_calibration_picture(folder: Path) -> None:
     write(folder, GOOD, "calibration: {kind: checkerboard, image: c.png, squares: [5, 5], square_mm: 5}\n")
     (problem,) = check_experiment(folder)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 COMES_CLOSE = 0.6
 """Chosen: part of the letters that two names share from which one may be a slip for the other; difflib's default."""
@@ -72,6 +72,8 @@ class ExperimentError(UserError):
 def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     """Say the problems in at most `limit` lines, errors first; where there are more, the last line says how many.
 
+    One that several trials have alike is said once.
+
     Parameters
     ----------
     problems : in any order.
@@ -84,13 +86,24 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
     >>> format_problems([Problem(message="is blank", column=f"c{i}") for i in range(4)], limit=3)
     ['error: c0 is blank', 'error: c1 is blank', '… and 2 more (2 errors, 0 warnings)']
     """
-    ordered = sorted(problems, key=lambda problem: problem.severity != "error")
+    ordered = sorted(_once(problems), key=lambda problem: problem.severity != "error")
     if len(ordered) <= limit:
         return [str(problem) for problem in ordered]
     remaining = ordered[limit - 1 :]
     errors = sum(problem.severity == "error" for problem in remaining)
     more = f"… and {len(remaining)} more ({errors} errors, {len(remaining) - errors} warnings)"
     return [*(str(problem) for problem in ordered[: limit - 1]), more]
+
+
+def _once(problems: Iterable[Problem]) -> list[Problem]:
+    """Problems that differ in trial and line alone as one that names the first and counts the rest."""
+    alike: dict[Problem, list[Problem]] = {}
+    for problem in problems:
+        alike.setdefault(replace(problem, trial="", line=0), []).append(problem)
+    return [
+        group[0] if len(group) == 1 else replace(group[0], line=0, trial=f"{group[0].trial} and {len(group) - 1} more")
+        for group in alike.values()
+    ]
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vinetrack.core.files import file_size
-from vinetrack.core.problems import ExperimentError, Problem, format_problems
+from vinetrack.core.problems import COMES_CLOSE, ExperimentError, Problem, format_problems
 from vinetrack.core.records import Correction, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
 from vinetrack.experiment.cells import oddity
@@ -51,7 +51,8 @@ class Experiment:
     `trials` are those to analyse, in the order of the sheet; `failed` maps the name of every trial with a fault to
     the reason, `left_out` those that the sheet puts aside (`use: no`) likewise; `names` lists all three in the order
     of the sheet and `lines` gives their lines in it. `problems` holds everything that was found, warnings too.
-    `angle_blank` names the vines whose direction of growth nobody stated: it counts as straight down.
+    `angle_blank` names the vines whose direction of growth nobody stated: it counts as straight down. `columns` are
+    those of the sheet: what it lacks stands in the settings.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Experiment:
     problems: tuple[Problem, ...] = ()
     lines: dict[str, int] = field(default_factory=dict)
     angle_blank: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -148,7 +150,8 @@ def read_experiment(folder: Path | str, strict: bool | None = None) -> Experimen
     strict = strict if strict is not None else settings is not None and settings.strict
     if settings is None or not sheet_is_sound or (strict and any(row.failed and row.in_use for row in rows)):
         raise ExperimentError(problems)
-    return _with_corrections(_assemble(folder, settings, rows, problems), corrections)
+    experiment = _assemble(folder, settings, rows, problems, table.columns if table else ())
+    return _with_corrections(experiment, corrections)
 
 
 def _with_corrections(experiment: Experiment, corrections: Mapping[str, tuple[Correction, ...]]) -> Experiment:
@@ -160,7 +163,9 @@ def _with_corrections(experiment: Experiment, corrections: Mapping[str, tuple[Co
     return replace(experiment, trials=trials)
 
 
-def _assemble(folder: Path, settings: ExperimentSettings, rows: list[Row], problems: list[Problem]) -> Experiment:
+def _assemble(
+    folder: Path, settings: ExperimentSettings, rows: list[Row], problems: list[Problem], columns: Iterable[str]
+) -> Experiment:
     """Sort the rows into trials to analyse, failed and left out."""
     good = [row for row in rows if row.in_use and not row.failed]
     errors = {row.name: [p.reason for p in row.problems if p.severity == "error"] for row in rows if row.in_use}
@@ -174,6 +179,7 @@ def _assemble(folder: Path, settings: ExperimentSettings, rows: list[Row], probl
         problems=tuple(problems),
         lines={row.name: row.line for row in rows},
         angle_blank=tuple(row.name for row in rows if "growth_angle_deg" not in row.values and row.travel_ratio == 2),
+        columns=tuple(columns),
     )
 
 
@@ -349,17 +355,24 @@ def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> l
     problems += order_problems(experiment.trials, SHEET)
     of_trials: list[Problem] = []
     there: list[Trial] = []
+    used = {trial.video for trial in experiment.trials if trial.video}
     for trial in experiment.trials:
-        of_trial = _check_track(trial) if trial.track else _check_video(trial)
+        of_trial = _check_track(trial) if trial.track else _check_video(trial, used)
         of_trials += [replace(problem, trial=trial.name) for problem in of_trial]
         if trial.video and not of_trial:
             there.append(trial)
     if there and open_videos is not None:
         of_trials += open_videos(experiment, there)
-    lines = experiment.lines
-    return problems + [
-        replace(problem, file=SHEET, line=lines[problem.trial]) if problem.trial else problem for problem in of_trials
-    ]
+    return problems + [_placed(problem, experiment) for problem in of_trials]
+
+
+def _placed(problem: Problem, experiment: Experiment) -> Problem:
+    """A problem of a trial with its place: the line of the sheet, or the settings where those alone state the value."""
+    if not problem.trial:
+        return problem
+    if problem.column in SHARED and problem.column not in experiment.columns:
+        return replace(problem, file=SETTINGS)
+    return replace(problem, file=SHEET, line=experiment.lines[problem.trial])
 
 
 def _check_track(trial: Trial) -> list[Problem]:
@@ -388,8 +401,8 @@ def _check_track(trial: Trial) -> list[Problem]:
     return [Problem(message=message, severity="warning", **place) for message in remarks]
 
 
-def _check_video(trial: Trial) -> list[Problem]:
-    """Whether there is something to decode at all."""
+def _check_video(trial: Trial, used: Set[Path]) -> list[Problem]:
+    """Whether there is something to decode at all; `used` are the files that any trial names."""
     path = trial.video
     if path is None:
         return []
@@ -401,7 +414,19 @@ def _check_video(trial: Trial) -> list[Problem]:
         if file_size(path) == 0:
             return [Problem(message="is an empty file", remedy="copy it anew", **place)]
     except (FileNotFoundError, ValueError):
-        return [Problem(message="does not exist", remedy="check the path and its upper and lower case", **place)]
+        return [Problem(message="does not exist", remedy=_nearest_file(path, used), **place)]
     except OSError as error:
         return [Problem(message=f"cannot be read: {error.strerror}", **place)]
     return []
+
+
+def _nearest_file(path: Path, used: Set[Path]) -> str:
+    """What to do where a file is not there: an unused name in its folder that comes close, or where to look."""
+    try:
+        names = sorted(entry.name for entry in path.parent.iterdir() if entry not in used)
+    except (OSError, ValueError):
+        names = []
+    close = difflib.get_close_matches(path.name.lower(), [name.lower() for name in names], 1, COMES_CLOSE)
+    if not close:
+        return "check the path and its upper and lower case"
+    return f"did you mean {next(name for name in names if name.lower() == close[0])}?"

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+import contextlib
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Any
 
 from vinetrack.core.problems import ExperimentError, Problem, format_problems
-
-if TYPE_CHECKING:
-    from vinetrack.core.records import Trial
 
 
 @dataclass(frozen=True)
@@ -51,10 +46,11 @@ def check_folder(folder: Path) -> Checked:
     -------
     Checked
     """
-    from vinetrack.experiment.folder import check_experiment, read_experiment
+    from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
     from vinetrack.pipeline.workflow import path_problems
-    from vinetrack.planning.pressure_plausibility import pressure_problems
+    from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
+    from vinetrack.tracks.importers import TrackError, load_track
     from vinetrack.video.recording_facts import facts_entry, facts_rows
     from vinetrack.video.survey import Surveyor
 
@@ -67,29 +63,16 @@ def check_folder(folder: Path) -> Checked:
     facts = {trial.name: known for trial, known in surveyor.facts.items()}
     trials = [trial for trial in experiment.trials if trial.name in facts]
     speeds = [(trial, facts[trial.name].mean_speed_m_s) for trial in trials]
-    speeds += [(trial, _track_speed(trial)) for trial in experiment.trials if trial.track is not None]
+    for trial in experiment.trials:
+        if trial.track is not None:
+            with contextlib.suppress(TrackError):
+                speeds.append((trial, track_speed(load_track(trial))))
     # Sizes that are wrong make the damping wrong that speeds imply.
     if not any(problem.severity == "error" for problem in problems):
-        problems += pressure_problems(speeds)
+        stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS
+        problems += [replace(problem, file=stated_in) for problem in pressure_problems(speeds)]
     seen = [facts[trial.name] for trial in trials]
     lines = facts_rows(seen, trials) if seen else []
     if 0 < len(surveyor.looked_into) < len(seen):
         lines.append(f"{len(surveyor.looked_into)} of {len(seen)} recordings were looked into, one of each condition")
     return Checked(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(experiment.blank_notes))
-
-
-def _track_speed(trial: Trial) -> float:
-    """Mean speed of the leading edge over the middle of its travel, m/s; NaN where the track does not say."""
-    from vinetrack.tracks.importers import TrackError, load_track
-
-    try:
-        track = load_track(trial)
-    except TrackError:
-        return math.nan
-    time_s, position_m = track.time_s[track.usable], track.lead_position_m[track.usable]
-    travel_m = np.maximum.accumulate(position_m - position_m[0]) if position_m.size else position_m
-    if travel_m.size < 5 or not travel_m[-1] > 0:
-        return math.nan
-    early, late = (int(np.searchsorted(travel_m, part * travel_m[-1])) for part in (0.2, 0.9))
-    duration_s = float(time_s[late] - time_s[early])
-    return float(travel_m[late] - travel_m[early]) / duration_s if duration_s > 0 else math.nan

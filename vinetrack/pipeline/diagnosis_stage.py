@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +17,9 @@ import numpy as np
 from vinetrack.core.numbers import with_error
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.narrative.power_text import power_brief
+from vinetrack.narrative.verdict_summary import joined
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
-from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_result
+from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_json, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
 
 if TYPE_CHECKING:
@@ -67,7 +69,7 @@ def diagnose_results(
     results = Results(folder)
     pairs, _ = measured(experiment, results)
     try:
-        diagnosis = diagnose_pairs(experiment, pairs, report)
+        diagnosis = beside_contradictions(diagnose_pairs(experiment, pairs, report), results, pairs)
     except Exception as error:
         return _write_refusal(results, experiment, _reason(error))
     log.info("%s: %s", diagnosis.verdict, diagnosis.explanation)
@@ -94,6 +96,58 @@ def diagnose_pairs(experiment: Experiment, pairs: Sequence[Any], report: Report 
     from vinetrack.diagnosis.diagnose import diagnose
 
     return diagnose(experiment, tracks={trial.name: track for trial, track in pairs}, report=report)
+
+
+def beside_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequence[tuple[Trial, Track]]) -> Diagnosis:
+    """The verdict with what was seen that contradicts the sheet: a wrong scale or unit passes for physics.
+
+    Parameters
+    ----------
+    diagnosis : as made from the trials.
+    results, pairs : as of `seen_against_stated`.
+
+    Returns
+    -------
+    Diagnosis
+    """
+    contradicted = seen_against_stated(results, pairs)
+    if not contradicted:
+        return diagnosis
+    columns = joined(list(contradicted))
+    doubt = f"But what was seen contradicts the sheet in {columns}: put that right before you believe this verdict."
+    return replace(
+        diagnosis,
+        explanation=f"{diagnosis.explanation} {doubt}",
+        notes=(*diagnosis.notes, *contradicted.values()),
+    )
+
+
+def seen_against_stated(results: Results, pairs: Sequence[tuple[Trial, Track]]) -> dict[str, str]:
+    """What recordings and speeds contradict in the sheet, in a sentence for each column.
+
+    Parameters
+    ----------
+    results : results folder, with what the tracker noted of each trial.
+    pairs : sequence of (Trial, Track)
+
+    Returns
+    -------
+    dict of str
+        By name of the column.
+    """
+    from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
+
+    noted: dict[str, list[tuple[str, str]]] = {}
+    for trial, _ in pairs:
+        for entry in read_json(results.analysed(trial.name)).get("contradictions", []):
+            noted.setdefault(entry["column"], []).append((trial.name, entry["reason"]))
+    sentences = {
+        column: f"{of_trial[0][0]}: {of_trial[0][1]}"
+        + (f" (and {len(of_trial) - 1} more trial{'s' if len(of_trial) > 2 else ''})" if len(of_trial) > 1 else "")
+        for column, of_trial in noted.items()
+    }
+    speeds = [(trial, track_speed(track)) for trial, track in pairs]
+    return sentences | {problem.column: problem.reason for problem in pressure_problems(speeds)}
 
 
 def _reason(error: Exception) -> str:

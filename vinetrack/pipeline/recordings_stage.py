@@ -18,7 +18,8 @@ from vinetrack.pipeline.tracks_stage import INTERNAL_FAULT, analyse, failed_row,
 from vinetrack.results.folder_layout import Results, read_json, read_result
 
 if TYPE_CHECKING:
-    from vinetrack.core.records import Track, Trial
+    from vinetrack.core.problems import Problem
+    from vinetrack.core.records import Trial
     from vinetrack.experiment.folder import Experiment
     from vinetrack.experiment.settings import RunSettings
     from vinetrack.video.measure import Measurement
@@ -74,7 +75,9 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     measurement = None
     try:
         measurement = measure_recording(trial, experiment.settings, experiment.folder)
-        track = _with_size_notes(trial, measurement)
+        differing = _differences(trial, measurement)
+        track = measurement.tracking.track
+        track = replace(track, notes=(*track.notes, *(problem.reason for problem in differing)))
         if trial.pressure_trace is not None:
             track = attach_pressure(track, *read_pressure_trace(trial.pressure_trace))
         reason, fault = analyse(
@@ -87,7 +90,10 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
             scale_rel_sigma=measurement.scale_rel_sigma,
             tube_width_mm=1e3 * measurement.m_per_px * measurement.tracking.tube_width_px,
         )
-        _add_view(results, trial.name, measurement, getattr(experiment.settings.calibration, "image", None))
+        view = _view(measurement, getattr(experiment.settings.calibration, "image", None))
+        contradictions = [{"column": problem.column, "reason": problem.reason} for problem in differing]
+        path = results.analysed(trial.name)
+        write_json(path, read_json(path) | view | {"contradictions": contradictions})
     except (RecordingError, TrackError) as error:
         reason, fault = str(error), ""
         write_empty(results, trial.name, failed_row(trial, reason))
@@ -100,8 +106,8 @@ def _analyse(experiment: Experiment, trial: Trial, results: Results, settings: R
     return reason, fault
 
 
-def _with_size_notes(trial: Trial, measurement: Measurement) -> Track:
-    """The track with a note for every size or exposure in the picture that differs from the sheet.
+def _differences(trial: Trial, measurement: Measurement) -> list[Problem]:
+    """Every size and exposure in the picture that differs from the sheet.
 
     Raises
     ------
@@ -116,12 +122,11 @@ def _with_size_notes(trial: Trial, measurement: Measurement) -> Track:
     errors = [problem.reason for problem in problems if problem.severity == "error"]
     if errors:
         raise RecordingError("; ".join(errors))
-    track = measurement.tracking.track
-    return replace(track, notes=(*track.notes, *(problem.reason for problem in problems)))
+    return problems
 
 
-def _add_view(results: Results, name: str, measurement: Measurement, image: str | None) -> None:
-    """Add to the file of a trial what the scale of its recording rests on, and the axis its `edge_px` counts along."""
+def _view(measurement: Measurement, image: str | None) -> dict[str, Any]:
+    """What the scale of a recording rests on, and the axis its `edge_px` counts along."""
     calibration = measurement.calibration
     entry: dict[str, Any] = {
         "kind": "sheet" if calibration is None else calibration.kind,
@@ -137,8 +142,7 @@ def _add_view(results: Results, name: str, measurement: Measurement, image: str 
     shake_px = measurement.tracking.shake_px
     line = {"from_px": axis.from_px, "to_px": axis.to_px, "width_px": axis.width_px}
     line |= {"shake_px": shake_px.round(2)} if np.any(shake_px) else {}
-    path = results.analysed(name)
-    write_json(path, read_json(path) | {"calibration": entry, "axis": line})
+    return {"calibration": entry, "axis": line}
 
 
 def _draw(trial: Trial, results: Results, measurement: Measurement | None, reason: str, settings: RunSettings) -> None:
