@@ -17,6 +17,7 @@ from vinetrack.diagnosis.compare import compare
 from vinetrack.diagnosis.ladder import (
     LADDER_COLUMNS,
     MOVED_COLUMNS,
+    Errors,
     excess,
     highest_pressure,
     in_sample,
@@ -27,6 +28,7 @@ from vinetrack.diagnosis.ladder import (
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.left_out import predict_trials
 from vinetrack.laboratory.tracks import BASE, Nature, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
@@ -88,6 +90,20 @@ def test_on_conditions_left_out_the_right_effect_is_within_a_tenth_of_the_truth_
         squares.append((left_out(found).rms_m ** 2, in_sample(with_the_truth(pairs)).rms_m ** 2))
     outside, truth = np.sqrt(np.mean(squares, axis=0))
     assert outside < 1.1 * truth
+
+
+def test_the_error_left_out_is_that_of_a_fit_that_never_saw_the_condition(pairs: Pairs) -> None:
+    """By hand: the model fitted anew to all other conditions, and laid on the one that was left out."""
+    one_vine = [pair for pair in pairs if pair[0].name.startswith("R2")]
+    found = vt.fit(vt.base_model(), one_vine, profile=False)
+    predicted = []
+    for condition in dict.fromkeys(trial.condition for trial, _ in one_vine):
+        seen = [pair for pair in one_vine if pair[0].condition != condition]
+        unseen = [pair for pair in one_vine if pair[0].condition == condition]
+        predicted += predict_trials(vt.fit(vt.base_model(), seen, profile=False), unseen, from_rest=True)
+    by_hand = Errors(tuple(predicted), {}).rms_m
+    assert left_out(found).rms_m == pytest.approx(by_hand, rel=0.05)
+    assert by_hand > 1.1 * in_sample(found).rms_m
 
 
 def test_what_is_held_in_advance_errs_alike_in_and_out_of_sample(pairs: Pairs) -> None:

@@ -14,7 +14,14 @@ from scipy.stats import multivariate_normal
 
 from vinetrack.inference.intervals import degrees_of_freedom, precision
 from vinetrack.inference.marginal_likelihood import deviance, estimate_noise, estimate_spreads, marginal
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, bounded_solve, cross_products, newton_step
+from vinetrack.inference.mixed_effects import (
+    FitState,
+    MixedProblem,
+    bounded_solve,
+    cross_products,
+    newton_step,
+    spreads,
+)
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
@@ -207,6 +214,28 @@ def test_noise_is_estimated_without_the_bias_of_what_was_fitted() -> None:
     # 9000 points: ρ to 0.01, σ² to 2 %. Without counting the line ρ would come out 0.06 too small.
     assert found == pytest.approx(rho, abs=0.03)
     assert variance.mean() == pytest.approx(1 - rho**2, rel=0.05)
+
+
+@pytest.mark.parametrize(("louder", "lowest", "highest"), [(1.0, 0.0, 0.5), (5.0, 0.8, 1.2)])
+def test_the_noise_of_short_trials_is_drawn_together_as_far_as_chance_explains_it(
+    louder: float, lowest: float, highest: float
+) -> None:
+    """Of twelve points σ² scatters by 41 % of itself; what half of the trials have 25 times over is no chance."""
+    draw = np.random.default_rng(20670)
+    n_trials, count = 40, 12
+    sd = np.where(np.arange(n_trials) % 2, louder, 1.0)
+    columns = [np.column_stack([np.zeros((count, 4)), s * draw.standard_normal(count)]) for s in sd]
+    grams = all_products(columns, [np.arange(count) == 0] * n_trials)
+    frame, state = frame_of(n_trials, count, 0), state_of(n_trials, 0, 1e-5, rho=0.0, sigma=1.0)
+    _, variance = estimate_noise(grams, frame, state, rho=0.0)
+    alone = np.array([np.mean(block[:, -1] ** 2) for block in columns])
+    assert lowest < np.std(np.log(variance)) / np.std(np.log(alone)) < highest
+    assert np.mean(variance) == pytest.approx(np.mean(alone), rel=0.1)
+
+
+def test_a_measured_pressure_scatters_by_the_error_of_its_gauge() -> None:
+    frame = replace(frame_of(3, 25, 1), gauge_error=np.array([0.0, 4e-3, 0.0]))
+    assert spreads(frame, (0.01, 0.03)) == pytest.approx(np.array([[0.01, 0.03], [4e-3, 0.03], [0.01, 0.03]]))
 
 
 def test_one_step_solves_a_straight_problem() -> None:

@@ -310,3 +310,15 @@ def test_short_windows_late_in_a_long_track_are_fitted_as_well_as_any(first, poi
     _, slope, curve = np.polynomial.polynomial.polyfit((t - (t[0] + t[-1]) / 2) / half_s, y - y.mean(), 2)
     assert mean[0] == pytest.approx(slope / half_s, rel=1e-9)
     assert drift[0] == pytest.approx(4 * curve / slope, rel=1e-8, abs=1e-9)
+
+
+def test_a_speed_that_bends_within_the_window_is_known_no_better_than_the_bend():
+    """P₃ of the window's own time moves its ends by 2c: the mean speed of the cubic is c/half more than the line's."""
+    time_s = np.arange(200) / 1000
+    u = 2 * time_s / time_s[-1] - 1
+    bend_m_s = 4e-3
+    y = 0.5 * time_s + bend_m_s * time_s[-1] / 2 * np.polynomial.legendre.legval(u, [0, 0, 0, 1])
+    track = make_track(time_s, y + ar1(200, 1e-6, 0.0, np.random.default_rng(1000)))
+    window = user_window(track, estimate_kinematics(track, travel_ratio=2), (0.0, 1.0))
+    assert window.x_ss_m_s == pytest.approx(1.0, abs=5e-4)
+    assert window.x_ss_sigma_m_s == pytest.approx(2 * bend_m_s, rel=0.05)

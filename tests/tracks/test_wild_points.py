@@ -107,3 +107,11 @@ def test_a_point_that_a_person_has_placed_is_not_wild() -> None:
         reject_wild_points(Track(time_s, position_m, np.full(60, 1e-6), flag, np.full(60, np.nan))).flag[30]
         == "corrected"
     )
+
+
+def test_where_one_point_in_eight_is_wild_none_is_rejected() -> None:
+    """The test then does not describe the track: what it would leave is no measurement of that motion."""
+    rows = np.arange(10, 290, 8)
+    draw = np.random.default_rng(20002)
+    track = displaced(steady_track(seed=20002), rows, draw.choice([-1, 1], rows.size) * 5e-3)
+    assert not wild_points(track.time_s, track.lead_position_m).any()

@@ -376,13 +376,26 @@ def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Sequence[Floa
     -------
     Structure
     """
-    from scipy.stats import f as fisher
-    from scipy.stats import norm, t
-
     answers = effect_sensitivities(fit, _probe_shapes(fit))
     if not answers.shapes:
         return Structure(0.0, 0, 1.0, 0.0)
-    scores = scores_of(fit, products_of(fit, columns, answers, systematics))
+    return structure_in(scores_of(fit, products_of(fit, columns, answers, systematics)))
+
+
+def structure_in(scores: Scores) -> Structure:
+    """What the scores of probes amount to together, and the loudest of them alone; see `structure_of`.
+
+    Parameters
+    ----------
+    scores : of the probes.
+
+    Returns
+    -------
+    Structure
+    """
+    from scipy.stats import f as fisher
+    from scipy.stats import norm, t
+
     root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
     live = np.diag(scores.information) > 0
     information = (scores.information / root[:, None] / root)[np.ix_(live, live)]

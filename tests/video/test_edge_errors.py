@@ -1,0 +1,108 @@
+"""Stated errors of the edge against its true ones, in pictures drawn here and by other code; seeds 331 and up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plain_scene import Plan, plain_scene
+from scipy.special import ndtr
+
+from vinetrack.core.records import Trial
+from vinetrack.video.axis import Axis
+from vinetrack.video.edge_repair import BANDS
+from vinetrack.video.frames import Frames, Recording, Region
+from vinetrack.video.track import Tracking, track_frames
+
+SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
+ROWS, COLUMNS, TUBE = 120, 460, 40
+SUB_INSTANTS = 60
+
+
+def tracked(luma: np.ndarray, exposure: float, axis: Axis | None = None) -> Tracking:
+    """One tenth of a millimetre a pixel, a thousand frames a second."""
+    n, height, width = luma.shape
+    recording = Recording(path=Path("drawn.mp4"), kind="container", width=width, height=height, bit_depth=8,
+                          declared_frames=n)  # fmt: skip
+    frames = Frames(recording, Region(0, 0, width, height), luma, np.arange(n), np.zeros(n, dtype=bool))
+    trial = Trial(name="t", capture_fps=1000.0, exposure_s=exposure / 1000.0, m_per_px=1e-4)
+    return track_frames(frames, trial, 1000.0, axis)
+
+
+def step_frames(edge_px: np.ndarray, noise: float = 2.0, seed: int = 331) -> np.ndarray:
+    """A straight front between background of 60 and film of 160, blurred by 1 px, averaged over instants.
+
+    `edge_px` has shape (n_frames, n_instants) or (n_frames, n_instants, n_bands): a front for each band of rows.
+    """
+    bands = edge_px if edge_px.ndim == 3 else edge_px[:, :, None]
+    cover = ndtr(bands[..., None] - np.arange(COLUMNS)).mean(axis=1)
+    luma = np.full((len(edge_px), ROWS, COLUMNS), 60.0)
+    top = (ROWS - TUBE) // 2
+    luma[:, top : top + TUBE] += 100 * np.repeat(cover, TUBE // cover.shape[1], axis=1)
+    luma += np.random.default_rng(seed).normal(0, noise, luma.shape)
+    return np.rint(np.clip(luma, 0, 255)).astype(np.uint8)
+
+
+def grown_px(frames: np.ndarray, start_px: float = 60.0, rest: int = 12, speed: float = 4.0) -> np.ndarray:
+    """Rest, then one speed, at these times in frames."""
+    return start_px + speed * np.maximum(frames - rest, 0.0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"wall_sd": 30.0, "tail_sd": 30.0},
+        {"wall_sd": 5.0, "tail_sd": 45.0},
+        {"background_sd": 30.0},
+        {"door": True},
+    ],
+)
+def test_stated_errors_are_those_that_are_made(changes: dict[str, float]) -> None:
+    """What a point errs by on its own account shows in second differences of the errors: Σ(1, −2, 1)² = 6."""
+    pulls = []
+    for seed in (331, 332):
+        plan = Plan(**{**SHORT, **changes, "seed": seed})
+        scene = plain_scene(plan)
+        tracking = tracked(scene.frames, plan.exposure)
+        error = tracking.track.edge_px + tracking.axis.from_px[0] - plan.from_px[0] - scene.edge_px
+        sigma = tracking.track.lead_position_sigma_m * 1e4
+        use = scene.moving & tracking.track.usable
+        error, sigma = error[use], sigma[use]
+        pulls.append(np.diff(error, 2) / np.sqrt(sigma[:-2] ** 2 + 4 * sigma[1:-1] ** 2 + sigma[2:] ** 2))
+    assert 0.6 < np.sqrt(np.mean(np.concatenate(pulls) ** 2)) < 1.3
+
+
+def test_what_misleads_bands_of_rows_slowly_is_an_error_though_the_track_is_smooth() -> None:
+    frames = np.arange(100.0)
+    draw = np.random.default_rng(333)
+    phase = draw.uniform(0, 2 * np.pi, (2, BANDS))
+    # Two waves for every band, which its neighbours do not have: differences of the track hardly see any of them.
+    waves = [0.6 * np.sin(2 * np.pi * frames[:, None] / period + p) for period, p in zip((11, 17), phase, strict=True)]
+    slow = np.sum(waves, axis=0)
+    true = grown_px(frames)
+    moves = (frames > 12)[:, None]
+    luma = step_frames((true[:, None] + slow * moves)[:, None, :])
+    tracking = tracked(luma, 0.05, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
+    use = (frames > 25) & (frames < 95) & tracking.track.usable
+    assert use.sum() > 60
+    error = (tracking.track.edge_px + tracking.axis.from_px[0] - true)[use]
+    sigma = tracking.track.lead_position_sigma_m[use] * 1e4
+    assert 0.3 < error.std() / np.sqrt(np.mean(sigma**2)) < 3.0
+
+
+@pytest.mark.parametrize("exposure", [0.1, 0.9])
+def test_an_edge_that_speeds_up_is_placed_where_it_was_at_mid_exposure(exposure: float) -> None:
+    """At 4 px a frame² its mean over 0.9 frames lies aτ²/24 = 0.135 px ahead of where it was in their middle."""
+    frames = np.arange(32.0)
+    instants = frames[:, None] + exposure * (np.arange(SUB_INSTANTS) + 0.5 - SUB_INSTANTS / 2) / SUB_INSTANTS
+
+    def place(time: np.ndarray) -> np.ndarray:
+        return 60.0 + 2.0 * np.clip(time - 12.0, 0.0, 13.0) ** 2
+
+    tracking = tracked(step_frames(place(instants), noise=1.0), exposure, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
+    use = (frames > 15) & (frames < 24) & tracking.track.usable
+    assert use.sum() >= 7
+    error = (tracking.track.edge_px + tracking.axis.from_px[0] - place(frames))[use]
+    assert abs(error.mean()) < 0.05
