@@ -114,7 +114,7 @@ def test_a_rate_that_contradicts_the_frames_own_is_refused(folder: Path, monkeyp
     monkeypatch.setattr(module, "inspect_recording", lambda path: replace(inspect(path), capture_fps=1069.0))
     (problem,) = check(folder, "a.mp4")
     assert (problem.column, problem.severity) == ("capture_fps", "error")
-    assert "1000 in the sheet but 1069 in the frames: correct the sheet" in str(problem)
+    assert "1000 in the sheet but 1069 in the recording: correct the sheet" in str(problem)
 
 
 def test_without_any_scale_there_is_one_problem(folder: Path) -> None:

@@ -32,7 +32,7 @@ COLUMNS: dict[str, Column] = {
             field="video",
             kind="path",
             shared=False,
-            meaning="The recording: mp4, mov, avi, mkv, or a folder or stack of pictures.",
+            meaning="The recording: mp4, mov, avi, mkv, Phantom cine, Photron mraw, or a folder or stack of pictures.",
         ),
         Column(
             name="track",
@@ -58,7 +58,7 @@ COLUMNS: dict[str, Column] = {
             unusual_hint="write the rate of capture, not that of playback",
             meaning="Frames a second at capture; never the rate at which the file plays.",
             measured="The camera's setting; the file's own rate is that of playback.",
-            default="required with a video, but for DNG frames",
+            default="required with a video that does not state it (DNG, cine, mraw do)",
         ),
         Column(
             name="capture_fps_is_playback",

@@ -32,6 +32,9 @@ PRESSURE_SIGMA, YIELD_SIGMA_KPA = 0.01, 0.2
 Chosen: a usual gauge is of class 1, and a yield pressure is read off a slowly rising one. At half or twice the errors
 of forces near the yield pressure halve or double where the sheet states none."""
 
+STATE_THEIR_RATE = frozenset({".dng", ".cine", ".cih", ".cihx"})
+"""Endings of files that carry the rate of capture."""
+
 RATE_REMEDY = "write the rate of capture: the file's own rate is that of playback"
 
 
@@ -203,7 +206,7 @@ def _needed(row: Row, folder: Path) -> list[str]:
     needed = list(NEEDED if row.travel_ratio == 2 else NEEDED[:1])
     if "pressure_kPa" in needed and ("pressure_trace" in row.values or "track" in row.values):
         needed.remove("pressure_kPa")
-    if "video" in row.values and "track" not in row.values and not _has_dng_frames(folder, row.values["video"]):
+    if "video" in row.values and "track" not in row.values and not _states_its_rate(folder, row.values["video"]):
         needed.append("capture_fps")
     return needed
 
@@ -223,11 +226,12 @@ def _judge_paths(row: Row, folder: Path) -> None:
         row.add("has neither a video nor a track", remedy="name the recording under video, or positions under track")
 
 
-def _has_dng_frames(folder: Path, video: str) -> bool:
-    """Whether a recording is a DNG frame or a folder of them, which carry the rate of capture."""
+def _states_its_rate(folder: Path, video: str) -> bool:
+    """Whether a recording is of a kind that may carry the rate of capture; whether it does shows when it is opened."""
     try:
         path = safe_join(folder, video)
-        return any(file.suffix.lower() == ".dng" for file in ([path] if not path.is_dir() else path.iterdir()))
+        files = path.iterdir() if path.is_dir() else [path, path.with_suffix(".cih"), path.with_suffix(".cihx")]
+        return any(file.suffix.lower() in STATE_THEIR_RATE and file.exists() for file in files)
     except (TableError, OSError, ValueError):
         return False
 

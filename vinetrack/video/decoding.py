@@ -76,7 +76,7 @@ def decode_container(
     """
     import av
 
-    decoded, room = Decoded(), _memory_for_pictures()
+    decoded, room = Decoded(), memory_for_pictures()
     with quiet_log() as complaints:
         try:
             with av.open(str(path)) as container:
@@ -170,8 +170,8 @@ def _times_complained_of(path: Path) -> set[float]:
     return marked
 
 
-def _memory_for_pictures() -> float:
-    """Bytes that decoded pictures may take."""
+def memory_for_pictures() -> float:
+    """Bytes that decoded pictures may take; infinity where the machine does not say how much it has."""
     try:
         return MEMORY_PART * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):

@@ -2,11 +2,13 @@
 
 The Y plane is copied straight from the decoder's buffer: converting to grey or colour first costs up to half the
 decoding speed. A recording's clock is never read from its container, which knows the playback rate only; DNG frames
-carry the true rate (tag 51044) and the exposure (33434), other image files carry neither.
+carry the true rate (tag 51044) and the exposure (33434), and so do the files of some high-speed cameras
+(`camera_headers`); other image files carry neither.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,12 +19,14 @@ from numpy.typing import NDArray
 
 from vinetrack.core.files import file_size
 from vinetrack.core.records import Trial
-from vinetrack.video.decoding import Decoded, damaged_frames, decode_container, quiet_log
+from vinetrack.video.decoding import Decoded, damaged_frames, decode_container, memory_for_pictures, quiet_log
 
 if TYPE_CHECKING:
     import av
 
-CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine"})
+    from vinetrack.video.raw_frames import RawFrames
+
+CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
 """Formats under which FFmpeg takes any text for a picture of its letters. Source: FFmpeg, bintext.c, tty.c."""
@@ -33,6 +37,11 @@ DECODER_THREADS = 2
 SAME_RATE = 0.005
 """Derived: 29.97 and 30 frames a second differ by 0.1 %, 23.976 and 24 likewise; a rate of capture that is no rate of
 playback but within 0.5 % of one is 30.1 for 30, which no camera offers."""
+
+SAME_EXPOSURE = 0.02
+"""Part by which exposures of sheet and recording may differ and be one. Chosen: cameras round to a microsecond of 50,
+sheets to two digits. By reasoning: at half some rounded ones are refused; at twice one of 96 µs for 100 passes, which
+moves no position."""
 
 
 class RecordingError(ValueError):
@@ -63,9 +72,10 @@ class Region:
 class Recording:
     """What a recording says about itself, before its frames are decoded.
 
-    `declared_frames` is the file's own count (None where it gives none); `capture_fps` and `exposure_s` are those of
-    DNG frames, None elsewhere; `playback_fps` is the rate at which a film plays, None for pictures; `notes` are
-    sentences for a person.
+    `kind` is `container`, `folder`, `stack` or `raw`. `declared_frames` is the file's own count (None where it gives
+    none); `capture_fps` and `exposure_s` are those that DNG frames and the files of high-speed cameras state, None
+    elsewhere; `raw` says where the frames of such a file lie; `playback_fps` is the rate at which a film plays, None
+    for pictures; `notes` are sentences for a person.
     """
 
     path: Path
@@ -80,6 +90,7 @@ class Recording:
     numbers: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
     playback_fps: float | None = None
+    raw: RawFrames | None = None
 
     @property
     def whole(self) -> Region:
@@ -137,6 +148,10 @@ def inspect_recording(path: Path | str) -> Recording:
         return inspect_images(path)
     if size == 0:
         raise RecordingError(f"{path.name}: the file is empty; copy it from the camera again")
+    if path.suffix.lower() in {".cine", ".mraw", ".cih", ".cihx"}:
+        from vinetrack.video.camera_headers import inspect_cine, inspect_mraw
+
+        return inspect_cine(path) if path.suffix.lower() == ".cine" else inspect_mraw(path)
     return _inspect_container(path)
 
 
@@ -160,6 +175,8 @@ def read_frames(path: Path | str | Recording, region: Region | None = None, thre
     """
     recording = path if isinstance(path, Recording) else inspect_recording(path)
     region = region or recording.whole
+    if recording.raw is not None:
+        return _read_raw(recording, recording.raw, region)
     if recording.kind != "container":
         from vinetrack.video.images import read_images
 
@@ -168,11 +185,39 @@ def read_frames(path: Path | str | Recording, region: Region | None = None, thre
     try:
         decoded = decode_container(recording.path, shape, lambda frame: _luma_plane(frame, region), threads)
     except MemoryError:
-        raise RecordingError(
-            f"{recording.path.name}: its frames of {recording.width} x {recording.height} px do not fit in the memory "
-            "of this machine; cut it to the growth, and to the part of the picture that shows it"
-        ) from None
+        raise _too_large(recording) from None
     return _assemble(recording, region, decoded)
+
+
+def _too_large(recording: Recording) -> RecordingError:
+    return RecordingError(
+        f"{recording.path.name}: its frames of {recording.width} x {recording.height} px do not fit in the memory "
+        "of this machine; cut it to the growth, and to the part of the picture that shows it"
+    )
+
+
+def _read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
+    """Frames of a camera's own file, straight into one array."""
+    name, notes = recording.path.name, list(recording.notes)
+    shape = (len(raw.offsets), *region.shape)
+    if math.prod(shape) * raw.dtype.itemsize > memory_for_pictures():
+        raise _too_large(recording)
+    luma, n = np.empty(shape, raw.dtype), 0
+    for n, picture in enumerate(raw.pictures(), 1):
+        luma[n - 1] = picture[region.slices]
+    if n == 0:
+        raise RecordingError(f"{name}: not one frame is in the file; copy it from the camera again")
+    if recording.declared_frames is not None and n < recording.declared_frames:
+        notes.append(
+            f"{name}: {n} frames are there where the file declares {recording.declared_frames}: cut short; "
+            "copy it from the camera again"
+        )
+    slot, irregular = np.arange(n), ""
+    if raw.times_s is not None:
+        slot, irregular = slots_from_times(raw.times_s[:n])
+    if irregular:
+        notes.append(f"{name}: {irregular}")
+    return Frames(recording, region, luma[:n], slot, np.zeros(n, dtype=bool), tuple(notes))
 
 
 def iterate_frames(recording: Recording, region: Region | None = None) -> Iterator[NDArray[Any]]:
@@ -188,6 +233,10 @@ def iterate_frames(recording: Recording, region: Region | None = None) -> Iterat
     grey levels, shape (height, width).
     """
     region = region or recording.whole
+    if recording.raw is not None:
+        for picture in recording.raw.pictures():
+            yield picture[region.slices]
+        return
     if recording.kind != "container":
         from vinetrack.video.images import iterate_images
 
@@ -326,7 +375,7 @@ def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]
 
 
 def capture_rate(trial: Trial, recording: Recording) -> float:
-    """Return the capture rate: the user's; that of DNG frames where the sheet is blank.
+    """Return the capture rate: the user's; that which the recording states where the sheet is blank.
 
     Parameters
     ----------
@@ -340,13 +389,13 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
     Raises
     ------
     RecordingError
-        Where there is none, where sheet and DNG frames differ, and where it is the file's rate of playback.
+        Where there is none, where sheet and recording differ, and where it is the file's rate of playback.
     """
     true_fps, stated = recording.capture_fps, trial.capture_fps
     if true_fps is not None:
         if np.isfinite(stated) and abs(stated / true_fps - 1) > 1e-3:
             raise RecordingError(
-                f"{trial.name}: capture_fps is {stated:g} in the sheet but {true_fps:g} in the frames; "
+                f"{trial.name}: capture_fps is {stated:g} in the sheet but {true_fps:g} in the recording; "
                 "correct the sheet"
             )
         return true_fps
@@ -359,3 +408,31 @@ def capture_rate(trial: Trial, recording: Recording) -> float:
             "write the rate of capture, or capture_fps_is_playback: yes where the film plays as fast as it was captured"
         )
     return stated
+
+
+def capture_exposure(trial: Trial, recording: Recording) -> float:
+    """Return the exposure of a frame: that which the recording states, else that of the sheet.
+
+    Parameters
+    ----------
+    trial : its `exposure_s` is that of the sheet, NaN where blank.
+    recording : from `inspect_recording`.
+
+    Returns
+    -------
+    s; NaN where neither knows it.
+
+    Raises
+    ------
+    RecordingError
+        Where both do and differ.
+    """
+    true_s, stated_s = recording.exposure_s, trial.exposure_s
+    if true_s is None:
+        return stated_s
+    if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > SAME_EXPOSURE:
+        raise RecordingError(
+            f"{trial.name}: exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording; "
+            "correct the sheet"
+        )
+    return true_s

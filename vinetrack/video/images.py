@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.video.camera_headers import side_file_of
 from vinetrack.video.frames import IMAGES, Frames, Recording, RecordingError, Region
+from vinetrack.video.raw_frames import levelled, unpacked
 
 TAG_EXPOSURE = 33434
 """Defined by TIFF/EP (ISO 12234-2): exposure time."""
@@ -52,6 +54,9 @@ def inspect_images(path: Path) -> Recording:
     fps, exposure = _dng_clock(files[0]) if files[0].suffix.lower() == ".dng" else (None, None)
     count = _pages(path) if kind == "stack" else len(files)
     height, width = readable.shape
+    side = side_file_of(path, files[0].suffix.lower().removeprefix("."), (width, height), count)
+    if side is not None and fps is None:
+        fps, exposure, depth, notes = side.rate, side.exposure_s, side.depth or depth, (*notes, *side.notes)
     return Recording(path, kind, width, height, depth, count, fps, exposure, files, numbers, notes)
 
 
@@ -245,7 +250,6 @@ def _dng_clock(file: Path) -> tuple[float | None, float | None]:
 
 def _read_dng(file: Path) -> NDArray[np.uint16]:
     """Raw values of a DNG; a colour mosaic is levelled by a [1 2 1] kernel, fair to every 2 by 2 pattern."""
-    import cv2
     import tifffile
 
     with tifffile.TiffFile(file) as tiff:
@@ -259,8 +263,7 @@ def _read_dng(file: Path) -> NDArray[np.uint16]:
     if raw.ndim == 3:
         raw = np.rint(raw[..., :3].astype(np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)).astype(raw.dtype)
     if mosaic:
-        kernel = np.array([0.25, 0.5, 0.25], np.float32)
-        raw = np.rint(cv2.sepFilter2D(raw.astype(np.float32), -1, kernel, kernel)).astype(np.uint16)
+        raw = levelled(raw)
     return raw.astype(np.uint16)
 
 
@@ -274,8 +277,5 @@ def _unpack_12_bit(file: Path, page: Any) -> NDArray[np.uint16]:
     height, width = int(page.imagelength), int(page.imagewidth)
     row = (width * 12 + 7) // 8
     data = np.frombuffer(b"".join(parts), np.uint8)[: height * row].reshape(height, row)
-    padded = np.pad(data, ((0, 0), (0, -row % 3))).reshape(height, -1, 3).astype(np.uint16)
-    pixels = np.stack(
-        [(padded[..., 0] << 4) | (padded[..., 1] >> 4), ((padded[..., 1] & 15) << 8) | padded[..., 2]], -1
-    )
-    return pixels.reshape(height, -1)[:, :width]
+    padded = np.pad(data, ((0, 0), (0, -row % 3)))
+    return unpacked(padded.ravel(), 12).reshape(height, -1)[:, :width]

@@ -17,7 +17,7 @@ from vinetrack.core.problems import Problem
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.terminal import progress
 from vinetrack.experiment.settings import AxisSettings, ExperimentSettings
-from vinetrack.video.frames import Recording, RecordingError, capture_rate, inspect_recording
+from vinetrack.video.frames import Recording, RecordingError, capture_exposure, capture_rate, inspect_recording
 from vinetrack.video.measure import given_axis
 from vinetrack.video.quick_look import look_at
 from vinetrack.video.recording_facts import RecordingFacts, size_problems
@@ -26,6 +26,7 @@ from vinetrack.video.track import FEWEST_FRAMES
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
     from vinetrack.video.calibration import PlaneCalibration
+    from vinetrack.video.raw_frames import RawFrames
 
 SETTINGS = "experiment.yaml"
 LARGEST_WALKED_BYTES = 64_000_000
@@ -148,11 +149,12 @@ def _understood(
 def _judge(trial: Trial, recording: Recording) -> list[Problem]:
     """A recording that opens, against what the sheet says of it and what the file declares."""
     place: dict[str, Any] = {"column": "video", "value": recording.path.name}
-    try:
-        capture_rate(trial, recording)
-    except RecordingError as error:
-        message, _, remedy = str(error).removeprefix(f"{trial.name}: capture_fps ").rpartition("; ")
-        return [Problem(message=message or remedy, column="capture_fps", remedy=remedy if message else "")]
+    for column, clock in (("capture_fps", capture_rate), ("exposure_us", capture_exposure)):
+        try:
+            clock(trial, recording)
+        except RecordingError as error:
+            message, _, remedy = str(error).removeprefix(f"{trial.name}: {column} ").rpartition("; ")
+            return [Problem(message=message or remedy, column=column, remedy=remedy if message else "")]
     problems = [
         Problem(message=f"is odd: {note.removeprefix(f'{recording.path.name}: ')}", severity="warning", **place)
         for note in recording.notes
@@ -171,6 +173,8 @@ def _judge(trial: Trial, recording: Recording) -> list[Problem]:
 
 def _frames_present(recording: Recording) -> int | None:
     """How many frames lie in the file as far as that is known without decoding; None where it is not."""
+    if recording.raw is not None:
+        return _raw_frames_present(recording.path.stat().st_size, recording.raw)
     if recording.kind != "container":
         return recording.declared_frames
     import av
@@ -188,6 +192,10 @@ def _frames_present(recording: Recording) -> int | None:
     except (av.error.FFmpegError, AttributeError):
         # A walk that ends in an error has met damage that decoding will put into words.
         return None
+
+
+def _raw_frames_present(size: int, raw: RawFrames) -> int:
+    return sum(offset + raw.frame_bytes <= size for offset in raw.offsets)
 
 
 Calibrations = dict[tuple[int, int], "PlaneCalibration"]

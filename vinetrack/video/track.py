@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats, Track, Trial
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
-from vinetrack.video.frames import Frames, RecordingError, capture_rate, inspect_recording, read_frames
+from vinetrack.video.frames import (
+    Frames,
+    RecordingError,
+    capture_exposure,
+    capture_rate,
+    inspect_recording,
+    read_frames,
+)
 from vinetrack.video.hand_corrections import corrected_by_hand
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.sound_frames import sound_stretch
@@ -170,7 +177,7 @@ def track_frames(
         In one sentence, where the frames hold no track.
     """
     name = frames.recording.path.name
-    exposure_s = trial.exposure_s if np.isfinite(trial.exposure_s) else (frames.recording.exposure_s or np.nan)
+    exposure_s = capture_exposure(trial, frames.recording)
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
     rejected = odd_frames(frames.luma)

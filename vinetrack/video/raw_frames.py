@@ -1,0 +1,125 @@
+"""Frames that lie in a file as the sensor gave them: 8 to 16 bit, packed or not, read one at a time.
+
+High-speed cameras write such files with a header of their own (`camera_headers`). Nothing is held but the frame that is
+read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+
+_TABLE_STEPS = (
+    "31111111111110111111111111111101111111111111110111111111111111011111111111111110111111111111111011111111"
+    "11111111011111111111111101111111111110111111111111111112111111111211111121111211121112111211211211211212"
+    "11212121121212121212122121221212212212212212221222122212222212222222122222222222222222222222322222223222"
+    "22322232223222322322322322323232232323232323232332323233233233233233323332333233333233333333233333333333"
+    "33333333433333333433334333343334334333433434334343343434343434343434434344344344344344434443444434444443"
+    "44444444444444444444444444544444544445444544454454454454454545445454545454554545455455455455455545554555"
+    "54555555455555555555555555555555556555555655556555655565565565565655656565656565656565665665656656665666"
+    "56665666656666666656666666666666676666666676666766667666766766766767667676767676767676767767677677677767"
+    "77677767777767777777777767777787777777777787777787777877787787787787787878778787878788787878878878878878"
+    "887888878888878888888888888888888888888988888988889888988988988988989898898988"
+)
+"""Steps from each of the 1024 values of a packed Phantom frame to the next, from 2 on, up to 4064; later values are
+4095. Source: the table of the vendor's format document, as pycine 0.3.2 has it. It undoes the compression by which the
+camera fits 12 bits in 10: without it an edge shifts by a part of its blur."""
+
+PHANTOM_TABLE: NDArray[np.uint16] = np.full(1024, 4095, np.uint16)
+"""Brightness in 12 bits of each value of a packed Phantom frame, shape (1024,)."""
+PHANTOM_TABLE[: len(_TABLE_STEPS) + 1] = 2 + np.cumsum([0, *map(int, _TABLE_STEPS)])
+
+
+@dataclass(frozen=True)
+class RawFrames:
+    """Where the frames of a file lie, and how their pixels are packed.
+
+    `offsets` are of the first byte of each frame; `stored_bits` those of a pixel in the file: 8, 16 (least significant
+    byte first), or packed 10 or 12 (most significant bits first). `bottom_up`: the last row comes first. `linearise`:
+    by PHANTOM_TABLE. `mosaic`: one colour a pixel, levelled to brightness. `times_s` is when each frame was captured,
+    shape (n_frames,), None where the file does not say.
+    """
+
+    file: Path
+    offsets: Sequence[int]
+    width: int
+    height: int
+    stored_bits: int
+    bottom_up: bool = False
+    linearise: bool = False
+    mosaic: bool = False
+    times_s: Floats | None = None
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame in the file."""
+        return self.width * self.height * self.stored_bits // 8
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of the pixels as they come out."""
+        return np.dtype(np.uint8 if self.stored_bits == 8 else np.uint16)
+
+    def pictures(self) -> Iterator[NDArray[Any]]:
+        """Yield one frame after another, shape (height, width); stops where the file ends."""
+        with self.file.open("rb") as stream:
+            for offset in self.offsets:
+                stream.seek(offset)
+                data = stream.read(self.frame_bytes)
+                if len(data) < self.frame_bytes:
+                    return
+                pixels = unpacked(np.frombuffer(data, np.uint8), self.stored_bits)
+                if self.linearise:
+                    pixels = PHANTOM_TABLE[pixels]
+                picture = pixels.reshape(self.height, self.width)
+                picture = picture[::-1] if self.bottom_up else picture
+                yield levelled(picture) if self.mosaic else picture
+
+
+def unpacked(data: NDArray[np.uint8], bits: int) -> NDArray[Any]:
+    """Pixels of packed bytes.
+
+    Parameters
+    ----------
+    data : shape (n_bytes,).
+    bits : of a pixel: 8, 16 (least significant byte first), or 10 or 12 (most significant bits first).
+
+    Returns
+    -------
+    values, shape (8 n_bytes / bits,), uint8 or uint16.
+    """
+    if bits == 8:
+        return data
+    if bits == 16:
+        return data.view("<u2").astype(np.uint16, copy=False)
+    if bits == 12:
+        first, both, second = data.reshape(-1, 3).astype(np.uint16).T
+        return np.stack([first << 4 | both >> 4, (both & 15) << 8 | second], axis=1).ravel()
+    a, b, c, d, e = data.reshape(-1, 5).astype(np.uint16).T
+    return np.stack(
+        [a << 2 | b >> 6, (b & 63) << 4 | c >> 4, (c & 15) << 6 | d >> 2, (d & 3) << 8 | e], axis=1
+    ).ravel()  # fmt: skip
+
+
+def levelled(mosaic: NDArray[Any]) -> NDArray[Any]:
+    """Brightness of a sensor with one colour a pixel: a [1 2 1] kernel both ways, fair to every 2 by 2 pattern.
+
+    Parameters
+    ----------
+    mosaic : raw values, shape (height, width).
+
+    Returns
+    -------
+    grey levels, that shape and type.
+    """
+    import cv2
+
+    kernel = np.array([0.25, 0.5, 0.25], np.float32)
+    return np.rint(cv2.sepFilter2D(mosaic.astype(np.float32), -1, kernel, kernel)).astype(mosaic.dtype)
