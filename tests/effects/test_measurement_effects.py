@@ -79,6 +79,16 @@ def test_area_scale_changes_area_and_film(vine: Vine) -> None:
     assert_same_motion(vine, {"area_scale.eps": 0.03}, acceleration)
 
 
+@pytest.mark.parametrize(("stated", "true"), [(LEVEL, LOADED), (LOADED, LEVEL)], ids=["hangs", "level"])
+def test_a_growth_angle_counted_from_the_level_has_the_weight_of_the_other_direction(stated: Vine, true: Vine) -> None:
+    assert_same_motion(stated, {"growth_angle.f": 1.0}, lambda _t, x, v: true.base(x, v) / true.m(x))
+
+
+def test_a_growth_angle_stated_down_for_up_is_twice_the_slip() -> None:
+    up = Vine(**{**LOADED.__dict__, "down": -1.0})
+    assert_same_motion(LOADED, {"growth_angle.f": 2.0}, lambda _t, x, v: up.base(x, v) / up.m(x))
+
+
 def test_a_lens_bends_about_the_middle_of_the_picture() -> None:
     plain = simulated(LOADED, {}, TIMES).lead_position_m
     got = simulated(LOADED, {"lens.k3": -0.7, "lens.y_c": 0.1}, TIMES).observed_position_m

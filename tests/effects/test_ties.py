@@ -104,6 +104,12 @@ def test_payload_friction_is_an_error_of_the_angle() -> None:
     assert gap(bob, {"payload_friction.mu_p": 0.2}, {}) > 1e-2
 
 
+def test_payload_friction_is_a_slip_of_the_growth_angle_but_for_the_film() -> None:
+    bob = Vine(**{**LOADED.__dict__, "P": 60e3, "t": 1e-9, "payload": 2.0})
+    assert gap(bob, {"payload_friction.mu_p": 0.2}, {"growth_angle.f": 0.2}) < SAME
+    assert gap(LOADED, {"payload_friction.mu_p": 1.0}, {"growth_angle.f": 1.0}) > 1e-3
+
+
 def test_a_scale_is_length_payload_gain_and_damping_on_the_level() -> None:
     # y' = s·y with L' = sL and m' = s·m: forces of s², so P' = s²P and B' = s^(2 − n) B.
     s = 1.03

@@ -12,9 +12,10 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment.folder import check_experiment
 from vinetrack.laboratory.render import render_recording
 from vinetrack.laboratory.scene import Tube, preset
+from vinetrack.video.axis import Axis
 from vinetrack.video.frames import RecordingError, capture_rate, inspect_recording
 from vinetrack.video.quick_look import look_at
-from vinetrack.video.recording_facts import RecordingFacts, exposure_problems, size_problems
+from vinetrack.video.recording_facts import RecordingFacts, direction_notes, exposure_problems, size_problems
 from vinetrack.video.survey import Surveyor
 from vinetrack.video.track import track_recording
 
@@ -60,6 +61,32 @@ def test_a_body_and_a_sheet_that_declines_are_not_compared() -> None:
     wrong = replace(FACTS, tube_width_mm=120.0)
     assert size_problems(replace(VINE, travel_ratio=1), wrong) == []
     assert size_problems(replace(VINE, compare_sizes=False), wrong) == []
+
+
+ALONG = {"level": Axis((10.0, 60.0), (300.0, 40.0)), "down": Axis((60.0, 10.0), (75.0, 200.0))}
+
+
+@pytest.mark.parametrize(
+    ("picture", "angle_deg", "blank", "words"),
+    [
+        ("level", 0.0, False, None),
+        ("down", 0.0, True, None),
+        ("level", 90.0, False, None),
+        (
+            "down",
+            90.0,
+            False,
+            "growth runs up or down in the picture (2 recordings, a first) and the sheet",
+        ),
+        ("level", 0.0, True, "growth runs level in the picture (2 recordings, a first) and a blank growth_angle_deg"),
+    ],
+)
+def test_growth_that_looks_otherwise_than_stated_is_noted(
+    picture: str, angle_deg: float, blank: bool, words: str | None
+) -> None:
+    trials = [replace(VINE, name=name, growth_angle_rad=np.radians(angle_deg)) for name in "ab"]
+    notes = direction_notes([replace(FACTS, axis=ALONG[picture])] * 2, trials, ["a", "b"] if blank else [])
+    assert [note.startswith(words or "") for note in notes] == ([True] if words else [])
 
 
 @pytest.fixture(scope="module")

@@ -99,13 +99,16 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     differ = bool(called(among, FIRST_LEVEL))
     if not questions.something and not questions.suspect and not differ:
         return [SelectionStep(ADEQUATE, questions)]
-    if questions.something and (slack := _slack(questions, effects, report)) is not None:
+    slack = _slack(questions, effects, report) if questions.something else None
+    if slack is not None and not _leaves_room(slack[0].kept):
         return slack
     search = CandidateFits(questions, report)
     search.singles()
     tried = search.fit_in_full()
     between = between_fits(fit, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
     tried += between
+    if slack is not None and not _is_better(tried, slack[0].kept[0]):
+        return slack
     if not questions.something and not differ and (not tried or _best_of(tried).sigma < SUSPECT_SIGMAS):
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
     if tried and again < MOST_AGAIN and _best_of(tried) not in between:
@@ -147,10 +150,16 @@ def _leaves_room(tried: Sequence[LikelihoodRatio]) -> bool:
     return best.chi2_per_dof > FAR_OFF or scatters_much(best)
 
 
+def _is_better(tried: Sequence[LikelihoodRatio], than: LikelihoodRatio) -> bool:
+    """Whether the best of these hypotheses is likelier than another."""
+    return bool(tried) and _best_of(tried).fit.log_likelihood > than.fit.log_likelihood + NO_BETTER
+
+
 def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:
     """Findings where a tail that may go slack explains what a tail that pushes does not; None where it does not.
 
-    It is asked first: a tail cannot push, and the rule brings no number that could make up for something else.
+    It is asked first: a tail cannot push, and the rule brings no number that could make up for something else. But
+    where its trials scatter much they may have been bent to it: then it stands only if no effect alone does better.
     """
     slack = slack_fit(questions.fit)
     if slack is None or slack.sigma < questions.threshold:

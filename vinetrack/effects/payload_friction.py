@@ -7,8 +7,8 @@ Matters with a payload, most on a horizontal vine, where the payload's whole wei
 On a vertical rig nothing presses the payload on the wall but clinging film and crookedness: there μ_p is an effective
 coefficient, not that of the materials.
 
-Easily taken for an error of the growth angle or of the payload's mass: both are a force in proportion to m_pay. Growth
-upwards and downwards tells it from an angle, which changes sign.
+Easily taken for an error of the growth angle (`growth_angle`) or of the payload's mass: both are a force in proportion
+to m_pay. Growth upwards and downwards tells it from an angle, which changes sign.
 
 Reduce it with a smooth, round payload of smaller diameter, and powder. Measure it with a spring balance: pull the
 payload through a vine that is held; and weigh it, and hold a plumb-line beside the vine.
@@ -21,7 +21,7 @@ from vinetrack.effects import Parameter, Worked
 
 KIND = "physical"
 NEEDS = ("payload_g",)
-EASILY_TAKEN_FOR = ("gravity",)
+EASILY_TAKEN_FOR = ("growth_angle",)
 PARAMETERS = (
     Parameter(
         "mu_p", "μ_p", "1", 0.3, bounds=(0.0, 10.0), plausible=(0.0, 1.5), meaning="friction of payload on the wall"

@@ -7,7 +7,7 @@ A ruler wrong by ten, a diameter in the column of the length or a rate of playba
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +42,10 @@ SAME_FACTOR = 0.1
 """Width and growth that are off by factors within a tenth of each other are off by one factor: the scale. Chosen:
 widths and growths are seen to some per cent. At half true errors of scale are told as two faults, at twice two faults
 as one of scale."""
+STEEP = 60.0
+"""Degrees between growth in the picture and its rows from which it runs up or down, and to its columns from which it
+runs level. Chosen: a camera is held askew by some degrees; at 45 a tilted rig would be told, at 75 a camera askew by 20
+would not."""
 LEAVE_OUT = "or write compare_sizes: no where only part of the tube is seen"
 
 
@@ -173,6 +177,41 @@ def _factor(ratio: float) -> str:
 def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str) -> Problem:
     severity = "error" if max(ratio, 1 / ratio) > ERROR_FACTOR else "warning"
     return Problem(message=f"differs: {seen}", severity=severity, column=column, value=f"{stated_mm:g}", remedy=remedy)
+
+
+def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], blank: Collection[str]) -> list[str]:
+    """Where growth in the picture looks otherwise than the sheet has it; no fault, for cameras are turned.
+
+    A vine that is level by the sheet and runs up or down in the picture, and one whose blank angle counts as straight
+    down and that runs level. A stated 0 says that somebody thought of it: fast cameras lie on their side to fit it in.
+
+    Parameters
+    ----------
+    facts, trials : of the same recordings, in the same order.
+    blank : names of trials whose growth angle is blank.
+
+    Returns
+    -------
+    sentences, one for each of the two.
+    """
+    upright, level = [], []
+    for fact, trial in zip(facts, trials, strict=True):
+        if fact.axis is None or trial.travel_ratio == 1:
+            continue
+        right, down = (abs(b - a) for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
+        slope_deg = math.degrees(math.atan2(down, right))
+        from_level_deg = math.degrees(math.asin(min(abs(math.cos(trial.growth_angle_rad)), 1.0)))
+        upright += [trial.name] if slope_deg > STEEP and from_level_deg < 90 - STEEP else []
+        level += [trial.name] if slope_deg < 90 - STEEP and trial.name in blank else []
+    told = (
+        (upright, "up or down", "the sheet has it level: right if filmed from above or with the camera on its side"),
+        (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
+    )
+    return [f"growth runs {way} in the picture ({_some(names)}) and {remark}" for names, way, remark in told if names]
+
+
+def _some(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{len(names)} recordings, {names[0]} first"
 
 
 def facts_rows(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:

@@ -1,0 +1,65 @@
+"""Growth angle: counted from the level instead of from straight down, so that the weight pulls where it does not.
+
+Matters with a payload: a hanging vine stated as level (90 for 0), or a level one whose blank angle counts as straight
+down, has the whole weight wrong: 0.35 N with 35.6 g, as much as 1.5 kPa on 24 mm.
+
+    tail force +m(x) g f (sinθ − cosθ)
+
+θ is the growth angle as stated and f how much of the slip there is: 1 is level for straight down or straight down for
+level, 2 up for down. In between lies a tilt: 20° from straight down are 0.06, 20° from the level 0.34.
+
+Easily taken for `payload_friction`, or P_y and B where all trials carry one payload. What tells it from them is the
+film, whose weight leaves as the vine grows: on vines of light film, 0.1 mm on 12 mm, it is too little for that.
+
+Measure it with a plumb-line beside the vine, and look at a picture of the rig: straight down is 0, level 90, up 180.
+
+Source: Alvarez et al. (2025), Eq. (1).
+"""
+
+import numpy as np
+
+from vinetrack.core.constants import GRAVITY_M_S2
+from vinetrack.effects import Parameter, Worked
+
+KIND = "measurement"
+NEEDS = ("length_mm",)
+EASILY_TAKEN_FOR = ("payload_friction", "pressure_gauge")
+PARAMETERS = (
+    Parameter(
+        "f", "f", "1", 1.0, bounds=(0.0, 2.0), plausible=(0.8, 1.2),
+        meaning="1 where the angle was counted from the level and not from straight down",
+    ),
+)  # fmt: skip
+
+
+def tail_force(s, rig, f):  # noqa: D103
+    sine = np.sqrt(np.maximum(1.0 - rig.cos_angle**2, 0.0))
+    return s.moving_mass * GRAVITY_M_S2 * f * (sine - rig.cos_angle)
+
+
+WORKED = (
+    Worked(
+        "tail_force",
+        0.34924,
+        "35.6 g × 9.81 × (1 − 0): stated level, hangs",
+        state={"moving_mass": 35.6e-3},
+        rig={"cos_angle": 0.0},
+        parameters={"f": 1.0},
+    ),
+    Worked(
+        "tail_force",
+        -0.34924,
+        "35.6 g × 9.81 × (0 − 1): stated straight down, level",
+        state={"moving_mass": 35.6e-3},
+        rig={"cos_angle": 1.0},
+        parameters={"f": 1.0},
+    ),
+    Worked(
+        "tail_force",
+        0.0,
+        "of no size",
+        state={"moving_mass": 35.6e-3},
+        rig={"cos_angle": 0.0},
+        parameters={"f": 0.0},
+    ),
+)
