@@ -11,7 +11,15 @@ from numpy.random import Generator, default_rng
 from odrpack import odr_fit
 from scipy.stats import binom, t
 
-from vinetrack.kinematics.damping import Points, fit_damping, fit_laws, mark_half_steady, slope
+from vinetrack.kinematics.damping import (
+    NO_SLOPE,
+    Points,
+    fit_damping,
+    fit_laws,
+    mark_half_steady,
+    mark_left_out,
+    slope,
+)
 
 N = 0.37
 B = {"R1": 0.57, "R2": 1.83, "R3": 4.54, "R4": 6.44}
@@ -348,11 +356,26 @@ def test_a_measured_pressure_leaves_only_the_scatter_of_B() -> None:
     assert stated["scatter"] > 1.5 * traced["scatter"]
 
 
+def test_points_of_a_vine_that_carries_no_slope_are_not_used_and_say_why() -> None:
+    points = campaign(default_rng(2)).assign(used=True, eligible=True, reason="", condition="c")
+    points["x_ss_paper_m_s"], points["force_paper_N"] = points["x_ss_m_s"], points["force_N"]
+    few = points["vine"].eq("R3") & (points.groupby("vine").cumcount() >= 2)
+    points = points[~few].reset_index(drop=True)
+    marked = mark_left_out(points)
+    of_r3 = marked["vine"] == "R3"
+    assert not marked.loc[of_r3, "used"].any()
+    assert marked.loc[~of_r3, "used"].all()
+    assert set(marked.loc[of_r3, "reason"]) == {f"{NO_SLOPE}2 steady trials, at least 3 are needed"}
+    before, after = (fit_laws(table, resamples=20)["both_axes"] for table in (points, marked))
+    assert after["left_out"] == before["left_out"] == {"R3": "2 steady trials, at least 3 are needed"}
+    assert after["n"] == before["n"]
+
+
 # ---- the published rule beside ours ----
 
 
 def test_the_published_rule_is_fitted_from_its_own_columns() -> None:
-    points = campaign(default_rng(0)).assign(used=True, eligible=True)
+    points = campaign(default_rng(0)).assign(used=True, eligible=True, reason="")
     points["x_ss_paper_m_s"] = 1.2 * points["x_ss_m_s"]
     points["force_paper_N"] = points["force_N"]
     points.loc[:9, "x_ss_paper_m_s"] = np.nan

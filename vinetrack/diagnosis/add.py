@@ -8,10 +8,19 @@ from typing import TYPE_CHECKING
 from vinetrack.core.records import Track
 from vinetrack.diagnosis.candidates import shapes_of
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
-from vinetrack.diagnosis.multi_start import SubsetFitter, best_subset_fit, full_fit, start_of
+from vinetrack.diagnosis.misfit_tests import FAR_OFF
+from vinetrack.diagnosis.multi_start import (
+    SubsetFitter,
+    best_subset_fit,
+    from_other_starts,
+    full_fit,
+    start_of,
+    without,
+)
+from vinetrack.diagnosis.selection import MOST_AGAIN, NO_BETTER
 from vinetrack.dynamics.model import make_model
 from vinetrack.dynamics.trial_inputs import check_needs
-from vinetrack.effects import EffectError, find_effect
+from vinetrack.effects import Effect, EffectError, find_effect
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError, pairs_of
 from vinetrack.inference.fit_result import Fit
@@ -65,7 +74,27 @@ def add(
     if effect not in questioned:
         questioned = (*questioned, effect)
     before = initial_fit(model, pairs_of(experiment, tracks)[0], questioned, profile=False)
-    report(f"fitting it with {effect.name}")
+    before, after = _both(before, effect, report)
+    report("errors before and after")
+    return before, after, ladder((before, after), ("", effect.name))
+
+
+def _both(before: Fit, effect: Effect, report: Callable[[str], None]) -> tuple[Fit, Fit]:
+    """The fits without and with an effect, each from its best minimum, as the diagnosis compares them."""
+    if before.chi2_per_dof > FAR_OFF:
+        before = from_other_starts(before)
+    for _ in range(1 + MOST_AGAIN):
+        report(f"fitting it with {effect.name}")
+        after = _with(before, effect)
+        rival = without(before, after)
+        if rival.log_likelihood <= before.log_likelihood + NO_BETTER:
+            break
+        before = rival
+    return before, after
+
+
+def _with(before: Fit, effect: Effect) -> Fit:
+    """The fit with an effect, from several starts."""
     slope = SubsetFitter(before)
     starts = [((effect,), start_of(shape, shape.step * 10)) for shape in shapes_of(effect)]
     climb = best_subset_fit(slope, starts, float("inf"))
@@ -73,7 +102,6 @@ def add(
     if after is None:
         raise FitError(f"The model with {effect.name} cannot be followed from any start.")
     if after.log_likelihood < before.log_likelihood:
-        again = refit(before, model + effect)
+        again = refit(before, before.model + effect)
         after = max((after, again), key=lambda fit: fit.log_likelihood)
-    report("errors before and after")
-    return before, after, ladder((before, after), ("", effect.name))
+    return after

@@ -45,6 +45,10 @@ FEWEST_FOR_RESAMPLING = 10
 Student's."""
 
 
+NO_SLOPE = "its vine carries no slope: "
+"""Begins the reason of a point whose vine is left out of the law."""
+
+
 @dataclass(frozen=True)
 class Points:
     """Steady points in logarithms; arrays have shape (n_points,), `vine` counts from 0 in the order of `names`."""
@@ -72,8 +76,9 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
     Parameters
     ----------
     points : a row a trial, as `vinetrack.kinematics.summary` makes them: those with `used` enter `log_log` and
-        `both_axes`; every trial that could, by its payload and travel ratio, and has a window by the published rule
-        enters `paper` with set pressure, without weight and fitted as published.
+        `both_axes`, and the vines that `mark_left_out` left out are named there; every trial that could, by its payload
+        and travel ratio, and has a window by the published rule enters `paper` with set pressure, without weight and
+        fitted as published.
     resamples : resamples of whole trials.
     seed : of the resampling.
 
@@ -82,7 +87,8 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
     dict
         `log_log`, `both_axes`, `paper`, each as `fit_damping` describes.
     """
-    fits = fit_damping(points[points["used"]], resamples=resamples, seed=seed)
+    of_no_slope = points["reason"].fillna("").astype(str).str.startswith(NO_SLOPE)
+    fits = fit_damping(points[points["used"] | of_no_slope], resamples=resamples, seed=seed)
     literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
     literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
     return fits | {"paper": fit_damping(literal, resamples=resamples, seed=seed)["log_log"]}
@@ -112,6 +118,25 @@ def mark_half_steady(points: pd.DataFrame) -> pd.DataFrame:
     marked = points.copy()
     marked.loc[few, "reason"] = words
     marked.loc[few, "used"] = False
+    return marked
+
+
+def mark_left_out(points: pd.DataFrame) -> pd.DataFrame:
+    """Say of every point whether the law rests on it: half steady conditions, and vines that carry no slope, do not.
+
+    Parameters
+    ----------
+    points : as those of `mark_half_steady`, with `vine`, `x_ss_m_s` and `force_N`.
+
+    Returns
+    -------
+    a copy in which `used` is False and `reason` set where the law leaves a point out.
+    """
+    marked = mark_half_steady(points)
+    for vine, why in _admit(marked[marked["used"]])[1].items():
+        mine = marked["used"] & (marked["vine"] == vine)
+        marked.loc[mine, "reason"] = NO_SLOPE + why
+        marked.loc[mine, "used"] = False
     return marked
 
 

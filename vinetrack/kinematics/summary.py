@@ -17,7 +17,7 @@ from vinetrack.dynamics.model import Model
 from vinetrack.effects import EffectError
 from vinetrack.experiment.settings import RunSettings
 from vinetrack.kinematics.conditions import energy_efficiency, lead_velocity_at
-from vinetrack.kinematics.damping import fit_laws, mark_half_steady
+from vinetrack.kinematics.damping import fit_laws, mark_left_out
 from vinetrack.kinematics.force import (
     SteadyForce,
     known_pressure,
@@ -359,7 +359,7 @@ def redo_damping(model: Model, motions: Sequence[TrialMotion], settings: RunSett
         raise ValueError(
             f"no trial can be looked at under this model: {'; '.join(left_out.values()) or 'there is none'}"
         )
-    points = mark_half_steady(pd.DataFrame(rows))
+    points = mark_left_out(pd.DataFrame(rows))
     laws = fit_laws(points, resamples=settings.damping.resamples, seed=settings.damping.seed)
     return DampingLaw(points, laws, left_out)
 

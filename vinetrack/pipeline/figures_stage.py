@@ -159,7 +159,7 @@ def campaign_inputs(folder: Path, known: tuple[Trial, ...]) -> dict[str, tuple[A
     names = described.loc[described["status"] != "left_out", "trial"]
     moved = {name: read_result(results.kinematics(name)) for name in names}
     in_fit = [vine for method in METHOD_NAMES for vine in damping[method]["vines"]]
-    points = points.assign(used=points["used"] & points["vine"].isin(in_fit))
+    points = points.assign(used=points["used"] & bool(in_fit))
     compared = label_conditions(read_result(results.comparison), described)
     trajectories = {name: read_result(results.trajectories(name)) for name in compared["condition"]}
     scaling, diagnosed = read_json(results.scaling), read_diagnosed(results, described)

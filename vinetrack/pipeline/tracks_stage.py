@@ -160,7 +160,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
         If a trial has not been analysed.
     """
     from vinetrack.kinematics.conditions import condition_table
-    from vinetrack.kinematics.damping import mark_half_steady
+    from vinetrack.kinematics.damping import mark_left_out
 
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
@@ -171,7 +171,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
         results.steady, _frame([row for content in analysed.values() for row in content["windows"]], STEADY_COLUMNS)
     )
     points = _frame([c["point"] for c in analysed.values() if c["point"]], POINT_COLUMNS)
-    write_csv(results.points, mark_half_steady(points))
+    write_csv(results.points, mark_left_out(points))
     places = {"final_at_fraction": settings.final_at_fraction, "efficiency_at_mm": settings.efficiency_at_mm}
     write_csv(results.conditions, condition_table(table, experiment.trials, **places))
     write_csv(results.trials, table)
