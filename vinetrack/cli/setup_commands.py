@@ -17,11 +17,11 @@ def register(app: typer.Typer) -> None:
     ----------
     app : the command line.
     """
-    app.command(name="setup", rich_help_panel=START)(setup)
-    app.command(name="track", rich_help_panel=START)(track)
+    app.command(name="setup", rich_help_panel=START)(_setup)
+    app.command(name="track", rich_help_panel=START)(_track)
 
 
-def setup(
+def _setup(
     folder: Annotated[Path, typer.Argument(help="A folder of recordings.", metavar="FOLDER")],
     page: Annotated[
         bool, typer.Option("--page/--no-page", help="Open a page, or write both files with blanks to fill.")
@@ -32,16 +32,7 @@ def setup(
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a browser.")] = True,
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
-    """A local page that makes trials.csv and experiment.yaml of a folder of recordings, or both with blanks to fill.
-
-    Parameters
-    ----------
-    folder : of recordings.
-    page : whether the page is opened, or both files are written with blanks to fill.
-    port : to serve on, 0 for any that is free; None looks for one.
-    browser : whether a browser is opened.
-    log : file for messages and tracebacks; none if None.
-    """
+    """A local page that makes trials.csv and experiment.yaml of a folder of recordings, or both with blanks to fill."""
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
@@ -55,7 +46,7 @@ def setup(
             write_blanks(folder, typer.echo)
 
 
-def track(
+def _track(
     recording: Annotated[Path, typer.Argument(help="A film, a stack, or a folder of pictures.", metavar="RECORDING")],
     fps: Annotated[
         float | None, typer.Option("--fps", min=1e-6, help="Frames a second at capture.", show_default=False)
@@ -83,22 +74,7 @@ def track(
     json_file: JsonFile = None,
     log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")] = None,
 ) -> None:
-    """The leading edge of one recording, without an experiment: a table, a strip and a clip.
-
-    Parameters
-    ----------
-    recording : a film, a stack, or a folder of pictures.
-    fps : frames a second at capture; None where not known.
-    exposure_us : exposure of a frame, µs; None where not known.
-    mm_per_px : scale, mm/px; None for none.
-    calibration : settings file whose calibration is the scale.
-    axis : two points of the picture, `x,y:x,y`, px.
-    frames : first and last frame to use, `from:to`, counted from 0.
-    body : whether what moves does so as a whole.
-    out : folder to write.
-    json_file : of the option `--json`.
-    log : file for messages and tracebacks; none if None.
-    """
+    """The leading edge of one recording, without an experiment: a table, a strip and a clip."""
     from vinetrack.cli.main import _busy, _sentences
 
     with _sentences(log):

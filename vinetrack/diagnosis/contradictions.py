@@ -107,4 +107,5 @@ def _still_drifts(fit: Fit) -> Iterator[str]:
         return
     table = result.table
     sure = table[table["significant"] & (np.maximum(table["z"], table["z_constancy"]) > SURELY_DRIFTS)]
-    yield from sure.drop_duplicates(["parameter", "against"])["sentence"]
+    model = " + ".join(fit.model.names)
+    yield from (f"With {model}: {line}" for line in sure.drop_duplicates(["parameter", "against"])["sentence"])

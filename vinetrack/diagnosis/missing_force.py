@@ -171,7 +171,8 @@ class _Look:
 
 def _look(model_fit: Fit, fit: ForceFit) -> _Look:
     motions = motions_of(model_fit, fit.trial_effects)
-    longest = {motion.trial.condition: 0.0 for motion in motions}
+    # A vine that stands still by its model is at the start of its growth throughout.
+    longest = {motion.trial.condition: float(np.finfo(float).tiny) for motion in motions}
     for motion in motions:
         longest[motion.trial.condition] = max(longest[motion.trial.condition], float(motion.lead_position_m.max()))
     pieces = force_sensitivities(

@@ -34,6 +34,9 @@ ADDS_NOTHING = 0.95
 """Ratio of fitted to stated error of P_y from which the trajectories are said not to constrain it. Chosen: at 0.95
 they add a tenth of the information; wording alone depends on it."""
 
+WIDENED = 1.05
+"""The same ratio from which it is said why the fitted error exceeds the stated one. Chosen as the last; wording alone."""
+
 MISSES = 2.0
 """χ² per degree of freedom from which the fit warns that it misses the data. Chosen: half of it would warn of every
 sound fit (χ² per degree of freedom is 1 there), twice would keep silent about visible misfit; it decides a warning
@@ -371,7 +374,13 @@ def _messages(
                 f"{number.title} ({number.key}) sits at its bound {number.bound:.4g}: the data want it beyond"
             )
         elif math.isfinite(free.prior_sd) and number.sigma > ADDS_NOTHING * free.prior_sd:
-            messages.append(f"{number.title}: the trajectories say no more than the sheet does")
+            wider = number.sigma > WIDENED * free.prior_sd
+            why = (
+                ", and trials disagree about it by more than their noise: its error exceeds the sheet's"
+                if wider
+                else ""
+            )
+            messages.append(f"{number.title}: the trajectories say no more than the sheet does{why}")
     if known.tied.any():
         titles = [f"{n.title} ({n.key})" for n, tied in zip(numbers, known.tied, strict=True) if tied]
         messages.append(f"cannot be told apart at all by these data: {', '.join(titles)}")

@@ -6,6 +6,7 @@ A diagnosis that cannot be made never stops the run: `diagnosis.json` then has n
 from __future__ import annotations
 
 import logging
+import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,7 +18,7 @@ import numpy as np
 from vinetrack.core.numbers import with_error
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.narrative.power_text import power_brief
-from vinetrack.narrative.verdict_summary import joined
+from vinetrack.narrative.verdict_summary import facts, joined, sentence
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_json, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
+DOUBT = "But what was seen contradicts the sheet in"
+_BETWEEN_SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])")
 PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
 
 
@@ -114,7 +117,7 @@ def beside_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequenc
     if not contradicted:
         return diagnosis
     columns = joined(list(contradicted))
-    doubt = f"But what was seen contradicts the sheet in {columns}: put that right before you believe this verdict."
+    doubt = f"{DOUBT} {columns}: put that right before you believe this verdict."
     return replace(
         diagnosis,
         explanation=f"{diagnosis.explanation} {doubt}",
@@ -325,7 +328,7 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
 
 
 def diagnosis_lines(folder: Path) -> list[str]:
-    """What `diagnosis.json` of a results folder says, in few words.
+    """What `diagnosis.json` of a results folder says: the verdict in a line, then its reasons, a line a sentence.
 
     Parameters
     ----------
@@ -346,8 +349,13 @@ def diagnosis_lines(folder: Path) -> list[str]:
     if not diagnosis.verdict:
         return [diagnosis.explanation]
     beside = power_brief(diagnosis.power) if diagnosis.power is not None else ""
+    reasons, _, contradicted = diagnosis.explanation.partition(DOUBT)
+    sizes = [fact.answer for fact in facts(diagnosis, None) if fact.question.startswith(("Significance", "Size of"))]
+    told = f" ({'; '.join(sizes)})" if sizes else ""
+    headline = f"{diagnosis.verdict}: {sentence(diagnosis)}{told}"
     return [
-        f"{diagnosis.verdict}: {diagnosis.explanation}",
+        f"{headline} {DOUBT}{contradicted}" if contradicted else headline,
+        *(f"  {line}" for line in _BETWEEN_SENTENCES.split(reasons.strip())),
         *([f"{beside[0].upper()}{beside[1:]}"] if beside else []),
         *_damping_line(diagnosis),
         *(f"! {note}" for note in diagnosis.notes),

@@ -229,4 +229,5 @@ def run_lines(results: Path) -> list[str]:
     lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(5).itertuples()]
     if len(failed) > 5:
         lines.append(f"… and {len(failed) - 5} more trials failed")
-    return [*lines, f"Report: {Results(results).report}", *reversed(diagnosis_lines(results))]
+    verdict, *reasons = diagnosis_lines(results)
+    return [*lines, f"Report: {Results(results).report}", *reasons, verdict]

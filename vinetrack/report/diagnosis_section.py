@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+ABOUT_SIGMA = (
+    "● in the answer set. Δχ² counts the noise of the tracks alone, σ also how much trials disagree: of a fitted "
+    "candidate it is √Δχ² or less."
+)
+
+
 @dataclass(frozen=True)
 class DiagnosisResult:
     """The diagnosis, the errors of its models, the values of every number along it, and the damping law under each.
@@ -67,7 +73,6 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "force": missing_force(diagnosis.missing_force),
         "rounds": [_round(i, entry) for i, entry in enumerate(diagnosis.rounds)],
         "hidden": _hidden(diagnosis, result.units),
-        "blind": _blind(diagnosis.ranking),
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
@@ -133,7 +138,8 @@ def _round(index: int, entry: Round) -> dict[str, Any]:
         "title": f"Round {index + 1}: {round_question(entry)}",
         "verdict": entry.verdict,
         "explanation": entry.explanation,
-        "table": ReportTable("", head, rows, frozenset({2, 3}), "● in the answer set") if rows else None,
+        "table": ReportTable("", head, rows, frozenset({2, 3}), ABOUT_SIGMA) if rows else None,
+        "blind": _blind(entry.ranking),
     }
 
 
