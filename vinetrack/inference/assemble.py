@@ -35,7 +35,8 @@ ADDS_NOTHING = 0.95
 they add a tenth of the information; wording alone depends on it."""
 
 WIDENED = 1.05
-"""The same ratio from which it is said why the fitted error exceeds the stated one. Chosen as the last; wording alone."""
+"""The same ratio from which it is said why the fitted error exceeds the stated one. Chosen; wording alone depends on
+it."""
 
 MISSES = 2.0
 """χ² per degree of freedom from which the fit warns that it misses the data. Chosen: half of it would warn of every
@@ -375,11 +376,7 @@ def _messages(
             )
         elif math.isfinite(free.prior_sd) and number.sigma > ADDS_NOTHING * free.prior_sd:
             wider = number.sigma > WIDENED * free.prior_sd
-            why = (
-                ", and trials disagree about it by more than their noise: its error exceeds the sheet's"
-                if wider
-                else ""
-            )
+            why = "; they disagree by more than their noise, so its error exceeds the sheet's" if wider else ""
             messages.append(f"{number.title}: the trajectories say no more than the sheet does{why}")
     if known.tied.any():
         titles = [f"{n.title} ({n.key})" for n, tied in zip(numbers, known.tied, strict=True) if tied]
