@@ -78,7 +78,7 @@ def test_progress_is_a_line_a_step_and_a_failure_names_stage_and_reason() -> Non
     ]  # fmt: skip
     said: list[str] = []
     failed, words = run_stage._follow(iter(printed), said.append)
-    assert said == ["1 of 9: recordings tracked", "2 of 9: 2 recordings tracked"]
+    assert said == ["step 1 of 9 done: recordings tracked", "step 2 of 9 done: 2 recordings tracked"]
     assert failed == {"model": "/out/logs/model.log"}
     assert words == ["tracks: the disk is full"]
 

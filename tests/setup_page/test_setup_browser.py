@@ -129,6 +129,10 @@ def test_a_frame_is_proofread_and_the_file_says_so(person: Person, clips: Path) 
         ("d15_24kPa_1", "20", "drop"),
         ("d15_24kPa_1", "21", "move"),
     ]
+    person.chrome.run("document.querySelector('[data-handle^=End]').focus()")
+    person.key("ArrowDown", 40)
+    warning = "document.querySelector('#moved-points')?.textContent"
+    person.chrome.wait(f"{warning}?.includes('along the axis as it was')", "the warning of moved points")
 
 
 def test_a_problem_stands_under_the_cell_it_concerns(person: Person) -> None:

@@ -183,7 +183,7 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
                 bar.say(text)
                 bar.reach(steps)
             else:
-                say(f"{steps} of {total}: {text}")
+                say(f"step {steps} of {total} done: {text}")
         elif match := _FAILED.match(line):
             rule = match[1]
             failed.setdefault(rule, "")

@@ -331,7 +331,9 @@ function drawAxisTool() {
   const scope = el("select", {id: "axis-scope", onchange: (event) => { const now = currentAxis(); if (now?.given) { const value = event.target.value; if (value === "trial") setAxis(now, "trial"); else setAxis(now, "all"); drawOver(); drawTools(); } }},
     el("option", {value: "all", selected: axis?.given !== "trial"}, "all trials"), el("option", {value: "trial", selected: axis?.given === "trial"}, "this trial alone"));
   const place = () => { const [w, h] = [state.clip.width, state.clip.height]; setAxis({from_px: [0.1 * w, h / 2], to_px: [0.9 * w, h / 2]}, "all"); drawOver(); drawTools(); };
-  $("axis-tool").replaceChildren(said("axis"), el("p", {class: "hint"}, words), el("div", {class: "row"},
+  const moved = Object.values(state.corrections).flat().filter((one) => one.action === "move").length;
+  const warning = moved ? el("p", {class: "hint", id: "moved-points", role: "note"}, `${moved === 1 ? "A point that was moved counts" : `${moved} points that were moved count`} along the axis as it was: after a change of it, move them again.`) : null;
+  $("axis-tool").replaceChildren(...[said("axis"), el("p", {class: "hint"}, words), warning].filter(Boolean), el("div", {class: "row"},
     axis ? el("span", {class: "fact"}, el("b", {}, ends), " px") : el("button", {type: "button", onclick: place}, "Draw one"),
     el("label", {}, "A dragged axis holds for ", scope), axis?.given ? el("button", {type: "button", class: "plain", onclick: clearAxis}, "Take what the motion shows") : null));
 }
