@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,9 +10,12 @@ import numpy as np
 import pytest
 
 from vinetrack.core.records import Trial
-from vinetrack.experiment.folder import check_experiment
+from vinetrack.experiment.folder import check_experiment, read_experiment
+from vinetrack.experiment.settings import run_settings
 from vinetrack.laboratory.render import render_recording
 from vinetrack.laboratory.scene import Tube, preset
+from vinetrack.pipeline.recordings_stage import analyse_recording
+from vinetrack.results.folder_layout import Results, read_json
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import RecordingError, capture_rate, inspect_recording
 from vinetrack.video.quick_look import look_at
@@ -173,3 +177,19 @@ def test_check_understands_a_right_recording(clip: Path, tmp_path: Path) -> None
 )
 def test_check_catches_a_slip(clip: Path, tmp_path: Path, row: str, settings: str, expected: list[str]) -> None:
     assert surveyed(clip, tmp_path / "v", row, settings)[0] == expected
+
+
+def test_a_scale_a_fifth_off_is_kept_with_the_trial_for_the_verdict(clip: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "vines"
+    folder.mkdir()
+    shutil.copy(clip, folder / "a.mp4")
+    columns = "trial,video,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,mm_per_px,capture_fps"
+    for name, scale in (("right", SCALE_MM), ("off", 0.8 * SCALE_MM)):
+        (folder / "trials.csv").write_text(f"{columns}\n{name},a.mp4,12,100,140,60,3,{scale},{FPS}\n")
+        analyse_recording(read_experiment(folder), name, tmp_path / "out", run_settings({}))
+    noted = {name: read_json(Results(tmp_path / "out").analysed(name)) for name in ("right", "off")}
+    assert (noted["right"]["contradictions"], noted["right"]["row"]["status"]) == ([], "ok")
+    (entry,) = noted["off"]["contradictions"]
+    assert entry["column"] == "diameter_mm"
+    assert "check the scale" in entry["reason"]
+    assert noted["off"]["row"]["status"] == "warning"
