@@ -12,15 +12,8 @@ from camera_files import write_cine, write_mraw, write_side_file
 from plain_scene import Plan, plain_scene, write_images
 
 from vinetrack.core.records import Trial
-from vinetrack.video.frames import (
-    RecordingError,
-    Region,
-    capture_exposure,
-    capture_rate,
-    inspect_recording,
-    iterate_frames,
-    read_frames,
-)
+from vinetrack.video.capture_clock import capture_exposure, capture_rate
+from vinetrack.video.frames import RecordingError, Region, inspect_recording, iterate_frames, read_frames
 from vinetrack.video.raw_frames import PHANTOM_TABLE
 from vinetrack.video.track import track_recording
 

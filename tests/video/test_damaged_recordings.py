@@ -161,7 +161,7 @@ def test_a_packet_that_cannot_be_decoded_costs_its_own_frame(clip: Clip, tmp_pat
 
 
 def test_a_recording_that_does_not_fit_in_memory_is_refused(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinetrack.video.decoding._memory_for_pictures", lambda: 30 * 960 * 320.0)
+    monkeypatch.setattr("vinetrack.video.decoding.memory_for_pictures", lambda: 30 * 960 * 320.0)
     with pytest.raises(RecordingError, match=r"960 x 320 px do not fit in the memory"):
         read_frames(clip.trial.video)
 

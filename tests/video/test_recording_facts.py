@@ -17,7 +17,8 @@ from vinetrack.laboratory.scene import Tube, preset
 from vinetrack.pipeline.recordings_stage import analyse_recording
 from vinetrack.results.folder_layout import Results, read_json
 from vinetrack.video.axis import Axis
-from vinetrack.video.frames import RecordingError, capture_rate, inspect_recording
+from vinetrack.video.capture_clock import capture_rate
+from vinetrack.video.frames import RecordingError, inspect_recording
 from vinetrack.video.quick_look import look_at
 from vinetrack.video.recording_facts import RecordingFacts, direction_notes, exposure_problems, size_problems
 from vinetrack.video.survey import Surveyor

@@ -61,7 +61,8 @@ def _draw_kymograph(ax: Axes, title: str, tracking: Tracking, m_per_px: float) -
     time_ms, down = _downwards(tracking)
     dark, light = np.nanpercentile(small, [1, 99])
     half_ms = 0.5 * float(np.median(np.diff(time_ms)))
-    extent = (-0.5, strip.shape[1] - 0.5, float(time_ms[-1]) + half_ms, float(time_ms[0]) - half_ms)
+    shown_ms = time_ms[tracking.strip_rows]
+    extent = (-0.5, strip.shape[1] - 0.5, float(shown_ms[-1]) + half_ms, float(shown_ms[0]) - half_ms)
     ax.imshow(small, aspect="auto", extent=extent, cmap="gray", vmin=dark, vmax=light, interpolation="none")
     edge, by_hand = track.edge_px, hand_corrected(track.flag)
     odd = flagged(track.flag) & ~by_hand

@@ -36,6 +36,8 @@ KEPT_CLIPS = 2
 with one, going back decodes again, with four memory doubles."""
 THUMBNAIL_PX = 220
 """Width of the pictures in the list; chosen: as wide as its column."""
+BLANK = 128
+"""Grey level of the strip where no frame was decoded. Chosen between black and white; nothing depends on it."""
 STRIP_PX = 1600
 """Longest side of a strip; chosen: twice the page's width on a common screen."""
 
@@ -303,7 +305,8 @@ def _axis_of(trial: Trial, settings: ExperimentSettings) -> Axis | None:
 def _track_json(tracking: Tracking) -> dict[str, Any]:
     track, strip = tracking.track, tracking.kymograph
     dark, light = np.nanpercentile(strip, [1, 99])
-    grey = (255 * (strip - dark) / max(float(light - dark), 1.0)).clip(0, 255).astype(np.uint8)
+    grey = np.full((len(track.time_s), strip.shape[1]), BLANK, np.uint8)
+    grey[tracking.strip_rows] = (255 * (strip - dark) / max(float(light - dark), 1.0)).clip(0, 255).astype(np.uint8)
     import cv2
 
     # Time to the right, growth upwards.

@@ -17,7 +17,8 @@ import numpy as np
 
 from vinetrack.core.files import file_size
 from vinetrack.core.records import Floats
-from vinetrack.video.frames import SAME_RATE, Recording, RecordingError
+from vinetrack.video.capture_clock import SAME_RATE
+from vinetrack.video.frames import Recording, RecordingError
 from vinetrack.video.raw_frames import RawFrames
 
 MARK, RATE, SHUTTER_US, COLOUR_FILTER, REAL_BITS, SHUTTER_NS = 140, 768, 772, 808, 896, 1568

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Bools
+from vinetrack.core.records import Bools, Floats
 
 if TYPE_CHECKING:
     import av
@@ -33,19 +33,27 @@ PREDICTED_BOTH_WAYS = 3
 """Code of a B frame. Defined by FFmpeg (AV_PICTURE_TYPE_B)."""
 
 MEMORY_PART = 0.4
-"""Part of the machine's memory that the pictures of one recording may take. Derived: they are held twice while they are
-put in one array, and a fifth is for everything else."""
+"""Part of the machine's memory that the pictures of one recording may take. Derived: strips of them take as much again
+at most, and a fifth is for everything else."""
+
+FEW = 256
+"""Frames for which there is place where a film does not declare how many it has; a half more whenever that is full.
+Chosen; at half or twice one is copied once more or less."""
+
+HALF_TICK = 0.5
+"""Of a film's unit of time: times are whole numbers of it. Derived."""
 
 
 @dataclass
 class Decoded:
     """Frames in the order in which they are shown: pictures, times (NaN where unknown), and how each was coded.
 
+    `pictures` has shape (n_frames, height, width).
     `corrupt` marks those that the decoder calls so, `key` those coded alone, `between` those coded from later frames
     too; `complaints` are what the decoder said.
     """
 
-    pictures: list[NDArray[Any]] = field(default_factory=list)
+    pictures: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0), np.uint8))
     times_s: list[float] = field(default_factory=list)
     corrupt: list[bool] = field(default_factory=list)
     key: list[bool] = field(default_factory=list)
@@ -54,9 +62,16 @@ class Decoded:
 
 
 def decode_container(
-    path: Path, shape: tuple[int, int], picture_of: Callable[[av.VideoFrame], NDArray[Any]], threads: int
+    path: Path,
+    shape: tuple[int, int],
+    picture_of: Callable[[av.VideoFrame], NDArray[Any]],
+    threads: int,
+    expected: int | None = None,
+    between_s: tuple[float, float] | None = None,
 ) -> Decoded:
     """Decode every frame; a packet that cannot be decoded costs its own frame, not all that follow.
+
+    Pictures go straight into one array, so that they are held once.
 
     Parameters
     ----------
@@ -64,6 +79,8 @@ def decode_container(
     shape : height and width that every frame must have, px; decoding ends at the first that has another.
     picture_of : what is kept of a frame.
     threads : of the decoder.
+    expected : frames that the file declares; None where it does not.
+    between_s : times of the first and last frame that are wanted, s; all where None.
 
     Returns
     -------
@@ -77,6 +94,7 @@ def decode_container(
     import av
 
     decoded, room = Decoded(), memory_for_pictures()
+    held: NDArray[Any] | None = None
     with quiet_log() as complaints:
         try:
             with av.open(str(path)) as container:
@@ -85,18 +103,31 @@ def decode_container(
                 stream.codec_context.thread_count = threads
                 decoder = stream.codec_context.name
                 base = float(stream.time_base) if stream.time_base else 1.0
+                if between_s is not None:
+                    container.seek(max(int(between_s[0] / base), 0), stream=stream)
                 for frame in _frames_of(container.demux(stream), complaints):
+                    if between_s is not None and frame.pts is not None:
+                        if frame.pts * base < between_s[0] - HALF_TICK * base:
+                            continue
+                        if frame.pts * base > between_s[1] + HALF_TICK * base:
+                            break
                     if (frame.height, frame.width) != shape:
                         complaints.append("the size of the picture changes")
                         break
-                    _keep(decoded, frame, picture_of(frame), base)
-                    room -= decoded.pictures[-1].nbytes
-                    if room < 0:
+                    picture = picture_of(frame)
+                    n = len(decoded.times_s)
+                    if (n + 1) * picture.nbytes > room:
                         raise MemoryError
+                    if held is None or n == len(held):
+                        held = _longer(held, picture, expected, room)
+                    held[n] = picture
+                    _keep(decoded, frame, base)
         except av.error.FFmpegError as error:
             complaints.append(str(error.strerror or error))
     decoded.complaints = list(complaints)
-    if decoded.complaints and decoded.pictures and decoder in UNMARKED:
+    if held is not None:
+        decoded.pictures = held[: len(decoded.times_s)]
+    if decoded.complaints and decoded.times_s and decoder in UNMARKED:
         marked = _times_complained_of(path)
         decoded.corrupt = [time_s in marked for time_s in decoded.times_s]
     return decoded
@@ -128,8 +159,89 @@ def damaged_frames(decoded: Decoded, slot: NDArray[np.int_]) -> Bools:
     return damaged
 
 
-def _keep(decoded: Decoded, frame: av.VideoFrame, picture: NDArray[Any], base_s: float) -> None:
-    decoded.pictures.append(picture)
+def _longer(held: NDArray[Any] | None, picture: NDArray[Any], expected: int | None, room: float) -> NDArray[Any]:
+    """Place for more pictures; memory that nothing is written to takes none."""
+    if held is None:
+        count = expected if expected and expected * picture.nbytes <= room else FEW
+        return np.empty((count, *picture.shape), picture.dtype)
+    longer = np.empty((len(held) + len(held) // 2 + 1, *held.shape[1:]), held.dtype)
+    longer[: len(held)] = held
+    return longer
+
+
+@dataclass(frozen=True)
+class PacketIndex:
+    """Every frame of a film in the order in which it is shown: `pts` in units of `base_s`, and whether it is a key one.
+
+    Shapes (n_frames,).
+    """
+
+    pts: NDArray[np.int64]
+    key: Bools
+    base_s: float
+
+    @property
+    def times_s(self) -> Floats:
+        """Time of every frame, s."""
+        return np.asarray(self.pts * self.base_s, dtype=np.float64)
+
+
+def packet_index(path: Path) -> PacketIndex | None:
+    """List the frames of a film without decoding them.
+
+    Parameters
+    ----------
+    path : of a film.
+
+    Returns
+    -------
+    index : None where packets bear no times, or the same ones.
+    """
+    import av
+
+    pts, key = [], []
+    with quiet_log(), contextlib.suppress(av.error.FFmpegError), av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        base = float(stream.time_base) if stream.time_base else 1.0
+        for packet in container.demux(stream):
+            if not packet.size:
+                continue
+            if packet.pts is None:
+                return None
+            pts.append(packet.pts)
+            key.append(packet.is_keyframe)
+    order = np.argsort(pts)
+    times = np.array(pts, dtype=np.int64)[order]
+    if len(times) < 2 or np.any(np.diff(times) <= 0):
+        return None
+    return PacketIndex(times, np.array(key, dtype=bool)[order], base)
+
+
+def decode_packets(path: Path, chosen: Container[int] | None, threads: int) -> Iterator[av.VideoFrame]:
+    """Decode packets of a film, by themselves.
+
+    Parameters
+    ----------
+    path : of a film.
+    chosen : presentation times of those to be decoded, which must be key frames; None for all.
+    threads : of the decoder.
+
+    Yields
+    ------
+    frames, those that cannot be decoded left out.
+    """
+    import av
+
+    with quiet_log() as complaints, av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        stream.codec_context.thread_count = threads
+        packets = container.demux(stream)
+        wanted = (packet for packet in packets if chosen is None or not packet.size or packet.pts in chosen)
+        yield from _frames_of(wanted, complaints)
+
+
+def _keep(decoded: Decoded, frame: av.VideoFrame, base_s: float) -> None:
     decoded.times_s.append(math.nan if frame.pts is None else frame.pts * base_s)
     decoded.corrupt.append(bool(frame.is_corrupt))
     decoded.key.append(bool(frame.key_frame))

@@ -8,9 +8,8 @@ carry the true rate (tag 51044) and the exposure (33434), and so do the files of
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.files import file_size
-from vinetrack.core.records import Trial
-from vinetrack.video.decoding import Decoded, damaged_frames, decode_container, memory_for_pictures, quiet_log
+from vinetrack.video.decoding import (
+    HALF_TICK,
+    Decoded,
+    PacketIndex,
+    damaged_frames,
+    decode_container,
+    quiet_log,
+)
 
 if TYPE_CHECKING:
     import av
@@ -33,15 +38,6 @@ TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
 
 DECODER_THREADS = 2
 """Chosen: as many recordings are tracked at once as there are cores; more threads gain nothing then."""
-
-SAME_RATE = 0.005
-"""Derived: 29.97 and 30 frames a second differ by 0.1 %, 23.976 and 24 likewise; a rate of capture that is no rate of
-playback but within 0.5 % of one is 30.1 for 30, which no camera offers."""
-
-SAME_EXPOSURE = 0.02
-"""Part by which exposures of sheet and recording may differ and be one. Chosen: cameras round to a microsecond of 50,
-sheets to two digits. By reasoning: at half some rounded ones are refused; at twice one of 96 µs for 100 passes, which
-moves no position."""
 
 
 class RecordingError(ValueError):
@@ -105,7 +101,8 @@ class Frames:
     `luma` has shape (n_frames, height, width), uint8 or uint16; `slot` shape (n_frames,) counts capture periods from
     the first frame, as the timestamps (or the numbers of image files) tell: 0, 1, 2 … where none is missing.
     `damaged` marks frames the decoder calls corrupt, and those decoded from them: all up to the next key frame. `notes`
-    are sentences for a person.
+    are sentences for a person. Of a long recording only the frames about its event are decoded; `slots_before` and
+    `slots_after`, shape (n,), are the capture periods of those before and after.
     """
 
     recording: Recording
@@ -114,9 +111,21 @@ class Frames:
     slot: NDArray[np.int_]
     damaged: NDArray[np.bool_]
     notes: tuple[str, ...] = ()
+    slots_before: NDArray[np.int_] = field(default_factory=lambda: np.zeros(0, dtype=int))
+    slots_after: NDArray[np.int_] = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     def __len__(self) -> int:
         return len(self.luma)
+
+    @property
+    def first(self) -> int:
+        """Number of the first of them in the recording, counted from 0."""
+        return len(self.slots_before)
+
+    @property
+    def n_recorded(self) -> int:
+        """Frames of the recording, decoded or not."""
+        return len(self.slots_before) + len(self.luma) + len(self.slots_after)
 
 
 def inspect_recording(path: Path | str) -> Recording:
@@ -155,7 +164,12 @@ def inspect_recording(path: Path | str) -> Recording:
     return _inspect_container(path)
 
 
-def read_frames(path: Path | str | Recording, region: Region | None = None, threads: int = DECODER_THREADS) -> Frames:
+def read_frames(
+    path: Path | str | Recording,
+    region: Region | None = None,
+    threads: int = DECODER_THREADS,
+    part: tuple[int, int, PacketIndex] | None = None,
+) -> Frames:
     """Decode every frame of a recording, or the `region` of it.
 
     Parameters
@@ -163,6 +177,7 @@ def read_frames(path: Path | str | Recording, region: Region | None = None, thre
     path : of the recording, or what `inspect_recording` returned.
     region : part of the picture; the whole where None.
     threads : of the decoder.
+    part : first and last frame of a film that are decoded, with the list of all; None for every frame.
 
     Returns
     -------
@@ -176,48 +191,42 @@ def read_frames(path: Path | str | Recording, region: Region | None = None, thre
     recording = path if isinstance(path, Recording) else inspect_recording(path)
     region = region or recording.whole
     if recording.raw is not None:
-        return _read_raw(recording, recording.raw, region)
+        from vinetrack.video.raw_frames import read_raw
+
+        return read_raw(recording, recording.raw, region)
     if recording.kind != "container":
         from vinetrack.video.images import read_images
 
         return read_images(recording, region)
     shape = recording.height, recording.width
+    expected, between_s = recording.declared_frames, None
+    if part is not None:
+        first, last, index = part
+        expected, between_s = last - first + 1, (float(index.times_s[first]), float(index.times_s[last]))
     try:
-        decoded = decode_container(recording.path, shape, lambda frame: _luma_plane(frame, region), threads)
+        decoded = decode_container(
+            recording.path, shape, lambda frame: luma_plane(frame, region), threads, expected, between_s
+        )
     except MemoryError:
-        raise _too_large(recording) from None
-    return _assemble(recording, region, decoded)
+        raise too_large(recording) from None
+    return _assemble(recording, region, decoded, None if part is None else part[2])
 
 
-def _too_large(recording: Recording) -> RecordingError:
+def too_large(recording: Recording) -> RecordingError:
+    """What is said of a recording that does not fit in memory.
+
+    Parameters
+    ----------
+    recording : from `inspect_recording`.
+
+    Returns
+    -------
+    the error, to be raised.
+    """
     return RecordingError(
         f"{recording.path.name}: its frames of {recording.width} x {recording.height} px do not fit in the memory "
         "of this machine; cut it to the growth, and to the part of the picture that shows it"
     )
-
-
-def _read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
-    """Frames of a camera's own file, straight into one array."""
-    name, notes = recording.path.name, list(recording.notes)
-    shape = (len(raw.offsets), *region.shape)
-    if math.prod(shape) * raw.dtype.itemsize > memory_for_pictures():
-        raise _too_large(recording)
-    luma, n = np.empty(shape, raw.dtype), 0
-    for n, picture in enumerate(raw.pictures(), 1):
-        luma[n - 1] = picture[region.slices]
-    if n == 0:
-        raise RecordingError(f"{name}: not one frame is in the file; copy it from the camera again")
-    if recording.declared_frames is not None and n < recording.declared_frames:
-        notes.append(
-            f"{name}: {n} frames are there where the file declares {recording.declared_frames}: cut short; "
-            "copy it from the camera again"
-        )
-    slot, irregular = np.arange(n), ""
-    if raw.times_s is not None:
-        slot, irregular = slots_from_times(raw.times_s[:n])
-    if irregular:
-        notes.append(f"{name}: {irregular}")
-    return Frames(recording, region, luma[:n], slot, np.zeros(n, dtype=bool), tuple(notes))
 
 
 def iterate_frames(recording: Recording, region: Region | None = None) -> Iterator[NDArray[Any]]:
@@ -247,13 +256,23 @@ def iterate_frames(recording: Recording, region: Region | None = None) -> Iterat
     with av.open(str(recording.path)) as container:
         try:
             for frame in container.decode(video=0):
-                yield _luma_plane(frame, region)
+                yield luma_plane(frame, region)
         except av.error.FFmpegError:
             return
 
 
-def _luma_plane(frame: av.VideoFrame, region: Region) -> NDArray[Any]:
-    """Brightness of one decoded frame inside `region`: a copy, shape region.shape, uint8 or uint16."""
+def luma_plane(frame: av.VideoFrame, region: Region) -> NDArray[Any]:
+    """Brightness of one decoded frame.
+
+    Parameters
+    ----------
+    frame : as the decoder gives it.
+    region : part of the picture.
+
+    Returns
+    -------
+    grey levels, a copy, shape region.shape, uint8 or uint16.
+    """
     name = frame.format.name
     depth = frame.format.components[0].bits
     if not (name.startswith(("yuv", "gray", "nv12", "nv16", "nv21", "p010")) and frame.format.is_planar) and (
@@ -318,18 +337,30 @@ def _looks_like_mp4(path: Path) -> bool:
         return stream.read(12)[4:8] in {b"ftyp", b"mdat", b"wide", b"free"}
 
 
-def _assemble(recording: Recording, region: Region, decoded: Decoded) -> Frames:
-    n = len(decoded.pictures)
+def _assemble(recording: Recording, region: Region, decoded: Decoded, index: PacketIndex | None) -> Frames:
+    n = len(decoded.times_s)
     name = recording.path.name
     if n == 0:
         raise RecordingError(f"{name}: not one frame can be decoded; the file is damaged")
     notes = list(recording.notes)
-    if recording.declared_frames is not None and n < recording.declared_frames:
+    there = n if index is None else len(index.pts)
+    if recording.declared_frames is not None and there < recording.declared_frames:
         notes.append(
-            f"{name}: {n} frames decoded where the file declares {recording.declared_frames}: "
-            "cut short or damaged; copy it from the camera again"
+            f"{name}: {there} frames {'decoded' if index is None else 'are there'} where the file declares "
+            f"{recording.declared_frames}: cut short or damaged; copy it from the camera again"
         )
-    slot, irregular = slots_from_times(np.array(decoded.times_s))
+    times_s = np.array(decoded.times_s)
+    before = after = slot = np.zeros(0, dtype=int)
+    if index is None:
+        slot, irregular = slots_from_times(times_s)
+    else:
+        slots, irregular = slots_from_times(index.times_s)
+        number = np.searchsorted(index.times_s, times_s - HALF_TICK * index.base_s)
+        before, slot, after = slots[: number[0]], slots[number], slots[number[-1] + 1 :]
+        notes.append(
+            f"{name}: of {there} frames {number[0]} to {number[-1]} are decoded, about what moves; name others in "
+            "frames_used"
+        )
     damaged = damaged_frames(decoded, slot)
     if decoded.complaints or damaged.any():
         complaint = f"; the decoder says: {decoded.complaints[0].strip()}" if decoded.complaints else ""
@@ -339,7 +370,7 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded) -> Frames:
         )
     if irregular:
         notes.append(f"{name}: {irregular}")
-    return Frames(recording, region, np.stack(decoded.pictures), slot, damaged, tuple(notes))
+    return Frames(recording, region, decoded.pictures, slot, damaged, tuple(notes), before, after)
 
 
 def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]:
@@ -372,67 +403,3 @@ def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]
     if missing == 0 or missing > max(3, len(times) // 10):
         return plain, "" if missing == 0 else "its timestamps are irregular; frames are timed by their index"
     return slot, f"{missing} frames are missing by the timestamps; the others keep their own time"
-
-
-def capture_rate(trial: Trial, recording: Recording) -> float:
-    """Return the capture rate: the user's; that which the recording states where the sheet is blank.
-
-    Parameters
-    ----------
-    trial : its `capture_fps` is that of the sheet, NaN where blank.
-    recording : from `inspect_recording`.
-
-    Returns
-    -------
-    frames a second.
-
-    Raises
-    ------
-    RecordingError
-        Where there is none, where sheet and recording differ, and where it is the file's rate of playback.
-    """
-    true_fps, stated = recording.capture_fps, trial.capture_fps
-    if true_fps is not None:
-        if np.isfinite(stated) and abs(stated / true_fps - 1) > 1e-3:
-            raise RecordingError(
-                f"{trial.name}: capture_fps is {stated:g} in the sheet but {true_fps:g} in the recording; "
-                "correct the sheet"
-            )
-        return true_fps
-    if not np.isfinite(stated):
-        raise RecordingError(f"{trial.name}: capture_fps is missing; the file knows its playback rate only")
-    playback = recording.playback_fps
-    if playback and abs(stated / playback - 1) < SAME_RATE and not trial.capture_fps_is_playback:
-        raise RecordingError(
-            f"{trial.name}: capture_fps is {stated:g} in the sheet, the rate at which the file plays ({playback:.4g}); "
-            "write the rate of capture, or capture_fps_is_playback: yes where the film plays as fast as it was captured"
-        )
-    return stated
-
-
-def capture_exposure(trial: Trial, recording: Recording) -> float:
-    """Return the exposure of a frame: that which the recording states, else that of the sheet.
-
-    Parameters
-    ----------
-    trial : its `exposure_s` is that of the sheet, NaN where blank.
-    recording : from `inspect_recording`.
-
-    Returns
-    -------
-    s; NaN where neither knows it.
-
-    Raises
-    ------
-    RecordingError
-        Where both do and differ.
-    """
-    true_s, stated_s = recording.exposure_s, trial.exposure_s
-    if true_s is None:
-        return stated_s
-    if np.isfinite(stated_s) and abs(stated_s / true_s - 1) > SAME_EXPOSURE:
-        raise RecordingError(
-            f"{trial.name}: exposure_us is {1e6 * stated_s:.4g} in the sheet but {1e6 * true_s:.4g} in the recording; "
-            "correct the sheet"
-        )
-    return true_s

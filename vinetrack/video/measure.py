@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
-from vinetrack.video.frames import Frames, Recording, RecordingError, capture_rate, inspect_recording, read_frames
+from vinetrack.video.capture_clock import capture_rate
+from vinetrack.video.event_frames import read_event
+from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording
 from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.track import Tracking, track_frames
 
@@ -71,7 +73,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
         raise RecordingError(
             f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
         )
-    frames = read_frames(recording)
+    frames = read_event(recording, trial.frames_used)
     m_per_px, rel_sigma, position_m = trial.m_per_px, math.nan, None
     axis = given_axis(trial, settings, m_per_px if calibration is None else calibration.m_per_px)
     if calibration is not None:

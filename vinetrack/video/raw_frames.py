@@ -6,6 +6,7 @@ read.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.video.decoding import memory_for_pictures
+from vinetrack.video.frames import Frames, Recording, RecordingError, Region, slots_from_times, too_large
 
 _TABLE_STEPS = (
     "31111111111110111111111111111101111111111111110111111111111111011111111111111110111111111111111011111111"
@@ -123,3 +126,43 @@ def levelled(mosaic: NDArray[Any]) -> NDArray[Any]:
 
     kernel = np.array([0.25, 0.5, 0.25], np.float32)
     return np.rint(cv2.sepFilter2D(mosaic.astype(np.float32), -1, kernel, kernel)).astype(mosaic.dtype)
+
+
+def read_raw(recording: Recording, raw: RawFrames, region: Region) -> Frames:
+    """Read every frame of a camera's own file, straight into one array.
+
+    Parameters
+    ----------
+    recording : from `inspect_recording`.
+    raw : where its frames lie.
+    region : part of the picture.
+
+    Returns
+    -------
+    every frame with its capture period.
+
+    Raises
+    ------
+    RecordingError
+        Where they do not fit in memory, or there is none.
+    """
+    name, notes = recording.path.name, list(recording.notes)
+    shape = (len(raw.offsets), *region.shape)
+    if math.prod(shape) * raw.dtype.itemsize > memory_for_pictures():
+        raise too_large(recording)
+    luma, n = np.empty(shape, raw.dtype), 0
+    for n, picture in enumerate(raw.pictures(), 1):
+        luma[n - 1] = picture[region.slices]
+    if n == 0:
+        raise RecordingError(f"{name}: not one frame is in the file; copy it from the camera again")
+    if recording.declared_frames is not None and n < recording.declared_frames:
+        notes.append(
+            f"{name}: {n} frames are there where the file declares {recording.declared_frames}: cut short; "
+            "copy it from the camera again"
+        )
+    slot, irregular = np.arange(n), ""
+    if raw.times_s is not None:
+        slot, irregular = slots_from_times(raw.times_s[:n])
+    if irregular:
+        notes.append(f"{name}: {irregular}")
+    return Frames(recording, region, luma[:n], slot, np.zeros(n, dtype=bool), tuple(notes))

@@ -17,7 +17,8 @@ from vinetrack.core.problems import Problem
 from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.terminal import progress
 from vinetrack.experiment.settings import AxisSettings, ExperimentSettings
-from vinetrack.video.frames import Recording, RecordingError, capture_exposure, capture_rate, inspect_recording
+from vinetrack.video.capture_clock import capture_exposure, capture_rate
+from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.measure import given_axis
 from vinetrack.video.quick_look import look_at
 from vinetrack.video.recording_facts import RecordingFacts, size_problems

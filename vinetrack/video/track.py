@@ -10,17 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Floats, Indices, Track, Trial
 from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
+from vinetrack.video.capture_clock import capture_exposure, capture_rate
+from vinetrack.video.event_frames import read_event
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
-from vinetrack.video.frames import (
-    Frames,
-    RecordingError,
-    capture_exposure,
-    capture_rate,
-    inspect_recording,
-    read_frames,
-)
+from vinetrack.video.frames import Frames, RecordingError, inspect_recording
 from vinetrack.video.hand_corrections import corrected_by_hand
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.sound_frames import sound_stretch
@@ -85,6 +80,7 @@ class Tracking:
     (n_frames,), is how far along the axis a shaken camera moved each picture: what is drawn on it goes along.
     `tube_width_px` is the width of the tube behind the edge and `tube_width_sigma_px` its standard error, NaN for a
     body and for a tube that leaves the axis; `seen_exposure_frames`, `fast_px_per_frame` see `edge.EdgeFit`.
+    `strip_frames` are the frames that are the rows of `kymograph`, None for all.
     """
 
     track: Track
@@ -98,6 +94,12 @@ class Tracking:
     tube_width_sigma_px: float = math.nan
     seen_exposure_frames: float = math.nan
     fast_px_per_frame: float = math.nan
+    strip_frames: Indices | None = None
+
+    @property
+    def strip_rows(self) -> Indices:
+        """Frame of each row of `kymograph`, shape (n_rows,)."""
+        return np.arange(len(self.track.time_s)) if self.strip_frames is None else self.strip_frames
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ def track_recording(
         raise RecordingError(f"{trial.name}: no recording is named; fill in the column video")
     recording = inspect_recording(trial.video)
     capture_fps = capture_rate(trial, recording)
-    frames = read_frames(recording)
+    frames = read_event(recording, trial.frames_used)
     return track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
 
 
@@ -180,9 +182,9 @@ def track_frames(
     exposure_s = capture_exposure(trial, frames.recording)
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
-    rejected = odd_frames(frames.luma)
-    first, last = trial.frames_used or (0, len(frames) - 1)
-    number = np.arange(len(frames))
+    rejected = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
+    first, last = trial.frames_used or (0, frames.n_recorded - 1)
+    number = frames.first + np.arange(len(frames))
     used = (number >= first) & (number <= last)
     if used.sum() < FEWEST_FRAMES:
         raise RecordingError(f"{name}: frames_used leaves {int(used.sum())} of {len(frames)} frames; widen it")
@@ -203,7 +205,8 @@ def track_frames(
     sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
     end_px = strip.axis.length_px - edge_fit.reach_px
     verdict = judge(
-        edge_fit.edge_px, sigma, frames.slot[kept], kept, unsure=edge_fit.unsure, repeated=repeated, end_px=end_px,
+        edge_fit.edge_px, sigma, frames.slot[kept], number[kept], unsure=edge_fit.unsure, repeated=repeated,
+        end_px=end_px,
     )  # fmt: skip
     sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
     if verdict.last_moving < 0:
@@ -216,9 +219,9 @@ def track_frames(
     scale = trial.m_per_px if m_per_px is None else m_per_px
     notes = [*frames.notes, *verdict.notes]
     if edge_fit.end is not None:
-        notes.append(f"{name}: {_end_in_words(edge_fit.end, kept)}")
+        notes.append(f"{name}: {_end_in_words(edge_fit.end, number[kept])}")
     elif not _is_grown(edge_fit.edge_px, verdict, trial.length_m / scale):
-        notes += _ending(luma, verdict, edge_fit.edge_px, name, kept)
+        notes += _ending(luma, verdict, edge_fit.edge_px, name, number[kept])
     if not orderly:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
@@ -226,22 +229,22 @@ def track_frames(
         )
     if frames.damaged[used].any():
         notes.append(
-            f"{name}: {int(sound.sum())} of {len(frames)} frames are used, {kept[0]} to {kept[-1]}: damaged ones, and"
-            " those beyond them, do not count until their edge is placed in corrections.csv"
+            f"{name}: {int(sound.sum())} of {len(frames)} frames are used, {number[kept[0]]} to {number[kept[-1]]}: "
+            "damaged ones, and those beyond them, do not count until their edge is placed in corrections.csv"
         )
     if rejected.any():
-        first = int(np.flatnonzero(rejected)[0])
+        first = int(number[rejected][0])
         notes.append(f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {first}")
     track = _assemble(frames, kept, edge_fit, sigma, verdict, capture_fps, exposure_s, notes)
     track = corrected_by_hand(track, trial.corrections)
     track = _in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
-    pictures = tuple((int(kept[i]), luma[i]) for i in chosen)
-    shake_px = np.zeros(len(frames))
-    shake_px[kept] = strip.shift_px[:, 0] if strip.steadied else 0.0
+    pictures = tuple((int(number[kept[i]]), luma[i].copy()) for i in chosen)
+    shake_px = np.zeros(frames.n_recorded)
+    shake_px[number[kept]] = strip.shift_px[:, 0] if strip.steadied else 0.0
     return Tracking(
         track, strip.axis, _kymograph(strip), pictures, edge_fit.blur_px, edge_fit.exposure_frames, shake_px,
-        *edge_fit.width_px, *edge_fit.seen_exposure,
+        *edge_fit.width_px, *edge_fit.seen_exposure, strip_frames=number[kept],
     )  # fmt: skip
 
 
@@ -405,8 +408,13 @@ def _assemble(
     error[kept] = np.where(verdict.unseen, np.nan, sigma)
     flag[kept] = verdict.flag
     slot[kept] = verdict.slot
+    # Frames that were not decoded, since nothing moves in them, have rows as well.
+    before, after = frames.slots_before, frames.slots_after
+    slot = np.concatenate([before, slot, after + (slot[-1] - frames.slot[-1])])
+    flag = np.concatenate([np.full(len(before), "before_release"), flag, np.full(len(after), "after_end")])
+    edge, error = (np.pad(values, (len(before), len(after)), constant_values=np.nan) for values in (edge, error))
     time = slot / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)
-    return Track(time, np.full(n, np.nan), error, flag, edge, None, tuple(notes))
+    return Track(time, np.full(len(edge), np.nan), error, flag.astype("<U64"), edge, None, tuple(notes))
 
 
 def _in_metres(track: Track, axis: Axis, m_per_px: float, position_m: Callable[[Floats], Floats] | None) -> Track:

@@ -1,0 +1,145 @@
+"""Long recordings: only the frames about the event are decoded, and the track is the one of the whole recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from camera_files import write_cine
+from plain_scene import Plan, Scene, plain_scene, write_video
+
+from vinetrack.core.records import Track, Trial
+from vinetrack.video import event_frames
+from vinetrack.video.decoding import packet_index
+from vinetrack.video.event_frames import MARGIN_FRAMES, event_range, read_event
+from vinetrack.video.frames import inspect_recording, read_frames
+from vinetrack.video.track import track_recording
+
+BEFORE, AFTER = 500, 300
+"""Frames of rest beyond those of the scene."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return plain_scene(
+        Plan(seed=20942, width=384, height=96, from_px=(24.0, 48.0), end_px=320.0, radius=14.0, speed=9.0)
+    )
+
+
+@pytest.fixture(scope="module")
+def long_frames(scene: Scene) -> np.ndarray:
+    """The scene with rest before and after it, each frame of rest with grain of its own."""
+    rng = np.random.default_rng(20943)
+
+    def rest(frame: np.ndarray, count: int) -> np.ndarray:
+        grain = np.rint(rng.normal(0, 2.0, (count, *frame.shape)))
+        return np.clip(frame + grain, 0, 255).astype(np.uint8)
+
+    return np.concatenate([rest(scene.frames[0], BEFORE), scene.frames, rest(scene.frames[-1], AFTER)])
+
+
+@pytest.fixture(scope="module", params=["key frame every 30", "one key frame", "key frames alone"])
+def film(request: pytest.FixtureRequest, long_frames: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    options = {"key frame every 30": "30", "one key frame": "5000", "key frames alone": "1"}
+    path = tmp_path_factory.mktemp("film") / "long.mp4"
+    return write_video(path, long_frames, options={"crf": "14", "g": options[request.param]})
+
+
+@pytest.fixture
+def bracketed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every recording counts as a long one."""
+    monkeypatch.setattr(event_frames, "HELD_BYTES", 0)
+
+
+def track(path: Path, **stated: object) -> Track:
+    return track_recording(replace(Trial(name="t", video=path, capture_fps=1000.0, exposure_s=2e-4), **stated)).track
+
+
+def test_a_film_that_can_be_held_is_decoded_whole(film: Path, long_frames: np.ndarray) -> None:
+    frames = read_event(inspect_recording(film))
+    assert (len(frames), frames.first, frames.n_recorded) == (len(long_frames), 0, len(long_frames))
+
+
+@pytest.mark.usefixtures("bracketed")
+def test_of_a_long_film_the_event_is_decoded_and_no_more(film: Path, scene: Scene, long_frames: np.ndarray) -> None:
+    frames = read_event(inspect_recording(film))
+    moving = np.flatnonzero(scene.moving) + BEFORE
+    assert frames.first <= moving[0] - 40
+    assert frames.first + len(frames) > moving[-1] + 40
+    assert len(frames) < len(moving) + 2 * (MARGIN_FRAMES + 60)
+    assert frames.n_recorded == len(long_frames)
+    whole = read_frames(film)
+    same = slice(frames.first, frames.first + len(frames))
+    assert np.array_equal(frames.luma, whole.luma[same])
+    assert np.array_equal(frames.slot, whole.slot[same])
+    assert f"of {len(long_frames)} frames {frames.first} to {same.stop - 1} are decoded" in frames.notes[-1]
+
+
+def test_the_track_is_that_of_the_whole_film(film: Path, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = track(film)
+    monkeypatch.setattr(event_frames, "HELD_BYTES", 0)
+    part = track(film)
+    assert len(part.time_s) == len(whole.time_s)
+    assert part.time_s == pytest.approx(whole.time_s)
+    moving = np.flatnonzero(scene.moving) + BEFORE
+    known = np.isfinite(part.edge_px[moving]) & np.isfinite(whole.edge_px[moving])
+    assert known.mean() > 0.95
+    apart = (part.edge_px - whole.edge_px)[moving][known]
+    assert np.std(apart) < 0.05
+    assert set(part.flag[: BEFORE - 150]) == {"before_release"}
+    assert set(part.flag[-100:]) == {"after_end"}
+    off = part.edge_px[moving][known] - scene.edge_px[moving - BEFORE][known]
+    assert np.std(off) < 0.3
+
+
+@pytest.mark.usefixtures("bracketed")
+def test_frames_that_the_sheet_names_are_those_that_are_decoded(film: Path, scene: Scene) -> None:
+    wanted = (BEFORE - 20, BEFORE + len(scene.frames) - 1)
+    frames = read_event(inspect_recording(film), wanted)
+    assert (frames.first, frames.first + len(frames) - 1) == wanted
+    made = track(film, frames_used=wanted)
+    assert np.isfinite(made.edge_px).sum() > 0.9 * scene.moving.sum()
+    assert not np.isfinite(made.edge_px[: wanted[0]]).any()
+
+
+@pytest.mark.usefixtures("bracketed")
+def test_of_a_long_cine_the_event_is_read_and_no_more(scene: Scene, long_frames: np.ndarray, tmp_path: Path) -> None:
+    missing = np.delete(np.arange(len(long_frames) + 1), BEFORE + 30) / 1000 + 0.2
+    deep = long_frames.astype(np.uint16) * 16
+    path = write_cine(tmp_path / "long.cine", deep, rate=1000, exposure_ns=200_000, times_s=missing)
+    frames = read_event(inspect_recording(path))
+    same = slice(frames.first, frames.first + len(frames))
+    assert len(frames) < len(scene.frames) + 2 * (MARGIN_FRAMES + 20)
+    assert np.array_equal(frames.luma, deep[same])
+    assert np.array_equal(frames.slot, np.rint((missing - 0.2) * 1000)[same])
+    made = track(path, capture_fps=np.nan, exposure_s=np.nan)
+    assert len(made.time_s) == len(long_frames)
+    assert made.time_s[-1] == pytest.approx(len(long_frames) / 1000 + 1e-4)
+
+
+@pytest.mark.usefixtures("bracketed")
+def test_a_film_in_which_nothing_stands_out_is_decoded_whole(tmp_path: Path) -> None:
+    still = np.random.default_rng(4).normal(90, 2, (200, 64, 96)).clip(0, 255).astype(np.uint8)
+    path = write_video(tmp_path / "still.mp4", still, options={"crf": "14", "g": "10"})
+    assert len(read_event(inspect_recording(path))) == 200
+
+
+def test_the_event_lies_between_the_pictures_that_differ_from_either_end() -> None:
+    rng = np.random.default_rng(8)
+    pictures = [rng.normal(80, 1.5, (48, 64)).clip(0, 255).astype(np.uint8) for _ in range(60)]
+    for i in range(20, 60):
+        pictures[i][20:30, : min(60, 4 * (i - 19))] = 170
+    numbers = np.arange(60) * 50
+    # From picture 19, the last at rest, to 34, the first at the end, and a margin of MARGIN_PART of that.
+    assert event_range(pictures, numbers, 3000) == (19 * 50 - 112, 34 * 50 + 112)
+    assert event_range(pictures[:20], numbers[:20], 1000) is None
+
+
+def test_packets_are_listed_in_the_order_in_which_they_are_shown(film: Path, long_frames: np.ndarray) -> None:
+    index = packet_index(film)
+    assert index is not None
+    assert len(index.pts) == len(long_frames)
+    assert np.ptp(np.diff(index.times_s)) == pytest.approx(0, abs=1e-9)
+    assert index.key[0]
