@@ -116,6 +116,27 @@ def _latch(draw: Draw, scene: Scene) -> Hidden:
     return Hidden({"latch_F": F, "latch_reach": reach}, {"latch_release.F": F, "latch_release.reach": reach})
 
 
+def _falling(draw: Draw, scene: Scene) -> Hidden:
+    F, speed = scene.weakest_N * _between(draw, 0.1, 0.8), _between(draw, 0.1, 3.0)
+    power = float(draw.choice([1.0, 2.0]))
+    values = {"falling_friction.F_s": F, "falling_friction.v_s": speed, "falling_friction.k": power}
+    return Hidden({"stribeck_F": F, "stribeck_speed": speed, "stribeck_power": power}, values)
+
+
+def _pulsation(draw: Draw, scene: Scene) -> Hidden:
+    # From half a period in the time that a slow trial takes, up to where the vine no longer follows.
+    lowest = max(5.0, 0.5 * scene.slowest_m_s / (2 * scene.longest_m))
+    a, hz, phase = _between(draw, 0.02, 0.2), _between(draw, lowest, 60.0), float(draw.uniform(-math.pi, math.pi))
+    values = {"supply_pulsation.a": a, "supply_pulsation.f": hz, "supply_pulsation.phi": phase}
+    return Hidden({"ringing": a, "ringing_hz": hz, "ringing_phase": phase}, values)
+
+
+def _stop(draw: Draw, scene: Scene) -> Hidden:
+    y = scene.shortest_m * float(draw.uniform(0.3, 0.8))
+    k = scene.weakest_N / (scene.longest_m - y) * _between(draw, 0.2, 10.0)
+    return Hidden({"stop_k": k, "stop_y": y}, {"end_stop.k": k, "end_stop.y_0": y})
+
+
 def _length_scale(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
     eps = _either(draw, 0.005, 0.1)
     return Hidden(values={"length_scale.eps": eps}, scale=eps)
@@ -179,6 +200,16 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "wall_stretch": (_one("wall_stretch.kappa", "kappa", 5e-7, 1e-5), Wants()),
     "tail_stretch": (_one("tail_stretch.compliance", "compliance", 2e-8, 1e-7), Wants()),
     "latch_release": (_latch, Wants()),
+    "reel_inertia": (_one("reel_inertia.M", "reel_kg", 0.002, 0.1), Wants()),
+    "falling_friction": (_falling, Wants()),
+    "supply_pulsation": (_pulsation, Wants()),
+    "end_stop": (_stop, Wants()),
+    "quadratic_length_friction": (
+        _one(
+            "quadratic_length_friction.q", "square_q", 0.05, 50.0, lambda s: 0.8 * s.weakest_N / s.longest_m**2
+        ),
+        Wants(),
+    ),
     "length_scale": (_length_scale, Wants()),
     "time_base": (_time_base, Wants()),
     "pressure_gain": (_pressure_gain, Wants(quiet=True)),
@@ -222,11 +253,6 @@ def _ripple(draw: Draw, scene: Scene) -> Hidden:
     return Hidden({"ripple_F": F, "ripple_length": length, "ripple_phase": phase})
 
 
-def _stribeck(draw: Draw, scene: Scene) -> Hidden:
-    F = scene.weakest_N * _between(draw, 0.05, 0.6)
-    return Hidden({"stribeck_F": F, "stribeck_speed": scene.slowest_m_s * _between(draw, 0.3, 4.0)})
-
-
 def _growing(draw: Draw, scene: Scene) -> Hidden:
     slowest_s = 2 * scene.longest_m / scene.slowest_m_s
     return Hidden({"growing_F": scene.weakest_N * _between(draw, 0.1, 0.7), "growing_s": slowest_s})
@@ -237,21 +263,25 @@ def _changed_film(draw: Draw, scene: Scene) -> Hidden:
     return Hidden({"step_B": _either(draw, 0.05, 0.3), "step_y": y})
 
 
-def _ringing(draw: Draw, scene: Scene) -> Hidden:
-    hz = float(draw.uniform(0.7, 3)) * scene.slowest_m_s / scene.longest_m
-    return Hidden({"ringing": _between(draw, 0.02, 0.15), "ringing_hz": hz})
+def _cubic(draw: Draw, scene: Scene) -> Hidden:
+    return Hidden({"cubic": scene.weakest_N * _between(draw, 0.05, 0.6) / scene.slowest_m_s**3})
+
+
+def _beyond(draw: Draw, scene: Scene) -> Hidden:
+    speed = scene.slowest_m_s * float(draw.uniform(0.3, 0.8))
+    return Hidden({"beyond": scene.weakest_N * _between(draw, 0.1, 1.0) / speed**2, "beyond_speed": speed})
 
 
 OUTSIDERS: dict[str, tuple[Maker, Wants]] = {
     "rough_patch": (_patch, Wants()),
     "ripple": (_ripple, Wants()),
-    "stribeck": (_stribeck, Wants()),
     "growing_friction": (_growing, Wants()),
     "changed_film": (_changed_film, Wants()),
-    "ringing": (_ringing, Wants()),
+    "cubic": (_cubic, Wants()),
+    "beyond_a_speed": (_beyond, Wants()),
 }
-"""Forces that are in no catalogue: a rough patch, a ripple along the film, one that falls with speed, one that grows
-with time, a film that changes half-way, a supply that rings."""
+"""Forces that are in no catalogue: a rough patch, a ripple along the film, one that grows with time, a film that changes
+half-way, one with the third power of the speed, one with the square of what is beyond a speed."""
 
 NULLS = (
     "anything",

@@ -63,6 +63,16 @@ class Physics(NamedTuple):
     latch_F: float = 0.0
     latch_reach: float = 1.0
     static_yield: float = 0.0
+    reel_kg: float = 0.0
+    stribeck_F: float = 0.0
+    stribeck_speed: float = 1.0
+    stribeck_power: float = 1.0
+    ringing: float = 0.0
+    ringing_hz: float = 1.0
+    ringing_phase: float = 0.0
+    stop_k: float = 0.0
+    stop_y: float = 0.0
+    square_q: float = 0.0
     # What no catalogue has.
     patch_F: float = 0.0
     patch_y: float = 0.0
@@ -70,14 +80,13 @@ class Physics(NamedTuple):
     ripple_F: float = 0.0
     ripple_length: float = 1.0
     ripple_phase: float = 0.0
-    stribeck_F: float = 0.0
-    stribeck_speed: float = 1.0
     growing_F: float = 0.0
     growing_s: float = 1.0
     step_B: float = 0.0
     step_y: float = 0.0
-    ringing: float = 0.0
-    ringing_hz: float = 1.0
+    cubic: float = 0.0
+    beyond: float = 0.0
+    beyond_speed: float = 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -90,7 +99,7 @@ def _sourced(t, y, chamber_Pa, area, tube, f):
             swept = tube.chamber / (tube.chamber + area * y)
             P = (tube.pressure + AMBIENT_PA) * swept**f.gamma - AMBIENT_PA
     P *= math.exp(-f.leak_rate * t)
-    return P * (1.0 + f.ringing * math.sin(2.0 * math.pi * f.ringing_hz * t))
+    return P * (1.0 + f.ringing * math.sin(2.0 * math.pi * f.ringing_hz * t + f.ringing_phase))
 
 
 @njit(cache=True, nogil=True)
@@ -144,7 +153,9 @@ def tail_force(t, y, w, P, film_kg, tube, f, bends):
     force -= f.latch_F * math.exp(-y / f.latch_reach)
     force -= f.patch_F * math.exp(-0.5 * ((y - f.patch_y) / f.patch_width) ** 2)
     force -= f.ripple_F * math.sin(2.0 * math.pi * y / f.ripple_length + f.ripple_phase)
-    force -= f.stribeck_F * math.exp(-w / f.stribeck_speed)
+    force -= f.stribeck_F * math.exp(-((w / f.stribeck_speed) ** f.stribeck_power))
+    force -= f.stop_k * max(y - f.stop_y, 0.0) + f.square_q * y * y
+    force -= f.cubic * w**3 + f.beyond * max(w - f.beyond_speed, 0.0) ** 2
     return force - f.growing_F * t / f.growing_s
 
 
@@ -157,7 +168,7 @@ def rates(t, y, w, chamber_Pa, tube, f, bends, trace_t, trace_P):
     film_kg = max(density * (tube.length - y), 0.0)
     gas_density = (P + AMBIENT_PA) / GAS_R_T
     least_kg = density * math.pi * tube.thickness + 0.25 * gas_density * area * tube.length
-    moved_kg = max(film_kg + f.gas * 0.25 * gas_density * area * y, least_kg) + tube.payload
+    moved_kg = max(film_kg + f.gas * 0.25 * gas_density * area * y, least_kg) + tube.payload + f.reel_kg
     drive = 0.5 * ((P - tube.yield_pressure) * area - tip_losses(w, P, area, f, y))
     accelerated = (drive + tail_force(t, y, w, P, film_kg, tube, f, bends)) / moved_kg
     if w <= 0.0:

@@ -37,10 +37,10 @@ def outsider_values(truth: Truth) -> dict[str, float]:
     values = {
         "rough_patch": {"F": f.patch_F, "place": f.patch_y, "width": f.patch_width},
         "ripple": {"F": f.ripple_F, "length": f.ripple_length, "phase": f.ripple_phase},
-        "stribeck": {"F": f.stribeck_F, "speed": f.stribeck_speed},
+        "cubic": {"c": f.cubic},
+        "beyond_a_speed": {"c": f.beyond, "speed": f.beyond_speed},
         "growing_friction": {"rate": f.growing_F / f.growing_s},
         "changed_film": {"delta": f.step_B, "place": f.step_y},
-        "ringing": {"swing": f.ringing, "rate": f.ringing_hz},
     }
     return {f"{truth.outsider}.{name}": value for name, value in values.get(truth.outsider, {}).items()}
 

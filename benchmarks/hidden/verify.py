@@ -33,6 +33,17 @@ SIZES: dict[str, tuple[Mapping[str, float], Mapping[str, float]]] = {
     "wall_stretch": ({"kappa": 3e-6}, {"kappa": 3e-6}),
     "tail_stretch": ({"compliance": 6e-8}, {"compliance": 6e-8}),
     "latch_release": ({"latch_F": 0.1, "latch_reach": 8e-3}, {"F": 0.1, "reach": 8e-3}),
+    "reel_inertia": ({"reel_kg": 0.01}, {"M": 0.01}),
+    "falling_friction": (
+        {"stribeck_F": 0.5, "stribeck_speed": 1.5, "stribeck_power": 2.0},
+        {"F_s": 0.5, "v_s": 1.5, "k": 2.0},
+    ),
+    "supply_pulsation": (
+        {"ringing": 0.1, "ringing_hz": 22.0, "ringing_phase": 0.7},
+        {"a": 0.1, "f": 22.0, "phi": 0.7},
+    ),
+    "end_stop": ({"stop_k": 8.0, "stop_y": 0.1}, {"k": 8.0, "y_0": 0.1}),
+    "quadratic_length_friction": ({"square_q": 3.0}, {"q": 3.0}),
     "length_scale": ({}, {"eps": 0.03}),
     "time_base": ({}, {"eps": -0.04}),
     "pressure_gain": ({}, {"eps": 0.05}),

@@ -62,10 +62,10 @@ def test_two_simulators_agree(effect):
 OUTSIDE = {
     "rough_patch": {"patch_F": 0.8, "patch_y": 0.1, "patch_width": 0.01},
     "ripple": {"ripple_F": 0.4, "ripple_length": 0.05, "ripple_phase": 1.0},
-    "stribeck": {"stribeck_F": 0.6, "stribeck_speed": 2.0},
+    "cubic": {"cubic": 1e-3},
+    "beyond_a_speed": {"beyond": 0.02, "beyond_speed": 2.0},
     "growing_friction": {"growing_F": 0.8, "growing_s": 0.2},
     "changed_film": {"step_B": 0.1, "step_y": 0.12},
-    "ringing": {"ringing": 0.05, "ringing_hz": 12.0},
 }
 
 

@@ -177,7 +177,9 @@ def plausible_range(parameter: Parameter) -> tuple[float, float]:
 
 
 def _typical_values(parameter: Parameter) -> tuple[float, ...]:
-    """Three values that span what is plausible, two where that is narrow."""
+    """Values that the effect names; else three that span what is plausible, two where that is narrow."""
+    if parameter.tried:
+        return parameter.tried
     low, high = plausible_range(parameter)
     if low > 0 and high / low > WIDE_RANGE:
         return tuple(np.geomspace(low, high, 5)[1:4].tolist())

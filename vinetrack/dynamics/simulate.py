@@ -385,7 +385,7 @@ def _limits(
         of_effect = model.effects[i].breakpoints
         assert of_effect is not None
         for k in np.flatnonzero(on[:, i]).tolist():
-            positions_m[k] += of_effect(TrialInputs(*rigs[k]))
+            positions_m[k] += of_effect(TrialInputs(*rigs[k]), *thetas[k, model.places[i]])
     breakpoints = np.full((len(rigs), 1 + max(map(len, positions_m), default=0)), math.inf)
     breakpoints[:, 0] = floor
     for k, positions in enumerate(positions_m):

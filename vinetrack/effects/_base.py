@@ -89,7 +89,8 @@ class Parameter:
 
     `zero` is the value at which the effect vanishes; `shared` says over what one value holds: `all` trials or one
     `vine`. `bounds` are what physics allows, `plausible` what an experimenter would believe. One that is `held` is
-    known beforehand: a fit leaves it at its value unless told to find it.
+    known beforehand: a fit leaves it at its value unless told to find it. `tried` are values at which a diagnosis tries
+    the effect where it is no size but a shape; without them two or three of the plausible range.
     """
 
     name: str
@@ -102,6 +103,7 @@ class Parameter:
     plausible: tuple[float, float] | None = None
     meaning: str = ""
     held: bool = False
+    tried: tuple[float, ...] = ()
 
     @property
     def sign(self) -> int:
@@ -130,7 +132,8 @@ class Worked:
 class Effect:
     """One term of the model, read from one file.
 
-    Its functions take `(s: State, rig: Rig, *parameters)` and return, by hook:
+    `breakpoints` takes `(rig: TrialInputs, *parameters)`; its other functions take `(s: State, rig: TrialInputs,
+    *parameters)` and return, by hook:
 
     true_time           time since release at which what the camera stamps `s.time` really happened, s
     trace_time          time since release at which what a pressure trace stamps `s.time` really happened, s
@@ -166,7 +169,7 @@ class Effect:
     replaces: tuple[str, ...] = ()  #: effects that it contains and that rest while it is in the model
     order: int = 3  #: place among the effects of one hook
     finite: bool = False  #: small sizes look like something else (a later release): it is tried at finite ones too
-    breakpoints: Callable[[TrialInputs], Sequence[float]] | None = None  #: lead positions where its slope breaks, m
+    breakpoints: Callable[..., Sequence[float]] | None = None  #: lead positions where its slope breaks, m
 
     @property
     def formula(self) -> str:

@@ -110,11 +110,16 @@ def load_effect(path: Path | str) -> Effect:
 
 
 def _breakpoints(module: ModuleType) -> Any:
-    """The function `breakpoints` of an effect's file; under its former name for one release."""
+    """The function `breakpoints` of an effect's file, of rig and parameters; under its former name for one release.
+
+    One that takes the rig alone does not depend on parameters.
+    """
     if hasattr(module, "corners") and not hasattr(module, "breakpoints"):
         warnings.warn(f"{module.__file__}: `corners` is now called `breakpoints`", FutureWarning, stacklevel=3)
-        return module.corners
-    return getattr(module, "breakpoints", None)
+    function = getattr(module, "breakpoints", getattr(module, "corners", None))
+    if function is None or len(inspect.signature(function).parameters) > 1:
+        return function
+    return lambda rig, *_: function(rig)
 
 
 def _faults(effect: Effect) -> Iterable[str]:

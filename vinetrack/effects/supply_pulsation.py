@@ -1,0 +1,65 @@
+"""Supply pulsation: the pressure swings, as behind a pump or a regulator that hunts.
+
+Matters where the swing is slow enough for the vine to follow: at 20 Hz one part in twenty of the pressure moves the
+edge by millimetres, at 100 Hz by tenths.
+
+    P → P (1 + a sin(2π f t + φ)), t from release
+
+φ counts as one number for all trials: release is locked to the swing, or the swing begins with the opening. A swing
+that meets each trial at another phase is a deviation of single trials instead.
+
+Easily taken for noise that is correlated, or where less than one period is filmed for `leak` and `reservoir_depletion`.
+A pressure measured beside the inlet shows it, and then takes the place of this effect.
+
+Reduce it with a chamber between pump and vine, ten times the volume that the vine takes. Measure it with a fast gauge.
+
+Source: the first term of a Fourier series; reciprocating pumps and relay-controlled regulators are its usual makers.
+"""
+
+import numpy as np
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "physical"
+IN_TRACE = True
+ORDER = 2  # convention: see `Effect`, its place among those of one hook
+EASILY_TAKEN_FOR = ("leak", "reservoir_depletion")
+PARAMETERS = (
+    Parameter("a", "a", "1", 0.05, bounds=(0.0, 0.9), plausible=(0.0, 0.2), meaning="swing as a part of the pressure"),
+    Parameter(
+        "f", "f", "Hz", 20.0, bounds=(1.0, 500.0), zero=20.0, plausible=(5.0, 100.0),
+        tried=tuple(float(f) for f in np.geomspace(5.5, 90.0, 13)), meaning="frequency",
+    ),
+    Parameter(
+        "phi", "φ", "rad", 0.0, bounds=(-7.0, 7.0), tried=(-np.pi / 2, 0.0, np.pi / 2, np.pi), meaning="phase at release"
+    ),
+)  # fmt: skip
+
+
+def pressure(s, rig, a, f, phi):  # noqa: ARG001, D103
+    return s.pressure * (1.0 + a * np.sin(2.0 * np.pi * f * np.maximum(s.time, 0.0) + phi))
+
+
+WORKED = (
+    Worked(
+        "pressure",
+        29.4e3,
+        "28000 × (1 + 0.05 sin(2π × 25 × 0.010)) = 28000 × (1 + 0.05 sin(π/2))",
+        state={"pressure": 28e3, "time": 10e-3},
+        parameters={"a": 0.05, "f": 25.0, "phi": 0.0},
+    ),
+    Worked(
+        "pressure",
+        28.7e3,
+        "at release 28000 × (1 + 0.05 sin(π/6)) = 28000 × 1.025",
+        state={"pressure": 28e3, "time": 0.0},
+        parameters={"a": 0.05, "f": 25.0, "phi": np.pi / 6},
+    ),
+    Worked(
+        "pressure",
+        28e3,
+        "of no size",
+        state={"pressure": 28e3, "time": 10e-3},
+        parameters={"a": 0.0, "f": 25.0, "phi": 1.0},
+    ),
+)
