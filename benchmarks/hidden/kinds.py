@@ -205,9 +205,7 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "supply_pulsation": (_pulsation, Wants()),
     "end_stop": (_stop, Wants()),
     "quadratic_length_friction": (
-        _one(
-            "quadratic_length_friction.q", "square_q", 0.05, 50.0, lambda s: 0.8 * s.weakest_N / s.longest_m**2
-        ),
+        _one("quadratic_length_friction.q", "square_q", 0.05, 50.0, lambda s: 0.8 * s.weakest_N / s.longest_m**2),
         Wants(),
     ),
     "length_scale": (_length_scale, Wants()),

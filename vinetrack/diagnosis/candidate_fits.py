@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, likelihood_ratio
-from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, SUSPECT, MisfitTests, misfit_tests
 from vinetrack.diagnosis.multi_start import SubsetFit, SubsetFitter, best_subset_fit, full_fit, start_of, starts_of
 from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
@@ -98,6 +98,14 @@ class CandidateFits:
         """Effects that may be missing, the most promising first."""
         names = dict.fromkeys(self.questions.answers.effects)
         return sorted(names, key=lambda name: -self.questions.promise(name))
+
+    @property
+    def explained(self) -> bool:
+        """Whether a hypothesis explains the tracks: what still stays far off once it is fitted is no rival.
+
+        Those that came near it on a part of the trials are led on all the same.
+        """
+        return any(hypothesis.fit.chi2_per_dof < SUSPECT for hypothesis in self.fitted.values())
 
     def after(self, fit: Fit) -> MisfitTests:
         """What one of its fits leaves, asked once.
@@ -263,20 +271,24 @@ class CandidateFits:
             return
         self.report(f"fitting {name}")
         best = max((fitted_one.fit.log_likelihood for fitted_one in self.fitted.values()), default=-math.inf)
-        hypothesis = self._from_climb(climb, best)
+        led = math.isfinite(climb.deviance) or not self.explained
+        hypothesis = self._from_climb(climb, best, led=led)
         promised = self.base - climb.deviance if math.isfinite(climb.deviance) else 0.0
         if hypothesis is not None and hypothesis.delta_chi2 < max(WORSE, PART_KEPT * promised):
             # The smaller model is in this one, and part of the trials gained more: it was led astray by its start.
             smallest = SubsetFit(climb.effects, math.nan, self._smallest(climb.effects))
-            others = (self._from_climb(climb, best, afresh=True), self._from_climb(smallest, best))
+            others = (
+                self._from_climb(climb, best, afresh=True, led=led),
+                self._from_climb(smallest, best, led=led),
+            )
             hypothesis = max((known for known in (hypothesis, *others) if known is not None), key=_gain)
         if hypothesis is None or hypothesis.delta_chi2 < WORSE:
             self.silent.add(name)
         elif name not in self.fitted or hypothesis.delta_chi2 > self.fitted[name].delta_chi2:
             self.fitted[name] = hypothesis
 
-    def _from_climb(self, climb: SubsetFit, best: float, *, afresh: bool = False) -> LikelihoodRatio | None:
-        fit = full_fit(self.questions.fit, climb, best, afresh=afresh)
+    def _from_climb(self, climb: SubsetFit, best: float, *, led: bool, afresh: bool = False) -> LikelihoodRatio | None:
+        fit = full_fit(self.questions.fit, climb, best, afresh=afresh, led=led)
         return None if fit is None else likelihood_ratio(self.questions.fit, climb.effects, fit)
 
 

@@ -246,7 +246,9 @@ def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -
     return best
 
 
-def full_fit(before: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: bool = False) -> Fit | None:
+def full_fit(
+    before: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: bool = False, led: bool = True
+) -> Fit | None:
     """The hypothesis fitted to all trials from where its climb ended; None where it cannot be followed.
 
     `afresh` begins with nothing of what the fit had bent to do without it. One whose ln L is still far below the `best`
@@ -262,6 +264,8 @@ def full_fit(before: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: 
         Largest ln L of any hypothesis so far.
     afresh : bool
         Begin with releases, deviations and noise as the tracks show them.
+    led : bool
+        Whether a fit that ends far off is begun again, see `refit`.
 
     Returns
     -------
@@ -271,7 +275,9 @@ def full_fit(before: Fit, climb: SubsetFit, best: float = -math.inf, *, afresh: 
     for effect in climb.effects:
         model = model + effect
     try:
-        fit = refit(before, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False, afresh=afresh)
+        fit = refit(
+            before, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False, afresh=afresh, led=led
+        )
         if fit.noise_correlation > SLOW_NOISE and is_poor_fit(fit.predictor, fit.solution):
             # Noise that wanders as it likes makes anything likely.
             return None

@@ -4,8 +4,8 @@ Matters beyond y₀ and not at all before; a stiff one ends the growth before al
 
     tail force −k max(0, y − y₀)
 
-k is the stiffness seen by the tail and y₀ the growth at which it begins, the same for all trials. A vine that has come to
-rest against it stays: it is not thrown back.
+k is the stiffness seen by the tail and y₀ the growth at which it begins, the same for all trials. A vine that has come
+to rest against it stays: it is not thrown back.
 
 Easily taken for `tail_friction`, or for the end of growth where the sheet's length is too large. A trial of another
 length tells them apart: the end of growth moves with the length, a stop in the room does not.

@@ -8,10 +8,11 @@ F_s is what rest has beyond sliding, v_s the tail speed at which 1/e of it is le
 first. With F_s above the drive the vine never starts.
 
 Easily taken for `static_yield` or a smaller n of `eversion_damping`; with v_s far below all speeds it is a
-`latch_release`. Trials at low and at high pressure tell them apart: what falls with speed hardly counts in fast ones.
+`latch_release`. Trials at low and at high pressure tell them apart: what falls with speed hardly counts in fast
+ones.
 
-Reduce it with powder or oil on the film, or by growing faster. Measure it with a spring balance: pull the tail through a
-held vine at several speeds.
+Reduce it with powder or oil on the film, or by growing faster. Measure it with a spring balance: pull the tail through
+a held vine at several speeds.
 
 Source: Stribeck's curve in the form of Bo & Pavelescu (1982), Wear 82, 277–289, where k lies between 1/2 and 1 for dry
 contacts, and 2 is the Gaussian form of Tustin's rule; Armstrong-Hélouvry, Dupont, Canudas de Wit (1994), Automatica 30,
@@ -27,9 +28,11 @@ NEEDS = ("length_mm",)
 FINITE = True
 EASILY_TAKEN_FOR = ("static_yield", "eversion_damping")
 PARAMETERS = (
-    Parameter("F_s", "F_s", "N", 0.2, bounds=(0.0, 1e3), plausible=(0.0, 5.0), meaning="friction at rest beyond sliding"),
     Parameter(
-        "v_s", "v_s", "m/s", 0.5, bounds=(1e-2, 30.0), zero=0.5, plausible=(0.05, 3.0), meaning="speed at which it fades"
+        "F_s", "F_s", "N", 0.2, bounds=(0.0, 1e3), plausible=(0.0, 5.0), meaning="friction at rest beyond sliding"
+    ),
+    Parameter(
+        "v_s", "v_s", "m/s", 0.5, bounds=(1e-2, 30.0), zero=0.5, plausible=(0.05, 3.0), meaning="where it fades"
     ),
     Parameter(
         "k", "k", "1", 1.0, bounds=(1.0, 2.0), zero=1.0, plausible=(1.0, 2.0), tried=(1.0, 2.0),

@@ -23,13 +23,11 @@ KIND = "physical"
 NEEDS = ("length_mm",)
 EASILY_TAKEN_FOR = ("gas_inertia", "latch_release")
 PARAMETERS = (
-    Parameter(
-        "M", "M", "kg", 0.01, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="J/r² of what the tail turns"
-    ),
+    Parameter("M", "M", "kg", 0.01, bounds=(0.0, 100.0), plausible=(0.0, 1.0), meaning="J/r² of what the tail turns"),
 )
 
 
-def added_mass(s, rig, M):  # noqa: D103
+def added_mass(s, rig, M):  # noqa: ARG001, D103
     return M + 0.0 * s.lead_position
 
 

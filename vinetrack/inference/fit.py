@@ -164,6 +164,7 @@ def refit(
     most_iterations: int = MOST_ITERATIONS,
     thorough: bool = True,
     afresh: bool = False,
+    led: bool = True,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
@@ -192,6 +193,9 @@ def refit(
         else it is only led so far that it can be held against others.
     afresh : bool
         Whether releases, deviations and noise begin as the tracks show them, and not as the fit left them.
+    led : bool
+        Whether a fit that ends far off is begun again, led by what it misses; where another model explains the tracks
+        already, what stays far off is out of the running.
     watch : callable, optional
         Called with each step of the iterations; what it raises ends the fit.
 
@@ -244,7 +248,8 @@ def refit(
             solution = solve(predictor, problem, state, held, warm=True, most_iterations=most_iterations, watch=watch)
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
-    solution = solve_again(predictor, solution, held, watch, thorough=thorough)
+    if led:
+        solution = solve_again(predictor, solution, held, watch, thorough=thorough)
     fitted = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
     return replace(fitted, pairs=before.pairs)
 
