@@ -278,8 +278,8 @@ OUTSIDERS: dict[str, tuple[Maker, Wants]] = {
     "cubic": (_cubic, Wants()),
     "beyond_a_speed": (_beyond, Wants()),
 }
-"""Forces that are in no catalogue: a rough patch, a ripple along the film, one that grows with time, a film that changes
-half-way, one with the third power of the speed, one with the square of what is beyond a speed."""
+"""Forces that are in no catalogue: a rough patch, a ripple along the film, one that grows with time, a film that
+changes half-way, one with the third power of the speed, one with the square of what is beyond a speed."""
 
 NULLS = (
     "anything",
