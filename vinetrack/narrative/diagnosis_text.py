@@ -55,7 +55,7 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     """
     if not diagnosis.rounds:
         return diagnosis.explanation
-    lines = [f"{diagnosis.verdict}: {_headline(diagnosis)}", "", diagnosis.explanation]
+    lines = [verdict_line(diagnosis), "", diagnosis.explanation]
     if diagnosis.power is not None:
         lines += ["", false_alarm_sentence(diagnosis.power), *could_have_seen(diagnosis.power)]
     for step in diagnosis.rounds:
@@ -69,6 +69,20 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
         lines += ["", str(diagnosis.next_experiment.get("text", ""))]
     lines += [f"! {note}" for note in diagnosis.notes]
     return "\n".join(lines)
+
+
+def verdict_line(diagnosis: Diagnosis) -> str:
+    """Return the verdict in a line.
+
+    Parameters
+    ----------
+    diagnosis : with a verdict.
+
+    Returns
+    -------
+    str
+    """
+    return f"{diagnosis.verdict}: {_headline(diagnosis)}"
 
 
 def _rows(table: pd.DataFrame) -> Iterator[Any]:

@@ -17,8 +17,9 @@ import numpy as np
 
 from vinetrack.core.numbers import with_error
 from vinetrack.core.tables import write_csv, write_json
+from vinetrack.narrative.diagnosis_text import verdict_line
 from vinetrack.narrative.power_text import power_brief
-from vinetrack.narrative.verdict_summary import facts, joined, sentence
+from vinetrack.narrative.verdict_summary import facts, joined
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_json, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
@@ -352,11 +353,11 @@ def diagnosis_lines(folder: Path) -> list[str]:
     reasons, _, contradicted = diagnosis.explanation.partition(DOUBT)
     sizes = [fact.answer for fact in facts(diagnosis, None) if fact.question.startswith(("Significance", "Size of"))]
     told = f" ({'; '.join(sizes)})" if sizes else ""
-    headline = f"{diagnosis.verdict}: {sentence(diagnosis)}{told}"
+    headline = f"{verdict_line(diagnosis)}{told}"
     return [
-        f"{headline} {DOUBT}{contradicted}" if contradicted else headline,
+        f"{headline}. {DOUBT}{contradicted}" if contradicted else headline,
         *(f"  {line}" for line in _BETWEEN_SENTENCES.split(reasons.strip())),
-        *([f"{beside[0].upper()}{beside[1:]}"] if beside else []),
+        *([f"{beside[0].upper()}{beside[1:]}"] if beside and beside not in headline else []),
         *_damping_line(diagnosis),
         *(f"! {note}" for note in diagnosis.notes),
     ]
