@@ -95,11 +95,12 @@ def judge(trial: Trial, truth_m: np.ndarray, answer: Any) -> None:
         warnings.simplefilter("always")
         try:
             track = track_recording(trial).track
-            n = min(len(truth_m), len(track.usable))
-            use = track.usable[:n] & np.isfinite(track.lead_position_m[:n])
-            error = track.lead_position_m[:n][use] - truth_m[:n][use]
+            # At the time that the track gives a frame: where some were lost, that is what may be wrong.
+            slot = np.rint((track.time_s - track.time_s[0]) * trial.capture_fps).astype(int)
+            use = track.usable & np.isfinite(track.lead_position_m) & (slot < len(truth_m))
+            error = track.lead_position_m[use] - truth_m[slot[use]]
             error = np.abs(error - np.median(error)) if error.size else np.zeros(0)
-            sure = track.lead_position_sigma_m[:n][use] < WRONG_M / 5
+            sure = track.lead_position_sigma_m[use] < WRONG_M / 5
             outcome = "confident and wrong" if np.any(sure & (error > WRONG_M)) else "tracked"
         except RecordingError:
             outcome = "refused in a sentence"

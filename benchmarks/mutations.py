@@ -90,7 +90,14 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="only check that every old text is there")
     wanted = parser.parse_args()
     chosen = [one for one in listed() if any(word in f"{one.file} {one.what}" for word in wanted.only)]
-    texts = [altered(one) for one in chosen]
+    texts, stale = [], []
+    for one in chosen:
+        try:
+            texts.append(altered(one))
+        except ValueError as error:
+            stale.append(str(error))
+    if stale:
+        raise SystemExit("\n".join(stale))
     if wanted.list:
         for one in chosen:
             print(f"{one.file:32s} {one.what}")

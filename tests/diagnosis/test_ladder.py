@@ -124,6 +124,12 @@ def test_every_trial_is_left_out_once_and_the_highest_pressure_is_that_of_its_vi
     assert sorted(trial.name for trial in highest_pressure(fits[1]).trials) == [name for name in names if "48" in name]
 
 
+def test_the_highest_pressure_is_that_of_each_vine(pairs: Pairs) -> None:
+    lower = [pair for pair in pairs if "R4_48" not in pair[0].name and pair[0].name.endswith("_1")]
+    found = vt.fit(vt.base_model(), lower, profile=False)
+    assert sorted(one.trial.name for one in highest_pressure(found).trials) == ["R2_48kPa_1", "R4_38kPa_1"]
+
+
 def test_a_trial_left_out_has_no_deviation_of_its_own(fits: tuple[Fit, Fit]) -> None:
     assert {(one.pressure_deviation, one.damping_deviation) for one in left_out(fits[0]).trials} == {(0.0, 0.0)}
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from vinetrack.core.constants import AIR_DENSITY_KG_M3, GRAVITY_M_S2
 from vinetrack.core.records import Track, Trial
 from vinetrack.inference.fit_result import Number
 from vinetrack.inference.intervals import precision
-from vinetrack.inference.robust_covariance import robust_covariance
+from vinetrack.inference.robust_covariance import _few_trials, robust_covariance, widened_covariance
 from vinetrack.inference.systematics import PRESSURE_ERROR_PA
 
 Pairs = list[tuple[Trial, Track]]
@@ -68,6 +69,32 @@ def test_errors_hold_where_those_of_the_noise_are_too_small(make: Callable[[int]
     by_noise, stated = deviations(make, seeds)
     assert by_noise > 1.4
     assert 0.5 < stated < 1.3
+
+
+def test_no_error_is_smaller_than_what_the_scatter_of_trials_shows() -> None:
+    """Of bent pictures the first campaign's trials scatter 1.6 times as widely in one number as the noise says."""
+    found = vt.fit(vt.base_model(), bent(20620), profile=False)
+    plain, robust = (np.diag(matrix) for matrix in robust_covariance(found.predictor, found.solution))
+    assert np.max(robust / plain) > 1.5
+    known = precision(found.solution)
+    stated = np.diag(widened_covariance(found.predictor, found.solution, found.trials, known).covariance)
+    assert np.all(stated / np.diag(known.covariance) >= 0.99 * robust / plain)
+
+
+@pytest.mark.parametrize("trials", [2, 4, 7])
+def test_of_few_trials_the_variance_of_their_mean_is_found_without_bias(trials: int) -> None:
+    """Each pulls the mean towards itself by 1/N: what is left of them has the variance (1 − 1/N)σ², degrees N − 1."""
+    draw = np.random.default_rng(20690)
+    solution = SimpleNamespace(problem=SimpleNamespace(prior_precision=np.zeros(1)))
+    information, plain = np.full((trials, 1, 1), 25.0), np.array([[1 / (25.0 * trials)]])
+    found = []
+    for _ in range(3000):
+        values = 0.2 * draw.standard_normal(trials)
+        scores = 25.0 * (values - values.mean())[:, None]
+        variance, degrees = _few_trials(information, scores, solution, plain)
+        assert degrees[0] == pytest.approx(trials - 1)
+        found.append(variance[0])
+    assert np.mean(found) == pytest.approx(plain[0, 0], rel=0.08)
 
 
 def test_trials_that_scatter_as_the_model_says_have_the_errors_of_the_model() -> None:

@@ -21,7 +21,8 @@ from vinetrack.laboratory.tracks import Nature, grow
 from vinetrack.video.axis import Axis
 from vinetrack.video.edge import outline, track_edge
 from vinetrack.video.edge_state import EdgeState, core_frames
-from vinetrack.video.frames import Frames, RecordingError, read_frames
+from vinetrack.video.frame_faults import torn_frames
+from vinetrack.video.frames import Frames, RecordingError, read_frames, slots_from_times
 from vinetrack.video.strip import Strip
 from vinetrack.video.track import track_frames, track_recording
 
@@ -158,6 +159,64 @@ def test_a_packet_that_cannot_be_decoded_costs_its_own_frame(clip: Clip, tmp_pat
     data[sixth + 8 : sixth + 400] = bytes(392)
     path.write_bytes(bytes(data))
     assert len(read_frames(path)) >= 11
+
+
+def torn(luma: np.ndarray, frame: int, row: int = 8, begin: int = 300, by: int = 30) -> np.ndarray:
+    """The pictures with one row of blocks of one frame read wrongly from a column on."""
+    out = luma.copy()
+    strip = out[frame, 16 * row : 16 * row + 16, begin:].astype(int)
+    out[frame, 16 * row : 16 * row + 16, begin:] = np.clip(strip + by, 0, 255)
+    return out
+
+
+def test_a_frame_unlike_those_around_it_along_a_row_of_blocks_is_torn(clip: Clip) -> None:
+    assert not torn_frames(clip.frames.luma).any()
+    for frame, row in ((0, 3), (35, 8), (36, 10), (70, 15)):
+        assert np.flatnonzero(torn_frames(torn(clip.frames.luma, frame, row))).tolist() == [frame]
+    twice = torn(torn(clip.frames.luma, 30), 31, by=50)
+    assert np.flatnonzero(torn_frames(twice)).tolist() == [30, 31]
+
+
+def test_a_patch_that_moves_or_a_light_that_flickers_tears_nothing(clip: Clip) -> None:
+    lit = clip.frames.luma.astype(float) * np.where(np.arange(len(clip.frames.luma)) % 2, 1.0, 0.96)[:, None, None]
+    assert not torn_frames(np.rint(lit).astype(np.uint8)).any()
+    crossed = clip.frames.luma.copy()
+    for i in range(20, 40):  # a dark door 100 px wide that swings along the tube by 30 px a frame
+        crossed[i, :, 30 * (i - 20) : 30 * (i - 20) + 100] = 20
+    assert not torn_frames(crossed).any()
+
+
+def test_frames_that_decoders_know_nothing_of_are_damaged_where_they_are_torn(clip: Clip, tmp_path: Path) -> None:
+    path = tmp_path / "a.mov"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mjpeg", rate=60)
+        stream.width, stream.height, stream.pix_fmt = 960, 320, "yuvj420p"
+        for i, picture in enumerate(torn(clip.frames.luma[:40], 22)):
+            frame = av.VideoFrame.from_ndarray(picture, format="gray").reformat(format="yuvj420p")
+            frame.pts = i
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+    frames = read_frames(path)
+    assert np.flatnonzero(frames.damaged).tolist() == [22]
+    assert "damaged: 1 of 40 frames" in " ".join(frames.notes)
+
+
+def test_frames_known_to_be_lost_leave_gaps_in_the_times_however_many() -> None:
+    times = np.delete(np.arange(60.0), np.arange(20, 30))
+    assert np.array_equal(slots_from_times(times)[0], np.arange(50))
+    assert np.array_equal(slots_from_times(times, known_missing=10)[0], times)
+    in_milliseconds = np.round(np.delete(np.arange(71.0), np.arange(30, 51)) / 60, 3)
+    assert slots_from_times(in_milliseconds, known_missing=21)[0][[29, 30]].tolist() == [29, 51]
+
+
+def test_what_lies_beyond_frames_that_were_lost_does_not_count(clip: Clip) -> None:
+    kept = np.delete(np.arange(len(clip.frames)), np.arange(48, 58))
+    frames = replace(clip.frames, luma=clip.frames.luma[kept], slot=kept, damaged=np.zeros(len(kept), dtype=bool))
+    track = track_frames(frames, clip.trial, CAPTURE_FPS).track
+    assert not track.usable[48:].any()
+    assert "48 of 61 frames are used, 0 to 47" in " ".join(track.notes)
+    error = track.lead_position_m[:48] - clip.truth.lead_position_m[:48]
+    assert np.max(np.abs(error - np.median(error))) < 1e-3
 
 
 def test_a_recording_that_does_not_fit_in_memory_is_refused(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,3 +69,15 @@ def test_what_fails_leaves_the_old_clip_and_no_other_file(tmp_path: Path, given,
         write_clip(path, given, 10)
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
     assert path.read_bytes() == b"the old one"
+
+
+def test_the_same_pictures_are_the_same_bytes_whatever_the_memory_held(tmp_path: Path) -> None:
+    draw = np.random.default_rng(20701)
+    noisy = [np.clip(p + draw.normal(0, 12, p.shape), 0, 255).astype(np.uint8) for p in pictures(30, 198, 480)]
+    written = []
+    for k in range(6):
+        held = [draw.bytes(int(draw.integers(1, 2_000_000))) for _ in range(20)]
+        del held
+        write_clip(tmp_path / f"{k}.mp4", iter(noisy), 9.0)
+        written.append((tmp_path / f"{k}.mp4").read_bytes())
+    assert len(set(written)) == 1

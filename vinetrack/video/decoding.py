@@ -50,7 +50,7 @@ class Decoded:
 
     `pictures` has shape (n_frames, height, width).
     `corrupt` marks those that the decoder calls so, `key` those coded alone, `between` those coded from later frames
-    too; `complaints` are what the decoder said.
+    too; `complaints` are what the decoder said, and `decoder` is its name.
     """
 
     pictures: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0), np.uint8))
@@ -59,6 +59,7 @@ class Decoded:
     key: list[bool] = field(default_factory=list)
     between: list[bool] = field(default_factory=list)
     complaints: list[str] = field(default_factory=list)
+    decoder: str = ""
 
 
 def decode_container(
@@ -101,7 +102,7 @@ def decode_container(
                 stream = container.streams.video[0]
                 stream.thread_type = "AUTO"
                 stream.codec_context.thread_count = threads
-                decoder = stream.codec_context.name
+                decoded.decoder = stream.codec_context.name
                 base = float(stream.time_base) if stream.time_base else 1.0
                 if between_s is not None:
                     container.seek(max(int(between_s[0] / base), 0), stream=stream)
@@ -127,7 +128,7 @@ def decode_container(
     decoded.complaints = list(complaints)
     if held is not None:
         decoded.pictures = held[: len(decoded.times_s)]
-    if decoded.complaints and decoded.times_s and decoder in UNMARKED:
+    if decoded.complaints and decoded.times_s and decoded.decoder in UNMARKED:
         marked = _times_complained_of(path)
         decoded.corrupt = [time_s in marked for time_s in decoded.times_s]
     return decoded

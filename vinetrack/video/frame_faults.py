@@ -1,14 +1,16 @@
-"""Pictures that are not what the camera saw at their time: odd ones at the beginning, copies of the one before."""
+"""Pictures that are not what the camera saw at their time: torn ones, odd ones at the beginning, copies."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Bools, Floats
-from vinetrack.video.strip import Strip
+
+if TYPE_CHECKING:
+    from vinetrack.video.strip import Strip
 
 ODD_AMONG = 3
 """First frames that may be odd. Chosen: cameras are known to write a wrong second frame and a corrupt first one."""
@@ -25,6 +27,48 @@ edges err by tenths of a pixel. At half noise decides, at twice copies in slow g
 STANDS, ALIKE = 0.1, 0.15
 """A copy moves less than this part of a step, and its picture changes by less than this part of the usual. Chosen: a
 coder changes even a copy a little. At half compressed copies stay, at twice slow frames pass for copies."""
+
+TORN_BLOCK_PX, TORN_RUN = 16, 12
+"""Side of the blocks that are compared, and how many of one row must leave what the frames before and after show.
+Derived: codecs write pictures in blocks of 16 px, row by row, and what is read wrongly goes on to the end of the row.
+Measured (benchmarks/damaged_recordings.py, seed 20300): 9 at most where a door swings, 20 to 60 in torn frames."""
+TORN_GREY, TORN_USUAL = 4.0, 4.0
+"""Grey levels of 255 by which a block must leave them, beside so many times what it usually does. Chosen: the mean of a
+block has a noise of a quarter of a level; film that slides in a tube is uneven in every frame. At half noise of dark
+recordings counts, at twice faint tears pass."""
+
+
+def torn_frames(luma: NDArray[Any]) -> Bools:
+    """Frames in which part of a row of blocks is unlike the frames before and after: read wrongly from a damaged file.
+
+    A front that passes leaves a block between what it was and what it is; a tear lies beyond both.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+
+    Returns
+    -------
+    mask, shape (n_frames,).
+    """
+    n, height, width = luma.shape
+    rows, columns = height // TORN_BLOCK_PX, width // TORN_BLOCK_PX
+    if n < 6 or rows == 0 or columns < TORN_RUN:
+        return np.zeros(n, dtype=bool)
+    cut = luma[:, : rows * TORN_BLOCK_PX, : columns * TORN_BLOCK_PX]
+    grid = (rows, TORN_BLOCK_PX, columns, TORN_BLOCK_PX)
+    block = np.array([picture.reshape(grid).mean(axis=(1, 3), dtype=np.float32) for picture in cut])
+    block -= np.median(block - np.median(block, axis=0), axis=(1, 2))[:, None, None]  # flicker
+    beyond = np.zeros_like(block)
+    place = np.arange(n)
+    for gap in (1, 2):  # two torn frames in a row are seen by those around both
+        before = np.where(place >= gap, place - gap, place + 2 * gap)
+        after = np.where(place + gap < n, place + gap, place - 2 * gap)
+        low, high = np.minimum(block[before], block[after]), np.maximum(block[before], block[after])
+        beyond = np.maximum(beyond, np.maximum(block - high, low - block))
+    unit = 1.0 if luma.dtype == np.uint8 else max(float(block.max()), 1.0) / 255
+    limit = TORN_GREY * unit + TORN_USUAL * np.quantile(beyond, 0.75, axis=0)
+    return np.asarray((beyond > limit).sum(axis=2).max(axis=1) >= TORN_RUN)
 
 
 def odd_frames(luma: NDArray[Any]) -> Bools:

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from vinetrack.core.files import file_size
 from vinetrack.video.decoding import (
     HALF_TICK,
+    UNMARKED,
     Decoded,
     PacketIndex,
     damaged_frames,
     decode_container,
     quiet_log,
 )
+from vinetrack.video.frame_faults import torn_frames
 
 if TYPE_CHECKING:
     import av
@@ -349,18 +351,21 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
             f"{name}: {there} frames {'decoded' if index is None else 'are there'} where the file declares "
             f"{recording.declared_frames}: cut short or damaged; copy it from the camera again"
         )
+    lost = max((recording.declared_frames or 0) - there, 0)
     times_s = np.array(decoded.times_s)
     before = after = slot = np.zeros(0, dtype=int)
     if index is None:
-        slot, irregular = slots_from_times(times_s)
+        slot, irregular = slots_from_times(times_s, lost)
     else:
-        slots, irregular = slots_from_times(index.times_s)
+        slots, irregular = slots_from_times(index.times_s, lost)
         number = np.searchsorted(index.times_s, times_s - HALF_TICK * index.base_s)
         before, slot, after = slots[: number[0]], slots[number], slots[number[-1] + 1 :]
         notes.append(
             f"{name}: of {there} frames {number[0]} to {number[-1]} are decoded, about what moves; name others in "
             "frames_used"
         )
+    if decoded.decoder in UNMARKED:
+        decoded.corrupt = (np.array(decoded.corrupt) | torn_frames(decoded.pictures)).tolist()
     damaged = damaged_frames(decoded, slot)
     if decoded.complaints or damaged.any():
         complaint = f"; the decoder says: {decoded.complaints[0].strip()}" if decoded.complaints else ""
@@ -373,7 +378,7 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
     return Frames(recording, region, decoded.pictures, slot, damaged, tuple(notes), before, after)
 
 
-def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]:
+def slots_from_times(times: NDArray[np.float64], known_missing: int = 0) -> tuple[NDArray[np.int_], str]:
     """Capture period of every frame from its timestamp, and what is irregular about them ("" where nothing is).
 
     Timestamps are rounded to whole periods of their median spacing: a missing frame leaves a gap of one. Timestamps
@@ -382,6 +387,7 @@ def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]
     Parameters
     ----------
     times : timestamps, shape (n_frames,), any unit.
+    known_missing : frames that the file declares and that could not be decoded.
 
     Returns
     -------
@@ -394,12 +400,14 @@ def slots_from_times(times: NDArray[np.float64]) -> tuple[NDArray[np.int_], str]
     period = float(np.median(steps))
     if period <= 0 or np.any(steps <= 0):
         return plain, "timestamps repeat or run backwards; frames are timed by their index"
+    # Times in whole milliseconds have steps of 16 and 17 of them: over a long gap only their mean counts right.
+    period = float(np.mean(steps[steps < 1.5 * period]))
     periods = steps / period
     if np.any(np.abs(periods - np.rint(periods)) > 0.25) or np.any(np.rint(periods) < 1):
         return plain, "the container's frame rate varies; frames are timed by their index"
     slot = np.concatenate([[0], np.cumsum(np.rint(periods).astype(int))])
     missing = int(slot[-1] - plain[-1])
     # A recorder drops single frames; where a tenth of all is missing the container counts in other units.
-    if missing == 0 or missing > max(3, len(times) // 10):
+    if missing == 0 or missing > max(3, len(times) // 10, known_missing):
         return plain, "" if missing == 0 else "its timestamps are irregular; frames are timed by their index"
     return slot, f"{missing} frames are missing by the timestamps; the others keep their own time"

@@ -227,10 +227,11 @@ def track_frames(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
             "to about a pixel"
         )
-    if frames.damaged[used].any():
+    if sound.sum() < used.sum():
         notes.append(
             f"{name}: {int(sound.sum())} of {len(frames)} frames are used, {number[kept[0]]} to {number[kept[-1]]}: "
-            "damaged ones, and those beyond them, do not count until their edge is placed in corrections.csv"
+            "damaged ones, and those beyond them or beyond lost ones, do not count until their edge is placed in "
+            "corrections.csv"
         )
     if rejected.any():
         first = int(number[rejected][0])

@@ -1,0 +1,41 @@
+"""The file for hosted machines names what is here: versions of Python, files, targets of make."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).parents[1]
+TEXT = (ROOT / ".github" / "workflows" / "tests.yml").read_text(encoding="utf-8")
+JOBS = yaml.safe_load(TEXT)["jobs"]
+
+
+def commands() -> str:
+    """Every line that a job runs."""
+    return "\n".join(step["run"] for job in JOBS.values() for step in job["steps"] if "run" in step)
+
+
+def test_versions_of_python_begin_with_the_oldest_that_is_supported() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["requires-python"] == f">={JOBS['tests']['strategy']['matrix']['python'][0]}"
+
+
+def test_jobs_run_on_linux_macos_and_windows_on_two_kinds_of_processor() -> None:
+    matrix = JOBS["tests"]["strategy"]["matrix"]
+    systems = {*matrix["system"], *(more["system"] for more in matrix["include"])}
+    assert {"ubuntu-24.04", "ubuntu-24.04-arm", "macos-14", "windows-2022"} <= systems
+
+
+def test_files_extras_and_targets_that_jobs_name_exist() -> None:
+    run = commands()
+    for path in re.findall(r"[\w./-]+\.(?:py|lock)\b", run):
+        assert (ROOT / path).is_file(), path
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    for line in re.findall(r"^make (.+)$", run, re.MULTILINE):
+        assert set(line.split()) <= targets
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    for named in re.findall(r'"\.\[(.+?)\]"', run):
+        assert set(named.split(",")) <= set(extras)
