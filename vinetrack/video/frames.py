@@ -351,13 +351,13 @@ def _assemble(recording: Recording, region: Region, decoded: Decoded, index: Pac
             f"{name}: {there} frames {'decoded' if index is None else 'are there'} where the file declares "
             f"{recording.declared_frames}: cut short or damaged; copy it from the camera again"
         )
-    lost = max((recording.declared_frames or 0) - there, 0)
+    undecoded = max((recording.declared_frames or 0) - there, 0)
     times_s = np.array(decoded.times_s)
     before = after = slot = np.zeros(0, dtype=int)
     if index is None:
-        slot, irregular = slots_from_times(times_s, lost)
+        slot, irregular = slots_from_times(times_s, undecoded)
     else:
-        slots, irregular = slots_from_times(index.times_s, lost)
+        slots, irregular = slots_from_times(index.times_s, undecoded)
         number = np.searchsorted(index.times_s, times_s - HALF_TICK * index.base_s)
         before, slot, after = slots[: number[0]], slots[number], slots[number[-1] + 1 :]
         notes.append(

@@ -42,14 +42,20 @@ def sound_stretch(frames: Frames, used: Bools) -> Bools:
         In one sentence, where that stretch is not long enough.
     """
     damaged = frames.damaged & used
-    if not damaged.any() and np.max(np.diff(frames.slot[used]), initial=1) <= MOST_DROPPED + 1:
+    # Frames that are lost, within or at the end, are not sound either.
+    span = 1 + int(np.ptp(frames.slot[used]))
+    if used.all():
+        span = max(span, (frames.recording.declared_frames or 0) - len(frames.slots_before) - len(frames.slots_after))
+    whole = span < used.sum() / LEAST_PART
+    if whole and not damaged.any() and np.max(np.diff(frames.slot[used]), initial=1) <= MOST_DROPPED + 1:
         return used
     sound = np.flatnonzero(used & ~damaged)
     breaks = np.flatnonzero(np.diff(frames.slot[sound]) > LONGEST_HOLE + 1) + 1
     longest = max(np.split(sound, breaks), key=len)
-    if len(longest) < LEAST_PART * (1 + np.ptp(frames.slot[used])):  # frames that are lost are not sound either
+    if len(longest) < LEAST_PART * span:
         where = f", {longest[0]} to {longest[-1]}," if len(longest) else ""
-        what = f"{int(damaged.sum())} of {int(used.sum())} frames are damaged" if damaged.any() else "frames are lost"
+        count = int(damaged.sum())
+        what = f"{count} of {int(used.sum())} frames are damaged" if count else "frames are missing"
         raise RecordingError(
             f"{frames.recording.path.name}: {what} and only {len(longest)}{where} follow each other without damage: "
             "copy it from the camera again, or name sound ones in frames_used"
