@@ -1,4 +1,4 @@
-"""The file for hosted machines names what is here: versions of Python, files, targets of make."""
+"""The file for hosted machines and the profiles of Snakemake name what is here: versions, files, targets, options."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 import tomllib
 from pathlib import Path
 
+import pytest
 import yaml
 
 ROOT = Path(__file__).parents[1]
@@ -39,3 +40,12 @@ def test_files_extras_and_targets_that_jobs_name_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     for named in re.findall(r'"\.\[(.+?)\]"', run):
         assert set(named.split(",")) <= set(extras)
+
+
+@pytest.mark.parametrize("profile", ["default", "slurm"])
+def test_profiles_hold_options_that_snakemake_knows(profile: str) -> None:
+    from snakemake.cli import get_argument_parser
+
+    known = {word.lstrip("-") for action in get_argument_parser()._actions for word in action.option_strings}
+    settings = yaml.safe_load((ROOT / "profiles" / profile / "config.yaml").read_text(encoding="utf-8"))
+    assert set(settings) <= known
