@@ -33,14 +33,16 @@ FIRST_PART = 0.6
 """Part of a recording's rest that comes before the event."""
 
 CHILD = """
-import json, resource, sys, time
+import json, sys, time
 from pathlib import Path
 from vinetrack.core.records import Trial
 from vinetrack.video.frames import DECODER_THREADS
 from vinetrack.video.track import track_recording
 from vinetrack.setup_page.clip_views import warm_up
 def peak():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    # Of this process alone: what getrusage says includes the memory of the process that started it.
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
 import av
 task, path = sys.argv[1:]
 warm_up()

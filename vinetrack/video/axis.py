@@ -8,6 +8,7 @@ how much change a monotone path along it collects; the best is refined by the pi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -94,12 +95,29 @@ class Axis:
         return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
 
 
-def find_axis(luma: NDArray[Any]) -> Axis:
+class SmallPictures:
+    """The frames of a recording, shrunk once for all that look for its axis.
+
+    `frames` has shape (n_frames, height, width) in grey levels of 255, free of flicker; `factor` is by how much they
+    shrank and `shape` the height and width before, px.
+    """
+
+    def __init__(self, luma: NDArray[Any]) -> None:
+        self.frames, self.factor = _small_frames(luma)
+        self.shape = luma.shape[1:]
+
+    @cached_property
+    def changed(self) -> tuple[Floats, Floats, Floats, Floats, int]:
+        """Pixels that change: x, y, when and worth, shape (n_pixels,) each; and the number of times looked at."""
+        return _changed_pixels(self.frames, len(self.frames))
+
+
+def find_axis(luma: NDArray[Any] | SmallPictures) -> Axis:
     """Find the axis of growth from the motion itself.
 
     Parameters
     ----------
-    luma : brightness, shape (n_frames, height, width).
+    luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
 
     Returns
     -------
@@ -110,10 +128,11 @@ def find_axis(luma: NDArray[Any]) -> Axis:
     RecordingError
         Where nothing moves, or what moves follows no line.
     """
-    if len(luma) < 3:
+    seen = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
+    small = seen.frames
+    if len(small) < 3:
         raise RecordingError("fewer than 3 frames: no motion can be seen")
-    small, factor = _small_frames(luma)
-    best = _find_line(small, len(small))
+    best = _line_of(small, seen.changed)
     if best.order < ORDERLY:
         # It meets a wall, bends, sweeps: the longest beginning that is orderly tells the axis.
         for part in PREFIXES:
@@ -123,15 +142,15 @@ def find_axis(luma: NDArray[Any]) -> Axis:
                 best = shorter
     if best.collected <= 0:
         raise RecordingError("nothing moves in the picture")
-    return _to_picture(best, factor, luma.shape[1:])
+    return _to_picture(best, seen.factor, seen.shape)
 
 
-def is_orderly(luma: NDArray[Any], axis: Axis) -> bool:
+def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
     """Whether most of what changes along `axis` is a front that passes once, and what it brings stays.
 
     Parameters
     ----------
-    luma : brightness, shape (n_frames, height, width).
+    luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
     axis : in the picture, px.
 
     Returns
@@ -143,11 +162,11 @@ def is_orderly(luma: NDArray[Any], axis: Axis) -> bool:
     RecordingError
         Where nothing moves along the axis.
     """
-    small, factor = _small_frames(luma)
-    scaled = _shrunk(axis, factor)
+    seen = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
+    scaled = _shrunk(axis, seen.factor)
     angle = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
-    band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*small.shape[1:])))
-    x, y, time, weight, n_times = _changed_pixels(small, len(small))
+    band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*seen.frames.shape[1:])))
+    x, y, time, weight, n_times = seen.changed
     near = np.abs((np.column_stack([x, y]) - scaled.from_px) @ scaled.normal) < band
     if near.sum() < 12:
         raise RecordingError("nothing moves along the axis")
@@ -156,7 +175,7 @@ def is_orderly(luma: NDArray[Any], axis: Axis) -> bool:
     return bool(line[3][agree].sum() >= ORDERLY * line[3].sum())
 
 
-def centred_on_motion(luma: NDArray[Any], given: Axis) -> Axis:
+def centred_on_motion(luma: NDArray[Any] | SmallPictures, given: Axis) -> Axis:
     """A given axis moved and turned onto the line of what moves within its width, and as wide as that.
 
     It keeps its ends' places along itself: only what lies across is corrected, by up to half of `given.width_px` and
@@ -164,7 +183,7 @@ def centred_on_motion(luma: NDArray[Any], given: Axis) -> Axis:
 
     Parameters
     ----------
-    luma : brightness, shape (n_frames, height, width).
+    luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
     given : axis in the picture, its width that of the strip to look in, px.
 
     Returns
@@ -176,9 +195,9 @@ def centred_on_motion(luma: NDArray[Any], given: Axis) -> Axis:
     RecordingError
         Where nothing moves within the width.
     """
-    small, factor = _small_frames(luma)
-    scaled = _shrunk(given, factor)
-    x, y, time, weight, n_times = _changed_pixels(small, len(small))
+    seen = luma if isinstance(luma, SmallPictures) else SmallPictures(luma)
+    scaled, factor = _shrunk(given, seen.factor), seen.factor
+    x, y, time, weight, n_times = seen.changed
     reach = max(0.5 * scaled.width_px, 3.0)
     offset = np.column_stack([x, y]) - scaled.from_px
     across = offset @ scaled.normal
@@ -231,7 +250,14 @@ def _changed_pixels(small: NDArray[np.float32], count: int) -> tuple[Floats, Flo
 
 def _find_line(small: NDArray[np.float32], count: int, patient: bool = False) -> _Line:
     """The best line in the first `count` frames; collects nothing where there is none (an error unless `patient`)."""
-    x, y, time, weight, n_times = _changed_pixels(small, count)
+    return _line_of(small, _changed_pixels(small, count), patient)
+
+
+def _line_of(
+    small: NDArray[np.float32], changed: tuple[Floats, Floats, Floats, Floats, int], patient: bool = False
+) -> _Line:
+    """The best line through pixels that change."""
+    x, y, time, weight, n_times = changed
     nothing = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
     if len(x) < 12:
         return nothing

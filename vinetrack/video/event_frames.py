@@ -40,7 +40,10 @@ widens brackets, at twice the first pixels of growth are missed, for which the m
 LEAST_PIXELS = 8
 """Pixels that must have changed. Chosen: the tip of a vine 20 px wide that moves by 10 px. By reasoning: at half glints
 count, at twice the first 20 px are missed, for which the margin is."""
-MARGIN_FRAMES, MARGIN_PART = 60, 0.15
+NOISE_PAIRS = 40
+"""Pairs of pictures from which the noise is known. Chosen: to a tenth of itself in each pixel. At half to a seventh, at
+twice twice the memory."""
+MARGIN_FRAMES, MARGIN_PART = 40, 0.15
 """Frames, and part of the event, that are added at either end. Chosen: rest and background are seen in them; slow
 beginnings change less than LEAST_GREY. By reasoning: at half little rest is left; at twice a short event takes
 twice the memory."""
@@ -91,16 +94,26 @@ def event_range(pictures: list[NDArray[np.uint8]], numbers: NDArray[np.int_], co
         return None
     import cv2
 
-    # Blurred, the values are no whole numbers any more, and medians of them tell of noise below a grey level.
-    small = np.stack([cv2.blur(picture.astype(np.float32), (3, 3)) for picture in pictures])
-    gain = np.median((small[:, ::2, ::2] + 1.0) / (small[len(small) // 2, ::2, ::2] + 1.0), axis=(1, 2))
-    small = (small / np.clip(gain, 0.2, 5.0)[:, None, None]).astype(np.float32)
-    noise = 1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(small, axis=0)), axis=0)
+    middle = pictures[len(pictures) // 2][::2, ::2].astype(np.float32) + 1.0
+
+    def level(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+        # Blurred, the values are no whole numbers any more, and medians of them tell of noise below a grey level.
+        blurred = cv2.blur(picture.astype(np.float32), (3, 3))
+        gain = np.clip(np.median((blurred[::2, ::2] + 1.0) / middle), 0.2, 5.0)
+        return np.asarray(blurred / np.float32(gain), dtype=np.float32)
+
+    pairs = np.linspace(0, len(pictures) - 2, min(NOISE_PAIRS, len(pictures) - 1)).astype(int)
+    steps = [np.abs(level(pictures[i + 1]) - level(pictures[i])) for i in pairs]
+    noise = 1.4826 / np.sqrt(2) * np.median(steps, axis=0)
     # The median of three pictures at either end is rest.
-    first, last = np.median(small[:3], axis=0), np.median(small[-3:], axis=0)
+    first, last = (np.median([level(picture) for picture in end], axis=0) for end in (pictures[:3], pictures[-3:]))
     limit = np.maximum(CHANGED * np.maximum(noise, np.median(noise)), LEAST_GREY)
-    begun = np.flatnonzero((np.abs(small - first) > limit).sum(axis=(1, 2)) >= LEAST_PIXELS)
-    going = np.flatnonzero((np.abs(small - last) > limit).sum(axis=(1, 2)) >= LEAST_PIXELS)
+
+    def differ(still: NDArray[np.float32]) -> NDArray[np.int_]:
+        counts = [np.count_nonzero(np.abs(level(picture) - still) > limit) for picture in pictures]
+        return np.flatnonzero(np.array(counts) >= LEAST_PIXELS)
+
+    begun, going = differ(first), differ(last)
     if not len(begun) or not len(going):
         return None
     start = int(numbers[max(begun[0] - 1, 0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Indices, Track, Trial
-from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
+from vinetrack.video.axis import Axis, SmallPictures, centred_on_motion, find_axis, is_orderly
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
 from vinetrack.video.event_frames import read_event
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
@@ -264,14 +265,15 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     axis, px; and False where the vine bends or sweeps away.
     """
     given = axis is not None
-    axis = axis if axis is not None else find_axis(luma)
+    small = SmallPictures(luma)
+    axis = axis if axis is not None else find_axis(small)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
     if given:
         # Room for an axis that is a few degrees off; it is centred on what moves, here or in `_follow`.
         axis = replace(axis, width_px=axis.width_px + ROOM * axis.length_px)
         if trial.travel_ratio == 1:
-            axis = centred_on_motion(luma, axis)
-    return axis, trial.travel_ratio == 1 or is_orderly(luma, axis)
+            axis = centred_on_motion(small, axis)
+    return axis, trial.travel_ratio == 1 or is_orderly(small, axis)
 
 
 def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, orderly: bool) -> tuple[Strip, _Edge]:
@@ -380,8 +382,10 @@ def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str, 
     n, last = len(edge_px), verdict.last_moving
     if last < 0 or last >= n - SHORTEST_END or verdict.left_picture is not None:
         return []
-    small = luma[:, ::3, ::3].astype(np.float32)
-    change = np.abs(np.diff(small, axis=0)).mean(axis=(1, 2))
+    import cv2
+
+    pairs = itertools.pairwise(luma)
+    change = np.array([cv2.absdiff(a[::3, ::3].copy(), b[::3, ::3].copy()).mean() for a, b in pairs])
     before = float(np.median(change[verdict.first_moving : last])) if last > verdict.first_moving else 0.0
     least = float(np.min(change)) if len(change) else 0.0
     later = float(np.median(change[last + 1 :]))
