@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vinetrack.cli.output import MORE, JsonFile, tell
+from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -31,6 +32,7 @@ def register(app: typer.Typer) -> None:
     """
     app.command("diagnose", rich_help_panel=MORE)(_diagnose)
     app.command("add", rich_help_panel=MORE)(_add)
+    app.command("propose", rich_help_panel=MORE)(_propose)
     app.command("diagnosis", rich_help_panel="Stages of the workflow")(_diagnosis)
 
 
@@ -70,7 +72,7 @@ def _diagnose(
 
 
 def _add(
-    effect: Annotated[str, typer.Argument(help="Name of the effect.", metavar="EFFECT")],
+    effect: Annotated[str, typer.Argument(help="Name of the effect, or its file.", metavar="EFFECT")],
     results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
     save: Annotated[bool, typer.Option("--save", help="Write it to `model:` of the experiment.")] = False,
     experiment: Moved = None,
@@ -85,6 +87,11 @@ def _add(
         from vinetrack.pipeline.source_experiment import experiment_behind
 
         read = experiment_behind(results, experiment)
+        if save and effect.endswith(".py"):
+            raise UserError(
+                f"{effect}: to save it, name the file under `effects:` of {read.folder / 'experiment.yaml'}, then add"
+                f" it by its name: vinetrack add {Path(effect).stem} {results} --save"
+            )
         with _told() as report:
             lines = add_effect(read, results, effect, report)
         if save:
@@ -93,6 +100,25 @@ def _add(
             path = save_model(read.folder, [*read.settings.model, effect])
             lines.append(f"Saved to {path}; run vinetrack run, or snakemake, again to have everything with it.")
         tell(lines, {"effect": effect, "saved": save, "lines": lines}, json_file)
+
+
+def _propose(
+    results: Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")],
+    to: Annotated[Path | None, typer.Option("--to", help="Write the effect to this file.", show_default=False)] = None,
+    experiment: Moved = None,
+    json_file: JsonFile = None,
+    log: LogFile = None,
+) -> None:
+    """Where no known effect mends the model: the law of force that does best, as an effect file of your own."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.pipeline.diagnosis_stage import propose_effect
+        from vinetrack.pipeline.source_experiment import experiment_behind
+
+        with _told() as report:
+            lines = propose_effect(experiment_behind(results, experiment), results, to, report)
+        tell(lines, {"lines": lines}, json_file)
 
 
 def _diagnosis(

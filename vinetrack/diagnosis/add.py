@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinetrack.core.records import Track
@@ -43,7 +44,7 @@ def add(
     tracks : mapping
         Tracks by name of trial.
     name : str
-        Name of the effect.
+        Name of the effect, or path of its file.
     report : callable
         Called with a sentence at each step.
 
@@ -65,7 +66,9 @@ def add(
 
     user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
     model = make_model(experiment.settings.model, user_effects)
-    effect = find_effect(name, user_effects)
+    if name.endswith(".py"):
+        user_effects = {**own_effects([name]), **user_effects}
+    effect = find_effect(Path(name).stem, user_effects)
     if effect.name in model:
         raise EffectError(f"{effect.name} is in the model already: {' + '.join(model.names)}.")
     check_needs(model + effect, *(trial for trial in experiment.trials if trial.name in tracks))
@@ -74,13 +77,29 @@ def add(
     if effect not in questioned:
         questioned = (*questioned, effect)
     before = initial_fit(model, pairs_of(experiment, tracks)[0], questioned, profile=False)
-    before, after = _both(before, effect, report)
+    before, after = both_fits(before, effect, report)
     report("errors before and after")
     return before, after, ladder((before, after), ("", effect.name))
 
 
-def _both(before: Fit, effect: Effect, report: Callable[[str], None]) -> tuple[Fit, Fit]:
-    """The fits without and with an effect, each from its best minimum, as the diagnosis compares them."""
+def both_fits(before: Fit, effect: Effect, report: Callable[[str], None]) -> tuple[Fit, Fit]:
+    """The fits without and with an effect, each from its best minimum, as the diagnosis compares them.
+
+    Parameters
+    ----------
+    before : the fit without it.
+    effect : to be added.
+    report : called with a sentence at each step.
+
+    Returns
+    -------
+    before, after : Fit
+
+    Raises
+    ------
+    FitError
+        If the model with the effect cannot be followed from any start.
+    """
     if before.chi2_per_dof > FAR_OFF:
         before = from_other_starts(before)
     for _ in range(1 + MOST_AGAIN):

@@ -88,19 +88,31 @@ Answers = Callable[[Sequence[Law]], list[Floats]]
 
 
 @dataclass(frozen=True)
+class SeenLaw:
+    """A law with its size: amplitudes, N, the part of what any smooth force could explain, and the words for it."""
+
+    law: Law
+    amplitude_N: tuple[float, ...]
+    explained: float
+    words: str
+
+
+@dataclass(frozen=True)
 class MissingForce:
     """What is missing, as a force on the tail, N.
 
     `table`, columns `FORCE_COLUMNS`: the force of every condition (blank: mean over all) against `lead_position_m`,
     `tail_velocity_m_s`, `time_s` and `pressure_Pa`. `laws`, columns `LAW_COLUMNS`, the best of each kind, best first;
     `explained` is the part of what any smooth force could explain. `depends_on` gives the same for a force that hangs
-    on one thing alone.
+    on one thing alone. `seen` are the laws whose force is more than errors could make, best first; none where no smooth
+    force mends the misfit.
     """
 
     table: pd.DataFrame
     laws: pd.DataFrame
     depends_on: Mapping[str, float]
     sentence: str
+    seen: tuple[SeenLaw, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
@@ -155,7 +167,14 @@ def missing_force(model_fit: Fit) -> MissingForce:
         laws=_law_table(laws),
         depends_on=depends,
         sentence=_sentence(laws, depends, _mended(fit, whole)),
+        seen=() if _mended(fit, whole) < MENDS else tuple(_seen(law) for law in laws if law.seen),
     )
+
+
+def _seen(judged: _Judged) -> SeenLaw:
+    amplitude = judged.gain.amplitude
+    words = judged.law.words(amplitude.tolist(), judged.gain.sigma)
+    return SeenLaw(judged.law, tuple(amplitude.tolist()), judged.explained, words)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from vinetrack.effects._catalogue import (
     remedy,
     told_apart,
 )
+from vinetrack.effects._first_run import remember
 from vinetrack.effects._own import own_effects
 
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
     "load_effect",
     "own_effects",
     "remedy",
+    "remember",
     "told_apart",
 ]
 

@@ -47,11 +47,22 @@ def first_run(path: Path) -> str:
     if os.environ.get(POLICY) == "known":
         return f"has never run here (sha256 {digest}), and {POLICY} is `known`: read it, then run it once without that"
     print(f"{path} (sha256 {digest}) runs for the first time: it is a program with your rights.", file=sys.stderr)
-    with contextlib.suppress(OSError):
-        from vinetrack.core.tables import write_json
-
-        write_json(memory_file(), known | {digest: str(path)})
+    remember(path)
     return ""
+
+
+def remember(path: Path) -> None:
+    """Count an own effect as known: it has been named, or this program wrote it.
+
+    Parameters
+    ----------
+    path : of the effect's file.
+    """
+    from vinetrack.core.tables import write_json
+
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    with contextlib.suppress(OSError):
+        write_json(memory_file(), _known() | {digest: str(path.resolve())})
 
 
 def _known() -> dict[str, str]:

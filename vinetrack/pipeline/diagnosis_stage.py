@@ -328,6 +328,69 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
     return added_in_words(before, after, table, moved((before, after), ("", name)))
 
 
+def propose_effect(experiment: Experiment, folder: Path, to: Path | None = None, report: Report = _quiet) -> list[str]:
+    """Write the law that mends what no effect of the catalogue does as an effect of the user's own.
+
+    Parameters
+    ----------
+    experiment : sheet and settings.
+    folder : results folder, diagnosed.
+    to : where the file goes; without it, into the experiment's folder.
+    report : callable
+        Called with a sentence at each step.
+
+    Returns
+    -------
+    list of str
+        Lines for the terminal.
+
+    Raises
+    ------
+    ResultsError
+        If a stage before this one has not run, or the diagnosis did not end as `unexplained`.
+    FitError
+        If the model cannot be followed.
+    """
+    from vinetrack.core.tables import write_text
+    from vinetrack.diagnosis.propose import effect_text, propose
+    from vinetrack.diagnosis.result import UNEXPLAINED
+    from vinetrack.dynamics.model import make_model
+    from vinetrack.effects import own_effects, remember
+
+    results = Results(folder)
+    diagnosis = read_diagnosis(results)
+    if diagnosis is None:
+        raise ResultsError(f"{folder}: it has not been diagnosed; run vinetrack diagnose {folder}")
+    if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
+        raise ResultsError(
+            f"{folder}: its verdict is `{diagnosis.final_verdict}`. A law of its own is proposed only for what no"
+            " effect of the catalogue explains (`unexplained`); `vinetrack diagnose` prints what was found."
+        )
+    user_effects = own_effects([experiment.folder / path for path in experiment.settings.effects])
+    model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), user_effects)
+    pairs, _ = measured(experiment, results)
+    proposal = propose(model, pairs, report)
+    lines = proposal.sentences()
+    if not proposal.tied:
+        return lines
+    best = proposal.tied[0]
+    remark = (
+        f"From {len(proposal.before.trials)} trials of {experiment.name}, where {' + '.join(model.names)} misses"
+        f" left-out conditions by {1e3 * proposal.rms_left_out_m:.2f} mm, and with this law by"
+        f" {1e3 * best.rms_left_out_m:.2f} mm (Δχ² = {best.ratio.delta_chi2:.0f})."
+    )
+    path = to or experiment.folder / f"{best.effect.name}.py"
+    if path.exists():
+        raise ResultsError(f"{path} is there already: move it away, or name another file with --to.")
+    write_text(path, effect_text(best.seen, remark))
+    remember(path)
+    return [
+        *lines,
+        f"Written to {path}. Read it; `vinetrack add {path} {folder}` fits it. To have the diagnosis question it, name"
+        f" it under `effects:` of {experiment.folder / 'experiment.yaml'}.",
+    ]
+
+
 def diagnosis_lines(folder: Path) -> list[str]:
     """What `diagnosis.json` of a results folder says: the verdict in a line, then its reasons, a line a sentence.
 
