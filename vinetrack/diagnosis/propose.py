@@ -228,7 +228,7 @@ def effect_text(seen: SeenLaw, remark: str = "") -> str:
         f"AREA = {law.by_area:.6g}  # m²\n" if area else None,
         "PARAMETERS = (",
         f"    {_size_parameter(written.size, size)},",
-        *(f"    {_shape_parameter(*one)}," for one in zip(written.shapes, shapes, strict=True)),
+        *(f"    {_shape_parameter(*number)}," for number in zip(written.shapes, shapes, strict=True)),
         ")\n\n",
         f"def tail_force(s, rig, {', '.join(names)}):",
         f"    return {names[0]} * ({written.code}){area}\n\n",
