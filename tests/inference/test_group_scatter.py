@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+from lsoda_vine import small_campaign
+
+import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.inference.robust_covariance import coarsest_groups, group_scatter
+from vinetrack.inference.robust_covariance import coarsest_groups, group_scatter, robust_covariance
 
 
 def trials(specimens: int, days: int = 0, count: int = 24) -> list[Trial]:
@@ -41,3 +45,21 @@ def test_groups_of_one_are_single_trials() -> None:
     single -= single.mean(axis=0)
     names = [str(i) for i in range(10)]
     np.testing.assert_allclose(group_scatter(single, names, 3), single.T @ single * 10 / 7)
+
+
+def test_trials_of_one_day_that_err_alike_make_errors_larger() -> None:
+    """The same tracks, once with their days told: eight days of two trials, whose bends are those of the day."""
+    pairs, _ = small_campaign(20710, damping=1e-3, pressure=1e-3)
+    bends_m = np.repeat(4e-4 * np.random.default_rng(20710).standard_normal(8), 2)
+    bent = []
+    for (trial, track), bend in zip(pairs, bends_m, strict=True):
+        part = (track.lead_position_m - track.lead_position_m[0]) / np.ptp(track.lead_position_m)
+        bent.append((trial, replace(track, lead_position_m=track.lead_position_m + bend * np.sin(6 * part))))
+    found = vt.fit(vt.base_model(), bent, profile=False)
+    alone = np.diag(robust_covariance(found.predictor, found.solution)[1])
+    found.predictor.data = [
+        replace(data, trial=replace(data.trial, day=f"{k // 2}")) for k, data in enumerate(found.predictor.data)
+    ]
+    by_day = np.diag(robust_covariance(found.predictor, found.solution)[1])
+    assert np.all(by_day >= alone)
+    assert np.max(by_day / alone) > 1.2

@@ -71,12 +71,17 @@ def test_errors_hold_where_those_of_the_noise_are_too_small(make: Callable[[int]
     assert 0.5 < stated < 1.3
 
 
-def test_no_error_is_smaller_than_what_the_scatter_of_trials_shows() -> None:
-    """Of bent pictures the first campaign's trials scatter 1.6 times as widely in one number as the noise says."""
+def test_no_error_is_smaller_than_what_the_scatter_of_trials_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of bent pictures the first campaign's trials scatter 1.6 times as widely in one number as the noise says.
+
+    What trials err by together, which here is more, is left aside.
+    """
     found = vt.fit(vt.base_model(), bent(20620), profile=False)
     plain, robust = (np.diag(matrix) for matrix in robust_covariance(found.predictor, found.solution))
     assert np.max(robust / plain) > 1.5
     known = precision(found.solution)
+    nothing = [np.zeros((trial.time_s.size, 0)) for trial in found.predictor.data]
+    monkeypatch.setattr("vinetrack.inference.robust_covariance.systematics_of", lambda *_, **__: nothing)
     stated = np.diag(widened_covariance(found.predictor, found.solution, found.trials, known).covariance)
     assert np.all(stated / np.diag(known.covariance) >= 0.99 * robust / plain)
 
