@@ -51,10 +51,18 @@ def test_check_of_any_error_exits_with_1_and_names_file_trial_and_column(tmp_pat
 
 
 def test_check_says_two_hundred_problems_in_twenty_lines(tmp_path: Path) -> None:
+    rows = "".join(f"t{i},a.csv,12,100,300,{9000 + i},3\n" for i in range(200))
+    done = run("check", experiment(tmp_path / "v", rows))
+    assert done.exit_code == 1
+    assert len(done.output.splitlines()) <= 20
+
+
+def test_check_says_a_problem_that_two_hundred_trials_share_once(tmp_path: Path) -> None:
     rows = "".join(f"t{i},a.csv,12,100,300,9999,3\n" for i in range(200))
     done = run("check", experiment(tmp_path / "v", rows))
     assert done.exit_code == 1
-    assert len(done.output.splitlines()) == 20
+    assert "t0 and 199 more" in done.output
+    assert len(done.output.splitlines()) == 2
 
 
 def test_check_of_a_missing_folder_suggests_one(tmp_path: Path) -> None:

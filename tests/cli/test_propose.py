@@ -61,6 +61,8 @@ def test_a_law_is_written_beside_the_experiment_and_added(bench: tuple[Path, Pat
 def test_nothing_is_proposed_where_the_verdict_is_another(bench: tuple[Path, Path], tmp_path: Path) -> None:
     copy = shutil.copytree(bench[1], tmp_path / "results")
     diagnosis = json.loads((copy / "diagnosis.json").read_text())
+    for asked in diagnosis["rounds"]:
+        asked["verdict"] = "adequate"
     (copy / "diagnosis.json").write_text(json.dumps(diagnosis | {"verdict": "adequate", "final_verdict": "adequate"}))
     code, output = run("propose", copy)
     assert code == 1

@@ -87,8 +87,11 @@ def fit_laws(points: pd.DataFrame, *, resamples: int = 2000, seed: int = 0) -> d
     dict
         `log_log`, `both_axes`, `paper`, each as `fit_damping` describes.
     """
-    of_no_slope = points["reason"].fillna("").astype(str).str.startswith(NO_SLOPE)
-    fits = fit_damping(points[points["used"] | of_no_slope], resamples=resamples, seed=seed)
+    asked = points["used"]
+    if "reason" in points:
+        # Points of vines that carry no slope are left out by the law itself, which says so.
+        asked = asked | points["reason"].fillna("").astype(str).str.startswith(NO_SLOPE)
+    fits = fit_damping(points[asked], resamples=resamples, seed=seed)
     literal = points[points["eligible"] & (points["x_ss_paper_m_s"] > 0)]
     literal = literal.assign(x_ss_m_s=literal["x_ss_paper_m_s"], force_N=literal["force_paper_N"])
     return fits | {"paper": fit_damping(literal, resamples=resamples, seed=seed)["log_log"]}

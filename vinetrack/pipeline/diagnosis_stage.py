@@ -379,7 +379,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None = None,
         f" left-out conditions by {1e3 * proposal.rms_left_out_m:.2f} mm, and with this law by"
         f" {1e3 * best.rms_left_out_m:.2f} mm (Δχ² = {best.ratio.delta_chi2:.0f})."
     )
-    path = to or experiment.folder / f"{best.effect.name}.py"
+    path = to or experiment.folder / best.effect.path.name
     if path.exists():
         raise ResultsError(f"{path} is there already: move it away, or name another file with --to.")
     write_text(path, effect_text(best.seen, remark))
