@@ -90,8 +90,8 @@ def test_a_model_that_moves_nothing_has_no_smooth_errors_of_position() -> None:
 @needs_recordings
 @pytest.mark.xfail(
     strict=True,
-    reason="12 of 14: the fit to five tube recordings that the model does not describe ends at n = 2 and B = 1000, their "
-    "bounds, where the other B are given errors as if these were known (2.0 ± 0.7 for a tube that alone asks for 28)",
+    reason="12 of 14: a fit to five tube recordings that the model does not describe ends at n = 2 and B = 1000, the "
+    "bounds, where the other B get errors as if these were known (2.0 ± 0.7 for a tube that alone asks for 28)",
 )
 def test_nine_of_ten_real_repeats_are_within_the_band_of_the_others(tmp_path: Path) -> None:
     """Eight stacks of cups and six recordings of three tubes, each predicted from the others of its kind."""
