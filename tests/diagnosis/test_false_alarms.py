@@ -20,7 +20,7 @@ from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, likelihood_ratio, weights_of
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, LATER_LEVEL, LOUD_PROBE, MisfitTests
-from vinetrack.diagnosis.score_test import Scores, Structure, _systematics_aside, family_threshold, structure_in
+from vinetrack.diagnosis.score_test import Scores, Structure, _systematics_aside, structure_in
 from vinetrack.inference.fit_result import Number
 
 QUIET = Structure(0.0, 0, 1.0, 0.0)
@@ -39,7 +39,7 @@ def questioned(of: Scores, signs: Any = 0, structure: Structure = QUIET, level: 
     """The tests of candidates with these scores."""
     signs = np.broadcast_to(signs, of.score.shape).tolist()
     shapes = [SimpleNamespace(effect=SimpleNamespace(parameters=(1,)), size=SimpleNamespace(sign=s)) for s in signs]
-    answers: Any = SimpleNamespace(shapes=shapes)
+    answers: Any = SimpleNamespace(shapes=shapes, effects=tuple(f"effect_{k}" for k in range(len(shapes))))
     fit: Any = None
     return MisfitTests(fit, (), answers, fit, of, structure, level)
 
@@ -62,8 +62,8 @@ def test_a_size_explains_its_own_part_of_how_trials_scatter() -> None:
 def test_the_best_of_all_candidates_is_a_false_alarm_in_one_campaign_of_a_hundred_at_most(scatter: float) -> None:
     draw = np.random.default_rng(20602)
     campaigns = [questioned(scores(draw, 12, 4, scatter)) for _ in range(2000)]
-    # Their cosines are all near 0: one threshold serves them all.
-    alarms = sum(bool(asked.possible.max() > campaigns[0].threshold) for asked in campaigns)
+    # Their cosines are all near 0: one family of thresholds serves them all.
+    alarms = sum(asked.excess(campaigns[0].family) > 0 for asked in campaigns)
     assert alarms <= 20
 
 
@@ -72,15 +72,8 @@ def test_a_candidate_of_seven_standard_errors_is_found() -> None:
     found = 0
     for _ in range(40):
         asked = questioned(scores(draw, 24, 4, sizes=[7 / math.sqrt(24), 0, 0, 0]))
-        found += bool(asked.possible[0] > asked.threshold)
+        found += bool(asked.possible[0] > asked.family.of("effect_0"))
     assert found >= 36
-
-
-@pytest.mark.parametrize(("sign", "tails"), [(0, 2.0), (1, 1.0)])
-def test_the_threshold_of_one_candidate_is_the_quantile_of_the_normal(sign: int, tails: float) -> None:
-    from scipy.stats import norm
-
-    assert family_threshold(np.eye(1), [sign], 0.02) == pytest.approx(norm.isf(0.02 / tails), abs=0.05)
 
 
 @pytest.mark.parametrize("scatter", [1.0, 3.0])

@@ -278,7 +278,7 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     tuple(single for single in finding.confounded if single.number.key.split(".")[0] == effect.name),
                 )
             )
-        elif finding.verdict == ADEQUATE and not shows and z < questions.threshold:
+        elif finding.verdict == ADEQUATE and not shows and z < questions.family.of(effect.name):
             rows.append(Candidate(effect.name, effect.kind, NOT_TESTABLE, z**2, z, reason=TOO_WEAK))
         else:
             rows.append(

@@ -1,7 +1,7 @@
 """Power of the score tests by linear theory: the size of every candidate that is found with a given probability.
 
-The diagnosis takes a candidate for missing when its score, in standard errors, exceeds the threshold c of the best of
-all candidates (`score_test.family_threshold`). With an effect of size a the score of shape j is normal,
+The diagnosis takes a candidate for missing when its score, in standard errors, exceeds the threshold c of that
+candidate (`family_test`). With an effect of size a the score of shape j is normal,
 
     z_j ~ N(μ_j(a), 1),   μ_j(a) = I_jk a / √I_jj,   corr(z_i, z_j) = I_ij / √(I_ii I_jj)
 
@@ -113,7 +113,7 @@ def power_of(
         wary = "the model misses the trials by more than their noise, which the sizes take for noise"
     return Power(
         n_trials=len(questions.fit.trials),
-        threshold=questions.threshold,
+        threshold=questions.family.single,
         false_alarms=_false_alarms(first or questions),
         effects=tuple(effects),
         not_testable={**(not_testable or {}), **silent},
@@ -244,7 +244,8 @@ def _needed_means(questions: MisfitTests, place: int, widening: Floats) -> Float
     Derivation at the head of the module; p_i is the share of trial i in the information about the shape.
     """
     scores = questions.scores
-    passes = SCORES / widening >= questions.threshold
+    limit = questions.family.of(questions.answers.effects[place])
+    passes = SCORES / widening >= limit
     threshold = float(SCORES[np.argmax(passes)]) if passes.any() else math.inf
     draw = np.random.default_rng(SEED)
     single = np.maximum(scores.informations[:, place, place], 0.0)
@@ -257,7 +258,7 @@ def _needed_means(questions: MisfitTests, place: int, widening: Floats) -> Float
     left = np.sqrt(share) * noise - share * score[:, None]
     left = left - left.mean(axis=1, keepdims=True)
     ratio = np.sqrt(np.sum(left**2, axis=1) * trials / scores.degrees)
-    by_scatter = float(t.isf(norm.sf(questions.threshold), max(scores.degrees, 3.0)))
+    by_scatter = float(t.isf(norm.sf(limit), max(scores.degrees, 3.0)))
     return np.asarray(np.maximum(threshold, by_scatter * ratio) - score)
 
 
@@ -325,7 +326,8 @@ def _taken_for(
     counted = np.where(_credible(questions, drawn), _one_way(drawn, questions.signs), 0.0)
     squares, names = _by_effect(questions, np.maximum(counted, 0.0) ** 2)
     itself = names.index(response.effect.name)
-    heard = squares.max(axis=1) > questions.threshold**2
+    limits = np.array([questions.family.of(name) for name in names])
+    heard = np.any(squares > limits**2, axis=1)
     if np.count_nonzero(heard) < DRAWS / 100:
         return {}, math.nan
     holding = {effect.name for effect in questions.effects if response.effect.name in effect.replaces}

@@ -12,11 +12,11 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, plausible_range, shapes_of
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect_sensitivities
+from vinetrack.diagnosis.family_test import FamilyTest, family_test
 from vinetrack.diagnosis.score_test import (
     Products,
     Scores,
     Structure,
-    family_threshold,
     fit_columns,
     linear_gains,
     products_of,
@@ -96,14 +96,28 @@ class MisfitTests:
         return [shape.size.sign if shape.effect.parameters else 1 for shape in self.answers.shapes]
 
     @cached_property
-    def threshold(self) -> float:
-        """The z that the best of all shapes exceeds by chance with probability `level`."""
-        return family_threshold(self.scores.cosines, self.signs, self.level)
+    def family(self) -> FamilyTest:
+        """The z that each candidate has to exceed, so that any of them does by chance with probability `level`."""
+        return family_test(self.scores.cosines, self.signs, self.answers.effects, self.level)
+
+    def excess(self, family: FamilyTest) -> float:
+        """By how much the candidate that stands out most exceeds its threshold; below 0 where none does.
+
+        Parameters
+        ----------
+        family : thresholds of all candidates.
+
+        Returns
+        -------
+        float
+        """
+        limits = np.array([family.of(name) for name in self.answers.effects])
+        return float(np.max(self.possible - limits, initial=-math.inf))
 
     @property
     def something(self) -> bool:
         """Whether anything is missing, known or not."""
-        return bool(self.off or self.fails or (self.possible.size and self.possible.max() > self.threshold))
+        return bool(self.off or self.fails or self.excess(self.family) > 0)
 
     @property
     def fails(self) -> bool:
@@ -123,8 +137,7 @@ class MisfitTests:
     @cached_property
     def whispers(self) -> bool:
         """Whether any candidate stands out as far as would say of a first model that something is missing."""
-        first = family_threshold(self.scores.cosines, self.signs, FIRST_LEVEL)
-        return bool(self.possible.max(initial=0.0) > first)
+        return self.excess(family_test(self.scores.cosines, self.signs, self.answers.effects, FIRST_LEVEL)) > 0
 
     @property
     def shaped(self) -> bool:

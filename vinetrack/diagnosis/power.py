@@ -218,8 +218,8 @@ class SimulatedRates:
 class Power:
     """What the trials of a campaign can see of every candidate. Printed, it is what a person reads on the terminal.
 
-    `threshold` is the score, in standard errors, that the best of all candidates must exceed. `false_alarms` maps each
-    test to the chance at which it takes nothing for something; they add up at most. `not_testable` maps other
+    `threshold` is the score, in standard errors, that a candidate tried in one shape must exceed. `false_alarms` maps
+    each test to the chance at which it takes nothing for something; they add up at most. `not_testable` maps other
     candidates to the reason why they cannot be seen. `wary` tells why the sizes are not to be trusted, blank where
     they are. `simulated` are rates of complete diagnoses, where campaigns were simulated.
     """

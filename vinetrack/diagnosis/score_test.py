@@ -416,33 +416,3 @@ def structure_in(scores: Scores) -> Structure:
     chances = 2 * t.sf(np.abs(scores.z[live]), np.clip(felt - 1, 1.0, max(scores.degrees, 3.0)))
     loudest = min(degrees * float(np.min(chances, initial=1.0)), 1.0)
     return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), loudest)
-
-
-def family_threshold(cosines: Floats, signs: Sequence[int], level: float, draws: int = 40_000) -> float:
-    """The z that the largest of correlated scores exceeds with this probability where nothing is missing.
-
-    Candidates are correlated and some have one sign only: sixteen may act like four.
-
-    Parameters
-    ----------
-    cosines : array, shape (n, n)
-        Correlations of the scores.
-    signs : sequence of int
-        Sign of each candidate, 0 where it may have either.
-    level : float
-        Chance of a false alarm of them all.
-    draws : int
-        Monte Carlo draws; 40 000 give the 95 % quantile to 0.01.
-
-    Returns
-    -------
-    float
-    """
-    count = len(signs)
-    if not count:
-        return 0.0
-    values, vectors = np.linalg.eigh(cosines)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    normal = np.random.default_rng(20).standard_normal((draws, count)) @ root.T
-    sided = np.where(np.array(signs) == 0, np.abs(normal), normal * np.array(signs))
-    return float(np.quantile(sided.max(axis=1), 1 - level))

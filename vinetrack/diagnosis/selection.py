@@ -129,9 +129,9 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
     tried = [hypothesis for hypothesis in tried if hypothesis not in between]
     credible = [hypothesis for hypothesis in tried if hypothesis.credible]
-    if not credible or _best_of(credible).sigma < questions.threshold:
+    if not credible or not _stands_out(_best_of(credible), questions):
         # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
-        loud = questions.possible.max(initial=0.0) > questions.threshold + LOUD
+        loud = questions.excess(questions.family) > LOUD
         fails = questions.fails or questions.off or loud
         verdict = UNEXPLAINED if fails else ADEQUATE
         return [SelectionStep(verdict, questions, tried=tuple(tried), search=search)]
@@ -162,7 +162,7 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
     where its trials scatter much they may have been bent to it: then it stands only if no effect alone does better.
     """
     slack = slack_fit(questions.fit)
-    if slack is None or slack.sigma < questions.threshold:
+    if slack is None or not _stands_out(slack, questions):
         return None
     report("letting the tail go slack")
     # A model far off may gain by any freedom: the rule is named only where it leaves nothing to explain.
@@ -171,6 +171,18 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
         return None
     first = SelectionStep(MISSING, questions, (slack,), (slack,), (), slack.names)
     return [first, SelectionStep(ADEQUATE, after)]
+
+
+def _stands_out(hypothesis: LikelihoodRatio, questions: MisfitTests) -> bool:
+    """Whether an effect is worth more standard deviations than chance alone gives one of the candidates."""
+    return hypothesis.sigma >= questions.family.of(hypothesis.names[-1])
+
+
+def _is_needed(pair: LikelihoodRatio, single: LikelihoodRatio, search: CandidateFits) -> bool:
+    """Whether a pair is better than the best single effect by more than chance gives a further candidate."""
+    further = search.after(single.fit).family
+    limit = max(further.of(name) for name in pair.names if name not in single.names)
+    return 2 * (pair.fit.log_likelihood - single.fit.log_likelihood) >= limit**2
 
 
 def _best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:
@@ -185,7 +197,7 @@ def _alone(
     if not tried:
         return None
     best = _best_of(tried)
-    if best.sigma < questions.threshold:
+    if not _stands_out(best, questions):
         return None
     kept, aside, after = _mending(tried, search)
     if after is None:
@@ -286,7 +298,7 @@ def _together(
     if not both:
         return nothing
     kept, aside, after = _mending(both, search)
-    if after is None or 2 * (kept[0].fit.log_likelihood - ranked[0].fit.log_likelihood) < after.threshold**2:
+    if after is None or not _is_needed(kept[0], ranked[0], search):
         return nothing
     common = set.intersection(*(set(hypothesis.names) for hypothesis in kept))
     by_name = {hypothesis.names[0]: hypothesis for hypothesis in ranked if len(hypothesis.names) == 1}

@@ -182,11 +182,13 @@ def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
         return f"{model} explains {trials} as well as positions are known. {finding.note[0].upper()}{finding.note[1:]}."
     text = f"{model} explains {trials}: no missing effect can be detected."
     if questions.possible.size:
-        place = int(questions.possible.argmax())
+        names = questions.answers.effects
+        limits = [questions.family.of(name) for name in names]
+        place = int((questions.possible - limits).argmax())
         text += (
             f" The most significant of {_count_testable(questions)} candidates, "
-            f"{questions.answers.effects[place]}, has {questions.possible[place]:.1f} σ; by chance the best of "
-            f"them exceeds {questions.threshold:.1f} σ once in {1 / questions.level:.0f} campaigns."
+            f"{names[place]}, has {questions.possible[place]:.1f} σ, and {limits[place]:.1f} σ are asked of it; by "
+            f"chance any of them has what is asked of it once in {1 / questions.level:.0f} campaigns."
         )
     return text
 
@@ -195,7 +197,7 @@ def _count_testable(questions: MisfitTests) -> int:
     """How many effects these trials could show: those that the ranking has as tested."""
     return sum(
         effect.name not in questions.answers.silent
-        and (questions.largest(effect)[1] or questions.best_z(effect.name)[0] >= questions.threshold)
+        and (questions.largest(effect)[1] or questions.best_z(effect.name)[0] >= questions.family.of(effect.name))
         for effect in questions.effects
     )
 
