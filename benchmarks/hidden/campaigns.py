@@ -60,10 +60,12 @@ class Hidden:
     truth: Truth
 
 
-def make(kind: str, seed: int, *, filmed: bool = False) -> Hidden:
+def make(kind: str, seed: int, *, filmed: bool = False, trials: int = 0) -> Hidden:
     """The campaign of this kind and seed; the same ones give the same numbers.
 
     One to be `filmed` has the positions as they were: noise, lost frames and late starts are the camera's business.
+    With a number of `trials` the conditions are those of the kind and seed all the same, each repeated as often as it
+    takes.
 
     Raises
     ------
@@ -74,7 +76,7 @@ def make(kind: str, seed: int, *, filmed: bool = False) -> Hidden:
         raise KeyError(kind)
     for attempt in range(50):
         draw = np.random.default_rng([zlib.crc32(kind.encode()), seed, attempt])
-        found = _attempt(kind, seed, draw, filmed=filmed)
+        found = _attempt(kind, seed, draw, filmed=filmed, trials=trials)
         if found is not None:
             return found
     raise RuntimeError(f"No campaign of kind {kind} moves with seed {seed}.")
@@ -115,10 +117,12 @@ def _nuisances(kind: str, regime_name: str, draw: np.random.Generator) -> Nuisan
     return how
 
 
-def _attempt(kind: str, seed: int, draw: np.random.Generator, *, filmed: bool) -> Hidden | None:
+def _attempt(kind: str, seed: int, draw: np.random.Generator, *, filmed: bool, trials: int) -> Hidden | None:
     """One campaign, or None where too few of its trials move."""
     names, outsider, regime_name = _parts(kind)
     settings = design(draw, _wants(names, outsider, kind))
+    if trials:
+        settings = [settings[k % len(settings)] for k in range(trials)]
     how = _nuisances(kind, regime_name, draw)
     if filmed:
         how = replace(how, noise="white", noise_m=0.0, dropped=0.0, without_rest=0.0, trace_sigma_kPa=math.nan)

@@ -176,9 +176,10 @@ def cross_products(blocks: Floats, problem: MixedProblem) -> Floats:
     array, shape (n_free, n_free)
     """
     p = problem.prior_mean.size
-    total = np.zeros((p + 1, p + 1))
-    np.add.at(total, (problem.index[:, :, None], problem.index[:, None, :]), blocks)
-    return total[:p, :p]
+    places = _places(problem)
+    flat = places[:, :, None] * (p + 1) + places[:, None, :]
+    total = np.bincount(flat.ravel(), weights=blocks.ravel(), minlength=(p + 1) ** 2)
+    return np.asarray(total.reshape(p + 1, p + 1)[:p, :p])
 
 
 def cross_products_vector(blocks: Floats, problem: MixedProblem) -> Floats:
@@ -193,9 +194,13 @@ def cross_products_vector(blocks: Floats, problem: MixedProblem) -> Floats:
     -------
     array, shape (n_free,)
     """
-    total = np.zeros(problem.prior_mean.size + 1)
-    np.add.at(total, problem.index, blocks)
-    return total[:-1]
+    p = problem.prior_mean.size
+    return np.asarray(np.bincount(_places(problem).ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
+
+
+def _places(problem: MixedProblem) -> NDArray[np.int_]:
+    """`index` with the place behind all numbers for keys that a trial does not feel."""
+    return np.where(problem.index < 0, problem.prior_mean.size, problem.index)
 
 
 def newton_step(grams: Floats, problem: MixedProblem, state: FitState, damping: float) -> tuple[Floats, Floats, float]:
