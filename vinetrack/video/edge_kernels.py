@@ -2,7 +2,7 @@
 
 A strip is kept as the camera wrote it; `scale[t] * value + offset[t]` is its brightness freed of flicker. An edge
 `y` blurred by optics (Gaussian of width `blur`) and by motion (a box of `length`) covers the pixel at `s` by
-p(y − s), see `cover_table`.
+p(y − s), see `edge_cover`.
 """
 
 from __future__ import annotations
@@ -12,19 +12,11 @@ import math
 import numpy as np
 from numba import njit
 
-STEP = 0.05
-"""Spacing of the table of covers, px. Derived: linear interpolation errs by at most |p''|·STEP²/8, with |p''| ≤
-0.242/blur² and the least blur of 0.4 px 5e-4."""
+from vinetrack.video.edge_cover import MATHS, VECTOR, cover_reach, cover_table, phase
+
 BEHIND = 25
 """Columns behind the first passed one whose film is looked at: neighbours that stand in where it is never seen.
 Chosen: nearly two lengths of MEMORY in `edge_state`. Half or twice changes only film that is never seen."""
-FORGOTTEN = 4.0
-"""Frames further off than this many memories, e⁻⁴ = 2 %, are not read. Chosen for time; at half 14 % of the weight is
-left out, at twice time grows."""
-PARTIAL = 0.05
-"""Weight of a half-covered pixel: what it says of film and background depends on where the edge was thought to be.
-Chosen: a pixel seen half covered in 20 frames weighs as one seen bare once. By reasoning: at half or twice the few
-pixels never seen bare change."""
 FOREIGN = 1.7
 """How much farther than background film is from what resembles neither. Chosen above 1, so that what resembles neither
 hides background. By reasoning: nearer 1 a payload counts as film, farther a stain on the film does as background."""
@@ -33,209 +25,7 @@ DOUBT = 0.1
 small beside the clip of 6: only pixels without contrast are decided by it."""
 
 
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
-def cover_table(length: float, blur: float, reach: float) -> np.ndarray:
-    """Cover p and slope dp/dx at x = −reach, −reach + STEP, … ; shape (n, 2).
-
-    p is the mean of the normal distribution function over a box of `length`: ∫Φ = zΦ(z) + φ(z).
-
-    Parameters
-    ----------
-    length : of the motion blur, px.
-    blur : standard deviation of the optical blur, px.
-    reach : farthest distance from the edge, px.
-
-    Returns
-    -------
-    p and dp/dx, shape (n, 2), n = 2 reach/STEP + 2.
-    """
-    n = int(2 * reach / STEP) + 2
-    table = np.empty((n, 2))
-    length = max(length, 0.02)
-    for i in range(n):
-        x = -reach + i * STEP
-        a = (x + length / 2) / blur
-        b = (x - length / 2) / blur
-        cdf_a = 0.5 * (1 + math.erf(a * 0.7071067811865476))
-        cdf_b = 0.5 * (1 + math.erf(b * 0.7071067811865476))
-        ga = a * cdf_a + 0.3989422804014327 * math.exp(-0.5 * a * a)
-        gb = b * cdf_b + 0.3989422804014327 * math.exp(-0.5 * b * b)
-        table[i, 0] = (ga - gb) * blur / length
-        table[i, 1] = (cdf_a - cdf_b) / length
-    return table
-
-
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
-def _look_up(table: np.ndarray, reach: float, x: float) -> tuple[float, float]:
-    if x <= -reach:
-        return 0.0, 0.0
-    if x >= reach:
-        return 1.0, 0.0
-    at = (x + reach) / STEP
-    i = int(at)
-    f = at - i
-    return table[i, 0] + f * (table[i + 1, 0] - table[i, 0]), table[i, 1] + f * (table[i + 1, 1] - table[i, 1])
-
-
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
-def gather(
-    strip: np.ndarray,
-    scale: np.ndarray,
-    offset: np.ndarray,
-    edge: np.ndarray,
-    lengths: np.ndarray,
-    lag: np.ndarray,
-    blur: float,
-    early: np.ndarray,
-    late: np.ndarray,
-    memory_frames: float,
-    pictures: np.ndarray,
-    clip: float,
-) -> np.ndarray:
-    """Sums for the least squares of (before, after) at every pixel; shape (n_across, n_along, 11).
-
-    The edge is over column s from frame `early[s]` to `late[s]`. Background counts before, film after, by a weight
-    that falls as exp(−frames / memory_frames): what was seen last before and first after counts most. Half-covered
-    pixels count in between, hardly. The answer's columns: Σwq², Σwqp, Σwp², ΣwqV, ΣwpV (q = 1 − p) of those, then
-    weight, sum and sum of squares of V where only background, and where only film, is seen.
-    With `clip` > 0 a value that strays from the last solution is weighed down by 1/(1 + (r/clip)²).
-
-    Parameters
-    ----------
-    strip : values as the camera wrote them, shape (n_frames, n_across, n_along).
-    scale, offset : brightness = scale · value + offset, shape (n_frames,).
-    edge, lengths : place of the edge and length of its motion blur, shape (n_frames,), px; NaN where unknown.
-    lag : by how much each row of the tip lags behind its foremost point, shape (n_across,), px.
-    blur : standard deviation of the optical blur, px.
-    early, late : first and last frame with the edge over a column, shape (n_along,).
-    memory_frames : frames after which weights fall to 1/e.
-    pictures : the last solution of `solve`; unused where `clip` is 0.
-    clip : grey levels.
-
-    Returns
-    -------
-    the sums.
-    """
-    n, rows, columns = strip.shape
-    sums = np.zeros((rows, columns, 11), np.float32)
-    share = np.zeros(columns)
-    for t in range(n):
-        if not math.isfinite(edge[t]):
-            continue
-        reach = 0.5 * lengths[t] + 4 * blur + 0.5
-        table = cover_table(lengths[t], blur, reach)
-        first, last = columns, 0
-        for s in range(columns):
-            d = max(early[s] - t, t - late[s], 0.0) / memory_frames
-            share[s] = math.exp(-d) if d < FORGOTTEN else 0.0
-            if share[s] > 0:
-                first, last = min(first, s), s + 1
-        for u in range(rows):
-            at = edge[t] - lag[u]
-            for s in range(first, last):
-                p, _ = _look_up(table, reach, at - s)
-                q = 1 - p
-                value = strip[t, u, s] * scale[t] + offset[t]
-                w = share[s]
-                if p > 0.98:
-                    if t < late[s]:
-                        continue
-                elif p > 0.02:
-                    if t < early[s] or t > late[s]:
-                        continue
-                    w *= PARTIAL
-                if clip > 0:
-                    r = value - pictures[1, u, s] * q - pictures[0, u, s] * p
-                    w /= 1 + r * r / (clip * clip)
-                at_pixel = sums[u, s]
-                if q > 0.98:
-                    at_pixel[5] += w
-                    at_pixel[6] += w * value
-                    at_pixel[7] += w * value * value
-                elif p > 0.98:
-                    at_pixel[8] += w
-                    at_pixel[9] += w * value
-                    at_pixel[10] += w * value * value
-                else:
-                    at_pixel[0] += w * q * q
-                    at_pixel[1] += w * q * p
-                    at_pixel[2] += w * p * p
-                    at_pixel[3] += w * q * value
-                    at_pixel[4] += w * p * value
-    return sums
-
-
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
-def solve(sums: np.ndarray, ridge: float, memory: float, fallback: float, noise: float, texture: float) -> np.ndarray:
-    """Brightness after and before the edge at every pixel, and the variance about each; shape (4, n_across, n_along).
-
-    A pixel that never shows one of the two, or whose background changes (a door swings there), takes it from its row:
-    film from the columns behind it, background from those ahead, with weights falling as `memory`^distance; its
-    variance is then `texture`², a tenth more where it changes.
-
-    Parameters
-    ----------
-    sums : from `gather`, shape (n_across, n_along, 11).
-    ridge : weight of the row's guess where a pixel was seen itself, frames.
-    memory : factor by which weights of neighbours fall from column to column.
-    fallback : brightness where nothing is known.
-    noise, texture : standard deviation of a value, and of a pixel about its neighbours, grey levels.
-
-    Returns
-    -------
-    after, before, variance after, variance before.
-    """
-    rows, columns, _ = sums.shape
-    out = np.empty((4, rows, columns), np.float32)
-    guess = np.empty(columns)
-    unsteady = (1.5 * texture) ** 2
-    for u in range(rows):
-        total, count, level = 0.0, 0.0, fallback
-        for s in range(columns - 1, -1, -1):
-            if count > 1e-3:
-                level = total / count
-            guess[s] = level
-            steady = _variance(sums[u, s, 5], sums[u, s, 6], sums[u, s, 7], noise) < unsteady
-            total = total * memory + (sums[u, s, 6] if steady else 0.0)
-            count = count * memory + (sums[u, s, 5] if steady else 0.0)
-        for s in range(columns - 1, -1, -1):
-            if guess[s] != fallback:
-                break
-            guess[s] = sums[u, s, 6] / sums[u, s, 5] if sums[u, s, 5] > 0 else fallback
-        total, count, level = 0.0, 0.0, fallback
-        for s in range(columns):
-            if count > 1e-3:
-                level = total / count
-            elif sums[u, s, 8] > 0:
-                level = sums[u, s, 9] / sums[u, s, 8]
-            total = total * memory + sums[u, s, 9]
-            count = count * memory + sums[u, s, 8]
-            # Never seen bare: what a half-covered pixel seems to show would follow any error of the edge.
-            bare_variance = _variance(sums[u, s, 5], sums[u, s, 6], sums[u, s, 7], noise)
-            bare, film = sums[u, s, 5] > 0.1 and bare_variance < unsteady, sums[u, s, 8] > 0.1
-            qq, qp, pp = sums[u, s, 0] + sums[u, s, 5], sums[u, s, 1], sums[u, s, 2] + sums[u, s, 8]
-            vq, vp = sums[u, s, 3] + sums[u, s, 6], sums[u, s, 4] + sums[u, s, 9]
-            rq = ridge if bare else 1e4 * (1 + qq)
-            rp = ridge if film else 1e4 * (1 + pp)
-            qq, pp, vq, vp = qq + rq, pp + rp, vq + rq * guess[s], vp + rp * level
-            det = qq * pp - qp * qp
-            out[0, u, s] = (vp * qq - vq * qp) / det
-            out[1, u, s] = (vq * pp - vp * qp) / det
-            out[2, u, s] = _variance(sums[u, s, 8], sums[u, s, 9], sums[u, s, 10], noise) if film else texture**2
-            out[3, u, s] = bare_variance if bare else (1.1 if bare_variance >= unsteady else 1.0) * texture**2
-    return out
-
-
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
-def _variance(weight: float, total: float, squares: float, noise: float) -> float:
-    """Variance of what a pixel showed, never below that of the noise, drawn towards it where few frames speak."""
-    if weight <= 0:
-        return noise**2
-    seen = max(squares / weight - (total / weight) ** 2, 0.0)
-    return max((weight * seen + 2 * noise**2) / (weight + 2), noise**2)
-
-
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
 def film_evidence(
     strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, pictures: np.ndarray, width: float, clip: float
 ) -> np.ndarray:
@@ -258,18 +48,24 @@ def film_evidence(
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
-    top = clip * clip
+    unity, doubt, wide = np.float32(1.0), np.float32(DOUBT), np.float32(width * width)
+    top, far = np.float32(clip * clip), np.float32(FOREIGN * clip * clip)
+    weight = unity / (pictures[2:] + wide)
     for t in range(n):
+        gain, level = np.float32(scale[t]), np.float32(offset[t])
+        line = out[t]
         for u in range(rows):
+            values, after, before = strip[t, u], pictures[0, u], pictures[1, u]
+            after_weight, before_weight = weight[0, u], weight[1, u]
             for s in range(columns):
-                value = strip[t, u, s] * scale[t] + offset[t]
-                a = (value - pictures[0, u, s]) ** 2 / (pictures[2, u, s] + width * width)
-                b = (value - pictures[1, u, s]) ** 2 / (pictures[3, u, s] + width * width)
-                out[t, s] += min(a, FOREIGN * top) - min(b, top) - DOUBT
+                value = values[s] * gain + level
+                a, b = value - after[s], value - before[s]
+                a, b = a * a * after_weight[s], b * b * before_weight[s]
+                line[s] += (a if a < far else far) - (b if b < top else top) - doubt
     return out
 
 
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
 def fit_edges(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -306,49 +102,70 @@ def fit_edges(
     """
     n, rows, columns = strip.shape
     out = np.full((n, 6), np.nan)
-    middle = len(inflation) // 2
     deepest = lag.max()
     for t in range(n):
         y = start[t]
         if not math.isfinite(y):
             continue
-        reach = 0.5 * lengths[t] + 4 * blur + 0.5
-        table = cover_table(lengths[t], blur, reach)
-        half = reach + margin
-        gain, level = 0.0, 0.0
+        half = cover_reach(lengths[t], blur) + margin
+        table = cover_table(lengths[t], blur, half)
+        middle = math.ceil(half) + 1
+        wider = np.empty(table.shape[2] + 1)
+        for k in range(len(wider)):
+            wider[k] = inflation[min(max(len(inflation) // 2 - middle + k - 1, 0), len(inflation) - 1)]
+        most = rows * (2 * middle + 2) + VECTOR
+        covers, slopes, steps = np.empty(most), np.empty(most), np.empty(most)
+        left, variances = np.empty(most), np.empty(most)
+        amplitude, level = 0.0, 0.0
         for _ in range(rounds):
             first = max(0, math.ceil(y - half - deepest))
             last = min(columns, int(y + half) + 1)
-            yy, yg, yl, gg, gl, ll = 1e-12, 0.0, 0.0, prior_sd**-2, 0.0, prior_sd**-2
-            ry, rg, rl = 0.0, -gain * prior_sd**-2, -level * prior_sd**-2
-            chi, used = 0.0, 0.0
+            # All rows of pixels behind one another first: sums over them are then one long loop.
+            used = 0
             for u in range(rows):
                 at = y - lag[u]
-                for s in range(first, last):
-                    x = at - s
-                    if x > half or x < -half:
-                        continue
-                    p, slope = _look_up(table, reach, x)
-                    contrast = pictures[0, u, s] - pictures[1, u, s]
-                    value = strip[t, u, s] * scale[t] + offset[t]
-                    r = value - pictures[1, u, s] - contrast * ((1 + gain) * p + level)
-                    i = min(max(int(middle - x), 0), len(inflation) - 1)
-                    variance = p * p * pictures[2, u, s] + (1 - p) * (1 - p) * pictures[3, u, s]
-                    variance *= inflation[i]
-                    w = 1 / (variance * (1 + r * r / (9 * variance)))
-                    dy = contrast * (1 + gain) * slope
-                    dg = contrast * p
-                    yy += w * dy * dy
-                    yg += w * dy * dg
-                    yl += w * dy * contrast
-                    gg += w * dg * dg
-                    gl += w * dg * contrast
-                    ll += w * contrast * contrast
-                    ry += w * dy * r
-                    rg += w * dg * r
-                    rl += w * contrast * r
-                    chi += w * r * r
-                    used += 1
+                whole, j, f, even = phase(at)
+                a, b = max(first, math.ceil(at - half)), min(last, math.floor(at + half) + 1)
+                if b <= a:
+                    continue
+                k, m = a - whole + middle, b - a
+                # Whole vectors; what is too much of the last one is overwritten by the next row, or not looked at.
+                full = m + (-m) % VECTOR if b + VECTOR <= columns else m
+                b, to = a + full, used + full
+                low, high = table[0, j, k : k + full], table[0, j + 1, k : k + full]
+                low_slope, high_slope = table[1, j, k : k + full], table[1, j + 1, k : k + full]
+                factor = wider[k + even : k + even + full]
+                values, after, before = strip[t, u, a:b], pictures[0, u, a:b], pictures[1, u, a:b]
+                after_variance, before_variance = pictures[2, u, a:b], pictures[3, u, a:b]
+                cover, slope, step_of = covers[used:to], slopes[used:to], steps[used:to]
+                rest_of, variance_of = left[used:to], variances[used:to]
+                for i in range(full):
+                    p = low[i] + f * (high[i] - low[i])
+                    cover[i] = p
+                    slope[i] = low_slope[i] + f * (high_slope[i] - low_slope[i])
+                    step_of[i] = after[i] - before[i]
+                    rest_of[i] = values[i] * scale[t] + offset[t] - before[i]
+                    variance_of[i] = (p * p * after_variance[i] + (1 - p) * (1 - p) * before_variance[i]) * factor[i]
+                used += m
+            yy, yg, yl, gg, gl, ll = 1e-12, 0.0, 0.0, prior_sd**-2, 0.0, prior_sd**-2
+            ry, rg, rl = 0.0, -amplitude * prior_sd**-2, -level * prior_sd**-2
+            chi = 0.0
+            for i in range(used):
+                contrast = steps[i]
+                dg = contrast * covers[i]
+                dy = contrast * (1 + amplitude) * slopes[i]
+                r = left[i] - (1 + amplitude) * dg - contrast * level
+                w = 1 / (variances[i] + r * r / 9)
+                yy += w * dy * dy
+                yg += w * dy * dg
+                yl += w * dy * contrast
+                gg += w * dg * dg
+                gl += w * dg * contrast
+                ll += w * contrast * contrast
+                ry += w * dy * r
+                rg += w * dg * r
+                rl += w * contrast * r
+                chi += w * r * r
             # Level and amplitude eliminated from the 3 by 3 normal equations.
             det = gg * ll - gl * gl
             ag, al = (yg * ll - yl * gl) / det, (yl * gg - yg * gl) / det
@@ -356,9 +173,9 @@ def fit_edges(
             if info <= 1e-9:
                 break
             step = (ry - ag * rg - al * rl) / info
-            gain += (ll * (rg - yg * step) - gl * (rl - yl * step)) / det
+            amplitude += (ll * (rg - yg * step) - gl * (rl - yl * step)) / det
             level += (gg * (rl - yl * step) - gl * (rg - yg * step)) / det
-            gain, level = min(max(gain, -0.7), 1.5), min(max(level, -0.7), 0.7)
+            amplitude, level = min(max(amplitude, -0.7), 1.5), min(max(level, -0.7), 0.7)
             limit = 1.0 + 0.25 * lengths[t]
             y += min(max(step, -limit), limit)
             out[t, 1] = 1 / math.sqrt(info)
@@ -366,11 +183,11 @@ def fit_edges(
             out[t, 5] = used
             if abs(step) < 1e-3:
                 break
-        out[t, 0], out[t, 3], out[t, 4] = y, gain, level
+        out[t, 0], out[t, 3], out[t, 4] = y, amplitude, level
     return out
 
 
-@njit(cache=True, fastmath={"contract", "arcp", "nsz", "reassoc"})
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
 def residual_sums(
     strip: np.ndarray,
     scale: np.ndarray,
@@ -402,48 +219,70 @@ def residual_sums(
     three sums, as above.
     """
     n, rows, columns = strip.shape
-    widest = 0.0
-    for t in range(n):
-        widest = max(widest, 0.5 * lengths[t])
-    bins = int(2 * (widest + 4 * blur + margin + lag.max())) + 5
-    middle = bins // 2
+    bins = int(2 * (0.5 * max(lengths.max(), 0.0) + 4 * blur + margin + lag.max())) + 5
+    centre = bins // 2
     by_distance = np.zeros((bins, 2))
-    column = np.zeros((bins, 2))
     by_row = np.zeros((rows, 2))
     misfit, count = 0.0, 0
     for t in range(n):
         if not use[t]:
             continue
         y = fit[t, 0]
-        reach = 0.5 * lengths[t] + 4 * blur + 0.5
-        table = cover_table(lengths[t], blur, reach)
-        half = reach + margin
+        half = cover_reach(lengths[t], blur) + margin
+        table = cover_table(lengths[t], blur, half)
+        middle = math.ceil(half) + 1
         first = max(0, math.ceil(y - half - lag.max()))
         last = min(columns, int(y + half) + 1)
-        column[:] = 0.0
+        # By k, the place in the table, from 1 on: a whole number of pixels behind or ahead of the edge.
+        column = np.zeros((2, table.shape[2] + 1))
+        odds = np.empty(table.shape[2])
         for u in range(rows):
             at = y - lag[u]
-            for s in range(first, last):
-                x = at - s
-                if x > half or x < -half:
-                    continue
-                p, slope = _look_up(table, reach, x)
-                contrast = pictures[0, u, s] - pictures[1, u, s]
-                value = strip[t, u, s] * scale[t] + offset[t]
-                r = value - pictures[1, u, s] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
-                i = min(max(int(middle - x), 0), bins - 1)
-                v = p * p * pictures[2, u, s] + (1 - p) * (1 - p) * pictures[3, u, s]
-                w = 1 / (v * (1 + r * r / (9 * v)))
-                column[i, 0] += w * contrast * r
-                column[i, 1] += w * contrast * contrast
+            whole, j, f, even = phase(at)
+            a, b = max(first, math.ceil(at - half)), min(last, math.floor(at + half) + 1)
+            if b <= a:
+                continue
+            k = a - whole + middle
+            m = b - a
+            count += m
+            low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
+            low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
+            values, after, before = strip[t, u, a:b], pictures[0, u, a:b], pictures[1, u, a:b]
+            after_variance, before_variance = pictures[2, u, a:b], pictures[3, u, a:b]
+            tops, squares = column[0, k + even : k + even + m], column[1, k + even : k + even + m]
+            top, square = 0.0, 0.0
+            for i in range(m):
+                p = low[i] + f * (high[i] - low[i])
+                slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
+                contrast = after[i] - before[i]
+                r = values[i] * scale[t] + offset[t] - before[i] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
+                v = p * p * after_variance[i] + (1 - p) * (1 - p) * before_variance[i]
+                w = 1 / (v + r * r / 9)
+                tops[i] += w * contrast * r
+                squares[i] += w * contrast * contrast
                 g = -contrast * slope
-                by_row[u, 0] += w * g * r
-                by_row[u, 1] += w * g * g
+                top += w * g * r
+                square += w * g * g
                 # A variance that knows nothing of the blur: else the widest blur would be its own excuse.
-                misfit += math.log(1 + r * r / (4.5 * (pictures[2, u, s] + pictures[3, u, s])))
-                count += 1
-        for i in range(bins):
-            if column[i, 1] > 0:
-                by_distance[i, 0] += column[i, 0] * column[i, 0] / column[i, 1]
+                odds[i] = 1 + r * r / (4.5 * (after_variance[i] + before_variance[i]))
+            by_row[u, 0] += top
+            by_row[u, 1] += square
+            misfit += _log_of_product(odds[:m])
+        for k in range(column.shape[1]):
+            if column[1, k] > 0:
+                i = min(max(centre - middle + k - 1, 0), bins - 1)
+                by_distance[i, 0] += column[0, k] * column[0, k] / column[1, k]
                 by_distance[i, 1] += 1
     return by_distance, by_row, misfit / max(count, 1)
+
+
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+def _log_of_product(factors: np.ndarray) -> float:
+    """Sum of the logarithms of factors from 1 to 1e18: of sixteen at a time, whose product is a finite number."""
+    total = 0.0
+    for start in range(0, len(factors), 16):
+        product = 1.0
+        for factor in factors[start : start + 16]:
+            product *= min(factor, 1e18)
+        total += math.log(product)
+    return total

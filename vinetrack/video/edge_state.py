@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video import edge_kernels as kernels
+from vinetrack.video import picture_kernels
 from vinetrack.video.strip import Strip
 
 MEMORY_FRAMES = 6.0
@@ -108,17 +109,17 @@ def repicture(strip: Strip, state: EdgeState, clip: float) -> EdgeState:
     the state with new `pictures`.
     """
     early, late = _passing(state, strip.values.shape[2])
-    sums = kernels.gather(
+    sums = picture_kernels.gather(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
         MEMORY_FRAMES, state.pictures, clip,
     )  # fmt: skip
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
-    pictures = kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
+    pictures = picture_kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
     hidden = _film_from_the_start(state, pictures)
     if hidden.any():
-        sums[:, hidden, 5:8] = 0.0
-        pictures = kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
+        sums[5:8, :, hidden] = 0.0
+        pictures = picture_kernels.solve(sums, RIDGE, MEMORY, middle, strip.noise, TEXTURE)
     return replace(state, pictures=pictures)
 
 

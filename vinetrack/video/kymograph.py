@@ -212,7 +212,7 @@ def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
     return smoothed, np.full(len(edge), SIGMA_PX)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def fan_gains(
     along: np.ndarray, across: np.ndarray, time: np.ndarray, weight: np.ndarray, bins: int, length: int, n_times: int
 ) -> np.ndarray:
@@ -230,16 +230,23 @@ def fan_gains(
     -------
     change collected in order, shape (bins − 1,).
     """
-    table = np.zeros((bins, n_times, length // 4 + 1), np.float32)
+    places = length // 4 + 1
+    table = np.zeros((bins, n_times, places), np.float32)
+    low, high = np.full((bins, n_times), places), np.full((bins, n_times), -1)
     for i in range(len(along)):
-        b = min(max(int(across[i]), 0), bins - 1)
-        table[b, int(time[i]), min(max(int(along[i] / 4), 0), length // 4)] += weight[i]
+        b, t, s = min(max(int(across[i]), 0), bins - 1), int(time[i]), min(max(int(along[i] / 4), 0), places - 1)
+        table[b, t, s] += weight[i]
+        low[b, t], high[b, t] = min(low[b, t], s), max(high[b, t], s)
     out = np.zeros(bins - 1)
-    best = np.zeros(length // 4 + 2)
+    best = np.zeros(places + 1)
     for b in range(bins - 1):
         best[:] = 0.0
         for t in range(n_times):
-            for s in range(1, len(best)):
+            last = max(high[b, t], high[b + 1, t]) + 1
+            # `best` never falls along the line: it rises only where something changes now, and on from there.
+            for s in range(min(low[b, t], low[b + 1, t]) + 1, places + 1):
+                if s > last and best[s] >= best[s - 1]:
+                    break
                 best[s] = max(best[s], best[s - 1] + table[b, t, s - 1] + table[b + 1, t, s - 1])
         out[b] = best[-1]
     return out

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
@@ -27,6 +28,9 @@ REFERENCE_FRAMES = 15
 PIXELS = 9000
 """Pixels of the bands that are used, evenly spread: enough for a shift of 0.01 px. Derived for slopes of 5 grey levels
 a pixel and noise of 5: 1/√9000 = 0.01 px."""
+BINS_A_LEVEL = 16
+"""Bins of a histogram of residuals by grey level of 255, in one of which their median is looked for. Chosen: a bin then
+holds some hundred of 9000 values; only time depends on it."""
 SHAKE_FLOOR_PX = 0.04
 """Shake below this is left alone: moving a picture by it costs more than it mends. Chosen as FLOOR_PX of
 `point_quality`."""
@@ -197,6 +201,19 @@ def _band_rows(shape: tuple[int, ...], axis: Axis, half: int) -> list[NDArray[np
     return bands
 
 
+@dataclass(frozen=True)
+class _Reference:
+    """Pixels of the bands with which frames are compared: where they lie, and what they show on average.
+
+    `along_px` and `across_px`, shape (n_pixels,), whole numbers; `basis`, shape (4, n_pixels): mean picture, one, and
+    its slopes along and across.
+    """
+
+    along_px: Floats
+    across_px: Floats
+    basis: Floats
+
+
 def _steady(
     luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], unit: float
 ) -> tuple[Floats, Floats, Floats, bool]:
@@ -205,38 +222,37 @@ def _steady(
     shift = np.zeros((n, 2))
     fit, steadied = np.zeros((n, 4)), False
     picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
+    means = _mean_pictures(luma, axis, bands, picks, None)
+    reference = _reference(means, bands)
     for turn in range(4):
-        views = [sample(luma, axis, rows, shift if turn else None) for rows in bands]
-        if turn == 0:
-            basis = [_basis(np.median(view[picks], axis=0)) for view in views]
-        fit, sd = _register(views, basis)
+        fit, sd = _register(luma, axis, reference, shift if turn else None, unit)
         if turn == 0:
             strength = float(np.median(np.abs(fit[:, 2:]))), float(np.median(sd))
             if not np.isfinite(strength[1]) or strength[0] < max(SHAKE_FLOOR_PX, 2.5 * strength[1]):
                 break
-            if not _halves_agree(views, basis):
+            if not _halves_agree(luma, axis, bands, means, unit):
                 break
             steadied = True
         shift = shift + np.clip(fit[:, 2:], -1.5, 1.5)
         if turn == 1:
-            views = [sample(luma, axis, rows, shift) for rows in bands]
-            basis = [_basis(np.median(view[picks], axis=0)) for view in views]
+            reference = _reference(_mean_pictures(luma, axis, bands, picks, shift), bands)
         if turn > 1 and float(np.abs(fit[:, 2:]).max()) < 0.02:
             break
     gain = np.clip(fit[:, 0], 0.2, 5.0)
     return unit / gain, -fit[:, 1] * unit / gain, shift, steadied
 
 
-def _halves_agree(views: list[NDArray[Any]], basis: list[NDArray[np.float32]]) -> bool:
+def _halves_agree(
+    luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], means: list[NDArray[np.float32]], unit: float
+) -> bool:
     """Whether the near and the far half of the bands tell of the same shift along the axis: a shaken camera moves both.
 
     A door, a shadow or a mirror image of the tip that passes moves one after the other.
     """
-    columns = views[0].shape[2]
+    columns = means[0].shape[1]
     parts = []
     for low, high in ((0, columns // 2), (columns // 2, columns)):
-        basis_here = [part.reshape(4, -1, columns - 2)[:, :, low : high - 2].reshape(4, -1) for part in basis]
-        parts.append(_register([view[:, :, low:high] for view in views], basis_here))
+        parts.append(_register(luma, axis, _reference(means, bands, (low, high)), None, unit))
     (first, first_sd), (second, second_sd) = parts
     apart, both = np.abs(first[:, 2] - second[:, 2]), np.abs(first[:, 2] + second[:, 2])
     most = apart + both >= np.quantile(apart + both, 0.75)
@@ -244,45 +260,134 @@ def _halves_agree(views: list[NDArray[Any]], basis: list[NDArray[np.float32]]) -
     return float(np.mean(apart[most])) < max(0.7 * float(np.mean(both[most])), doubt)
 
 
-def _basis(reference: NDArray[Any]) -> NDArray[np.float32]:
-    """Mean picture, one, and its slopes along and across, shape (4, n_pixels)."""
-    picture = reference.astype(np.float32)
-    across, along = np.gradient(picture, axis=0), np.gradient(picture, axis=1)
-    inner = (slice(1, -1), slice(1, -1))
-    parts = (picture[inner], np.ones_like(picture[inner]), -along[inner], -across[inner])
-    return np.stack([part.ravel() for part in parts])
+def _mean_pictures(
+    luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], picks: NDArray[np.int_], shift_px: Floats | None
+) -> list[NDArray[np.float32]]:
+    """Median of some frames in each band, shape (n_rows, n_along)."""
+    chosen = luma[picks]
+    views = [sample(chosen, axis, rows, None if shift_px is None else shift_px[picks]) for rows in bands]
+    return [np.median(view, axis=0).astype(np.float32) for view in views]
 
 
-def _register(views: list[NDArray[Any]], basis: list[NDArray[np.float32]]) -> tuple[Floats, Floats]:
+def _reference(
+    means: list[NDArray[np.float32]], bands: list[NDArray[np.int_]], columns: tuple[int, int] | None = None
+) -> _Reference:
+    """About PIXELS pixels of the bands, between two columns, with what they show on average."""
+    low, high = columns or (0, means[0].shape[1])
+    parts, along, across = [], [], []
+    for picture, rows in zip(means, bands, strict=True):
+        part = (slice(1, -1), slice(low + 1, high - 1))
+        slopes = -np.gradient(picture, axis=1)[part], -np.gradient(picture, axis=0)[part]
+        parts.append(np.stack([x.ravel() for x in (picture[part], np.ones_like(picture[part]), *slopes)]))
+        grid = np.meshgrid(np.arange(low + 1, high - 1), rows[1:-1])
+        along.append(grid[0].ravel())
+        across.append(grid[1].ravel())
+    basis = np.concatenate(parts, axis=1)
+    every = max(1, basis.shape[1] // PIXELS)
+    return _Reference(
+        np.concatenate(along)[::every].astype(float), np.concatenate(across)[::every].astype(float),
+        np.ascontiguousarray(basis[:, ::every], dtype=np.float64),
+    )  # fmt: skip
+
+
+def _pixels(luma: NDArray[Any], axis: Axis, reference: _Reference, shift_px: Floats | None) -> NDArray[Any]:
+    """The pixels of a reference in every frame, as `sample` would cut them, shape (n_frames, n_pixels)."""
+    import cv2
+
+    along, across = axis.direction, axis.normal
+    start = axis.points(reference.along_px, reference.across_px)
+    if shift_px is None and max(abs(along)) > 1 - 1e-9:
+        x, y = (np.clip(np.rint(start[:, i]), 0, luma.shape[2 - i] - 1).astype(int) for i in (0, 1))
+        return luma[:, y, x]
+    # Rows of a thousand: OpenCV takes no picture wider than 32767 pixels.
+    wide = -(-len(start) // 1000)
+    place = np.pad(start, ((0, wide * 1000 - len(start)), (0, 0)), mode="edge").reshape(wide, 1000, 2)
+    out = np.empty((len(luma), len(start)), luma.dtype)
+    for i, frame in enumerate(luma):
+        moved = place if shift_px is None else place + shift_px[i, 0] * along + shift_px[i, 1] * across
+        x, y = moved[..., 0].astype(np.float32), moved[..., 1].astype(np.float32)
+        seen = np.asarray(cv2.remap(frame, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+        out[i] = seen.ravel()[: len(start)]
+    return out
+
+
+def _register(
+    luma: NDArray[Any], axis: Axis, reference: _Reference, shift_px: Floats | None, unit: float
+) -> tuple[Floats, Floats]:
     """Gain, level, shift along and across of every frame (n, 4), and the error of the shift (n,), robustly.
 
     frame(x) = gain · picture(x − shift) + level. Where the bands show no texture the level is held near zero and the
     shift is left at zero.
     """
-    every = max(1, sum(part.shape[1] for part in basis) // PIXELS)
-    design = np.concatenate(basis, axis=1)[:, ::every].astype(np.float64)
-    n = len(views[0])
+    basis = reference.basis
+    level = float(np.abs(basis[0]).mean()) + 1e-9
+    count = basis.shape[1]
+    ridge = np.diag([0.0, 25.0 * count * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
+    solution, error = _robust_fits(_pixels(luma, axis, reference, shift_px), basis, ridge, unit)
+    gain = np.maximum(solution[:, 0], 0.05)
+    return np.column_stack([gain, solution[:, 1], solution[:, 2] / gain, solution[:, 3] / gain]), error
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares of every frame on the rows of `basis`, once more without what strays by four standard deviations.
+
+    `data` has shape (n_frames, n_pixels), `basis` (4, n_pixels); the answer the coefficients (n_frames, 4) and the
+    standard error of the third, (n_frames,).
+    """
+    n, count = data.shape
     out, error = np.zeros((n, 4)), np.full(n, np.inf)
-    gram = design @ design.T
-    level = float(np.abs(design[0]).mean()) + 1e-9
-    ridge = np.diag([0.0, 25.0 * gram[1, 1] * (2.0 / level) ** 2 * 0.01, 1e-3 * level, 1e-3 * level])
+    strays, keep = np.empty(count), np.ones(count)
+    whole = basis @ basis.T + ridge
     for t in range(n):
-        data = np.concatenate([view[t, 1:-1, 1:-1].ravel() for view in views])[::every].astype(np.float64)
-        keep = None
-        for _ in range(3):
-            d, g, v = (design, gram, data) if keep is None else (design[:, keep], None, data[keep])
-            g = d @ d.T if g is None else g
-            solution = np.linalg.solve(g + ridge, d @ v)
-            residual = data - solution @ design
-            size = 1.4826 * float(np.median(np.abs(residual))) + 0.3
-            fresh = np.abs(residual) < 4 * size
-            if keep is not None or fresh.mean() > 0.99:
+        keep[:] = 1.0
+        values = data[t]
+        for turn in range(2):
+            r0, r1, r2, r3 = 0.0, 0.0, 0.0, 0.0
+            for k in range(count):
+                value = keep[k] * values[k]
+                r0 += value * basis[0, k]
+                r1 += value * basis[1, k]
+                r2 += value * basis[2, k]
+                r3 += value * basis[3, k]
+            inverse = np.linalg.inv(whole if turn == 0 else (basis * keep) @ basis.T + ridge)
+            a, b, c, d = inverse @ np.array([r0, r1, r2, r3])
+            for k in range(count):
+                strays[k] = abs(values[k] - a * basis[0, k] - b * basis[1, k] - c * basis[2, k] - d * basis[3, k])
+            size = 1.4826 * _median(strays, keep, unit * BINS_A_LEVEL) + 0.3
+            out[t, 0], out[t, 1], out[t, 2], out[t, 3] = a, b, c, d
+            error[t] = size * np.sqrt(max(inverse[2, 2], 0.0))
+            inside = 0.0
+            for k in range(count):
+                keep[k] = 1.0 if strays[k] < 4 * size else 0.0
+                inside += keep[k]
+            if inside > 0.99 * count:
                 break
-            keep = fresh
-        gain = max(float(solution[0]), 0.05)
-        out[t] = gain, solution[1], -solution[2] / gain * -1.0, -solution[3] / gain * -1.0
-        error[t] = size * float(np.sqrt(max(np.linalg.inv(g + ridge)[2, 2], 0.0)))
     return out, error
+
+
+@njit(cache=True, nogil=True)
+def _median(values: np.ndarray, keep: np.ndarray, fine: float) -> float:
+    """Median of the values that are kept: only the bin of a histogram (`fine` a unit) that holds it is put in order."""
+    last = 256 * BINS_A_LEVEL - 1
+    bins = np.zeros(last + 1, np.int64)
+    for k in range(len(values)):
+        bins[min(int(values[k] * fine), last)] += 1 if keep[k] > 0 else 0
+    total = bins.sum()
+    answer = 0.0
+    for rank in ((total - 1) // 2, total // 2):
+        below, chosen = 0, 0
+        while below + bins[chosen] <= rank:
+            below += bins[chosen]
+            chosen += 1
+        inside = np.empty(bins[chosen])
+        filled = 0
+        for k in range(len(values)):
+            if keep[k] > 0 and min(int(values[k] * fine), last) == chosen:
+                inside[filled] = values[k]
+                filled += 1
+        answer += 0.5 * np.sort(inside)[rank - below]
+    return answer
 
 
 def _noise(values: NDArray[Any], scale: Floats) -> float:
