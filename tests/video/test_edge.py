@@ -134,6 +134,37 @@ def test_growth_out_of_the_picture_is_said_and_ends_the_track():
     assert track.usable[inside].all()
 
 
+@pytest.mark.parametrize("speed", [6.0, 20.0])
+def test_a_recording_that_ends_in_motion_says_how_far_the_vine_had_grown(speed):
+    plan = Plan(**{**SHORT, "seed": 213, "speed": speed})
+    scene = plain_scene(plan)
+    count = int(np.argmax(scene.edge_px > 300))
+    tracking = track_frames(in_memory(scene.frames[:count]), trial(plan, length_m=0.38), 1000.0)
+    said = [note for note in tracking.track.notes if "ends while the leading edge moves" in note]
+    grown = (scene.edge_px[count - 1] - plan.start_px) / 380
+    assert len(said) == 1
+    assert f"after {grown:.0%} of the vine's length" in said[0]
+    by_hand = trial(plan, length_m=0.38, frames_used=(0, count - 1))
+    notes = track_frames(in_memory(scene.frames[:count]), by_hand, 1000.0).track.notes
+    assert not any("ends while" in note for note in notes)
+
+
+@pytest.mark.parametrize("speed", [6.0, 20.0])
+def test_two_frames_of_rest_at_the_end_of_a_recording_are_no_growth(speed):
+    plan = Plan(**{**SHORT, "seed": 214, "speed": speed, "end_px": 330.0})
+    scene = plain_scene(plan)
+    count = int(np.flatnonzero(scene.moving)[-1]) + 3
+    track = track_frames(in_memory(scene.frames[:count]), trial(plan), 1000.0).track
+    assert not with_flag(track.flag, "after_end")[: count - 2].any()
+    assert with_flag(track.flag, "after_end")[count - 2 :].all()
+    assert not any("ends while" in note for note in track.notes)
+
+
+def test_a_pause_of_one_frame_in_slow_growth_is_no_stop():
+    edge = np.concatenate([np.full(8, 50.0), 50 + 1.0 * np.arange(1, 30), [79.0]])
+    assert moving_range(edge, np.full(edge.size, 0.05)) == (8, edge.size - 1)
+
+
 def test_still_recording_is_said():
     plan = Plan(seed=208, **SHORT)
     still = np.repeat(plain_scene(plan).frames[:1], 20, axis=0)

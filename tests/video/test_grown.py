@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vinetrack.video.motion_end import is_grown
 from vinetrack.video.point_quality import Judgement
-from vinetrack.video.track import _is_grown
 
 EDGE_PX = np.concatenate([np.full(10, 100.0), np.linspace(100, 500, 40), np.full(6, 500.0)])
 
@@ -20,13 +20,13 @@ def verdict(first_moving: int = 10, last_moving: int = 49) -> Judgement:
 
 @pytest.mark.parametrize(("length_px", "grown"), [(400, True), (405, True), (395, True), (430, False), (370, False)])
 def test_travel_is_held_against_the_length(length_px: float, grown: bool) -> None:
-    assert _is_grown(EDGE_PX, verdict(), length_px) is grown
+    assert is_grown(EDGE_PX, verdict(), length_px) is grown
 
 
 @pytest.mark.parametrize("judged", [verdict(first_moving=0), verdict(last_moving=EDGE_PX.size - 1), verdict(-1, -1)])
 def test_without_rest_or_end_nobody_knows(judged: Judgement) -> None:
-    assert not _is_grown(EDGE_PX, judged, 400.0)
+    assert not is_grown(EDGE_PX, judged, 400.0)
 
 
 def test_without_a_length_or_scale_nobody_knows() -> None:
-    assert not _is_grown(EDGE_PX, verdict(), np.nan)
+    assert not is_grown(EDGE_PX, verdict(), np.nan)

@@ -28,6 +28,10 @@ REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25
 """An edge stands that stays this near to its level, in standard errors and in px at the start and at the end. Chosen:
 one point of 370 by chance; ringing of coders moves an edge by some tenths of a pixel. By reasoning: at half coders'
 ringing releases the vine; at twice slow starts are cut by as much."""
+STOPS_DEAD = 5.0
+"""Steps so many times the tolerance of rest after which a last frame without a step shows a stop, though two places
+alike are no rest elsewhere. Chosen: growth that slows down takes frames for it. By reasoning: at half slow growth that
+pauses in the last frame is cut by two points, at twice an edge that stopped from 1 to 2 px a frame keeps them."""
 LEAST_TRAVEL_PX = 2.0
 """Travel from which something moves at all. Chosen: five times REST_PX. By reasoning: at half drift of a camera counts
 as growth, at twice hardly any recording is refused more."""
@@ -101,7 +105,8 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
     """First and last frame in which the edge is on its way; (0, n − 1) if it never rests, (n, −1) if it only rests.
 
     At rest means: within three sigma, at least REST_PX (END_REST_PX at the end, where a creeping stop still tells), of
-    the level that it keeps up to, or from, there.
+    the level that it keeps up to, or from, there, over three frames; over two where a recording ends upon a dead
+    stop.
 
     Parameters
     ----------
@@ -120,7 +125,10 @@ def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:
     if high - low < max(2 * REST_SIGMAS * noise, LEAST_TRAVEL_PX):
         return n, -1
     first = _leaves_level(y, max(REST_SIGMAS * noise, REST_PX))
-    last = len(y) - 1 - _leaves_level(-y[::-1], max(REST_SIGMAS * noise, END_REST_PX))
+    stands = max(REST_SIGMAS * noise, END_REST_PX)
+    last = len(y) - 1 - _leaves_level(-y[::-1], stands)
+    if last == len(y) - 1 and _stops_dead(y, stands):
+        last -= 2
     return int(good[first]), int(good[max(last, first)])
 
 
@@ -136,6 +144,12 @@ def _leaves_level(y: Floats, tolerance: float) -> int:
             break
     # Two frames alike may be a slow start; a rest has three.
     return last_at_rest + 1 if last_at_rest >= 2 else 0
+
+
+def _stops_dead(y: Floats, tolerance: float) -> bool:
+    """Whether a fast edge stands in the last two frames; the step onto its place may be a part of one."""
+    steps = np.diff(y[-7:])
+    return len(steps) == 6 and abs(steps[-1]) <= tolerance and float(steps[:-2].min()) > STOPS_DEAD * tolerance
 
 
 def judge(

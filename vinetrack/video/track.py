@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from vinetrack.video.event_frames import read_event
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording
 from vinetrack.video.hand_corrections import corrected_by_hand
+from vinetrack.video.motion_end import cut_short, end_of_body, end_of_growth, is_grown
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.strip import Strip, cut_strip, recut, squared
@@ -30,10 +30,6 @@ if TYPE_CHECKING:
 FEWEST_FRAMES = 5
 """Derived: fourth differences take five."""
 
-GROWN_TOLERANCE = 0.03
-"""Part of a vine's length by which travel and length may differ, for the vine to have grown whole. Chosen: lengths are
-cut to a few millimetres in 20 cm, and scales err by a per cent. At half whole growths go unrecognised, at twice a stop
-just before the end passes for it."""
 CENTRINGS = 3
 """Times the strip may be cut anew: what lay outside the first shows only in the second. Chosen; it is cut anew only
 while the axis moves by more than OFF_CENTRE_PX, so that more cost little."""
@@ -55,11 +51,6 @@ ROOM = 0.08
 0.04 of it, on either side."""
 MOVING_PX = 0.3
 """Step of a frame from which the roughness of the track is judged there. Chosen: at rest compression freezes it."""
-SHORTEST_END = 4
-"""Frames of standstill at the end that are worth a word. Chosen; at half two frames alike are told of."""
-STILL_CHANGING = 0.3
-"""Part of the change of pictures in motion from which the picture goes on changing when the edge stands. Chosen between
-noise, 0, and motion, 1. At half a hand that lets go counts, at twice only film that goes on sliding does."""
 MOSTLY_LOST = 0.5
 """Part of the frames without an edge from which a recording is not one where nothing moves. Chosen: the majority; it
 decides which of two messages is given."""
@@ -220,9 +211,11 @@ def track_frames(
     scale = trial.m_per_px if m_per_px is None else m_per_px
     notes = [*frames.notes, *verdict.notes]
     if edge_fit.end is not None:
-        notes.append(f"{name}: {_end_in_words(edge_fit.end, number[kept])}")
-    elif not _is_grown(edge_fit.edge_px, verdict, trial.length_m / scale):
-        notes += _ending(luma, verdict, edge_fit.edge_px, name, number[kept])
+        notes.append(f"{name}: {end_of_body(edge_fit.end, number[kept])}")
+    elif not is_grown(edge_fit.edge_px, verdict, trial.length_m / scale):
+        notes += end_of_growth(luma, verdict, edge_fit.edge_px, name, number[kept])
+        if trial.travel_ratio == 2 and trial.frames_used is None and number[kept[-1]] == frames.n_recorded - 1:
+            notes += cut_short(edge_fit.edge_px, verdict, trial.length_m / scale, name)
     if not orderly:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
@@ -358,44 +351,6 @@ def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
     odd |= (fit.apart_sigma_px > APART_PX) | fit.hidden
     vague = fit.sigma_px > np.maximum(VAGUE_PX, VAGUE_RATIO * np.nanmedian(fit.sigma_px))
     return np.asarray(odd | vague)
-
-
-def _is_grown(edge_px: Floats, verdict: Judgement, length_px: float) -> bool:
-    """Whether the edge stops where the whole vine has grown, as it should; no where its length or rest is unknown."""
-    if verdict.last_moving < 0 or not np.isfinite(length_px):
-        return False
-    start, end = edge_px[: verdict.first_moving], edge_px[verdict.last_moving + 1 :]
-    if not (np.isfinite(start).any() and np.isfinite(end).any()):
-        return False
-    return bool(abs((np.nanmedian(end) - np.nanmedian(start)) / length_px - 1) < GROWN_TOLERANCE)
-
-
-def _end_in_words(end: EndOfWay, number: NDArray[np.int_]) -> str:
-    frame = number[end.last_frame]
-    if end.turns_back:
-        return f"the body turns back after frame {frame}: a bounce, or the end of its way; later frames are not used"
-    return f"the body is not recognised after frame {frame}: it is gone, hidden or turned over"
-
-
-def _ending(luma: NDArray[Any], verdict: Judgement, edge_px: Floats, name: str, number: NDArray[np.int_]) -> list[str]:
-    """What is to be said of an edge that stops before the recording does."""
-    n, last = len(edge_px), verdict.last_moving
-    if last < 0 or last >= n - SHORTEST_END or verdict.left_picture is not None:
-        return []
-    import cv2
-
-    pairs = itertools.pairwise(luma)
-    change = np.array([cv2.absdiff(a[::3, ::3].copy(), b[::3, ::3].copy()).mean() for a, b in pairs])
-    before = float(np.median(change[verdict.first_moving : last])) if last > verdict.first_moving else 0.0
-    least = float(np.min(change)) if len(change) else 0.0
-    later = float(np.median(change[last + 1 :]))
-    resting = edge_px[last + 1 :][np.isfinite(edge_px[last + 1 :])]
-    if not resting.size:
-        return [f"{name}: the leading edge is not seen after frame {number[last]}"]
-    where = f"{name}: the leading edge stops at {np.median(resting):.0f} px after frame {number[last]}"
-    if later - least > STILL_CHANGING * (before - least):
-        return [f"{where} while the picture goes on changing: it met a wall or another obstacle, or left the axis"]
-    return [f"{where}, {n - 1 - last} frames before the recording ends: grown to its end, or held"]
 
 
 def _assemble(
