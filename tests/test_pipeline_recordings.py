@@ -126,6 +126,12 @@ def spread_px(found: np.ndarray) -> float:
 
 
 @pytest.mark.pipeline
+def test_the_report_shows_where_edges_fall_within_a_pixel(filmed: Filmed) -> None:
+    assert (filmed.results / "figures" / "pixel_places.svg").exists()
+    assert "Where edges fall within a pixel" in (filmed.results / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.pipeline
 @pytest.mark.parametrize("name", GOOD)
 def test_a_good_recording_is_tracked_within_a_third_of_a_pixel(filmed: Filmed, name: str) -> None:
     assert filmed.rows[name]["status"] in ("ok", "warning")

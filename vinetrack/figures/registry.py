@@ -81,6 +81,7 @@ _ALL = (
         "payload_speed", "damping", "Final speed and payload", "Final speed and payload", "conditions.csv"
     ),
     RegisteredFigure("overview", "damping", "All trials", "All trials at a glance", "trials.csv"),
+    RegisteredFigure("pixel_places", "damping", "Places within a pixel", "Where edges fall within a pixel"),
     RegisteredFigure("model_comparison", "model", "Model and measurement", "Model and measurement"),
     RegisteredFigure("model_residuals", "model", "Residuals of the model", "Residuals of the model", "comparison.csv"),
     RegisteredFigure("ladder", "verdict", "The ladder of errors", "The ladder of errors"),
@@ -164,6 +165,7 @@ def _drawing(name: str) -> Callable[..., Figure]:
         model_comparison,
         overview,
         paper_figures,
+        pixel_places,
         power_figures,
         size_figures,
         strip_figure,
@@ -178,6 +180,7 @@ def _drawing(name: str) -> Callable[..., Figure]:
         "efficiency": size_figures.draw_efficiency,
         "payload_speed": size_figures.draw_payload_speed,
         "overview": overview.draw_overview,
+        "pixel_places": pixel_places.draw_pixel_places,
         "model_comparison": model_comparison.draw_model_comparison,
         "model_residuals": model_comparison.draw_model_residuals,
         "ladder": ladder_figures.draw_ladder,
