@@ -45,7 +45,7 @@ COLUMNS: dict[str, Column] = {
             name="pressure_trace",
             field="pressure_trace",
             kind="path",
-            meaning="A CSV with time_s, pressure_kPa: the gauge pressure measured during the trial.",
+            meaning="The gauge pressure measured during the trial: a CSV with time_s, pressure_kPa, or a TDMS file.",
             measured="A gauge at the chamber, logged on the clock of the recording.",
         ),
         Column(
