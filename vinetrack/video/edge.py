@@ -133,8 +133,9 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = _first_state(strip, path, exposure)
+    change = _frame_changes(strip)
     for _ in range(3):
-        path = _second_path(strip, state, passed)
+        path = _second_path(strip, state, passed, change)
         state = repicture(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
     fit = fit_edges(strip, state)
     for turn in range(3 * rounds):
@@ -339,7 +340,7 @@ def _first_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
     return repicture(strip, state, 0.0)
 
 
-def _second_path(strip: Strip, state: EdgeState, passed: tuple[int, int]) -> Floats:
+def _second_path(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:
     """Front by what every pixel resembles, film or background."""
     contrast = np.abs(state.pictures[0] - state.pictures[1])[:, passed[0] : passed[1]]
     width = 0.1 * float(np.quantile(contrast, 0.7)) + strip.noise
@@ -347,20 +348,25 @@ def _second_path(strip: Strip, state: EdgeState, passed: tuple[int, int]) -> Flo
         strip.values, strip.scale, strip.offset, state.pictures, width, EVIDENCE_CLIP
     )  # fmt: skip
     evidence[:, : max(passed[0] - kernels.BEHIND, 0)] = 0.0
-    path = ky.evident_path(evidence * _novelty(strip, state.edge)[:, None])
+    path = ky.evident_path(evidence * _novelty(change, state.edge)[:, None])
     return np.clip(path - 0.5, passed[0] - kernels.BEHIND, passed[1] + 2)
 
 
-def _novelty(strip: Strip, edge: Floats) -> NDArray[np.float32]:
+def _frame_changes(strip: Strip) -> Floats:
+    """How much each frame of a strip differs from the one before it, shape (n_frames,)."""
+    change = np.zeros(len(strip.values))
+    for t in range(1, len(change)):
+        pair = strip.values[t - 1 : t + 1, ::2, ::2].astype(np.float32)
+        change[t] = float(np.mean(np.abs(pair[1] - pair[0])))
+    change[0] = change[1] if len(change) > 1 else 1.0
+    return change
+
+
+def _novelty(change: Floats, edge: Floats) -> NDArray[np.float32]:
     """How much each frame has to say that the one before it had not, 0.05 to 1, shape (n_frames,).
 
     While the tip rests behind a closed door that looks like film, a hundred frames are no better than one.
     """
-    change = np.zeros(len(edge))
-    for t in range(1, len(edge)):
-        pair = strip.values[t - 1 : t + 1, ::2, ::2].astype(np.float32)
-        change[t] = float(np.mean(np.abs(pair[1] - pair[0])))
-    change[0] = change[1] if len(change) > 1 else 1.0
     usual = float(np.median(change[moving_frames(edge)]))
     floor = float(np.quantile(change, 0.05))
     return np.clip((change - floor) / max(usual - floor, 1e-6), LEAST_NOVELTY, 1.0).astype(np.float32)
