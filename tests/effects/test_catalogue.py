@@ -86,6 +86,7 @@ NEUTRAL = {
     "tail_force": 0.0,
     "rest_force": 0.0,
     "observed_position": STATE.observed,
+    "row_delay": 0.0,
 }
 """What a hook returns that changes nothing. A chamber's rate has no such number: it takes the place of another law."""
 
@@ -128,7 +129,8 @@ def test_the_docstring_has_a_summary_a_formula_and_a_source(effect: Effect) -> N
 def test_the_kind_agrees_with_the_hooks_and_with_being_base(effect: Effect) -> None:
     assert (effect.kind == "base") == (effect.name in BASE_EFFECTS)
     if effect.kind == "measurement":
-        read_off = {"true_time", "trace_time", "observed_position", "gauge", "yield_gauge", "area", "film_gain"}
+        read_off = {"true_time", "trace_time", "observed_position", "row_delay", "gauge", "yield_gauge", "area"}
+        read_off |= {"film_gain"}
         weight = {"tail_force"} if effect.name == "growth_angle" else set()  # it turns a force that is there
         assert set(effect.functions) <= read_off | weight
 

@@ -196,7 +196,7 @@ def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without:
         terms = _along(model + effect, motion)
     except EffectError as error:
         return {**row, "note": str(error)}
-    if not set(effect.functions) - {"observed_position"}:
+    if not set(effect.functions) - {"observed_position", "row_delay"}:
         return {**row, **_shift(effect, motion, without)}
     if not set(effect.functions) - {"rest_force"}:
         return {**row, "note": "acts on a vine at rest only"}
@@ -216,8 +216,12 @@ def _shift(effect: Effect, motion: AuditedMotion, terms: Terms) -> dict[str, flo
     """How far off an effect that only shows to the camera puts the leading edge, from where it does at release."""
     rig = trial_inputs(motion.trial)
     state = terms.state._replace(tail_tension=np.maximum(terms.tension_N, 0.0))  # type: ignore[arg-type]
-    seen = effect.functions["observed_position"](state, rig, *(parameter.default for parameter in effect.parameters))
-    shift = np.asarray(seen, dtype=float) - motion.lead_position_m
+    sizes = [parameter.default for parameter in effect.parameters]
+    if "row_delay" in effect.functions:
+        late_s = effect.functions["row_delay"](state, rig, *sizes) * motion.lead_position_m
+        shift = np.interp(motion.time_s + late_s, motion.time_s, motion.lead_position_m) - motion.lead_position_m
+    else:
+        shift = np.asarray(effect.functions["observed_position"](state, rig, *sizes), float) - motion.lead_position_m
     i = int(np.argmax(np.abs(shift)))
     return {"shift_m": float(shift[i]), **_place(motion, i)}
 

@@ -58,6 +58,7 @@ class Equations:
     observed: Callable  #: position of the leading edge that the camera reports, m
     first_chamber: Callable  #: pressure of the chamber at release, of (trial) alone
     has_chamber: Callable  #: whether an effect gives the chamber an equation of its own, of no argument
+    row_delay: Callable  #: how much later rows are read by the metre, s/m, of (trial) alone
     tip_tension: Callable  #: tension that the tip leaves for the tail, N, and rate of the chamber; one more argument
     free_fall: Callable  #: acceleration of a slack tail, m/s², at (time, y, ẏ, x, v, chamber, trial)
     slack_fraction: Callable  #: `vinetrack.dynamics.slack_tail.slack_fraction`
@@ -204,6 +205,21 @@ def yes():
 def no():
     """False, as a function that the compiler sees through."""
     return False
+
+
+@compiled
+def no_row_delay(trial):  # noqa: ARG001
+    """Stands for `row_delay` where all rows of a picture are read at once.
+
+    Parameters
+    ----------
+    trial : unused.
+
+    Returns
+    -------
+    0 s/m.
+    """
+    return 0.0
 
 
 @compiled

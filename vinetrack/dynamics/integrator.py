@@ -30,6 +30,11 @@ from vinetrack.dynamics.equations import (
     next_slope_change,
 )
 from vinetrack.dynamics.radau import NO_STAGES, first_stages, quintic, radau_step
+from vinetrack.dynamics.row_readout import read_by_rows
+from vinetrack.effects import TrialInputs
+
+TRAVEL_RATIO = TrialInputs._fields.index("travel_ratio")
+"""Convention: where the travel ratio stands in a row of inputs."""
 
 MOST_STEPS = 20_000
 """Steps before a trajectory is given up, chosen: trajectories of the catalogue take 20 to 600. At half and at twice
@@ -214,6 +219,10 @@ def integrate_trials(
         status, end_time, end_speed, n_steps, slack_time = _integrate(
             equations, trial, times[rows], breakpoints[i], stops[i], rtol, out[rows], work
         )
+        delay = equations.row_delay(trial)
+        if delay != 0:
+            end = Point(end_time if status == ENDED else np.inf, stops[i], end_speed, 0.0, 0.0)
+            read_by_rows(times[rows], out[rows], inputs[i, TRAVEL_RATIO], end, delay)
         ends[i, 0] = status
         ends[i, 1] = end_time
         ends[i, 2] = end_speed

@@ -23,7 +23,7 @@ from vinetrack.core import constants
 from vinetrack.dynamics.integrator import BATCH
 from vinetrack.effects import Effect, TrialInputs
 
-PARTS = ("equations.py", "radau.py", "slack_tail.py", "integrator.py")
+PARTS = ("equations.py", "radau.py", "slack_tail.py", "row_readout.py", "integrator.py")
 """Files of the integrator, which the compiled form of a model holds too: an edit of one must compile anew."""
 
 _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
@@ -33,8 +33,8 @@ from pathlib import Path
 from numba import njit
 
 from vinetrack.dynamics.equations import (
-    Equations, angle_passed, compiled, never_slack, no, no_free_fall, no_slack_phase, no_tip_tension, not_slack_at_rest,
-    trace_at, yes,
+    Equations, angle_passed, compiled, never_slack, no, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
+    not_slack_at_rest, trace_at, yes,
 )
 from vinetrack.dynamics.integrator import integrate_trials
 from vinetrack.dynamics.slack_tail import follow_slack, slack_at_rest, slack_fraction
@@ -199,6 +199,9 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
             [*write.calls("gauge", "pressure = {call}"), "return pressure"],
         ),
     ]
+    if write.has("row_delay"):
+        delays = ["delay = 0.0", *write.calls("row_delay", "delay += {call}"), "return delay"]
+        functions += [write.function("row_delay", "trial", _AT_RELEASE, delays)]
     if tail_free:
         resting = ["if resting:", *[f"    {line}" for line in holding or ["pass"]]]
         functions += [
@@ -212,6 +215,7 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
         ]
     names = ", ".join(effect.name for effect in effects)
     fields = ["rates", "rest_acceleration", "observed", "first_chamber", "yes" if write.has("chamber_rate") else "no"]
+    fields += ["row_delay" if write.has("row_delay") else "no_row_delay"]
     fields += _TAIL_FREE if tail_free else _TAIL_TAUT
     foot = _FOOT.format(fields=", ".join(fields), batch=", ".join(BATCH))
     return "\n".join((_HEAD.format(names=names), *write.loads.values(), *functions, foot))

@@ -66,6 +66,7 @@ UNCHANGED = {
     "tail_force": 0.0,
     "rest_force": 0.0,
     "observed_position": _STATE.observed,
+    "row_delay": 0.0,
 }
 """What a function must leave behind, in the state above, where its effect has no size."""
 

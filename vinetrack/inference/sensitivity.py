@@ -87,7 +87,9 @@ class Predictor:
         check_needs(model, *(trial_data.trial for trial_data in data))
         self.rigs = np.array([trial_inputs(trial_data.trial) for trial_data in data], dtype=float)
         self.bends = [bends_of(trial_data.trial) for trial_data in data]
-        measured_otherwise = any({"true_time", "observed_position"} & set(effect.functions) for effect in model)
+        measured_otherwise = any(
+            {"true_time", "observed_position", "row_delay"} & set(effect.functions) for effect in model
+        )
         self.plain_release = [trial_data.trace is None and not measured_otherwise for trial_data in data]
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
