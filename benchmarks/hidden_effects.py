@@ -7,8 +7,8 @@ The campaigns (`benchmarks/hidden/`) share no code with the package's model: ano
 integrator, and nuisances that the fit does not assume (scatter of B and P of any shape, correlated noise of several
 kinds, heavy tails, wild points, unequal noise, wrong payloads, rounded pressures, trials cut short, no frames at rest).
 Force laws and plausible sizes are shared, they are physics. `--campaigns` is per kind; kinds are `null:<regime>`, the
-effects of the catalogue, pairs `a+b`, `outsider:<name>`, `frames:dropped`, `trace:<effect>`; groups of kinds: nulls,
-effects, physical, faults, pairs, outsiders, other, all.
+effects of the catalogue, pairs `a+b`, triples `a+b+c`, `outsider:<name>`, `frames:dropped`, `trace:<effect>`; groups of
+kinds: nulls, effects, physical, faults, pairs, triples, outsiders, other, all.
 
 How visible a truth was is measured by the package's own fit with the truth in the model, started at the true sizes:
 σ = √(2 Δ ln L). Detection is listed by it; the bar asks for what lies above 8 σ.

@@ -237,6 +237,14 @@ PAIRS: tuple[tuple[str, str], ...] = (
     ("wall_stretch", "tail_friction"),
 )
 
+TRIPLES: tuple[tuple[str, str, str], ...] = (
+    ("reservoir_depletion", "tail_friction", "air_drag"),
+    ("leak", "inlet_loss", "payload_friction"),
+    ("tail_friction", "reel_inertia", "falling_friction"),
+    ("reservoir_depletion", "latch_release", "wall_stretch"),
+    ("tail_friction", "latch_release", "length_scale"),
+)
+
 
 def _patch(draw: Draw, scene: Scene) -> Hidden:
     y = scene.shortest_m * float(draw.uniform(0.25, 0.7))
@@ -309,6 +317,7 @@ KINDS: tuple[str, ...] = (
     *(f"null:{name}" for name in NULLS),
     *EFFECTS,
     *("+".join(pair) for pair in PAIRS),
+    *("+".join(triple) for triple in TRIPLES),
     *(f"outsider:{name}" for name in OUTSIDERS),
     "frames:dropped",
     "trace:static_yield",
@@ -320,7 +329,7 @@ KINDS: tuple[str, ...] = (
 
 
 def kinds(group: str) -> tuple[str, ...]:
-    """Kinds of a group: `nulls, effects, pairs, outsiders, faults, other, all`, or kinds named in a comma list."""
+    """Kinds of a group: nulls, effects, pairs, triples, outsiders, faults, other, all; or kinds in a comma list."""
     groups = {
         "all": KINDS,
         "nulls": tuple(k for k in KINDS if k.startswith("null:")),
@@ -328,6 +337,7 @@ def kinds(group: str) -> tuple[str, ...]:
         "physical": tuple(k for k in EFFECTS if k not in MEASUREMENT),
         "faults": (*MEASUREMENT, "frames:dropped"),
         "pairs": tuple("+".join(pair) for pair in PAIRS),
+        "triples": tuple("+".join(triple) for triple in TRIPLES),
         "outsiders": tuple(k for k in KINDS if k.startswith("outsider:")),
         "other": tuple(k for k in KINDS if k.startswith(("trace:", "bends:", "frames:"))),
     }

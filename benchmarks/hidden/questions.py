@@ -54,8 +54,13 @@ def true_fit(base: Fit, truth: Truth, leave_out: str = "") -> Fit:
     values = {**truth.values, **outsider_values(truth)}
     start = {key: value for key, value in values.items() if key in model.parameter_names}
     # What shapes an outsider is known to the one who hid it: only its size is fitted.
-    shape = list(outsider_values(truth))[1:]
-    return vt.refit(base, model, start=start, fixed=[*base.options["fixed"], *shape])
+    fixed = [*base.options["fixed"], *list(outsider_values(truth))[1:]]
+    try:
+        return vt.refit(base, model, start=start, fixed=fixed)
+    except FitError:
+        # What the base model has bent to do without it may stop a vine that grew: then from the true B and n.
+        damping = {"eversion_damping.B": dict(truth.B), "eversion_damping.n": truth.n}
+        return vt.refit(base, model, start={**start, **damping}, fixed=fixed, afresh=True)
 
 
 def sigmas(better: Fit, worse: Fit) -> float:
@@ -122,7 +127,7 @@ def _number(value: object) -> float:
 
 
 def _visibility(base: Fit, last: Fit, truth: Truth) -> Row:
-    """`sigma`: all that is hidden against the base model; `sigma_second`: the lesser of two, given the other."""
+    """`sigma`: all that is hidden against the base model; `sigma_second`: the least of several, given the others."""
     if truth.in_trace or not (truth.effects or truth.outsider):
         return {"sigma": 0.0, "sigma_second": math.nan}
     try:

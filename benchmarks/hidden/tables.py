@@ -28,7 +28,8 @@ def judged(rows: pd.DataFrame) -> pd.DataFrame:
     truth = [set(filter(None, text.split("+"))) for text in out["hidden"]]
     answer = [set(filter(None, text.split("|"))) for text in out["answer"]]
     out["null"] = out["hidden"] == ""
-    out["pair"] = [len(one) > 1 for one in truth]
+    out["pair"] = [len(one) == 2 for one in truth]
+    out["triple"] = [len(one) > 2 for one in truth]
     out["called"] = out["verdict"] != "adequate"
     out["set_size"] = [len(one) for one in answer]
     out["right"] = [bool(one & all_) for one, all_ in zip(truth, answer, strict=True)]
@@ -131,6 +132,8 @@ def headline(rows: pd.DataFrame) -> pd.DataFrame:
         alone, nulls = singles(group), group[group["null"]]
         clear = alone[alone["sigma"] >= CLEAR]
         pairs = group[group["pair"] & (group["sigma_second"] >= CLEAR)]
+        triples = group[group["triple"]]
+        clear_triples = triples[triples["sigma_second"] >= CLEAR]
         outside = group[group["is_outsider"].astype(bool) & (group["sigma"] >= CLEAR)]
         faults = group[group["hidden"].map(lambda text: bool(text) and set(text.split("+")) <= FAULTS)]
         lines[method] = {
@@ -143,6 +146,8 @@ def headline(rows: pd.DataFrame) -> pd.DataFrame:
             "physics taken for a fault, above 8 σ": share(clear[~clear["hidden"].isin(FAULTS)]["physics_as_fault"]),
             "pairs, lesser one above 8 σ: both found, in order": share(_both(pairs)),
             "… or said to be more than one, or unexplained": share(_more(pairs)),
+            "three effects, the least above 8 σ: all in the set": share(_both(clear_triples)),
+            "three effects: nothing named that is not there": share(_none_invented(triples)),
             "outsiders above 8 σ called unexplained": share(outside["verdict"] == "unexplained"),
             "… of those with 8 σ left after the best answer": share(_left(outside)["verdict"] == "unexplained"),
             "seconds, median and 90 %": _seconds(group["seconds"]),
@@ -169,6 +174,17 @@ def _both(pairs: pd.DataFrame) -> pd.Series:
     return pairs.apply(lambda row: set(row["hidden"].split("+")) <= _found(row), axis=1).astype(bool)
 
 
+def _none_invented(rows: pd.DataFrame) -> pd.Series:
+    """Whether every effect that is named alone is there: those added, and the answer of the last round if it is one."""
+
+    def true(row: pd.Series) -> bool:
+        last = list(filter(None, str(row["final_answer"]).split("|")))
+        named = {*filter(None, str(row["effects"]).split("+")), *(last if len(last) == 1 else [])}
+        return named <= set(row["hidden"].split("+"))
+
+    return rows.apply(true, axis=1).astype(bool)
+
+
 def _more(pairs: pd.DataFrame) -> pd.Series:
     def more(row: pd.Series) -> bool:
         named = set(row["hidden"].split("+")) <= _found(row)
@@ -181,7 +197,7 @@ def coverage(rows: pd.DataFrame) -> pd.DataFrame:
     """How often 95 % intervals of sizes hold the truth, where the truth was in the answer set and above 8 σ."""
     sizes = []
     for row in rows[(rows["method"] == "vinetrack") & rows["right"] & (rows["sigma"] >= CLEAR)].itertuples():
-        sizes += [(*one, row.pair) for one in json.loads(row.sizes)]
+        sizes += [(*one, row.pair or row.triple) for one in json.loads(row.sizes)]
     table = pd.DataFrame(sizes, columns=["parameter", "truth", "value", "low", "high", "interval", "pair"])
     if table.empty:
         return table

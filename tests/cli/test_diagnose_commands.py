@@ -16,7 +16,9 @@ from vinetrack.cli.main import app
 from vinetrack.laboratory.tracks import BASE, Nature, grow, write_experiment
 from vinetrack.laboratory.vine_campaigns import damping_values
 
-LADDER = "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m"
+LADDER = (
+    "model,added,rms_in_sample_m,rms_left_out_m,rms_highest_pressure_m,floor_m,excess_left_out_m,floor_sigma_m,partial"
+)
 
 
 def run(*arguments: str | Path) -> tuple[int, str]:

@@ -1,4 +1,4 @@
-"""Every effect alone, and pairs of them: which hypotheses are worth a fit, and their fits."""
+"""Every effect alone: which hypotheses are worth a fit, and their fits. Several together: `effect_sets`."""
 
 from __future__ import annotations
 
@@ -63,10 +63,6 @@ STARTS_EACH = 3
 SURELY = 6.0
 """Standard deviations from nothing beyond which a number is there. Chosen: six standard errors, beyond doubt even with
 errors half as large as they should be."""
-
-FIRSTS, PARTNERS, SHARE_OF_BEST = 3, 4, 0.3
-"""Pairs are built on the three best effects alone, if they explain this part of what the best explains, with the four
-that promise most beside each. Chosen for time."""
 
 
 @dataclass
@@ -196,7 +192,7 @@ class CandidateFits:
             if behind or any(known is fitted_one.fit for known in self.simplified):
                 continue
             self.simplified.append(fitted_one.fit)
-            for both, fit in _simpler_forms(base_fit, fitted_one, self.questions.effects):
+            for both, fit in simpler_forms(base_fit, fitted_one, self.questions.effects):
                 simpler = likelihood_ratio(base_fit, both, fit)
                 known = self.fitted.get(simpler.label)
                 if known is None or simpler.delta_chi2 > max(known.delta_chi2, WORSE):
@@ -296,50 +292,23 @@ def _gain(hypothesis: LikelihoodRatio) -> float:
     return hypothesis.delta_chi2
 
 
-def pairs(
-    before: Fit, firsts: Sequence[LikelihoodRatio], effects: Sequence[Effect], report: Report
-) -> list[LikelihoodRatio]:
-    """Fits of two effects together: to each of the best single ones, those that promise to mend what it leaves.
+def simpler_forms(
+    before: Fit, pair: LikelihoodRatio, effects: Sequence[Effect]
+) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
+    """Give a hypothesis with one of its effects in the simpler form that it contains, fitted from where it ended.
 
     Parameters
     ----------
     before : the fit that is questioned.
-    firsts : sequence of LikelihoodRatio
-        Fits of single effects.
+    pair : the hypothesis, of one effect or several.
     effects : sequence of Effect
-        Candidates for the second.
-    report : callable
-        Called with a sentence at each fit.
+        All candidates.
 
-    Returns
-    -------
-    list of LikelihoodRatio
-        Most likely first.
+    Yields
+    ------
+    effects : tuple of Effect
+    fit : Fit
     """
-    fitted_pairs: dict[frozenset[str], LikelihoodRatio] = {}
-    top = max((first.delta_chi2 for first in firsts), default=0.0)
-    for first in [first for first in firsts if first.delta_chi2 >= SHARE_OF_BEST * top][:FIRSTS]:
-        later = misfit_tests(first.fit, effects, LATER_LEVEL)
-        search = CandidateFits(later, report, most_fitted=PARTNERS)
-        search.singles()
-        ranked = sorted(search.fitted.values(), key=lambda pair: -pair.fit.log_likelihood)
-        for second in ranked[:PARTNERS]:
-            names = frozenset((*first.names, *second.names))
-            both = likelihood_ratio(before, (*first.effects, *second.effects), second.fit)
-            if names not in fitted_pairs or both.fit.log_likelihood > fitted_pairs[names].fit.log_likelihood:
-                fitted_pairs[names] = both
-    for pair in sorted(fitted_pairs.values(), key=lambda pair: -pair.fit.log_likelihood)[:PARTNERS]:
-        for effects_both, fit in _simpler_forms(before, pair, effects):
-            names = frozenset(effect.name for effect in effects_both)
-            if names not in fitted_pairs or fit.log_likelihood > fitted_pairs[names].fit.log_likelihood:
-                fitted_pairs[names] = likelihood_ratio(before, effects_both, fit)
-    return sorted(fitted_pairs.values(), key=lambda pair: -pair.fit.log_likelihood)
-
-
-def _simpler_forms(
-    before: Fit, pair: LikelihoodRatio, effects: Sequence[Effect]
-) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
-    """A hypothesis with one of its effects in the simpler form that it contains, fitted from where it ended."""
     for held in pair.effects:
         for simpler in effects:
             if simpler.name not in held.replaces or simpler.name in pair.names or _needs_more(pair.fit, held, simpler):

@@ -20,7 +20,7 @@ from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.contradictions import contradictions
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, weights_of
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (
@@ -43,7 +43,7 @@ from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
-from vinetrack.inference.fit_result import Fit, Number
+from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.narrative.verdict_summary import joined
 from vinetrack.narrative.verdict_text import dropped_in_words, explain
@@ -236,7 +236,29 @@ def _round(finding: SelectionStep, blind: Mapping[str, str]) -> Round:
             for hypothesis in finding.kept
             if hypothesis.effects[-1].kind != BETWEEN_TRIALS
         },
+        sets=_sets(finding),
+        partial=_partial(finding),
+        partial_fits=tuple(hypothesis.fit for hypothesis in finding.partial),
     )
+
+
+def _sets(finding: SelectionStep) -> tuple[tuple[str, ...], ...]:
+    """The hypotheses of an answer set, each with all its effects, where one has several."""
+    sets = tuple(hypothesis.names for hypothesis in finding.kept)
+    return sets if any(len(names) > 1 for names in sets) else ()
+
+
+def _partial(finding: SelectionStep) -> tuple[Candidate, ...]:
+    """The steps that mend a part, each against the one before it."""
+    steps, before = [], finding.questions.fit
+    for hypothesis in finding.partial:
+        effect = hypothesis.effects[-1]
+        step = likelihood_ratio(before, (effect,), hypothesis.fit)
+        steps.append(
+            Candidate(effect.name, effect.kind, REFITTED, step.delta_chi2, step.sigma, step.numbers, step.plausible)
+        )
+        before = hypothesis.fit
+    return tuple(steps)
 
 
 def _cosines(questions: MisfitTests) -> tuple[tuple[str, ...], list[list[float]]]:
@@ -288,7 +310,7 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     SCREENED,
                     _promised(finding, effect.name, z),
                     z,
-                    _predicted(questions, effect, place),
+                    questions.predicted(effect, place),
                     in_answer_set=effect.name in finding.answer,
                     reason=_holds(effect, finding) or _behind(finding, effect.name),
                     largest={} if questions.poorly_fitted else largest,
@@ -336,31 +358,6 @@ def _known(value: float) -> float:
     return value if math.isfinite(value) else -math.inf
 
 
-def _predicted(questions: MisfitTests, effect: Effect, place: int) -> tuple[Number, ...]:
-    """The size that the sensitivities predict, with its error; nothing where the model is too far off for that."""
-    if place < 0 or not effect.parameters or questions.poorly_fitted:
-        return ()
-    size, sigma = float(questions.scores.size[place]), float(questions.scores.sigma[place])
-    parameter = questions.answers.shapes[place].size
-    value = parameter.zero + size
-    return (
-        Number(
-            key=f"{effect.name}.{parameter.name}",
-            vine="",
-            symbol=parameter.symbol,
-            unit=parameter.unit,
-            value=value,
-            sigma=sigma,
-            low=value - 1.96 * sigma,
-            high=value + 1.96 * sigma,
-            dof=questions.scores.degrees,
-            method="predicted",
-            lower=parameter.bounds[0],
-            upper=parameter.bounds[1],
-        ),
-    )
-
-
 def _artefact_first(result: Diagnosis, dropped: Sequence[str]) -> Diagnosis:
     """Frames are missing: that is said first, and what follows from the times put right stands as a note."""
     first = result.rounds[0]
@@ -387,7 +384,9 @@ def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:
 
     report("errors before and after")
     try:
-        table = ladder(result.fits, ("", *result.effects))
+        last = result.rounds[-1]
+        steps = [step.effect for step in last.partial]
+        table = ladder((*result.fits, *last.partial_fits), ("", *result.effects, *steps), len(steps))
         return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
         return replace(result, notes=(*result.notes, f"The ladder of errors could not be made: {error}"))

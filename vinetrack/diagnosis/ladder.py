@@ -35,6 +35,7 @@ LADDER_COLUMNS = (
     "floor_m",
     "excess_left_out_m",
     "floor_sigma_m",
+    "partial",
 )
 MOVED_COLUMNS = ("model", "added", "parameter", "vine", "symbol", "unit", "value", "sigma", "low_95", "high_95")
 
@@ -84,13 +85,14 @@ class Errors:
         return floor_m, error_m2 / (2 * floor_m) if floor_m > 0 else 0.0
 
 
-def ladder(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
+def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.DataFrame:
     """Errors of the model that the user came with and of every one after it.
 
     Parameters
     ----------
     fits : fits of the models in order, all to the same trials.
     added : what each added to the one before; blank for the first.
+    partial : how many of the last are steps that mend a part of what nothing mends in full.
 
     Returns
     -------
@@ -104,14 +106,32 @@ def ladder(fits: Sequence[Fit], added: Sequence[str]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    rows, notes = [], []
+    rows: list[dict[str, object]] = []
+    notes: list[str] = []
     for fit, name in zip(fits, added, strict=True):
         row, remarks = _ladder_row(fit, name)
+        row["partial"] = len(rows) >= len(fits) - partial
         rows.append(row)
         notes += [note for note in remarks if note not in notes]
     table = pd.DataFrame(rows, columns=list(LADDER_COLUMNS))
     table.attrs["notes"] = notes
     return table
+
+
+def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
+    """Leave out the steps of a ladder that mend only a part of what nothing mends in full.
+
+    Parameters
+    ----------
+    table : as in `ladder.csv`.
+
+    Returns
+    -------
+    DataFrame
+    """
+    if "partial" not in table:
+        return table
+    return table[[value not in (True, "True") for value in table["partial"]]]
 
 
 def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:

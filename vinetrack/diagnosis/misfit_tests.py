@@ -26,7 +26,7 @@ from vinetrack.diagnosis.score_test import (
 from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_motion
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_problem import track_correlation
-from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.solving import is_poor_fit, missed_fraction
 from vinetrack.inference.systematics import systematics_of
 
@@ -274,6 +274,40 @@ class MisfitTests:
                 key: parameter.zero + parameter.sign * (max(parameter.sign * size, 0.0) + ONE_SIDED_95 * sigma)
             }, True
         return {key: parameter.zero + math.copysign(abs(size) + ONE_SIDED_95 * sigma, size)}, True
+
+    def predicted(self, effect: Effect, place: int) -> tuple[Number, ...]:
+        """The size that the sensitivities predict, with its error; none where the model is too far off for that.
+
+        Parameters
+        ----------
+        effect : of the shape.
+        place : of one of its shapes, negative where it has none.
+
+        Returns
+        -------
+        tuple of Number
+        """
+        if place < 0 or not effect.parameters or self.poorly_fitted:
+            return ()
+        size, sigma = float(self.scores.size[place]), float(self.scores.sigma[place])
+        parameter = self.answers.shapes[place].size
+        value = parameter.zero + size
+        return (
+            Number(
+                key=f"{effect.name}.{parameter.name}",
+                vine="",
+                symbol=parameter.symbol,
+                unit=parameter.unit,
+                value=value,
+                sigma=sigma,
+                low=value - 1.96 * sigma,
+                high=value + 1.96 * sigma,
+                dof=self.scores.degrees,
+                method="predicted",
+                lower=parameter.bounds[0],
+                upper=parameter.bounds[1],
+            ),
+        )
 
 
 def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTests:

@@ -130,7 +130,9 @@ class Round:
 
     `ranking` has the best candidate first, those not testable last. `cosines` tells how alike what two candidates do
     to the trajectories looks once all that is fitted anyway is taken away: names, and a matrix in their order.
-    `fit` is that of the model, `fits` those of the hypotheses by name of effect.
+    `fit` is that of the model, `fits` those of the hypotheses by name of effect. `sets` are the members of the answer
+    set, each with all effects it adds, where any adds more than one; `partial` the steps that mend a part of what
+    nothing mends in full, each of one effect more, with `partial_fits`: none of them is said to be missing.
     """
 
     model: tuple[str, ...]
@@ -142,6 +144,9 @@ class Round:
     cosines: Sequence[Sequence[float]] = ()
     fit: Fit | None = None
     fits: Mapping[str, Fit] = field(default_factory=dict)
+    sets: tuple[tuple[str, ...], ...] = ()
+    partial: tuple[Candidate, ...] = ()
+    partial_fits: tuple[Fit, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `rounds`."""
@@ -149,6 +154,8 @@ class Round:
             "model": list(self.model),
             "verdict": self.verdict,
             "answer_set": list(self.answer_set),
+            "sets": [list(names) for names in self.sets],
+            "partial": [step.to_json() for step in self.partial],
             "explanation": self.explanation,
             "ranking": [candidate.to_json() for candidate in self.ranking],
             "cosines": {"effects": list(self.cosine_names), "matrix": [list(row) for row in self.cosines]},
@@ -175,6 +182,8 @@ class Round:
             explanation=str(entry.get("explanation") or ""),
             cosine_names=tuple(cosines.get("effects") or ()),
             cosines=tuple(tuple(or_nan(value) for value in row) for row in cosines.get("matrix") or ()),
+            sets=tuple(tuple(names) for names in entry.get("sets") or ()),
+            partial=tuple(Candidate.from_json(step) for step in entry.get("partial") or ()),
         )
 
 

@@ -1,7 +1,7 @@
 """From a fit to verdicts: is something missing, which effect, is anything left once it is there.
 
-A verdict is never more certain than the data. One effect alone must mend everything; if something is left, two effects
-together must; if something is left then, the truth is not in the catalogue.
+A verdict is never more certain than the data. One effect alone must mend everything; if something is left, several
+together must, up to five; if something is left then, the truth is not in the catalogue.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vinetrack.diagnosis.between_trials import between_fits, called, differences
-from vinetrack.diagnosis.candidate_fits import CandidateFits, Report, pairs
+from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.confounded_sizes import Confounder, confounders_of
 from vinetrack.diagnosis.contradictions import displacement_m, is_within_position_errors
+from vinetrack.diagnosis.effect_sets import MOST_EFFECTS, NO_BETTER, EffectSets
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET,
     MOST_INFLATION,
@@ -41,9 +42,9 @@ MOST_AGAIN = 2
 LOUD = 1.0
 """Standard deviations above the threshold from which a score is no chance, even if no refit bears it out."""
 
-NO_BETTER = 1.0
-"""Difference in ln L that counts as a better minimum. Chosen: unsettled iterations differ by a tenth."""
-
+MOSTLY = 0.5
+"""Part of the excess of χ² per degree of freedom over 1 that steps must take away for `unexplained` to show them as
+partial. Chosen: what explains less than half says little of where to look."""
 
 NOT_PHYSICAL = ("measurement", BETWEEN_TRIALS)
 """Kinds of hypotheses that are no physics."""
@@ -53,8 +54,9 @@ NOT_PHYSICAL = ("measurement", BETWEEN_TRIALS)
 class SelectionStep:
     """One round before it is put in words.
 
-    `kept` are the hypotheses in the answer set (of pairs: the partners, given what was added before), `tried` all that
-    were fitted, `aside` what was set aside and why, by name; `confounded` are sizes that may hold another effect.
+    `kept` are the hypotheses in the answer set (of sets of effects: the rest of them, given what was added before),
+    `tried` all that were fitted, `aside` what was set aside and why, by name; `confounded` are sizes that may hold
+    another effect. `partial` are steps, each of one effect more, that mend most of what nothing mends in full.
     """
 
     verdict: str
@@ -66,6 +68,7 @@ class SelectionStep:
     search: CandidateFits | None = None
     note: str = ""
     confounded: tuple[Confounder, ...] = ()
+    partial: tuple[LikelihoodRatio, ...] = ()
 
 
 def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[SelectionStep]:
@@ -135,8 +138,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
         fails = questions.fails or questions.off or loud
         verdict = UNEXPLAINED if fails else ADEQUATE
         return [SelectionStep(verdict, questions, tried=tuple(tried), search=search)]
-    report("two effects together")
-    return _together(questions, search, tried, effects, report)
+    return _together(questions, search, tried, report)
 
 
 def _leaves_room(tried: Sequence[LikelihoodRatio]) -> bool:
@@ -176,13 +178,6 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
 def _stands_out(hypothesis: LikelihoodRatio, questions: MisfitTests) -> bool:
     """Whether an effect is worth more standard deviations than chance alone gives one of the candidates."""
     return hypothesis.sigma >= questions.family.of(hypothesis.names[-1])
-
-
-def _is_needed(pair: LikelihoodRatio, single: LikelihoodRatio, search: CandidateFits) -> bool:
-    """Whether a pair is better than the best single effect by more than chance gives a further candidate."""
-    further = search.after(single.fit).family
-    limit = max(further.of(name) for name in pair.names if name not in single.names)
-    return 2 * (pair.fit.log_likelihood - single.fit.log_likelihood) >= limit**2
 
 
 def _best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:
@@ -229,7 +224,7 @@ def _too_small(best: LikelihoodRatio, questions: MisfitTests) -> str:
 
 
 def _mending(
-    hypotheses: Sequence[LikelihoodRatio], search: CandidateFits
+    hypotheses: Sequence[LikelihoodRatio], search: CandidateFits, sets: EffectSets | None = None
 ) -> tuple[list[LikelihoodRatio], dict[str, str], MisfitTests | None]:
     """The hypotheses that cannot be excluded and leave nothing, why others were set aside, and what the best leaves.
 
@@ -251,10 +246,12 @@ def _mending(
         mending: list[LikelihoodRatio] = []
         after: MisfitTests | None = None
         for hypothesis in group:
-            asked = search.after(hypothesis.fit) if hypothesis.credible else None
+            asked = search.after(hypothesis.fit) if _is_believable(hypothesis) else None
             # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
             if asked is None or asked.something or (len(hypothesis.effects) > 1 and asked.whispers):
                 aside[hypothesis.label] = hypothesis.reason if asked is None else "something is left once it is added"
+            elif sets is not None and len(hypothesis.effects) > 2 and (why := sets.superfluous(hypothesis)):
+                aside[hypothesis.label] = why
             elif not mending or hypothesis in answer_set([*mending, hypothesis])[0]:
                 mending.append(hypothesis)
                 after = after or asked
@@ -263,8 +260,13 @@ def _mending(
     return [], aside, None
 
 
+def _is_believable(hypothesis: LikelihoodRatio) -> bool:
+    """Whether its sizes can be an explanation; of three effects and more all must be plausible."""
+    return hypothesis.plausible and hypothesis.credible if len(hypothesis.effects) > 2 else hypothesis.credible
+
+
 def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
-    """What an answer set amounts to; of each hypothesis the last effect counts.
+    """What an answer set amounts to.
 
     Where nothing in it is physics that is missing, the measurement or the trials are at fault.
 
@@ -277,90 +279,123 @@ def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
     -------
     str
     """
-    if all(hypothesis.effects[-1].kind in NOT_PHYSICAL for hypothesis in kept):
+    if all(effect.kind in NOT_PHYSICAL for hypothesis in kept for effect in hypothesis.effects):
         return ARTEFACT
     return MISSING if len(kept) == 1 else AMBIGUOUS
 
 
 def _together(
-    questions: MisfitTests,
-    search: CandidateFits,
-    tried: Sequence[LikelihoodRatio],
-    effects: Sequence[Effect],
-    report: Report,
+    questions: MisfitTests, search: CandidateFits, tried: Sequence[LikelihoodRatio], report: Report
 ) -> list[SelectionStep]:
-    """Findings where two effects together mend what none does alone; else nothing known does."""
+    """Findings where several effects together mend what fewer do not; else nothing known does."""
     ranked = sorted(tried, key=lambda single: -single.fit.log_likelihood)
-    both = pairs(questions.fit, ranked, effects, report)
-    nothing = [
-        SelectionStep(UNEXPLAINED, questions, tried=(*ranked, *both), search=search, aside=_why_not(ranked, both))
-    ]
-    if not both:
-        return nothing
-    kept, aside, after = _mending(both, search)
-    if after is None or not _is_needed(kept[0], ranked[0], search):
-        return nothing
-    common = set.intersection(*(set(hypothesis.names) for hypothesis in kept))
-    by_name = {hypothesis.names[0]: hypothesis for hypothesis in ranked if len(hypothesis.names) == 1}
-    if not common:
-        names = tuple(dict.fromkeys(name for hypothesis in kept for name in hypothesis.names))
-        answer = _ordered(names, by_name)
-        first = SelectionStep(AMBIGUOUS, questions, tuple(kept), (*ranked, *both), tuple(aside.items()), answer, search)
-        return [first]
-    return _in_order(questions, search, kept, common, by_name, (*ranked, *both), aside, after)
+    sets = EffectSets(search, ranked, report)
+    size, again, reached = 2, 0, ranked[0]
+    aside: dict[str, str] = {}
+    while size <= MOST_EFFECTS:
+        report(f"{size} effects together")
+        grown = sets.grow(size)
+        if not grown or not any(hypothesis.credible for hypothesis in grown):
+            break
+        kept, aside, after = _mending(grown, search, sets)
+        if after is not None and sets.is_better(kept[0]):
+            return _of_sets(questions, sets, kept, aside, after)
+        if not sets.is_better(grown[0]):
+            break
+        reached = grown[0]
+        # What was added first may have stood for two that came later: the search goes on from the better smaller set.
+        back = size > 2 and again < MOST_AGAIN and sets.prune(grown[0])
+        size, again = (size - 1, again + 1) if back else (size + 1, again)
+    fitted = tuple(sets.known.values())
+    why = _why_not((*ranked[:1], *sets.of_size(2)[:1], reached), aside)
+    steps = _partial(questions, sets)
+    return [SelectionStep(UNEXPLAINED, questions, tried=fitted, search=search, aside=why, partial=steps)]
 
 
-def _ordered(names: Sequence[str], by_name: dict[str, LikelihoodRatio]) -> tuple[str, ...]:
-    """Names by how much each mends alone."""
-    return tuple(sorted(names, key=lambda name: -by_name[name].delta_chi2 if name in by_name else 0.0))
-
-
-def _in_order(
+def _of_sets(
     questions: MisfitTests,
-    search: CandidateFits,
+    sets: EffectSets,
     kept: Sequence[LikelihoodRatio],
-    common: set[str],
-    by_name: dict[str, LikelihoodRatio],
-    tried: Sequence[LikelihoodRatio],
     aside: dict[str, str],
     after: MisfitTests,
 ) -> list[SelectionStep]:
-    """Two rounds from pairs that share an effect: that one first, physics before faults of the measurement."""
+    """Rounds from sets of effects that mend everything: what all of them share, one by one, then what they differ in.
+
+    Physics comes before faults of the measurement, and of either what mends most alone.
+    """
+    tried, out_of_the_race = tuple(sets.known.values()), tuple(aside.items())
+    gains = {single.names[0]: single.delta_chi2 for single in tried if len(single.names) == 1}
     kinds = {effect.name: effect.kind for hypothesis in kept for effect in hypothesis.effects}
-    order = sorted(common, key=lambda name: (kinds[name] == "measurement", -_alone_gain(name, by_name)))
-    first_name = order[0]
-    turned = [_turned(hypothesis, first_name) for hypothesis in kept]
-    verdict = ARTEFACT if kinds[first_name] == "measurement" else MISSING
-    first = SelectionStep(
-        verdict, questions, tuple(turned[:1]), tuple(tried), tuple(aside.items()), (first_name,), search,
-        note="two effects are missing: none alone mends everything",
-    )  # fmt: skip
-    if verdict != MISSING:
-        return [first]
-    base = by_name.get(first_name)
-    later = misfit_tests(base.fit if base else turned[0].fit, questions.effects, LATER_LEVEL)
-    seconds = tuple(likelihood_ratio(later.fit, pair.effects[1:], pair.fit) for pair in turned)
-    second_verdict = verdict_of(seconds)
-    names = tuple(second.names[0] for second in seconds)
-    confounded = confounders_of(after, kept[0].names) if second_verdict == MISSING else ()
-    second = SelectionStep(second_verdict, later, seconds, seconds, answer=names, confounded=confounded)
-    return [first, second, SelectionStep(ADEQUATE, after)] if second_verdict == MISSING else [first, second]
+
+    def order(name: str) -> tuple[bool, float]:
+        return kinds[name] == "measurement", -gains.get(name, 0.0)
+
+    common = sorted(set.intersection(*(set(hypothesis.names) for hypothesis in kept)), key=order)
+    if not common:
+        names = tuple(sorted(dict.fromkeys(name for hypothesis in kept for name in hypothesis.names), key=order))
+        return [SelectionStep(AMBIGUOUS, questions, tuple(kept), tried, out_of_the_race, names, sets.search)]
+    shared = common if len(kept) > 1 else common[:-1]
+    steps: list[SelectionStep] = []
+    added: tuple[Effect, ...] = ()
+    asked = questions
+    for name in shared:
+        if kinds[name] == "measurement":
+            return [*steps, _shared_step(ARTEFACT, asked, sets, kept[0], added, name, tried, out_of_the_race)]
+        steps.append(_shared_step(MISSING, asked, sets, kept[0], added, name, tried, out_of_the_race))
+        added = (*added, next(effect for effect in kept[0].effects if effect.name == name))
+        alone = sets.of_effects(kept[0], added)
+        asked = sets.search.after(alone.fit if alone else kept[0].fit)
+    further = tuple(_beside(asked, hypothesis, added) for hypothesis in kept)
+    verdict = verdict_of(further)
+    names = tuple(sorted(dict.fromkeys(name for hypothesis in further for name in hypothesis.names), key=order))
+    confounded = confounders_of(after, kept[0].names) if verdict == MISSING else ()
+    steps.append(SelectionStep(verdict, asked, further, further, answer=names, confounded=confounded))
+    return [*steps, SelectionStep(ADEQUATE, after)] if verdict == MISSING else steps
 
 
-def _alone_gain(name: str, by_name: dict[str, LikelihoodRatio]) -> float:
-    return by_name[name].delta_chi2 if name in by_name else 0.0
+def _shared_step(
+    verdict: str,
+    asked: MisfitTests,
+    sets: EffectSets,
+    whole: LikelihoodRatio,
+    added: tuple[Effect, ...],
+    name: str,
+    tried: tuple[LikelihoodRatio, ...],
+    aside: tuple[tuple[str, str], ...],
+) -> SelectionStep:
+    """The round in which an effect is named that all sets share, once those `added` before it are in the model."""
+    left = [effect for effect in whole.effects if effect not in added]
+    left.sort(key=lambda effect: effect.name != name)
+    together = likelihood_ratio(asked.fit, left, whole.fit)
+    several = {2: "two", 3: "three", 4: "four", 5: "five"}[len(left)] if len(left) > 1 else ""
+    note = f"{several} effects are missing: none alone mends everything" if several else ""
+    if not added:
+        return SelectionStep(verdict, asked, (together,), tried, aside, (name,), sets.search, note)
+    alone = sets.of_effects(whole, (*added, left[0]))
+    fits = (together,) if alone is None else (likelihood_ratio(asked.fit, left[:1], alone.fit), together)
+    return SelectionStep(verdict, asked, (together,), fits, (), (name,), None, note)
 
 
-def _turned(hypothesis: LikelihoodRatio, first: str) -> LikelihoodRatio:
-    """The same pair with the effect of that name in front."""
-    from dataclasses import replace
-
-    ordered = sorted(hypothesis.effects, key=lambda effect: effect.name != first)
-    return replace(hypothesis, effects=tuple(ordered))
+def _beside(asked: MisfitTests, hypothesis: LikelihoodRatio, added: Sequence[Effect]) -> LikelihoodRatio:
+    """What a set adds to those that were added."""
+    left = [effect for effect in hypothesis.effects if effect.name not in {effect.name for effect in added}]
+    return likelihood_ratio(asked.fit, left, hypothesis.fit)
 
 
-def _why_not(ranked: Sequence[LikelihoodRatio], both: Sequence[LikelihoodRatio]) -> tuple[tuple[str, str], ...]:
+def _partial(questions: MisfitTests, sets: EffectSets) -> tuple[LikelihoodRatio, ...]:
+    """The steps that mend most of a misfit at plausible sizes; none where they mend little."""
+    steps = sets.steps()
+    before = questions.fit.chi2_per_dof - 1
+    mostly = bool(steps) and steps[-1].fit.chi2_per_dof - 1 < (1 - MOSTLY) * before
+    return steps if mostly else ()
+
+
+def _why_not(nearest: Sequence[LikelihoodRatio], aside: dict[str, str]) -> tuple[tuple[str, str], ...]:
+    """Why the nearest hypothesis of each size is no explanation."""
+    left = "something is left once it is added"
     return tuple(
-        (hypothesis.label, hypothesis.reason if not hypothesis.credible else "something is left once it is added")
-        for hypothesis in (*ranked[:1], *both[:1])
+        dict.fromkeys(
+            (hypothesis.label, hypothesis.reason if not hypothesis.credible else aside.get(hypothesis.label, left))
+            for hypothesis in nearest
+        )
     )

@@ -62,17 +62,19 @@ def draw_ladder(ladder: pd.DataFrame) -> Figure:
         for key, (_, colour, marker, line) in _ERRORS.items():
             ax.plot(steps, errors_mm[key], marker=marker, color=colour, ls=line, ms=7, zorder=3)
         _write_values(ax, errors_mm)
-        ax.set_xticks(steps, [_step_label(step, added) for step, added in enumerate(ladder["added"])])
+        partial = ladder["partial"] if "partial" in ladder else [False] * len(ladder)
+        labels = [_step_label(*step) for step in zip(range(len(ladder)), ladder["added"], partial, strict=True)]
+        ax.set_xticks(steps, labels)
         ax.grid(axis="x", visible=False)
         plain_log_ticks(ax, "y")
         _ladder_legend(ax, errors_mm)
     return fig
 
 
-def _step_label(step: int, added: Any) -> str:
+def _step_label(step: int, added: Any, partial: Any) -> str:
     if step == 0:
         return "initial\nmodel"
-    words = str(added).replace("+", " + ").replace("_", " ")
+    words = str(added).replace("+", " + ").replace("_", " ") + (" (partial)" if partial in (True, "True") else "")
     return "+ " + "\n".join(textwrap.wrap(words, 18, break_long_words=False))
 
 

@@ -133,7 +133,7 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
 
     body = [
         (
-            str(row.added) or "initial model",
+            (str(row.added) or "initial model") + _partial_mark(row),
             *(
                 f"{1e3 * value:.2f}" if math.isfinite(value) else "–"
                 for value in (row.rms_in_sample_m, row.rms_left_out_m, row.rms_highest_pressure_m, row.floor_m)
@@ -142,6 +142,11 @@ def _ladder_table(ladder: pd.DataFrame) -> list[str]:
         for row in _rows(ladder)
     ]
     return list(table(body, ("added", "in sample mm", "left out mm", "highest pressure mm", "replicates mm")))
+
+
+def _partial_mark(row: Any) -> str:
+    """What stands behind a step of the ladder that mends a part of what nothing mends in full."""
+    return ", partial" if getattr(row, "partial", False) in (True, "True") else ""
 
 
 def gain_in_words(before: Fit, after: Fit) -> str:

@@ -326,6 +326,9 @@ def _false_alarms(diagnosis: Diagnosis) -> Fact | None:
 
 
 def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
+    from vinetrack.diagnosis.ladder import settled_rows
+
+    ladder = None if ladder is None else settled_rows(ladder)
     if ladder is None or not len(ladder):
         return []
     first, last = ladder.iloc[0], ladder.iloc[-1]

@@ -94,12 +94,26 @@ def explain(finding: SelectionStep) -> str:
             f"find the fault and measure again, or correct the sheet.{_remedies(finding)}{_with_the_fault(finding)}"
         )
     text = (
-        f"The misfit of {model} exceeds the noise of {trials}, and no effect of the catalogue nor any two of the best "
+        f"The misfit of {model} exceeds the noise of {trials}, and no effect of the catalogue nor any set of the best "
         "explain it."
     )
     for name, why in finding.aside:
         text += f" The nearest is {name.replace('+', ' with ')}: {why}."
-    return text
+    return text + _partial_in_words(finding)
+
+
+def _partial_in_words(finding: SelectionStep) -> str:
+    """Steps that mend most of a misfit, and how much; blank where none do."""
+    if not finding.partial:
+        return ""
+    best = finding.partial[-1]
+    steps = joined([f"{step.names[-1]} (Δχ² = {step.delta_chi2:.0f} in all)" for step in finding.partial], "then")
+    before, after = finding.questions.fit.chi2_per_dof, best.fit.chi2_per_dof
+    return (
+        f" A part of it would be mended by {steps}: χ² per degree of freedom falls from {before:.1f} to {after:.1f}, "
+        f"with {sizes_in_words(best.numbers)}. Since something is left, these steps are partial: none is shown to be "
+        "missing."
+    )
 
 
 def confounders_in_words(confounders: Sequence[Confounder]) -> str:

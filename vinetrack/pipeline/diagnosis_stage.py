@@ -313,7 +313,7 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
     import pandas as pd
 
     from vinetrack.diagnosis.add import add
-    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, moved
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, moved, settled_rows
     from vinetrack.narrative.diagnosis_text import added_in_words
 
     results = Results(folder)
@@ -321,7 +321,8 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
     before, after, table = add(experiment, {trial.name: track for trial, track in pairs}, name, report)
     history = read_result(results.ladder) if results.ladder.exists() else empty_table(LADDER_COLUMNS)
     rows = table if not len(history) else table.iloc[1:]
-    known = set(zip(history["model"], history["added"].fillna(""), strict=True))
+    kept = settled_rows(history)
+    known = set(zip(kept["model"], kept["added"].fillna(""), strict=True))
     new = rows[[(model, added) not in known for model, added in zip(rows["model"], rows["added"], strict=True)]]
     if len(new):
         write_csv(results.ladder, pd.concat([history, new], ignore_index=True) if len(history) else new)

@@ -105,18 +105,20 @@ def ladder_table(ladder: pd.DataFrame | None) -> ReportTable | None:
         "excess on left out (mm)",
     )
     rows = [
-        (_step(str(row["added"] or "")), *(number(1e3 * float(row[key])) for key in keys))
+        (_step(str(row["added"] or ""), row.get("partial")), *(number(1e3 * float(row[key])) for key in keys))
         for row in ladder.to_dict("records")
     ]
     note = (
         "Root mean square error of position. Left out: every condition is predicted by the model fitted to all others; "
-        "every vine's highest pressure by the model fitted to all lower ones. Excess: √(rms² − replicates²)."
+        "every vine's highest pressure by the model fitted to all lower ones. Excess: √(rms² − replicates²). Partial: "
+        "a step that mends a part of what nothing mends in full; it is not said to be missing."
     )
     return ReportTable("The numbers of the ladder", head, rows, frozenset(range(1, len(head))), note)
 
 
-def _step(added: str) -> str:
-    return f"+ {listed(added.split('+'))}" if added else "initial model"
+def _step(added: str, partial: object = False) -> str:
+    mark = " (partial)" if partial in (True, "True") else ""
+    return f"+ {listed(added.split('+'))}{mark}" if added else "initial model"
 
 
 def _round(index: int, entry: Round) -> dict[str, Any]:

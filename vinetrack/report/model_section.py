@@ -71,9 +71,11 @@ def _final(diagnosis: Diagnosis | None) -> dict[str, Any] | None:
     """The model that the diagnosis ended with; None where nothing was added."""
     if diagnosis is None or not diagnosis.effects:
         return None
+    from vinetrack.diagnosis.ladder import settled_rows
+
     text = ""
     if diagnosis.ladder is not None and len(diagnosis.ladder):
-        last = diagnosis.ladder.iloc[-1]
+        last = settled_rows(diagnosis.ladder).iloc[-1]
         inside, outside, floor = (
             number(1e3 * float(last[key])) for key in ("rms_in_sample_m", "rms_left_out_m", "floor_m")
         )

@@ -1,0 +1,88 @@
+"""Several effects together, and steps that mend a part of what nothing mends in full.
+
+Seeds from 7200 are used here alone.
+"""
+
+from __future__ import annotations
+
+import json
+
+import pandas as pd
+import pytest
+from hidden_truth import grown
+
+import vinetrack as vt
+from vinetrack.diagnosis.ladder import LADDER_COLUMNS, settled_rows
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.narrative.diagnosis_text import diagnosis_text
+
+CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak", "pressure_gain")
+TRUTH = {
+    "reservoir_depletion.gamma": 1.3,
+    "tail_friction.mu_w": 1.0,
+    "latch_release.F": 1.0,
+    "latch_release.reach": 0.01,
+}
+
+
+@pytest.fixture(scope="module")
+def three_missing() -> Diagnosis:
+    return vt.diagnose(grown(TRUTH, seed=7200), candidates=CANDIDATES, ladder=False, advice=False)
+
+
+@pytest.fixture(scope="module")
+def one_not_asked() -> Diagnosis:
+    pairs = grown(TRUTH, seed=7200)
+    asked = [name for name in CANDIDATES if name != "latch_release"]
+    return vt.diagnose(pairs, candidates=asked, advice=False)
+
+
+def test_three_effects_are_found_one_after_the_other(three_missing: Diagnosis) -> None:
+    assert three_missing.verdict == "missing"
+    assert set(three_missing.effects) == {"reservoir_depletion", "tail_friction", "latch_release"}
+    assert three_missing.final_verdict == "adequate"
+    assert [len(step.model) for step in three_missing.rounds] == [4, 5, 6, 7]
+    assert "three effects are missing" in three_missing.explanation.lower()
+    numbers = {number.key: number for number in three_missing.parameters}
+    for key in ("reservoir_depletion.gamma", "tail_friction.mu_w"):
+        assert abs(numbers[key].value - TRUTH[key]) < 4 * numbers[key].sigma
+
+
+def test_every_round_says_which_effects_it_adds_together(three_missing: Diagnosis) -> None:
+    first, second, *_ = three_missing.rounds
+    assert len(first.sets) == 1
+    assert set(first.sets[0]) == set(three_missing.effects)
+    assert set(second.sets[0]) == set(three_missing.effects[1:])
+
+
+def test_what_lacks_an_effect_that_is_not_asked_stays_unexplained_and_shows_partial_steps(
+    one_not_asked: Diagnosis,
+) -> None:
+    assert one_not_asked.verdict == "unexplained"
+    assert one_not_asked.effects == one_not_asked.answer_set == ()
+    steps = [step.effect for step in one_not_asked.rounds[0].partial]
+    assert steps
+    assert "partial: none is shown to be missing" in one_not_asked.explanation
+    ladder = one_not_asked.ladder
+    assert ladder is not None
+    assert tuple(ladder.columns) == LADDER_COLUMNS
+    assert ladder["partial"].tolist() == [False, *[True] * len(steps)]
+    assert ladder["added"].tolist() == ["", *steps]
+    assert ladder["rms_in_sample_m"].iloc[-1] < 0.7 * ladder["rms_in_sample_m"].iloc[0]
+    assert f"{steps[0]}, partial" in diagnosis_text(one_not_asked)
+
+
+def test_partial_steps_and_sets_are_read_back(one_not_asked: Diagnosis, three_missing: Diagnosis) -> None:
+    for diagnosis in (one_not_asked, three_missing):
+        stored = Diagnosis.from_json(json.loads(json.dumps(diagnosis.to_json(), default=str)))
+        for step, read in zip(diagnosis.rounds, stored.rounds, strict=True):
+            assert read.sets == step.sets
+            assert [one.effect for one in read.partial] == [one.effect for one in step.partial]
+
+
+def test_headlines_are_those_of_the_model_that_stands() -> None:
+    rows = [("", False), ("leak", False), ("air_drag", True)]
+    table = pd.DataFrame(rows, columns=["added", "partial"])
+    assert settled_rows(table)["added"].tolist() == ["", "leak"]
+    assert settled_rows(table.astype({"partial": str}))["added"].tolist() == ["", "leak"]
+    assert len(settled_rows(table[["added"]])) == 3
