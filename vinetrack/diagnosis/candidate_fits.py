@@ -17,6 +17,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import FitError, refit
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.solving import is_poor_fit
 
 Report = Callable[[str], None]
 """Told in a few words what is being done."""
@@ -59,6 +60,11 @@ MOST_FITTED = 7
 
 STARTS_EACH = 3
 """Chosen for time, see above."""
+
+HOPELESS_PART = 0.5
+"""Part of the best gain below which a hypothesis that still misses a visible part of the growth is not begun from its
+other shapes, if climbs tried them. Chosen for time: most fits of a model far off are such; at half fewer are spared, at
+twice every poor one is."""
 
 SURELY = 6.0
 """Standard deviations from nothing beyond which a number is there. Chosen: six standard errors, beyond doubt even with
@@ -250,6 +256,16 @@ class CandidateFits:
             self._fit(SubsetFit((shape.effect,), math.nan, start_of(shape, float(sizes[place]))))
             if name in self.fitted and self.fitted[name].delta_chi2 > 0.7 * self.questions.promise(name):
                 break
+            if self._is_hopeless(name):
+                break
+
+    def _is_hopeless(self, name: str) -> bool:
+        """Whether a hypothesis is out of the running from its most promising shape, where climbs tried the others."""
+        known = self.fitted.get(name)
+        if known is None or name not in self.climbs:
+            return False
+        best = max(hypothesis.delta_chi2 for hypothesis in self.fitted.values())
+        return known.delta_chi2 < HOPELESS_PART * best and is_poor_fit(known.fit.predictor, known.fit.solution)
 
     def _smallest(self, effects: Sequence[Effect]) -> dict[str, Value]:
         """Values at which the effects hardly act."""
