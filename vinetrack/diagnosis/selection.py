@@ -42,6 +42,10 @@ MOST_AGAIN = 2
 LOUD = 1.0
 """Standard deviations above the threshold from which a score is no chance, even if no refit bears it out."""
 
+LEFT = 0.7
+"""Part of χ² that a third or further effect may leave of a fit that stays far off, or no more are added. Chosen for
+time: on what no catalogue holds steps go on for ever; at half four equal effects would not be found."""
+
 MOSTLY = 0.5
 """Part of the excess of χ² per degree of freedom over 1 that steps must take away for `unexplained` to show them as
 partial. Chosen: what explains less than half says little of where to look."""
@@ -302,7 +306,10 @@ def _together(
             return _of_sets(questions, sets, kept, aside, after)
         if not sets.is_better(grown[0]):
             break
+        leads_nowhere = size > 2 and _leads_nowhere(grown, reached)
         reached = grown[0]
+        if leads_nowhere:
+            break
         # What was added first may have stood for two that came later: the search goes on from the better smaller set.
         back = size > 2 and again < MOST_AGAIN and sets.prune(grown[0])
         size, again = (size - 1, again + 1) if back else (size + 1, again)
@@ -310,6 +317,14 @@ def _together(
     why = _why_not((*ranked[:1], *sets.of_size(2)[:1], reached), aside)
     steps = _partial(questions, sets)
     return [SelectionStep(UNEXPLAINED, questions, tried=fitted, search=search, aside=why, partial=steps)]
+
+
+def _leads_nowhere(grown: Sequence[LikelihoodRatio], smaller: LikelihoodRatio) -> bool:
+    """Whether larger sets are not worth their time: no size is plausible, or the best stays as far off as before."""
+    if not any(_is_believable(hypothesis) for hypothesis in grown):
+        return True
+    left = grown[0].fit.chi2_per_dof
+    return left > FAR_OFF and left > LEFT * smaller.fit.chi2_per_dof
 
 
 def _of_sets(
