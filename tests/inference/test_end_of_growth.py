@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hidden.laboratory_folder import write_experiment
+from hidden.laboratory_rows import campaign
 from hidden_truth import sheet
 
 import vinetrack as vt
@@ -77,3 +80,16 @@ def test_a_force_that_acts_like_a_pressure_is_told_by_how_trials_scatter_alone()
     by_scatter = 5e-3 * math.sqrt(4 / len(trials)) / float(np.mean(alike))
     assert 0.5 * by_scatter < sigma < 3 * by_scatter
     assert size == pytest.approx(0.3, abs=3 * sigma)
+
+
+def test_a_fit_ends_where_one_begun_at_other_sizes_ends(tmp_path: Path) -> None:
+    """Frames about the end of growth hold the delay of a rolling shutter at too small a size; the trials then deviate."""
+    shot = campaign("rolling_shutter", 20122, (12, 16))
+    write_experiment(shot, tmp_path / "laboratory")
+    fit = vt.fit(vt.base_model() + "rolling_shutter", tmp_path / "laboratory", profile=False)
+    (delay,) = (number for number in fit.numbers if number.key == "rolling_shutter.delay")
+    for size in (-1e-3, 2e-3):
+        again = vt.refit(fit, start={"rolling_shutter.delay": size})
+        assert again.log_likelihood < fit.log_likelihood + 0.5
+    truth = shot.truth["camera"]["row_delay_s_m"]  # type: ignore[index]
+    assert abs(delay.value - truth) < 2.5 * delay.sigma
