@@ -83,7 +83,7 @@ def test_a_force_that_acts_like_a_pressure_is_told_by_how_trials_scatter_alone()
 
 
 def test_a_fit_ends_where_one_begun_at_other_sizes_ends(tmp_path: Path) -> None:
-    """Frames about the end of growth hold the delay of a rolling shutter at too small a size; the trials then deviate."""
+    """Frames about the end of growth hold the delay of a rolling shutter at too small a size, and trials deviate."""
     shot = campaign("rolling_shutter", 20122, (12, 16))
     write_experiment(shot, tmp_path / "laboratory")
     fit = vt.fit(vt.base_model() + "rolling_shutter", tmp_path / "laboratory", profile=False)
