@@ -232,3 +232,15 @@ def test_a_packed_recording_is_tracked_as_well_as_it_is_filmed(tmp_path):
     off -= np.median(off)
     assert np.diff(track.time_s) == pytest.approx(1e-3)
     assert np.median(np.abs(off)) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("suffix", "words"), [(".raw", "Chronos"), (".r3d", "RED's"), (".braw", "Blackmagic's"), (".SEQ", "StreamPix")]
+)
+def test_formats_of_makers_that_are_not_read_are_refused_by_name(tmp_path, suffix, words):
+    path = tmp_path / f"shot{suffix}"
+    path.write_bytes(np.random.default_rng(972).integers(0, 256, 50_000, dtype=np.uint8).tobytes())
+    with pytest.raises(
+        RecordingError, match=rf"shot{suffix}: .*{words}.*; save it from the camera as DNG, TIFF or mp4"
+    ):
+        inspect_recording(path)

@@ -35,6 +35,13 @@ if TYPE_CHECKING:
 
 CONTAINERS = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".ts", ".cine", ".mraw"})
 IMAGES = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".bmp", ".pgm"})
+MAKERS_OWN = {
+    ".raw": "raw pixels without a header, as a Chronos writes them; nothing says their size, depth and rate",
+    ".r3d": "a recording in RED's own format",
+    ".braw": "a recording in Blackmagic's own format",
+    ".seq": "a sequence of StreamPix",
+}
+"""Formats that are not read, and what they are: no maker's description was at hand to check a reader against."""
 TEXT_FORMATS = frozenset({"tty", "bin", "xbin", "adf", "idf", "svg_pipe"})
 """Formats under which FFmpeg takes any text for a picture of its letters. Source: FFmpeg, bintext.c, tty.c."""
 
@@ -329,6 +336,8 @@ def _why_unreadable(path: Path, complaints: list[str], error: str) -> str:
     text = " ".join([*complaints, error])
     if "moov atom not found" in text and _looks_like_mp4(path):
         return f"{path.name}: cut short: the index that is written last is missing; copy the file again, or repair it"
+    if path.suffix.lower() in MAKERS_OWN:
+        return f"{path.name}: {MAKERS_OWN[path.suffix.lower()]}; save it from the camera as DNG, TIFF or mp4"
     if path.suffix.lower() not in CONTAINERS:
         return f"{path.name}: not a video that can be read; bring mp4, mov, avi, mkv, or a folder of images"
     return f"{path.name}: not a video, or its beginning is damaged; copy it from the camera again"
