@@ -19,7 +19,7 @@ from vinetrack.core.records import Track, Trial, plain_track, with_flag
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.contradictions import contradictions
-from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit
+from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
@@ -44,7 +44,6 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, EffectError
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.sensitivity import Predictor
 from vinetrack.narrative.verdict_summary import joined
 from vinetrack.narrative.verdict_text import dropped_in_words, explain
 from vinetrack.tracks.wild_points import listed_wild_points
@@ -115,7 +114,7 @@ def diagnose(
     wild = ""
     if isinstance(source, Fit):
         questioned = candidates_of(source.model, candidates, user_effects)
-        fit, dropped = _with_host(source, questioned), _dropped_in_fit(source)
+        fit, dropped = with_host(source, host_for(source.model, questioned)), _dropped_in_fit(source)
     else:
         settings = _settings(source)
         if settings is not None:
@@ -163,16 +162,6 @@ def _settings(
     settings = source.settings
     user_effects = own_effects([source.folder / path for path in settings.effects])
     return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
-
-
-def _with_host(fit: Fit, questioned: Sequence[Effect]) -> Fit:
-    """A fit whose trajectories come from a kernel that holds all candidates."""
-    host = host_for(fit.model, questioned)
-    predictor = Predictor(fit.predictor.layout, fit.predictor.data, host)
-    # Copies: the predictor adapts its steps in place, and the caller's fit must stay as it is.
-    predictor.steps = fit.predictor.steps.copy()
-    predictor.pressure_step = fit.predictor.pressure_step.copy()
-    return replace(fit, predictor=predictor)
 
 
 def _frames_put_right(pairs: Iterable[tuple[Trial, Track]]) -> tuple[list[tuple[Trial, Track]], list[str]]:

@@ -9,6 +9,7 @@ would end at numbers that differ in the third digit, and every page would show b
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from vinetrack.effects import Effect, catalogue, find_effect, load_effect
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_data import Pairs
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.sensitivity import Predictor
 
 PROBE_FILE = Path(__file__).with_name("probes") / "probe_force.py"
 
@@ -72,6 +74,27 @@ def host_for(model: Model, candidates: Iterable[Effect] = ()) -> Model:
     """
     held = {effect.name: effect for effect in (*catalogue().values(), probe(), *model, *candidates)}
     return Model(tuple(held[name] for name in held))
+
+
+def with_host(fit: Fit, host: Model | None) -> Fit:
+    """A fit whose trajectories come from the kernel of a larger model from here on.
+
+    Parameters
+    ----------
+    fit
+        A fitted model.
+    host : Model or None
+        Holds the effects of the model, and others that may be asked for.
+
+    Returns
+    -------
+    Fit
+    """
+    predictor = Predictor(fit.predictor.layout, fit.predictor.data, host)
+    # Copies: the predictor adapts its steps in place, and the caller's fit must stay as it is.
+    predictor.steps = fit.predictor.steps.copy()
+    predictor.pressure_step = fit.predictor.pressure_step.copy()
+    return replace(fit, predictor=predictor)
 
 
 def initial_fit(

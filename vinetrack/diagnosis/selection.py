@@ -7,13 +7,14 @@ together must, up to five; if something is left then, the truth is not in the ca
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vinetrack.diagnosis.between_trials import between_fits, called, differences
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.confounded_sizes import Confounder, confounders_of
 from vinetrack.diagnosis.contradictions import displacement_m, is_within_position_errors
 from vinetrack.diagnosis.effect_sets import MOST_EFFECTS, NO_BETTER, EffectSets
+from vinetrack.diagnosis.initial_fit import with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET,
     MOST_INFLATION,
@@ -171,6 +172,7 @@ def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) ->
     if slack is None or not _stands_out(slack, questions):
         return None
     report("letting the tail go slack")
+    slack = replace(slack, fit=with_host(slack.fit, questions.fit.predictor.host))
     # A model far off may gain by any freedom: the rule is named only where it leaves nothing to explain.
     after = misfit_tests(slack.fit, effects, LATER_LEVEL)
     if after.something or after.fails or after.off:

@@ -88,6 +88,9 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     A fit that has bent its trials to do without the rule may have bent them until no tail pushes. So where they scatter
     much the rule is also tried from other exponents, with nothing of the deviations.
 
+    The model is compiled alone: with all candidates and tails that may go slack that takes the better part of a minute,
+    for a rule that is mostly refuted.
+
     Parameters
     ----------
     fit : the fit that is questioned.
@@ -103,7 +106,7 @@ def slack_fit(fit: Fit) -> LikelihoodRatio | None:
     data = [
         replace(trial_data, trial=replace(trial_data.trial, tail_slack="free")) for trial_data in fit.predictor.data
     ]
-    slack = replace(fit, predictor=Predictor(fit.predictor.layout, data, fit.predictor.host))
+    slack = replace(fit, predictor=Predictor(fit.predictor.layout, data))
     fits = []
     with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
         fits.append(refit(slack, thorough=False))

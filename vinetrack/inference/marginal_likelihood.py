@@ -164,7 +164,7 @@ def deviance(
     total = square + log_det + part.log_constant - float(step @ (2 * slope - information @ step))
     k = np.flatnonzero(moving)
     if k.size:
-        inside = information[np.ix_(k, k)]
+        inside = information if moving.all() else information[np.ix_(k, k)]
         if restricted:
             total += float(np.linalg.slogdet(inside)[1])
         elif problem.random is not None and problem.random[k].any():

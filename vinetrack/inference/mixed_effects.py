@@ -293,6 +293,12 @@ def bounded_solve(
         Numbers that are not held: those that end at a bound are.
     """
     moving = problem.free & (np.diag(square) > 0)
+    if moving.all():
+        # Mostly no bound is met: then one solve is all, and this is asked some hundred times a fit.
+        whole = solve_scaled(square, slope)
+        room = np.where(whole > 0, problem.upper - theta, theta - problem.lower)
+        if (np.abs(whole) <= room).all():
+            return whole, moving
     step = np.zeros_like(slope)
     for _ in range(slope.size + 1):
         k = np.flatnonzero(moving)
