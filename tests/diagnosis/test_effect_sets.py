@@ -12,9 +12,10 @@ import pytest
 from hidden_truth import grown
 
 import vinetrack as vt
-from vinetrack.diagnosis.ladder import LADDER_COLUMNS, settled_rows
+from vinetrack.diagnosis.ladder import LADDER_COLUMNS
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.narrative.diagnosis_text import diagnosis_text
+from vinetrack.narrative.verdict_summary import settled_rows
 
 CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak", "pressure_gain")
 TRUTH = {

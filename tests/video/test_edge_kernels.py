@@ -9,7 +9,7 @@ import pytest
 
 from vinetrack.video import edge_cover, picture_kernels
 from vinetrack.video import edge_kernels as kernels
-from vinetrack.video.axis import Axis, _largest_changes
+from vinetrack.video.axis import Axis
 from vinetrack.video.kymograph import fan_gains
 from vinetrack.video.strip import _median, _pixels, _reference, sample
 
@@ -155,14 +155,6 @@ def test_a_median_by_histogram_is_the_median(count: int, step: float) -> None:
 def test_a_median_beyond_the_last_bin_is_the_median() -> None:
     values = np.linspace(400, 5000, 1001)
     assert _median(values, np.ones(1001), 16.0) == np.median(values)
-
-
-def test_changes_of_two_small_pictures_are_those_of_their_most_changed_pixels() -> None:
-    before, after = np.random.default_rng(965).uniform(0, 255, (2, 60, 80)).astype(np.float32)
-    expected = np.sort(np.abs(after - before).ravel())[-200:].mean()
-    assert _largest_changes(before, after) == pytest.approx(expected, abs=0.15)
-    few = before[:5, :20]
-    assert _largest_changes(few, few + 10) == pytest.approx(10, abs=0.15)
 
 
 @pytest.mark.parametrize("shake", [None, np.array([[0.6, -0.3], [0.0, 0.2], [-1.2, 0.4]])])

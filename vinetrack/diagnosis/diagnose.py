@@ -373,9 +373,9 @@ def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:
 
     report("errors before and after")
     try:
-        last = result.rounds[-1]
-        steps = [step.effect for step in last.partial]
-        table = ladder((*result.fits, *last.partial_fits), ("", *result.effects, *steps), len(steps))
+        steps = [step.effect for last in result.rounds[-1:] for step in last.partial]
+        further = [fit for last in result.rounds[-1:] for fit in last.partial_fits]
+        table = ladder((*result.fits, *further), ("", *result.effects, *steps), len(steps))
         return replace(result, ladder=table, notes=(*result.notes, *table.attrs["notes"]))
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
         return replace(result, notes=(*result.notes, f"The ladder of errors could not be made: {error}"))

@@ -118,22 +118,6 @@ def ladder(fits: Sequence[Fit], added: Sequence[str], partial: int = 0) -> pd.Da
     return table
 
 
-def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Leave out the steps of a ladder that mend only a part of what nothing mends in full.
-
-    Parameters
-    ----------
-    table : as in `ladder.csv`.
-
-    Returns
-    -------
-    DataFrame
-    """
-    if "partial" not in table:
-        return table
-    return table[[value not in (True, "True") for value in table["partial"]]]
-
-
 def _ladder_row(fit: Fit, added: str = "") -> tuple[dict[str, object], list[str]]:
     """The row of one model, and sentences about what could not be predicted."""
     inside, outside, highest = in_sample(fit), left_out(fit), highest_pressure(fit)

@@ -326,8 +326,6 @@ def _false_alarms(diagnosis: Diagnosis) -> Fact | None:
 
 
 def _errors(ladder: pd.DataFrame | None) -> list[Fact]:
-    from vinetrack.diagnosis.ladder import settled_rows
-
     ladder = None if ladder is None else settled_rows(ladder)
     if ladder is None or not len(ladder):
         return []
@@ -348,3 +346,19 @@ def _exponent(diagnosis: Diagnosis) -> list[Fact]:
         if entry.key == "eversion_damping.n" and known(entry.value):
             return [Fact("Damping exponent", size(entry), size_interval(entry))]
     return []
+
+
+def settled_rows(table: pd.DataFrame) -> pd.DataFrame:
+    """Leave out the steps of a ladder that mend only a part of what nothing mends in full.
+
+    Parameters
+    ----------
+    table : as in `ladder.csv`.
+
+    Returns
+    -------
+    DataFrame
+    """
+    if "partial" not in table:
+        return table
+    return table[[value not in (True, "True") for value in table["partial"]]]

@@ -19,7 +19,7 @@ from vinetrack.core.numbers import with_error
 from vinetrack.core.tables import write_csv, write_json
 from vinetrack.narrative.diagnosis_text import verdict_line
 from vinetrack.narrative.power_text import power_brief
-from vinetrack.narrative.verdict_summary import facts, joined
+from vinetrack.narrative.verdict_summary import facts, joined, settled_rows
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
 from vinetrack.results.folder_layout import Results, ResultsError, empty_table, read_json, read_result
 from vinetrack.results.stored_diagnosis import read_diagnosis
@@ -313,7 +313,7 @@ def add_effect(experiment: Experiment, folder: Path, name: str, report: Report =
     import pandas as pd
 
     from vinetrack.diagnosis.add import add
-    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, moved, settled_rows
+    from vinetrack.diagnosis.ladder import LADDER_COLUMNS, moved
     from vinetrack.narrative.diagnosis_text import added_in_words
 
     results = Results(folder)

@@ -71,7 +71,7 @@ def _final(diagnosis: Diagnosis | None) -> dict[str, Any] | None:
     """The model that the diagnosis ended with; None where nothing was added."""
     if diagnosis is None or not diagnosis.effects:
         return None
-    from vinetrack.diagnosis.ladder import settled_rows
+    from vinetrack.narrative.verdict_summary import settled_rows
 
     text = ""
     if diagnosis.ladder is not None and len(diagnosis.ladder):
