@@ -5,8 +5,8 @@
 Sheets of vines and of falling bodies with one to four trials, tables of positions with steady, accelerating, standing,
 sticking and reversing motion, few points or many, with and without pressure; settings of all sorts. Every stage of
 `vinetrack run` is called in this process. A fault is an exception that is no sentence for a person, or a trial, a fit
-or a diagnosis whose reason says so. Seeds 21000 to 21499, 31000 to 31013 and 31100 to
-31130 were looked at while faults were mended.
+or a diagnosis whose reason says so. Seeds 21000 to 21499, 31000 to 31013, 31100 to
+31130 and 31207 were looked at while faults were mended.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from vinetrack.video.frames import RecordingError
 from vinetrack.video.track import track_recording
 
 
-@pytest.mark.parametrize("seed", [21402, 21403, 31114])
+@pytest.mark.parametrize("seed", [21402, 21403, 31114, 31207])
 def test_a_drawn_experiment_meets_no_fault_of_the_program(tmp_path: Path, seed: int) -> None:
     write_experiment(tmp_path / "drawn", seed)
     assert not is_let_through(tmp_path / "drawn") or run_through(tmp_path / "drawn", tmp_path / "out", False) == []

@@ -141,7 +141,8 @@ def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: S
     covariance = stretch_covariance(scatter, stretches)
     mean, count = stretches.means_m.mean(axis=0), len(members)
     sigma = np.sqrt(np.diag(covariance) / count)
-    worst = int(np.argmax(np.abs(mean)))
+    # Replicates that were filmed at no common time, or in too few frames of it, have no means to hold against.
+    worst = int(np.argmax(np.abs(mean))) if mean.size else None
     trial = members[0].trial
     return {
         "vine": trial.vine,
@@ -153,11 +154,11 @@ def _condition_row(members: Sequence[TrialFit], stretches: Stretches, scatter: S
         "floor_m": errors["replicate_floor_m"],
         "ratio": errors["ratio"],
         "excess_m": excess(errors["rms_position_m"], errors["replicate_floor_m"]),
-        "z": unlikely(mean, covariance, count, scatter),
+        "z": unlikely(mean, covariance, count, scatter) if mean.size else 0.0,
         "worst_at_s": errors["worst_at_s"],
         "worst_at_m": errors["worst_at_m"],
-        "worst_residual_m": float(mean[worst]),
-        "worst_sigma_m": float(sigma[worst]),
+        "worst_residual_m": math.nan if worst is None else float(mean[worst]),
+        "worst_sigma_m": math.nan if worst is None else float(sigma[worst]),
     }
 
 
@@ -227,7 +228,7 @@ def _where(table: pd.DataFrame, fails: bool) -> list[str]:
             "Nowhere does the mean of the replicates leave the model by more than they explain themselves"
             f" (at most {max(float(worst['z']), 0.0):.1f} σ, at {_named(worst, table)})."
         ]
-    worst = table.iloc[0]
+    worst = table[np.isfinite(table["worst_residual_m"])].iloc[0]
     beside = (
         f"where replicates scatter by {_mm(worst['floor_m'])}"
         if math.isfinite(worst["floor_m"])
