@@ -232,7 +232,7 @@ class EffectSets:
         Returns
         -------
         tuple of LikelihoodRatio
-            None where no single effect is plausible.
+            Empty where no single effect is plausible.
         """
         best: LikelihoodRatio | None = None
         for size in range(1, MOST_EFFECTS + 1):

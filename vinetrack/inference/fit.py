@@ -23,14 +23,13 @@ from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
-from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_trials, prepared_pairs
-from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch, solve
+from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch
 from vinetrack.inference.parameters import BetweenTerm, make_layout
 from vinetrack.inference.prediction_band import with_bands
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.solving import POOR_FIT, led_back, solve_again, solve_from, solve_from_scratch
+from vinetrack.inference.solving import POOR_FIT, solve_again, solve_from, solve_from_scratch, solve_onward
 from vinetrack.inference.starts import align, initial_trial_effects
 
 if TYPE_CHECKING:
@@ -219,7 +218,7 @@ def refit(
     model = model or before.model
     known = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
     model = model.with_values({**known, **(start or {})})
-    data, old = before.predictor.data, before.solution.state
+    data = before.predictor.data
     names = {*model.parameter_names, "yield_pressure.P_y"}
     kept = {
         key: tuple(name for name in before.options[key] if _belongs(name, names)) if given is None else tuple(given)
@@ -243,9 +242,9 @@ def refit(
             trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))
             solution = solve_from(predictor, theta, trial_effects, held, most_iterations=most_iterations, watch=watch)
         else:
-            problem = replace(make_problem(predictor, old.trial_effects), own_centre=before.solution.problem.own_centre)
-            state = led_back(predictor, problem, replace(old, theta=theta), held)
-            solution = solve(predictor, problem, state, held, warm=True, most_iterations=most_iterations, watch=watch)
+            solution = solve_onward(
+                predictor, before.solution, theta, held, most_iterations=most_iterations, watch=watch
+            )
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
     if led:

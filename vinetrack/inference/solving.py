@@ -112,10 +112,8 @@ def _with_sizes_anew(predictor: Predictor, best: Solution, held: FixedTerms, wat
         return best
     theta = best.state.theta.copy()
     theta[further] = layout.start[further]
-    problem = replace(make_problem(predictor, best.state.trial_effects), own_centre=best.problem.own_centre)
     try:
-        state = led_back(predictor, problem, replace(best.state, theta=theta), held)
-        other = solve(predictor, problem, state, held, warm=True, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
+        other = solve_onward(predictor, best, theta, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
     except SimulationError:
         return best
     return min((best, other), key=_deviance) if not is_poor_fit(predictor, other) else best
@@ -259,6 +257,43 @@ def solve_from(
     return solve(
         predictor, make_problem(predictor, trial_effects), state, held, most_iterations=most_iterations, watch=watch
     )
+
+
+def solve_onward(
+    predictor: Predictor,
+    before: Solution,
+    theta: Floats,
+    held: FixedTerms,
+    *,
+    most_iterations: int = MOST_ITERATIONS,
+    watch: Watch | None = None,
+) -> Solution:
+    """Solve from other numbers with the trial effects, spreads and noise of a solution.
+
+    Parameters
+    ----------
+    predictor : of the same trials.
+    before : the solution, of the same model or of another.
+    theta : array, shape (n_free,)
+        Numbers to begin from, scaled.
+    held : spreads and noise that are not estimated.
+    most_iterations : int
+        Steps at most.
+    watch : callable, optional
+        Called with each step.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    SimulationError
+        If the model cannot be followed.
+    """
+    problem = replace(make_problem(predictor, before.state.trial_effects), own_centre=before.problem.own_centre)
+    state = led_back(predictor, problem, replace(before.state, theta=theta), held)
+    return solve(predictor, problem, state, held, warm=True, most_iterations=most_iterations, watch=watch)
 
 
 def solve_again(
