@@ -11,7 +11,7 @@ from by_hand import BARE, LOADED, Vine, simulated, whole_catalogue
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics.equations import TrialArrays
 from vinetrack.dynamics.force_terms import evaluate
-from vinetrack.dynamics.kernel import kernel
+from vinetrack.dynamics.kernel import PACKAGE, kernel, sum_source
 from vinetrack.dynamics.model import Model, base_model, effects_on
 from vinetrack.dynamics.simulate import simulate, trial_inputs
 from vinetrack.effects import catalogue
@@ -46,6 +46,13 @@ def test_each_effect(name: str, vine: Vine) -> None:
     terms = evaluate(model, trial, time, y, v)
     chamber = terms.pressure_Pa if name == "supply_refill" else None
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
+
+
+def test_copies_of_the_package_share_what_is_compiled() -> None:
+    """The text of a kernel, and with it its name in the cache, does not say where the package stands."""
+    text = sum_source(whole_catalogue({}).effects)
+    assert "PACKAGE / 'effects/air_drag.py'" in text
+    assert str(PACKAGE) not in text
 
 
 def test_all_together() -> None:

@@ -18,7 +18,9 @@ from hidden.questions import outsider_values, true_effects
 from hidden.verify import FRAME_S, SIZES, ours, trials
 
 import vinetrack as vt
-from vinetrack.dynamics.model import Model, make_model
+from vinetrack.diagnosis.initial_fit import host_for
+from vinetrack.dynamics.model import Model
+from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import catalogue
 from vinetrack.inference.fit_data import pairs_of
 
@@ -36,23 +38,20 @@ def test_every_candidate_that_a_release_can_show_is_hidden_in_some_campaign():
 
 
 def with_only(effect: str) -> Model:
-    """The whole catalogue with one effect at its size and all others at none: compiled once for all tests here."""
-    whole = make_model(name for name in catalogue() if name not in ("static_yield", *WRITTEN_OUT))
-    none = {
-        f"{one.name}.{parameter.name}": parameter.zero
-        for one in whole
-        for parameter in one.parameters
-        if one.kind != "base"
-    }
+    """The base model with one effect at its size."""
+    model = vt.base_model() + effect if effect else vt.base_model()
     size = {f"{effect}.{name}": value for name, value in SIZES[effect][1].items()}
-    return whole.with_values({**none, "eversion_damping.B": B, "eversion_damping.n": N, **size})
+    return model.with_values({"eversion_damping.B": B, "eversion_damping.n": N, **size})
 
 
 @pytest.mark.parametrize("effect", SIZES, ids=lambda effect: effect or "base")
 def test_two_simulators_agree(effect):
     for rig in ("payload, down", "horizontal, slow", "bent"):
         trial = trials()[rig]
-        theirs = vt.simulate(with_only(effect), trial, TIMES, relative_tolerance=1e-7).observed_position_m
+        model = with_only(effect)
+        # In the compiled model of the diagnoses, all its other effects at rest.
+        host = host_for(model)
+        theirs = simulate_many(model, [trial], [TIMES], host=host, relative_tolerance=1e-7)[0].observed_position_m
         other = ours(effect, trial, TIMES, B, N)
         seen = np.isfinite(other)
         assert np.nanmax(other) > 0.2 * trial.length_m
@@ -80,7 +79,9 @@ def test_a_force_of_no_catalogue_is_the_one_that_scoring_knows(name):
     truth = replace(make("null:few_trials", 900).truth, outsider=name, physics=physics)
     values = {"eversion_damping.B": B, "eversion_damping.n": N, **outsider_values(truth)}
     model = (vt.base_model() + true_effects((), name)[0]).with_values(values)
-    theirs = vt.simulate(model, trial, TIMES, relative_tolerance=1e-7).lead_position_m
+    # In one compiled model for all of them.
+    host = Model((*vt.base_model(), *(true_effects((), outsider)[0] for outsider in OUTSIDERS)))
+    theirs = simulate_many(model, [trial], [TIMES], host=host, relative_tolerance=1e-7)[0].lead_position_m
     seen = other[:, 1] < 0.95 * trial.length_m
     plain, _ = follow(TIMES, tube, Physics(B=B, n=N), np.empty((0, 3)))
     assert np.max(np.abs(other[seen, 1] - plain[seen, 1])) > 1e-3

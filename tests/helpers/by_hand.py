@@ -1,6 +1,7 @@
 """A vine followed by SciPy from an equation that a test writes out in full, and the same vine by the compiled model.
 
-One compiled model serves all tests: the whole catalogue, with every effect at no size that the test does not name.
+One compiled model serves all tests: that of the diagnoses, the whole catalogue with every effect at no size that the
+test does not name.
 Nothing here but `simulated` uses the package's own physics.
 """
 
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
-from vinetrack.dynamics.model import Model, make_model
+from vinetrack.diagnosis.initial_fit import host_for
+from vinetrack.dynamics.model import Model, base_model, make_model
 from vinetrack.dynamics.simulate import Trace, Trajectory, simulate
-from vinetrack.effects import catalogue
 
 G = 9.81
 ATM = 101_325.0
@@ -82,7 +83,7 @@ LEVEL = Vine(D=24e-3, t=200e-6, L=0.28, P=28e3, P_y=3e3, B=6.44, payload=35.6e-3
 
 def whole_catalogue(sizes: Mapping[str, float], names: Sequence[str] | None = None) -> Model:
     """Every effect at no size but those whose sizes are given, and the base effects."""
-    model = make_model(names or catalogue())
+    model = make_model(names) if names else host_for(base_model())
     nothing = {f"{e.name}.{p.name}": p.zero for e in model for p in e.parameters if e.kind != "base"}
     return model.with_values({**nothing, **sizes})
 

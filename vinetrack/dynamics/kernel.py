@@ -23,6 +23,8 @@ from vinetrack.core import constants
 from vinetrack.dynamics.integrator import BATCH
 from vinetrack.effects import Effect, TrialInputs
 
+PACKAGE = Path(__file__).parents[1]
+
 PARTS = ("equations.py", "radau.py", "slack_tail.py", "row_readout.py", "integrator.py")
 """Files of the integrator, which the compiled form of a model holds too: an edit of one must compile anew."""
 
@@ -32,6 +34,7 @@ from pathlib import Path
 
 from numba import njit
 
+import vinetrack
 from vinetrack.dynamics.equations import (
     Equations, angle_passed, compiled, never_slack, no, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
     not_slack_at_rest, trace_at, yes,
@@ -39,6 +42,8 @@ from vinetrack.dynamics.equations import (
 from vinetrack.dynamics.integrator import integrate_trials
 from vinetrack.dynamics.slack_tail import follow_slack, slack_at_rest, slack_fraction
 from vinetrack.effects import State, TrialInputs, load_effect
+
+PACKAGE = Path(vinetrack.__file__).parent
 
 '''
 
@@ -99,7 +104,7 @@ class _Writer:
                 continue
             arguments = "".join(f", theta[{offsets[i] + j}]" for j in range(len(effect.parameters)))
             name = f"{effect.name}__{hook}"
-            self.loads[name] = f"{name} = compiled(load_effect(Path({str(effect.path)!r})).functions[{hook!r}])"
+            self.loads[name] = f"{name} = compiled(load_effect({_place(effect.path)}).functions[{hook!r}])"
             # A measured trace already holds what happens in the chamber.
             condition = f"on[{i}] and not measured" if effect.in_trace else f"on[{i}]"
             lines += [f"if {condition}:", f"    {target.format(call=f'{name}({state}, rig{arguments})')}"]
@@ -158,6 +163,13 @@ class _Writer:
             measured="False" if at_release else "trial.trace_time.size > 0",
             body="\n".join(f"    {line}" for line in lines),
         )
+
+
+def _place(path: Path) -> str:
+    """Where an effect's file is, in Python: those of the package wherever it stands, so that every copy shares them."""
+    if path.is_relative_to(PACKAGE):
+        return f"PACKAGE / {path.relative_to(PACKAGE).as_posix()!r}"
+    return f"Path({str(path)!r})"
 
 
 def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
