@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +16,7 @@ from by_hand import BARE, LOADED, Vine, simulated, whole_catalogue
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics.equations import TrialArrays
 from vinetrack.dynamics.force_terms import evaluate
-from vinetrack.dynamics.kernel import PACKAGE, kernel, sum_source
+from vinetrack.dynamics.kernel import PACKAGE, kernel
 from vinetrack.dynamics.model import Model, base_model, effects_on
 from vinetrack.dynamics.simulate import simulate, trial_inputs
 from vinetrack.effects import catalogue
@@ -48,11 +53,30 @@ def test_each_effect(name: str, vine: Vine) -> None:
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
 
 
-def test_copies_of_the_package_share_what_is_compiled() -> None:
-    """The text of a kernel, and with it its name in the cache, does not say where the package stands."""
-    text = sum_source(whole_catalogue({}).effects)
-    assert "PACKAGE / 'effects/air_drag.py'" in text
-    assert str(PACKAGE) not in text
+FALL = """
+import numpy as np
+import vinetrack as vt
+from vinetrack.core.records import Trial
+trial = Trial(name="ball", travel_ratio=1.0, payload_kg=1.0)
+model = vt.base_model() - "pressure_drive" - "eversion_damping" - "yield_pressure"
+print(vt.simulate(model, trial, np.linspace(0, 0.2, 5)).lead_position_m.tolist())
+"""
+
+
+def test_copies_of_the_package_share_what_is_compiled(tmp_path: Path) -> None:
+    copy, cache = tmp_path / "elsewhere", tmp_path / "cache"
+    shutil.copytree(PACKAGE, copy / "vinetrack", ignore=shutil.ignore_patterns("__pycache__"))
+    said, compiled = [], []
+    for place in (PACKAGE.parent, copy):
+        environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache)}
+        run = subprocess.run(
+            [sys.executable, "-c", FALL], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        said.append(run.stdout)
+        compiled.append(sorted((path.name, path.stat().st_mtime_ns) for path in cache.rglob("kernel_*")))
+    assert said[0] == said[1]
+    assert compiled[0] == compiled[1]
+    assert any(name.endswith(".nbc") for name, _ in compiled[0])
 
 
 def test_all_together() -> None:

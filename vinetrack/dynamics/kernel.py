@@ -165,6 +165,11 @@ class _Writer:
         )
 
 
+def _modules(effect: Effect) -> list[str]:
+    """Names of the modules from which the functions of an effect come."""
+    return sorted({function.__module__ for function in effect.functions.values()})
+
+
 def _place(path: Path) -> str:
     """Where an effect's file is, in Python: those of the package wherever it stands, so that every copy shares them."""
     if path.is_relative_to(PACKAGE):
@@ -278,7 +283,8 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     parts = [source, *(Path(__file__).with_name(name).read_text(encoding="utf-8") for name in PARTS)]
     parts += [inspect.getsource(part) for part in (sys.modules[Effect.__module__], constants)]
     parts += [numba.__version__, sys.version]
-    parts += [effect.path.read_text() for effect in effects]
+    # What is compiled names the modules of its effects, and is of use only where they have the same names.
+    parts += [text for effect in effects for text in (effect.path.read_text(), *_modules(effect))]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
     path = _cache_folder() / f"kernel_{digest}.py"
     if not path.is_file():

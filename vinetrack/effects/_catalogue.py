@@ -32,7 +32,8 @@ class EffectError(UserError, ValueError):
 def _load_module(path: Path) -> ModuleType:
     """Run one effect file and return it as a module.
 
-    It is entered in `sys.modules` under a name made of its path and text: the compiled form of a model looks there.
+    It is entered in `sys.modules` under a name made of its place and text: the compiled form of a model looks there.
+    The place of an effect of the catalogue is that in the package: copies of the package share what is compiled.
 
     Raises
     ------
@@ -41,7 +42,9 @@ def _load_module(path: Path) -> ModuleType:
     """
     if not path.is_file():
         raise EffectError(f"{path}: there is no such effect file; `effects:` lists paths of Python files.")
-    digest = hashlib.sha256(str(path.resolve()).encode() + path.read_bytes()).hexdigest()[:12]
+    whole, package = path.resolve(), Path(__file__).resolve().parents[1]
+    place = whole.relative_to(package).as_posix() if whole.is_relative_to(package) else str(whole)
+    digest = hashlib.sha256(place.encode() + path.read_bytes()).hexdigest()[:12]
     name = f"vinetrack_effect_{path.stem}_{digest}"
     if name in sys.modules:
         return sys.modules[name]
