@@ -24,9 +24,12 @@ from lsoda_vine import (
 )
 
 import vinetrack as vt
-from vinetrack.core.records import Track, Trial
+from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.inference import solving
+from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.optimiser import Step
+from vinetrack.inference.optimiser import FixedTerms, Solution, Step, solve
+from vinetrack.inference.sensitivity import Predictor
 
 Campaign = tuple[Fit, list[tuple[Trial, Track]], list[dict[str, float]]]
 
@@ -55,6 +58,27 @@ def ball(seed: int, first_frame: int = 0, count: int = 120) -> tuple[Trial, Trac
     time_s = np.arange(first_frame, first_frame + count) / 240
     fallen = 0.5 * 9.80665 * np.maximum(time_s - 0.0513, 0) ** 2
     return trial, as_track(time_s, 0.02 + fallen + 2e-4 * draw.standard_normal(count))
+
+
+def test_what_passes_for_slow_noise_is_found_by_the_likelihood(
+    campaign: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Numbers off by a little, all that they miss taken for noise that wanders: the likelihood is no maximum there."""
+    fit, pairs, _ = campaign
+
+    def stuck(predictor: Predictor, theta: Floats, trial_effects: Floats, held: FixedTerms, **_: object) -> Solution:
+        off = fit.solution.state.theta + 0.001
+        variance = np.full(len(pairs), (2e-3) ** 2 * (1 - 0.9998**2))
+        state = replace(fit.solution.state, theta=off, spread=(1e-5, 1e-5), rho=0.9998, variance=variance)
+        slow = FixedTerms(spread=(1e-5, 1e-5), noise=(0.9998, variance))
+        solution = solve(predictor, make_problem(predictor, state.trial_effects), state, slow, most_iterations=0)
+        assert solution.state.rho > 0.99 and not solving.is_poor_fit(predictor, solution)
+        return solution
+
+    monkeypatch.setattr(solving, "solve_from", stuck)
+    again = vt.fit(vt.base_model(), pairs, profile=False)
+    assert again.log_likelihood == pytest.approx(fit.log_likelihood, abs=0.1)
+    assert again.noise_correlation == pytest.approx(fit.noise_correlation, abs=0.01)
 
 
 def test_the_numbers_of_a_campaign_are_found_within_their_errors(campaign: Campaign) -> None:

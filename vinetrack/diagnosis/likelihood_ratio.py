@@ -118,7 +118,7 @@ def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> Like
 
 
 def _compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
-    """That a size is smaller than its own error, in words; blank where none is.
+    """That a size is nothing, or smaller than its own error, in words; blank where none is.
 
     Such a fit is better by the shape that its other numbers give it, not by an effect of which anything is known.
     """
@@ -127,7 +127,7 @@ def _compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
         for parameter in () if effect.kind == BETWEEN_TRIALS else effect.parameters[:1]:
             for number in after.numbers:
                 known = number.key == f"{effect.name}.{parameter.name}" and math.isfinite(number.sigma)
-                if known and 0 < abs(number.value - parameter.zero) < LEAST_SIGMAS * number.sigma:
+                if known and abs(number.value - parameter.zero) < LEAST_SIGMAS * number.sigma:
                     return (
                         f"its size, {number.symbol} = {number.value:.2g} ± {number.sigma:.2g}, is compatible with none"
                     )

@@ -26,7 +26,7 @@ from vinetrack.inference.marginal_likelihood import deviance, marginal
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
-from vinetrack.inference.solving import is_poor_fit
+from vinetrack.inference.solving import SLOW_NOISE, is_poor_fit
 from vinetrack.inference.starts import align, one_of_each_condition
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]
@@ -46,9 +46,6 @@ MOST_CLIMBED = 14
 FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
 """Iterations of a full fit at first and in all, and how far behind the best in −2 ln L it is given up. Chosen for
 time."""
-
-SLOW_NOISE = 0.99
-"""Noise correlation above which a fit has taken misfit for noise. Chosen: a correlation time of a hundred frames."""
 
 LOWER, LOWER_PER_POINT = 1.0, 0.02
 """By how much −2 ln L of a climb must end lower for its start to be worth a fit. Chosen: unsettled iterations differ
