@@ -24,7 +24,7 @@ from lsoda_vine import (
 )
 
 import vinetrack as vt
-from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.core.records import Track, Trial
 from vinetrack.inference import solving
 from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit
@@ -66,13 +66,13 @@ def test_what_passes_for_slow_noise_is_found_by_the_likelihood(
     """Numbers off by a little, all that they miss taken for noise that wanders: the likelihood is no maximum there."""
     fit, pairs, _ = campaign
 
-    def stuck(predictor: Predictor, theta: Floats, trial_effects: Floats, held: FixedTerms, **_: object) -> Solution:
+    def stuck(predictor: Predictor, *_: object, **__: object) -> Solution:
         off = fit.solution.state.theta + 0.001
         variance = np.full(len(pairs), (2e-3) ** 2 * (1 - 0.9998**2))
         state = replace(fit.solution.state, theta=off, spread=(1e-5, 1e-5), rho=0.9998, variance=variance)
         slow = FixedTerms(spread=(1e-5, 1e-5), noise=(0.9998, variance))
         solution = solve(predictor, make_problem(predictor, state.trial_effects), state, slow, most_iterations=0)
-        assert solution.state.rho > 0.99 and not solving.is_poor_fit(predictor, solution)
+        assert not solving.is_poor_fit(predictor, solution)
         return solution
 
     monkeypatch.setattr(solving, "solve_from", stuck)
