@@ -46,6 +46,17 @@ def test_files_extras_and_targets_that_jobs_name_exist() -> None:
 def test_profiles_hold_options_that_snakemake_knows(profile: str) -> None:
     from snakemake.cli import get_argument_parser
 
+    if profile == "slurm":
+        pytest.importorskip("snakemake_executor_plugin_slurm")
     known = {word.lstrip("-") for action in get_argument_parser()._actions for word in action.option_strings}
     settings = yaml.safe_load((ROOT / "profiles" / profile / "config.yaml").read_text(encoding="utf-8"))
     assert set(settings) <= known
+
+
+def test_the_profile_for_a_cluster_names_rules_that_are_there() -> None:
+    settings = yaml.safe_load((ROOT / "profiles" / "slurm" / "config.yaml").read_text(encoding="utf-8"))
+    workflow = (ROOT / "vinetrack" / "pipeline" / "Snakefile").read_text(encoding="utf-8")
+    rules = set(re.findall(r"^ *rule (\w+):", workflow, re.MULTILINE))
+    grouped = dict(entry.split("=") for entry in settings["groups"])
+    assert {*settings["set-resources"], *grouped} <= rules
+    assert {entry.split("=")[0] for entry in settings["group-components"]} == set(grouped.values())

@@ -91,6 +91,13 @@ def test_a_process_number_given_to_another_program_is_not_the_run(tmp_path: Path
     assert json.loads(entry.read_text())["pid"] == os.getpid()
 
 
+def test_a_run_that_ends_in_another_folder_leaves_no_entry(tmp_path: Path) -> None:
+    """Snakemake with --directory is back where it was called when its process ends."""
+    short = "\n".join(BEGIN.splitlines()[:5]) + '\nassert Path("results/vines/.run.json").is_file()\nos.chdir(os.sep)'
+    subprocess.run([sys.executable, "-c", short], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+    assert not (tmp_path / "results" / "vines" / ENTRY).exists()
+
+
 def test_a_run_on_another_computer_counts_as_alive(tmp_path: Path) -> None:
     entry = tmp_path / "results" / "vines" / ENTRY
     begin(tmp_path)

@@ -113,7 +113,7 @@ def begin_run(results: Path, experiment: Path, working: Path, say: Callable[[str
         If another run that is still alive writes these results, naming its process.
     """
     refuse_running(results)
-    entry = results / ENTRY
+    entry = (results / ENTRY).absolute()  # Snakemake may end in another folder
     owner = _owner(entry)
     if owner is not None and owner.pid != os.getpid() and _remove_locks(working, results):
         say(f"{TAKEN_AWAY} (process {owner.pid}) is taken away; what it finished is kept.")
