@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
@@ -54,6 +55,27 @@ def test_the_command_writes_the_same_as_json(folder: Path, tmp_path: Path) -> No
     assert 0 < leak["size_50"] < leak["size_90"]
     assert "nine times in ten" in result.output
     assert figure.stat().st_size > 10_000
+
+
+def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "trials.csv").write_text(SHEET)
+    (tmp_path / "experiment.yaml").write_text(SETTINGS + "limits: {pressure_kPa: 14:40, new_vines: no}\n")
+    now = power_of_target(PowerAsked(folder))["leak"]
+    rows, size = tmp_path / "more.csv", f"leak={0.7 * now.size_at(0.9):.4g}"
+    arguments = ["power", str(tmp_path), "--effect", size, "--reach", "0.9", "--sheet", str(rows)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "of campaigns" in result.output
+    (tmp_path / "trials.csv").write_text(
+        pd.concat([pd.read_csv(folder / "trials.csv"), pd.read_csv(rows)]).to_csv(index=False)
+    )
+    again = power_of_target(PowerAsked(tmp_path))["leak"]
+    assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88
+
+
+def test_trials_to_add_need_a_size(folder: Path) -> None:
+    with pytest.raises(ExperimentError, match="needs a size"):
+        power_of_target(PowerAsked(folder, ("leak",), reach=0.9))
 
 
 def test_an_effect_that_is_no_candidate_is_refused(folder: Path) -> None:

@@ -6,13 +6,11 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from vinetrack.core.records import Trial
 from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_data import FitTrial
 from vinetrack.planning.feasible_trials import NEW_VINE, OTHER_RIG, SAME_RIG, Condition, conditions
 
 
@@ -31,10 +29,8 @@ def trial(pressure_kPa: float, **more: Any) -> Trial:
 
 
 def looked_at(trials: list[Trial], **limits: Any) -> list[Condition]:
-    """Conditions for an experiment of these trials; what their tracks show does not matter."""
-    time_s = np.arange(10) * 1e-3
-    data = [FitTrial(one, time_s, time_s, np.arange(10) == 0, 5, 1e-4, 0.0) for one in with_names(trials)]
-    return conditions(data, Limits(**limits))
+    """Conditions for an experiment of these trials."""
+    return conditions(with_names(trials), Limits(**limits))
 
 
 def values(found: list[Condition], name: str, unit: float) -> set[float]:

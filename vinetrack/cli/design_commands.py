@@ -312,6 +312,9 @@ def _campaign(
     effects: Effects = None,
     check: Annotated[int, typer.Option("--check", min=0, max=1000, help="Simulated campaigns that try it.")] = 20,
     seed: Seed = 1,
+    power: Annotated[
+        bool, typer.Option("--power", help="Say what the campaign could see of other effects, too.")
+    ] = False,
     sheet: Annotated[
         Path | None,
         typer.Option("--sheet", help="Write a sheet to film by, to this file.", rich_help_panel=OUT,
@@ -353,6 +356,7 @@ def _campaign(
             burst_share=burst_share,
             check=check,
             seed=seed,
+            power=power,
         )
         lines = fit_heading(asked) + design_campaign(asked, wanted, sheet=sheet, figure=figure)
         tell(lines, {"lines": lines}, json_file)

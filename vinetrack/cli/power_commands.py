@@ -11,7 +11,7 @@ import typer
 from vinetrack.cli.design_options import INPUTS, OUT, FigurePath, LogPath
 from vinetrack.cli.output import MORE, tell
 
-SIMULATION = "Simulation"
+SIMULATION, FURTHER = "Simulation", "What to add"
 
 
 def register(app: typer.Typer) -> None:
@@ -83,6 +83,16 @@ def _power(
         typer.Option("--answers", metavar="FILE", rich_help_panel=SIMULATION, show_default=False,
                      help="CSV that keeps the answers; what it has is not simulated again."),
     ] = None,
+    reach: Annotated[
+        float | None,
+        typer.Option("--reach", min=0.5, max=0.98, metavar="PROBABILITY", rich_help_panel=FURTHER, show_default=False,
+                     help="Look for the fewest further trials that find each --effect NAME=SIZE so often."),
+    ] = None,
+    sheet: Annotated[
+        Path | None,
+        typer.Option("--sheet", metavar="FILE", rich_help_panel=FURTHER, show_default=False,
+                     help="Write their rows of the sheet to this file, with --reach."),
+    ] = None,
     experiment: Annotated[
         Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
     ] = None,
@@ -98,7 +108,10 @@ def _power(
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
-        from vinetrack.pipeline.power_stage import PowerAsked, power_of_target
+        import pandas as pd
+
+        from vinetrack.core.tables import write_csv
+        from vinetrack.pipeline.power_stage import PowerAsked, power_of_target, sheet_rows
         from vinetrack.pipeline.prediction_inputs import check_figure, write_figure
 
         check_figure(figure)
@@ -117,6 +130,7 @@ def _power(
                 jobs=jobs,
                 first_seed=seed,
                 answers=answers,
+                reach=_or_nan(reach),
                 experiment=experiment,
             )
         )
@@ -124,6 +138,9 @@ def _power(
         if figure is not None:
             write_figure(power.plot(), figure)
             lines.append(f"Figure: {figure}")
+        if sheet is not None and power.further:
+            write_csv(sheet, pd.DataFrame(sheet_rows(power)))
+            lines.append(f"Rows of the sheet: {sheet}")
         tell(lines, power.to_json(), json_file)
 
 

@@ -124,6 +124,41 @@ def power_of(
     )
 
 
+def effect_power(questions: MisfitTests, name: str) -> EffectPower | None:
+    """Work out what the trials of a fit can see of one candidate, beside all others.
+
+    Parameters
+    ----------
+    questions : the fit, held against all candidates.
+    name : of the effect.
+
+    Returns
+    -------
+    EffectPower or None
+        As in `power_of` with `curved`; None where no score answers to it.
+    """
+    responses = _responses(questions, curved=True, only=name)
+    if not responses:
+        return None
+    return _effect_power(questions, responses[0], _joint_draws(questions), spread_widening(questions))
+
+
+def typical_place(questions: MisfitTests, name: str) -> int:
+    """The place of the shape that an effect is followed in.
+
+    Parameters
+    ----------
+    questions : the fit, held against candidates.
+    name : of an effect among them to which a trial answers.
+
+    Returns
+    -------
+    int
+    """
+    effect = next(effect for effect in questions.effects if effect.name == name)
+    return _typical_places(questions, effect)[-1]
+
+
 def inputs_of_fit(fit: Fit) -> tuple[PowerInput, ...]:
     """Noise and between-trial spreads that a fit estimated, or was told.
 
@@ -144,12 +179,14 @@ def inputs_of_fit(fit: Fit) -> tuple[PowerInput, ...]:
     return tuple(rows)
 
 
-def _responses(questions: MisfitTests, *, curved: bool) -> list[_Response]:
-    """Expected scores by size, from the information between shapes; one response an effect."""
+def _responses(questions: MisfitTests, *, curved: bool, only: str = "") -> list[_Response]:
+    """Expected scores by size, from the information between shapes; one response an effect, of all or of one."""
     information = questions.scores.information
     root = np.sqrt(np.maximum(np.diag(information), 1e-300))
     responses = []
     for effect in questions.effects:
+        if only not in ("", effect.name):
+            continue
         places = _typical_places(questions, effect)
         if not places:
             continue

@@ -186,7 +186,7 @@ def _hypothesis_names(tied: Sequence[Fit]) -> list[str]:
 def _bench(tied: Sequence[Fit], names: Sequence[str], limits: Limits) -> tuple[Bench, list[Side]]:
     """Hypotheses, every condition worth filming, and what a trial of each would answer."""
     data = tied[0].predictor.data
-    every = conditions(data, limits)
+    every = conditions([trial_data.trial for trial_data in data], limits)
     if not every:
         return Bench((), (), ()), []
     cameras = [camera_of(data, condition.like) for condition in every]

@@ -14,6 +14,8 @@ import numpy as np
 
 from vinetrack.core.notebook import plot
 from vinetrack.core.numbers import or_nan
+from vinetrack.core.records import Trial
+from vinetrack.experiment.schema import COLUMNS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -215,13 +217,102 @@ class SimulatedRates:
 
 
 @dataclass(frozen=True)
+class AddedTrial:
+    """A trial to make, what of the rig changes for it, and the probability once it is made too."""
+
+    trial: Trial
+    changed: tuple[str, ...]
+    new_vine: bool
+    probability: float
+
+
+@dataclass(frozen=True)
+class FurtherTrials:
+    """Trials that bring an effect of one size to a wanted probability of being found.
+
+    `before` is the probability with the trials so far; `endless` that with the best of all trials within the limits,
+    made without end; `looked_at` counts the conditions. `trials` come in the order in which they help most; empty where
+    none is needed, or none helps. `needed` tells how many trials it takes by what they ask for: the rig so far, another
+    rig, a new vine. `power` is that of all trials together.
+    """
+
+    effect: str
+    parameter: str
+    symbol: str
+    unit: str
+    value: float
+    reach: float
+    before: float
+    endless: float = math.nan
+    looked_at: int = 0
+    trials: tuple[AddedTrial, ...] = ()
+    needed: Mapping[str, int] = field(default_factory=dict)
+    power: EffectPower | None = None
+
+    @property
+    def after(self) -> float:
+        """Probability once all trials are made."""
+        return self.trials[-1].probability if self.trials else self.before
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether the wanted probability is reached."""
+        return self.after >= self.reach
+
+    def to_json(self) -> dict[str, Any]:
+        """As the key `further_trials` of what `vinetrack power --json` writes."""
+        return {
+            "effect": self.effect,
+            "parameter": self.parameter,
+            "unit": self.unit,
+            "value": self.value,
+            "wanted": self.reach,
+            "probability_before": self.before,
+            "probability_after": self.after,
+            "probability_endless": self.endless,
+            "conditions_looked_at": self.looked_at,
+            "needed": dict(self.needed),
+            "taken_for": dict(self.power.taken_for) if self.power else {},
+            "trials": [
+                {
+                    **sheet_cells(added.trial),
+                    "vine": added.trial.vine,
+                    "changed": list(added.changed),
+                    "new_vine": added.new_vine,
+                    "probability": added.probability,
+                }
+                for added in self.trials
+            ],
+        }
+
+
+def sheet_cells(trial: Trial) -> dict[str, float]:
+    """Return the cells of the sheet that tell how a further trial is set, blank ones left out.
+
+    Parameters
+    ----------
+    trial : to make.
+
+    Returns
+    -------
+    dict
+        By column.
+    """
+    names = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa", "yield_pressure_kPa", "payload_g",
+             "chamber_l", "inlet_mm", "growth_angle_deg", "capture_fps")  # fmt: skip
+    cells = {name: COLUMNS[name].of_trial(trial) for name in names}
+    return {name: float(f"{value:.6g}") for name, value in cells.items() if math.isfinite(value)}
+
+
+@dataclass(frozen=True)
 class Power:
     """What the trials of a campaign can see of every candidate. Printed, it is what a person reads on the terminal.
 
     `threshold` is the score, in standard errors, that a candidate tried in one shape must exceed. `false_alarms` maps
     each test to the chance at which it takes nothing for something; they add up at most. `not_testable` maps other
     candidates to the reason why they cannot be seen. `wary` tells why the sizes are not to be trusted, blank where
-    they are. `simulated` are rates of complete diagnoses, where campaigns were simulated.
+    they are. `simulated` are rates of complete diagnoses, where campaigns were simulated, and `further` the trials that
+    would find an effect more often, where they were asked for.
     """
 
     n_trials: int
@@ -234,6 +325,7 @@ class Power:
     model: tuple[str, ...] = ()
     wary: str = ""
     simulated: tuple[SimulatedRates, ...] = ()
+    further: tuple[FurtherTrials, ...] = ()
 
     @property
     def false_alarm_rate(self) -> float:
@@ -288,6 +380,7 @@ class Power:
             "wary": self.wary,
             "simulated": [rates.to_json() for rates in self.simulated],
             "in_words": [false_alarm_sentence(self), *could_have_seen(self)],
+            **({"further_trials": [plan.to_json() for plan in self.further]} if self.further else {}),
         }
 
     @classmethod

@@ -11,7 +11,7 @@ from vinetrack.core.units import display_unit
 from vinetrack.narrative.verdict_summary import joined, listed, plain
 
 if TYPE_CHECKING:
-    from vinetrack.diagnosis.power import EffectPower, NumberWidth, Power
+    from vinetrack.diagnosis.power import EffectPower, FurtherTrials, NumberWidth, Power
 
 HARDLY_EVER = 0.1
 """Probability below which an effect is found "hardly ever". Chosen: one campaign in ten; with one in twenty the size
@@ -249,17 +249,40 @@ def power_lines(power: Power) -> list[str]:
     lines += [f"  {entry.name}: {entry.value} ({entry.origin})" for entry in power.inputs]
     if power.wary:
         lines.append(f"! {power.wary}")
-    rows = [HEAD, *power_rows(sorted(power.effects, key=lambda entry: (not entry.is_visible, entry.effect)))]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(HEAD))]
-    lines += [
-        ("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))).rstrip() for row in rows
-    ]
+    lines += _size_table(power.effects)
     lines += [f"  not testable: {plain(name)}: {why}" for name, why in power.not_testable.items()]
     lines += [effect_sentence(entry, power.n_trials) for entry in _told(power)]
     lines += [false_alarm_sentence(power)]
     if power.numbers:
         lines.append(f"95 % intervals: {', '.join(map(width_text, power.numbers))}.")
+    for plan in power.further:
+        lines += ["", *further_lines(plan)]
     return lines + simulated_lines(power)
+
+
+def _size_table(effects: Sequence[EffectPower]) -> list[str]:
+    """A row an effect, those that can be seen first."""
+    rows = [HEAD, *power_rows(sorted(effects, key=lambda entry: (not entry.is_visible, entry.effect)))]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(HEAD))]
+    return [
+        ("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))).rstrip() for row in rows
+    ]
+
+
+def seen_lines(power: Power) -> list[str]:
+    """Return what a campaign designed for n and B could see of other effects.
+
+    Parameters
+    ----------
+    power : of the campaign.
+
+    Returns
+    -------
+    list of str
+    """
+    physical = [entry for entry in power.effects if entry.kind == "physical"]
+    head = f"what these {power.n_trials} trials could see of physics that their model lacks, by linear theory:"
+    return [head, *_size_table(physical), false_alarm_sentence(power)]
 
 
 def _told(power: Power) -> list[EffectPower]:
@@ -298,3 +321,71 @@ def simulated_lines(power: Power) -> list[str]:
             what + (f"; named: {named}" if named else "") + (f"; no verdict: {rates.failed}" if rates.failed else "")
         )
     return ["Simulated campaigns, diagnosed from beginning to end:", *(f"  {line}" for line in lines)] if lines else []
+
+
+def further_lines(plan: FurtherTrials) -> list[str]:
+    """Return the trials that bring an effect to the wanted probability, a row a condition, or why none do.
+
+    Parameters
+    ----------
+    plan : of further trials.
+
+    Returns
+    -------
+    list of str
+    """
+    from vinetrack.core.terminal import table
+    from vinetrack.diagnosis.power import sheet_cells
+
+    size = size_text(plan.power, plan.value) if plan.power is not None else number(plan.value, 2)
+    what = f"{plain(plan.effect)} at {plan.symbol} = {size}"
+    if plan.before >= plan.reach:
+        return [f"{what} is found in {percent(plan.before)} of campaigns with these trials: none need be added."]
+    if not plan.looked_at:
+        return [f"{what}: no further trial within `limits` can be made and filmed."]
+    count = len(plan.trials)
+    lines = [f"To find {what} in {percent(plan.reach)} of campaigns, {percent(plan.before)} now:"]
+    rows, done = [], 0
+    while done < count:
+        added = plan.trials[done]
+        same = [other for other in plan.trials[done:] if sheet_cells(other.trial) == sheet_cells(added.trial)]
+        times = next((k for k, other in enumerate(plan.trials[done:]) if other not in same), count - done)
+        cells = sheet_cells(added.trial)
+        changed = [f"{COLUMN_WORDS.get(name, name)} {cells.get(name, math.nan):g}" for name in added.changed]
+        new = ["a vine to be made"] if added.new_vine else []
+        rows.append(
+            (
+                str(times), added.trial.vine, f"{cells.get('pressure_kPa', math.nan):g}",
+                f"{cells.get('payload_g', 0.0):g}", ", ".join([*new, *changed]) or "–",
+                percent(plan.trials[done + times - 1].probability),
+            )
+        )  # fmt: skip
+        done += times
+    if rows and plan.after > plan.before:
+        head = ("trials", "vine", "pressure", "payload", "what is new", "found then")
+        lines += [f"  {line}" for line in table(rows, head, ("", "", "kPa", "g", "", ""), align="><>><>")]
+    if not plan.is_reached:
+        if plan.endless < plan.reach:
+            lines.append(
+                f"No number of trials within `limits` gets there: {plan.looked_at} kinds of trial were looked at, and "
+                f"all of them, made without end, would find it in {percent(plan.endless)}."
+            )
+        else:
+            lines.append(f"{count} further trials do not get there; more would, up to {percent(plan.endless)}.")
+    asked = {"with a new vine"} if any(added.new_vine for added in plan.trials) else set()
+    asked |= {"with another rig"} if any(added.changed for added in plan.trials) else set()
+    less = [
+        f"{words} about {needed}"
+        for words, needed in plan.needed.items()
+        if asked and words not in asked and needed >= count
+    ]
+    if plan.is_reached and less:
+        lines.append(f"Without what is new: {', '.join(less)} trials.")
+    if plan.power is not None and plan.power.taken_for:
+        taken = ", ".join(f"{plain(other)} {percent(rate)}" for other, rate in list(plan.power.taken_for.items())[:3])
+        lines.append(f"With them it would be taken for: {taken} (at the size found nine times in ten).")
+    return lines
+
+
+COLUMN_WORDS = {"chamber_l": "chamber (l)", "inlet_mm": "inlet (mm)", "growth_angle_deg": "angle (°)"}
+"""What of a rig may change from trial to trial, as it is printed."""

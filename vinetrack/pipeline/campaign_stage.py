@@ -34,7 +34,10 @@ STAND_IN_KPA = "100"
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the command asks of a campaign; errors are standard errors, that of B relative."""
+    """What the command asks of a campaign; errors are standard errors, that of B relative.
+
+    `power` asks what the campaign could see of effects beside those of its model.
+    """
 
     vines: tuple[str, ...]
     pressure: str | None
@@ -51,6 +54,7 @@ class Wanted:
     burst_share: float
     check: int
     seed: int
+    power: bool = False
 
 
 def _read_vine(text: str) -> dict[str, str]:
@@ -121,6 +125,8 @@ def design_campaign(
     if simulated is not None:
         lines += simulation_lines(planned, simulated)
     shown = planned.best or planned.nearest
+    if wanted.power:
+        lines += _seen(planned.candidates, shown, vine_inputs, camera)
     if sheet is not None:
         write_csv(sheet, _film_sheet(planned.candidates, shown, wanted))
         lines.append(f"Sheet, in an order drawn at random: {sheet}")
@@ -179,6 +185,31 @@ def _simulated(
             seed=wanted.seed,
             watch=bar.advance,
         )
+
+
+def _seen(shown: Candidates, design: Plan, vine_inputs: Sequence[PredictiveInputs], camera: FilmingPlan) -> list[str]:
+    """What the campaign could see of effects that are not in its model."""
+    from vinetrack.core.terminal import waiting
+    from vinetrack.diagnosis.campaign_power import CampaignDesign, design_power
+    from vinetrack.inference.fit_data import FitError
+    from vinetrack.narrative.power_text import seen_lines
+    from vinetrack.planning.campaign_design import trials_of
+
+    trials = tuple(trials_of(shown, design))
+    count = len(trials)
+    campaign = CampaignDesign(
+        model=shown.model,
+        trials=trials,
+        cameras=(camera,) * count,
+        spreads=vine_inputs[0].spreads,
+        tracker_sigma_m=(math.nan,) * count,
+        has_trace=(False,) * count,
+    )
+    try:
+        with waiting("working out what the campaign can see"):
+            return ["", *seen_lines(design_power(campaign))]
+    except FitError as error:
+        raise ResultsError(str(error)) from None
 
 
 def _film_sheet(shown: Candidates, design: Plan, wanted: Wanted) -> pd.DataFrame:

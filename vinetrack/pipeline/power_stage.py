@@ -6,15 +6,16 @@ import csv
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, design_power, fit_power
-from vinetrack.diagnosis.power import Power, PowerInput, SimulatedRates
+from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
 from vinetrack.experiment.provenance import PROVENANCE
+from vinetrack.experiment.settings import Limits
 from vinetrack.pipeline.pool import as_they_come
 from vinetrack.planning.campaign_information import FilmingPlan, joint_model
 
@@ -35,6 +36,7 @@ class PowerAsked:
     """What stands on the command line; NaN and None where nothing is said. Spreads are relative.
 
     `effects` are names, or `name=size` in the unit of the parameter; with `simulate`, campaigns are made with them.
+    With `reach`, a probability, the fewest further trials are looked for that find each of them so often.
     """
 
     target: Path
@@ -50,15 +52,17 @@ class PowerAsked:
     jobs: int = 1
     first_seed: int = 1
     answers: Path | None = None
+    reach: float = math.nan
     experiment: Path | None = None
 
 
 @dataclass(frozen=True)
 class _Campaign:
-    """The power of a campaign by linear theory, and the design to simulate it from."""
+    """The power of a campaign by linear theory, the design to simulate it from, and what further trials could be."""
 
     power: Power
     design: CampaignDesign
+    limits: Limits = field(default_factory=Limits)
 
 
 def power_of_target(asked: PowerAsked, given: Fit | Pairs | None = None) -> Power:
@@ -90,7 +94,44 @@ def power_of_target(asked: PowerAsked, given: Fit | Pairs | None = None) -> Powe
             _refuse(name, power)
     if asked.simulate:
         power = replace(power, simulated=tuple(_simulated(asked, campaign)))
+    if math.isfinite(asked.reach):
+        power = replace(power, further=tuple(_further(asked, campaign)))
     return power.of_effects(names)
+
+
+def _further(asked: PowerAsked, campaign: _Campaign) -> Iterator[FurtherTrials]:
+    """The fewest further trials for every effect that has a size."""
+    from vinetrack.core.terminal import waiting
+    from vinetrack.diagnosis.further_trials import further_trials
+
+    for text in asked.effects:
+        name, _, size = text.partition("=")
+        if not size or name in campaign.power.not_testable:
+            remedy = "write the size to be found, such as leak=0.5" if not size else campaign.power.not_testable[name]
+            words = "needs a size" if not size else "cannot be seen with the columns of these trials"
+            raise ExperimentError([Problem(message=words, column="--effect", value=text, remedy=remedy)])
+        value = _value_of(text, campaign.power[name])
+        with waiting(f"looking for trials that show {name}"):
+            yield further_trials(campaign.design, campaign.power[name], value, asked.reach, campaign.limits)
+
+
+def sheet_rows(power: Power) -> list[dict[str, object]]:
+    """Return the rows of the sheet for the further trials, as cells by column.
+
+    Parameters
+    ----------
+    power : with further trials.
+
+    Returns
+    -------
+    list of dict
+        One a trial; of several effects, one after the other.
+    """
+    return [
+        {"trial": f"{plan.effect}_{k}" if len(power.further) > 1 else added.trial.name, **sheet_cells(added.trial)}
+        for plan in power.further
+        for k, added in enumerate(plan.trials, 1)
+    ]
 
 
 def _refuse(name: str, power: Power) -> None:
@@ -105,26 +146,48 @@ def _refuse(name: str, power: Power) -> None:
     raise ExperimentError([Problem(message=words, column="--effect", value=name, remedy=remedy)])
 
 
+@dataclass(frozen=True)
+class _Measured:
+    """Trials that were measured; `names` are the effects of the model, `added` those that a diagnosis put into it."""
+
+    pairs: Sequence[tuple[Trial, Track]]
+    names: tuple[str, ...]
+    added: tuple[str, ...] = ()
+    user_effects: Mapping[str, Effect] = field(default_factory=dict)
+    candidates: Sequence[str] | None = None
+    limits: Limits = field(default_factory=Limits)
+
+
 def _campaign(asked: PowerAsked) -> _Campaign:
     """Of trials that were measured, where there are any; else of the sheet."""
-    from vinetrack.experiment.folder import read_experiment
     from vinetrack.experiment.planned import planned_sheet
+
+    measured = _measured(asked)
+    if measured is not None:
+        return _fitted(asked, measured)
+    return _planned(asked, planned_sheet(asked.target, every_row=True))
+
+
+def _measured(asked: PowerAsked) -> _Measured | None:
+    """The trials of a results folder or of an experiment with tracks; None of a sheet that nobody has filmed."""
+    from vinetrack.effects import own_effects
+    from vinetrack.experiment.folder import read_experiment
+    from vinetrack.inference.fit_data import pairs_of
 
     if (asked.target / PROVENANCE).exists():
         return _measured_results(asked)
-    if asked.target.is_dir():
-        try:
-            read = read_experiment(asked.target)
-        except ExperimentError:
-            read = None  # a sheet whose recordings do not exist yet is judged as a plan below
-        if read is not None and any(trial.track is not None for trial in read.trials):
-            from vinetrack.effects import own_effects
-            from vinetrack.inference.fit_data import pairs_of
-
-            user_effects = dict(own_effects([read.folder / path for path in read.settings.effects]))
-            pairs, _ = pairs_of(read)
-            return _fitted(asked, pairs, read.settings.model, user_effects, read.settings.candidates)
-    return _planned(asked, planned_sheet(asked.target, every_row=True))
+    if not asked.target.is_dir():
+        return None
+    try:
+        read = read_experiment(asked.target)
+    except ExperimentError:
+        return None  # a sheet whose recordings do not exist yet is judged as a plan
+    if all(trial.track is None for trial in read.trials):
+        return None
+    settings = read.settings
+    user_effects = dict(own_effects([read.folder / path for path in settings.effects]))
+    pairs, _ = pairs_of(read)
+    return _Measured(pairs, tuple(settings.model), (), user_effects, settings.candidates, settings.limits)
 
 
 def _given(asked: PowerAsked, given: Fit | Pairs) -> _Campaign:
@@ -134,10 +197,10 @@ def _given(asked: PowerAsked, given: Fit | Pairs) -> _Campaign:
 
     if isinstance(given, Fit):
         return _Campaign(fit_power(given), design_of_fit(given))
-    return _fitted(asked, list(given), BASE_EFFECTS, {}, None)
+    return _fitted(asked, _Measured(list(given), BASE_EFFECTS))
 
 
-def _measured_results(asked: PowerAsked) -> _Campaign:
+def _measured_results(asked: PowerAsked) -> _Measured:
     from vinetrack.diagnosis.result import ADEQUATE
     from vinetrack.effects import own_effects
     from vinetrack.pipeline.model_stage import measured
@@ -147,27 +210,24 @@ def _measured_results(asked: PowerAsked) -> _Campaign:
 
     results = Results(asked.target)
     experiment = experiment_behind(asked.target, asked.experiment)
+    settings = experiment.settings
     diagnosis = read_diagnosis(results)
-    added = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
-    user_effects = dict(own_effects([experiment.folder / path for path in experiment.settings.effects]))
-    names = (*experiment.settings.model, *(name for name in added if name not in experiment.settings.model))
-    return _fitted(asked, measured(experiment, results)[0], names, user_effects, experiment.settings.candidates)
+    found = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
+    added = tuple(name for name in found if name not in settings.model)
+    user_effects = dict(own_effects([experiment.folder / path for path in settings.effects]))
+    pairs = measured(experiment, results)[0]
+    return _Measured(pairs, (*settings.model, *added), added, user_effects, settings.candidates, settings.limits)
 
 
-def _fitted(
-    asked: PowerAsked,
-    pairs: Sequence[tuple[Trial, Track]],
-    names: Sequence[str],
-    user_effects: Mapping[str, Effect],
-    candidates: Sequence[str] | None,
-) -> _Campaign:
+def _fitted(asked: PowerAsked, measured: _Measured) -> _Campaign:
     """Trials that were measured: noise and scatter from the fit, but for what is stated."""
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for
     from vinetrack.dynamics.model import make_model
     from vinetrack.inference.fit import fit
 
-    model = make_model(tuple(names), user_effects)
-    host = host_for(model, candidates_of(model, candidates, user_effects))
+    pairs, candidates = measured.pairs, measured.candidates
+    model = make_model(measured.names, measured.user_effects)
+    host = host_for(model, candidates_of(model, candidates, measured.user_effects))
     first = fit(model, pairs, host=host, profile=False, thorough=False)
     stated = _stated_noise(asked, first.noise_m, first.noise_correlation)
     spreads = _stated_spreads(asked, (float(first.state.spread[0]), float(first.state.spread[1])))
@@ -178,7 +238,7 @@ def _fitted(
             first.noise_m, first.noise_correlation, tuple(first.state.spread),
             ("stated" if stated else "fit", "stated" if spreads else "fit"),
         )  # fmt: skip
-    return _Campaign(fit_power(first, candidates, inputs), design_of_fit(first, candidates))
+    return _Campaign(fit_power(first, candidates, inputs), design_of_fit(first, candidates), measured.limits)
 
 
 def _stated_noise(asked: PowerAsked, noise_m: float, correlation: float) -> tuple[float, float] | None:
@@ -249,7 +309,7 @@ def _planned(asked: PowerAsked, planned: PlannedTrials) -> _Campaign:
         has_trace=(False,) * len(trials),
         candidates=settings.candidates,
     )
-    return _Campaign(design_power(design, inputs), design)
+    return _Campaign(design_power(design, inputs), design, settings.limits)
 
 
 def _fps_origin(asked: PowerAsked, trials: Sequence[Trial]) -> str:
@@ -270,8 +330,6 @@ def _with_yield(trial: Trial, of_vine: Trial) -> Trial:
 
 def _sizes_of(asked: PowerAsked, campaign: _Campaign) -> list[tuple[str, float, float]]:
     """Effect, value in SI and promised rate of every kind of campaign that is simulated, the one with nothing first."""
-    from vinetrack.core.units import display_unit
-
     power = campaign.power
     wanted = [("", math.nan, power.false_alarm_rate)]
     for text in asked.effects:
@@ -279,17 +337,22 @@ def _sizes_of(asked: PowerAsked, campaign: _Campaign) -> list[tuple[str, float, 
         if name in power.not_testable:
             continue
         entry = power[name]
-        if not size:
-            sizes = [entry.size_at(0.5), entry.size_at(0.9)]
-        else:
-            try:
-                sizes = [float(size) / display_unit(entry.unit)[1]]
-            except ValueError:
-                remedy = f"write a number in {display_unit(entry.unit)[0] or 'the unit of the parameter'}"
-                problem = Problem(message="is no size", column="--effect", value=text, remedy=remedy)
-                raise ExperimentError([problem]) from None
+        sizes = [_value_of(text, entry)] if size else [entry.size_at(0.5), entry.size_at(0.9)]
         wanted += [(name, value, entry.probability_at(value)) for value in sizes if math.isfinite(value)]
     return wanted
+
+
+def _value_of(text: str, entry: EffectPower) -> float:
+    """The size in `name=size`, SI."""
+    from vinetrack.core.units import display_unit
+
+    unit, factor = display_unit(entry.unit)
+    try:
+        return float(text.partition("=")[2]) / factor
+    except ValueError:
+        remedy = f"write a number in {unit or 'the unit of the parameter'}"
+        problem = Problem(message="is no size", column="--effect", value=text, remedy=remedy)
+        raise ExperimentError([problem]) from None
 
 
 Task = tuple[CampaignDesign, str, float, int]

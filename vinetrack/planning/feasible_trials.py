@@ -19,7 +19,6 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment.naming import with_names
 from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.fit_data import FitTrial
 from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
 SAME_RIG, OTHER_RIG, NEW_VINE = EFFORTS = (0, 1, 2)
@@ -69,12 +68,12 @@ class Condition:
     changed: tuple[str, ...] = ()
 
 
-def conditions(data: Sequence[FitTrial], limits: Limits) -> list[Condition]:
+def conditions(trials: Sequence[Trial], limits: Limits) -> list[Condition]:
     """Every trial to look at; empty where the limits leave none.
 
     Parameters
     ----------
-    data : trials of the experiment, at least one.
+    trials : of the experiment, at least one.
     limits : what the user allows.
 
     Returns
@@ -82,11 +81,11 @@ def conditions(data: Sequence[FitTrial], limits: Limits) -> list[Condition]:
     list of Condition
         Named `next_1`, `next_2`, …
     """
-    models = _models(data)
+    models = _models(trials)
     if not models:
         return []
-    used = [trial_data.trial for trial_data in data if trial_data.trial.travel_ratio != 1]
-    vines = [(data[k].trial, k) for k in models]
+    used = [trial for trial in trials if trial.travel_ratio != 1]
+    vines = [(trials[k], k) for k in models]
     feasible = []
     for vine, k in vines:
         if _allowed(vine, limits):
@@ -103,7 +102,7 @@ def conditions(data: Sequence[FitTrial], limits: Limits) -> list[Condition]:
         replace(
             condition,
             trial=replace(condition.trial, name=name),
-            changed=_changed(condition.trial, data[condition.like].trial),
+            changed=_changed(condition.trial, trials[condition.like]),
         )
         for condition, name in zip(feasible, named, strict=True)
     ]
@@ -116,21 +115,12 @@ def _changed(rig: Trial, before: Trial) -> tuple[str, ...]:
     return tuple(column for column, name in RIG.items() if not _alike(rig, before, [name]))
 
 
-def _models(data: Sequence[FitTrial]) -> list[int]:
+def _models(trials: Sequence[Trial]) -> list[int]:
     """The trial of each everting vine that stands for it: the first of its commonest rig and yield pressure."""
-    rigs = [
-        (
-            trial_data.trial.vine,
-            trial_data.trial.yield_pressure_Pa,
-            trial_data.trial.chamber_m3,
-            trial_data.trial.inlet_m,
-            trial_data.trial.bends,
-        )
-        for trial_data in data
-    ]
+    rigs = [(trial.vine, trial.yield_pressure_Pa, trial.chamber_m3, trial.inlet_m, trial.bends) for trial in trials]
     texts = [repr(rig) for rig in rigs]
     places = []
-    for vine in dict.fromkeys(trial_data.trial.vine for trial_data in data if trial_data.trial.travel_ratio != 1):
+    for vine in dict.fromkeys(trial.vine for trial in trials if trial.travel_ratio != 1):
         mine = [texts[i] for i, rig in enumerate(rigs) if rig[0] == vine]
         places.append(texts.index(Counter(mine).most_common(1)[0][0]))
     return places
