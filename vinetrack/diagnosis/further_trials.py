@@ -228,7 +228,8 @@ class _Search:
 
     def _ordered(self, chosen: Sequence[int]) -> list[int]:
         """The same trials, the most telling first."""
-        left, order = list(chosen), []
+        left: list[int] = list(chosen)
+        order: list[int] = []
         while left:
             gains = _left(self._total(order) + self.each[left])
             order.append(left.pop(int(np.argmax(gains))))
