@@ -16,8 +16,9 @@ from vinetrack.core.problems import ExperimentError
 from vinetrack.diagnosis.campaign_power import CampaignDesign
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer
 from vinetrack.figures.registry import draw
-from vinetrack.pipeline import power_stage
-from vinetrack.pipeline.power_stage import PowerAsked, fingerprint, kept_answers, power_of_target
+from vinetrack.pipeline import simulated_answers
+from vinetrack.pipeline.power_stage import PowerAsked, power_of_target
+from vinetrack.pipeline.simulated_answers import fingerprint, kept_answers
 
 SHEET = (
     "trial,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
@@ -91,7 +92,7 @@ def test_kept_answers_are_not_simulated_again(folder: Path, tmp_path: Path, monk
         verdict, names = ("missing", ("leak",)) if effect and seed % 2 else ("adequate", ())
         return SimulatedAnswer(effect, value, seed, verdict, names, (), 1.0)
 
-    monkeypatch.setattr(power_stage, "simulated_answer", answered)
+    monkeypatch.setattr(simulated_answers, "simulated_answer", answered)
     asked = PowerAsked(folder, ("leak=0.01",), simulate=2, answers=tmp_path / "answers.csv")
     first = power_of_target(asked)
     assert sorted(asked_for) == [("", 1), ("", 2), ("leak", 1), ("leak", 2)]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,10 +11,11 @@ from typing import TYPE_CHECKING
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, design_power, fit_power
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
-from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
+from vinetrack.diagnosis.simulated_power import rates_of
+from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.experiment.settings import Limits
-from vinetrack.pipeline.pool import as_they_come
+from vinetrack.pipeline.simulated_answers import Simulation, key_of, simulated
 from vinetrack.planning.campaign_information import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
@@ -192,7 +191,6 @@ def _measured(asked: PowerAsked) -> _Measured | None:
 
 def _given(asked: PowerAsked, given: Fit | Pairs) -> _Campaign:
     """Of trials in memory: as they were fitted, or fitted with the base model."""
-    from vinetrack.effects import BASE_EFFECTS
     from vinetrack.inference.fit_result import Fit
 
     if isinstance(given, Fit):
@@ -355,41 +353,13 @@ def _value_of(text: str, entry: EffectPower) -> float:
         raise ExperimentError([problem]) from None
 
 
-Task = tuple[CampaignDesign, str, float, int]
-COLUMNS_KEPT = ("design", "effect", "value", "seed", "verdict", "answer_set", "effects", "seconds", "failed")
-
-
 def _simulated(asked: PowerAsked, campaign: _Campaign) -> Iterator[SimulatedRates]:
     """Rates of complete diagnoses; those kept by an earlier run are not made again."""
-    from vinetrack.core.terminal import Progress, progress
-
-    design = campaign.design
     wanted = _sizes_of(asked, campaign)
-    path = asked.answers or _answers_file(asked.target)
-    mark = fingerprint(design)
-    kept = {(a.effect, _key(a.value), a.seed): a for a in kept_answers(path, mark)}
-    seeds = range(asked.first_seed, asked.first_seed + asked.simulate)
-    tasks: list[Task] = [
-        (design, effect, value, seed)
-        for seed in seeds
-        for effect, value, _ in wanted
-        if (effect, _key(value), seed) not in kept
-    ]
-    total = len(wanted) * asked.simulate
-    bar: Progress[None]
-    with progress(total, "simulating", unit="campaign") as bar:
-        bar.advance(total - len(tasks))
-        for answer in as_they_come(_answer, tasks, asked.jobs):
-            _keep(path, mark, answer)
-            kept[answer.effect, _key(answer.value), answer.seed] = answer
-            bar.advance()
+    how = Simulation(asked.simulate, asked.first_seed, asked.jobs, asked.answers or _answers_file(asked.target))
+    answers = simulated(campaign.design, [(effect, value) for effect, value, _ in wanted], how)
     for effect, value, promised in wanted:
-        yield rates_of([kept[effect, _key(value), seed] for seed in seeds], promised)
-
-
-def _key(value: float) -> str:
-    """A size as it is written in the file of answers."""
-    return "" if math.isnan(value) else f"{value:.9g}"
+        yield rates_of([answers[effect, key_of(value), seed] for seed in how.seeds], promised)
 
 
 def _answers_file(target: Path) -> Path:
@@ -398,68 +368,3 @@ def _answers_file(target: Path) -> Path:
         return target / "power_answers.csv"
     name = target.resolve().name if target.is_dir() else target.stem
     return Path(f"power_answers_{name}.csv")
-
-
-def _answer(task: Task) -> SimulatedAnswer:
-    return simulated_answer(*task)
-
-
-def fingerprint(design: CampaignDesign) -> str:
-    """Return a short text that changes with anything that campaigns are simulated from.
-
-    Parameters
-    ----------
-    design : of the campaigns.
-
-    Returns
-    -------
-    str
-    """
-    parts = (design.model.names, sorted(design.model.values.items(), key=str), design.trials, design.cameras)
-    around = (design.spreads, design.tracker_sigma_m, design.has_trace, design.candidates)
-    return hashlib.sha256(repr((parts, around)).encode()).hexdigest()[:12]
-
-
-def kept_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
-    """Answers that an earlier run has kept about this design; those about others are passed over.
-
-    Parameters
-    ----------
-    path : of the file; it may be absent.
-    mark : fingerprint of the design.
-
-    Returns
-    -------
-    list of SimulatedAnswer
-    """
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
-    return [
-        SimulatedAnswer(
-            effect=row["effect"],
-            value=float(row["value"] or "nan"),
-            seed=int(row["seed"]),
-            verdict=row["verdict"],
-            answer_set=tuple(row["answer_set"].split("|")) if row["answer_set"] else (),
-            effects=tuple(row["effects"].split("|")) if row["effects"] else (),
-            seconds=float(row["seconds"] or "nan"),
-            failed=row["failed"],
-        )
-        for row in rows
-    ]
-
-
-def _keep(path: Path, mark: str, answer: SimulatedAnswer) -> None:
-    """Append one answer; the header stands in a new file."""
-    new = not path.is_file()
-    with path.open("a", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        if new:
-            writer.writerow(COLUMNS_KEPT)
-        seconds = "" if math.isnan(answer.seconds) else f"{answer.seconds:.2f}"
-        writer.writerow(
-            [mark, answer.effect, _key(answer.value), answer.seed, answer.verdict, "|".join(answer.answer_set),
-             "|".join(answer.effects), seconds, answer.failed]
-        )  # fmt: skip

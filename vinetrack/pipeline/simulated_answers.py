@@ -1,0 +1,156 @@
+"""Campaigns simulated one after the other or side by side, their answers kept in a file as they come.
+
+Begun again, only what is not in the file is simulated; answers about another design are passed over.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vinetrack.diagnosis.campaign_power import CampaignDesign
+from vinetrack.diagnosis.simulated_power import SimulatedAnswer, simulated_answer
+from vinetrack.pipeline.pool import as_they_come
+
+Task = tuple[CampaignDesign, str, float, int]
+COLUMNS_KEPT = ("design", "effect", "value", "seed", "verdict", "answer_set", "effects", "seconds", "failed")
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """How campaigns are simulated: how many, from which seed on, in how many processes, and where answers are kept."""
+
+    campaigns: int
+    first_seed: int
+    jobs: int
+    path: Path
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the campaigns."""
+        return range(self.first_seed, self.first_seed + self.campaigns)
+
+
+def simulated(
+    design: CampaignDesign, wanted: Sequence[tuple[str, float]], how: Simulation
+) -> dict[tuple[str, str, int], SimulatedAnswer]:
+    """Diagnose simulated campaigns from beginning to end.
+
+    Parameters
+    ----------
+    design : of the campaigns.
+    wanted : sequence of (str, float)
+        Effect, blank for none, and value of each kind of campaign, SI.
+    how : campaigns of each kind, seeds, processes and file.
+
+    Returns
+    -------
+    dict
+        Answers by effect, value as `key_of` writes it, and seed.
+    """
+    from vinetrack.core.terminal import Progress, progress
+
+    mark = fingerprint(design)
+    kept = {(a.effect, key_of(a.value), a.seed): a for a in kept_answers(how.path, mark)}
+    tasks: list[Task] = [
+        (design, effect, value, seed)
+        for seed in how.seeds
+        for effect, value in wanted
+        if (effect, key_of(value), seed) not in kept
+    ]
+    total = len(wanted) * how.campaigns
+    bar: Progress[None]
+    with progress(total, "simulating", unit="campaign") as bar:
+        bar.advance(total - len(tasks))
+        for answer in as_they_come(_answer, tasks, how.jobs):
+            _keep(how.path, COLUMNS_KEPT, _row(mark, answer))
+            kept[answer.effect, key_of(answer.value), answer.seed] = answer
+            bar.advance()
+    return kept
+
+
+def key_of(value: float) -> str:
+    """Return a size as it is written in the file of answers.
+
+    Parameters
+    ----------
+    value : SI; NaN for none.
+
+    Returns
+    -------
+    str
+    """
+    return "" if math.isnan(value) else f"{value:.9g}"
+
+
+def _answer(task: Task) -> SimulatedAnswer:
+    return simulated_answer(*task)
+
+
+def fingerprint(design: CampaignDesign) -> str:
+    """Return a short text that changes with anything that campaigns are simulated from.
+
+    Parameters
+    ----------
+    design : of the campaigns.
+
+    Returns
+    -------
+    str
+    """
+    parts = (design.model.names, sorted(design.model.values.items(), key=str), design.trials, design.cameras)
+    around = (design.spreads, design.tracker_sigma_m, design.has_trace, design.candidates)
+    return hashlib.sha256(repr((parts, around)).encode()).hexdigest()[:12]
+
+
+def kept_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
+    """Answers that an earlier run has kept about this design; those about others are passed over.
+
+    Parameters
+    ----------
+    path : of the file; it may be absent.
+    mark : fingerprint of the design.
+
+    Returns
+    -------
+    list of SimulatedAnswer
+    """
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
+    return [
+        SimulatedAnswer(
+            effect=row["effect"],
+            value=float(row["value"] or "nan"),
+            seed=int(row["seed"]),
+            verdict=row["verdict"],
+            answer_set=tuple(row["answer_set"].split("|")) if row["answer_set"] else (),
+            effects=tuple(row["effects"].split("|")) if row["effects"] else (),
+            seconds=float(row["seconds"] or "nan"),
+            failed=row["failed"],
+        )
+        for row in rows
+    ]
+
+
+def _row(mark: str, answer: SimulatedAnswer) -> list[object]:
+    seconds = "" if math.isnan(answer.seconds) else f"{answer.seconds:.2f}"
+    return [
+        mark, answer.effect, key_of(answer.value), answer.seed, answer.verdict, "|".join(answer.answer_set),
+        "|".join(answer.effects), seconds, answer.failed,
+    ]  # fmt: skip
+
+
+def _keep(path: Path, columns: Sequence[str], row: Sequence[object]) -> None:
+    """Append one answer; the header stands in a new file."""
+    new = not path.is_file()
+    with path.open("a", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        if new:
+            writer.writerow(columns)
+        writer.writerow(row)
