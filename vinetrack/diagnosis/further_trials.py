@@ -246,7 +246,7 @@ def _questions(design: CampaignDesign, added: Sequence[Condition], candidates: t
         B = dict(known) if isinstance(known, Mapping) else {trial.vine: float(known) for trial in design.trials}
         for vine, condition in new.items():
             like, trial = design.trials[condition.like], condition.trial
-            printed = [damping_prior(one.diameter_m, one.thickness_m) for one in (trial, like)]
+            printed = [damping_prior(sized.diameter_m, sized.thickness_m) for sized in (trial, like)]
             B[vine] = B[like.vine] * printed[0] / printed[1]
         values = {DAMPING: B}
     places = [condition.like for condition in added]

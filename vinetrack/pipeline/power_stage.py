@@ -210,8 +210,8 @@ def _measured_results(asked: PowerAsked) -> _Measured:
     experiment = experiment_behind(asked.target, asked.experiment)
     settings = experiment.settings
     diagnosis = read_diagnosis(results)
-    found = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
-    added = tuple(name for name in found if name not in settings.model)
+    named = diagnosis.effects if diagnosis is not None and diagnosis.final_verdict == ADEQUATE else ()
+    added = tuple(name for name in named if name not in settings.model)
     user_effects = dict(own_effects([experiment.folder / path for path in settings.effects]))
     pairs = measured(experiment, results)[0]
     return _Measured(pairs, (*settings.model, *added), added, user_effects, settings.candidates, settings.limits)
