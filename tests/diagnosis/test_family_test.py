@@ -35,6 +35,12 @@ def test_independent_candidates_share_as_sidak_says() -> None:
     assert family.share == pytest.approx(1 - (1 - 3e-3) ** (1 / 20), rel=0.02)
 
 
+@pytest.mark.parametrize("shapes", [2, 30])
+def test_shapes_that_are_the_same_curve_count_once(shapes: int) -> None:
+    family = family_test(np.ones((shapes, shapes)), [0] * shapes, ["only"] * shapes, 3e-3)
+    assert family.of("only") == pytest.approx(norm.isf(3e-3 / 2), abs=0.02)
+
+
 def test_any_candidate_exceeds_its_threshold_at_the_level_and_each_at_its_share() -> None:
     """Against two million draws from another generator."""
     cosines, level = alike_within(), 3e-3

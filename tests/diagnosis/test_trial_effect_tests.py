@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 from hidden_truth import Pairs, grown, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_motion
+from vinetrack.diagnosis.trial_effect_tests import STRETCH, conditions_apart, noisier_in_motion
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, Nature, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
@@ -70,6 +73,21 @@ def test_what_is_louder_in_motion_than_at_rest_is_heard() -> None:
 def test_noise_that_is_the_same_at_rest_is_noise() -> None:
     assert noisier_in_motion(fitted(wandering(at_rest=True))) > 1e-2
     assert all(noisier_in_motion(fitted(grown(seed=seed))) > 1e-2 for seed in (35, 36))
+
+
+@pytest.mark.parametrize(("heavy", "most"), [(False, 0.02), (True, 0.04)])
+def test_heavy_tails_alone_are_not_louder_in_motion(heavy: bool, most: float) -> None:
+    """600 campaigns in which nothing differs: few alarms at 1 %, also where single stretches are far louder."""
+    draw, alarms = np.random.default_rng(20732), 0
+    for _ in range(600):
+        white = draw.standard_normal((12, 16, STRETCH))
+        if heavy:
+            white /= np.sqrt(draw.chisquare(5, (12, 16, 1)) / 5)
+        trials = [SimpleNamespace(whitened=one.ravel()) for one in white]
+        data = SimpleNamespace(tracker_sigma_m=np.nan, gauge_error=0.0, n_rest=8 * STRETCH)
+        fit: Any = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
+        alarms += noisier_in_motion(fit) < 0.01
+    assert alarms / 600 < most
 
 
 def test_recordings_are_not_held_against_their_rest() -> None:
