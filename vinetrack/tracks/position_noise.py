@@ -232,18 +232,15 @@ def _chi2_median(dof: Floats) -> Floats:
 
 def _residuals(y: Floats, basis: Floats) -> tuple[Floats, Floats]:
     """For each ρ of the grid and each stretch: whitened residual sum of squares, and the log-determinants of REML."""
-    rss, log_det = [], []
-    for rho in RHO_GRID:
-        root = math.sqrt(1 - rho**2)
-        white_y = np.concatenate([root * y[:, :1], y[:, 1:] - rho * y[:, :-1]], axis=1)
-        white_x = np.concatenate([root * basis[:, :1], basis[:, 1:] - rho * basis[:, :-1]], axis=1)
-        q, r = np.linalg.qr(white_x)
-        inside = np.einsum("smk,sm->sk", q, white_y)
-        residual = white_y - np.einsum("smk,sk->sm", q, inside)
-        rss.append(np.sum(residual**2, axis=1))
-        diagonal = np.abs(np.diagonal(r, axis1=1, axis2=2))
-        log_det.append(2 * np.log(diagonal).sum(axis=1) - math.log(1 - rho**2))
-    return np.array(rss), np.array(log_det)
+    rho, root = RHO_GRID[:, None, None], np.sqrt(1 - RHO_GRID**2)[:, None, None]
+    white_y = np.concatenate([root * y[:, :1], y[:, 1:] - rho * y[:, :-1]], axis=2)
+    rho, root = rho[..., None], root[..., None]
+    white_x = np.concatenate([root * basis[:, :1], basis[:, 1:] - rho * basis[:, :-1]], axis=2)
+    q, r = np.linalg.qr(white_x)
+    inside = np.swapaxes(q, 2, 3) @ white_y[..., None]
+    residual = white_y - (q @ inside)[..., 0]
+    diagonal = np.abs(np.diagonal(r, axis1=2, axis2=3))
+    return np.sum(residual**2, axis=2), 2 * np.log(diagonal).sum(axis=2) - np.log(1 - RHO_GRID**2)[:, None]
 
 
 def _vertex(x: Floats, score: Floats, best: int) -> float:
