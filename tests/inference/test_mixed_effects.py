@@ -20,10 +20,12 @@ from vinetrack.inference.mixed_effects import (
     bounded_solve,
     cross_products,
     newton_step,
+    put_back,
     spreads,
 )
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.variance_kernels import step_inside
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
 RHO, SIGMA = 0.45, 0.3
@@ -102,6 +104,34 @@ def test_the_marginal_likelihood_is_that_of_the_dense_gaussian() -> None:
         for c, v in zip(columns, dense, strict=True)
     )
     assert found == pytest.approx(direct, rel=1e-8)
+
+
+def test_what_deviations_explain_so_far_is_put_back() -> None:
+    columns = columns_of(3, 15, 2, seed=8)
+    first = [np.arange(15) == 0] * 3
+    state = replace(state_of(3, 2, 0.5), trial_effects=np.random.default_rng(9).standard_normal((3, 4)))
+    whole = [c.copy() for c in columns]
+    for column, effects in zip(whole, state.trial_effects, strict=True):
+        column[:, -1] += column[:, 2:4] @ effects[2:]
+    white = at_correlation(all_products(columns, first), RHO)
+    assert put_back(white, state, -1) == pytest.approx(at_correlation(all_products(whole, first), RHO), rel=1e-9)
+
+
+def test_a_step_inside_all_bounds_is_that_of_least_squares() -> None:
+    draw = np.random.default_rng(10)
+    rows, size = draw.standard_normal((30, 5)) * [1, 10, 0.1, 1e3, 1], 5
+    square, slope = rows.T @ rows, rows.T @ draw.standard_normal(30)
+    step = np.linalg.solve(square, slope)
+    wide = np.full(size, np.inf)
+    solved, decrease, log_det = step_inside(square, slope, wide, wide)
+    assert solved
+    assert decrease == pytest.approx(step @ slope)
+    assert log_det == pytest.approx(np.linalg.slogdet(square)[1])
+    near = np.where(np.arange(size) == 2, 0.9 * np.abs(step), wide)
+    assert not step_inside(square, slope, near, near)[0]
+    # Of two numbers that only move together least squares has to choose.
+    twice = np.column_stack([rows, rows[:, 1] * (1 + 1e-9)])
+    assert not step_inside(twice.T @ twice, np.append(slope, slope[1]), np.append(wide, 1.0), np.append(wide, 1.0))[0]
 
 
 def test_the_restricted_likelihood_adds_the_information() -> None:

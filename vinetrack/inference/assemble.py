@@ -24,6 +24,7 @@ from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import SmoothErrors, smooth_errors
 from vinetrack.inference.robust_covariance import few_trials, widened_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation, whiten
 
 HARD_TO_TELL_APART = 0.98
@@ -276,7 +277,7 @@ def _own_sigma(solution: Solution, known: Precision) -> Floats:
     precision_own = trial_effect_prior(problem, state)[1]
     square = white[:, :OWN, :OWN] + precision_own[:, :, None] * np.eye(OWN)
     scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
-    even = square * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(OWN)
+    even = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(OWN)
     inverse = np.linalg.inv(even) * scale[:, :, None] * scale[:, None, :]
     lever = inverse @ white[:, :OWN, OWN:-1]
     shared = np.zeros((state.theta.size + 1,) * 2)

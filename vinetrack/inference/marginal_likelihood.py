@@ -18,14 +18,14 @@ from vinetrack.inference.mixed_effects import (
     FitState,
     MixedProblem,
     bounded_solve,
-    cross_products,
-    cross_products_vector,
+    key_places,
     put_back,
     solve_each,
     spreads,
     trial_effect_prior,
 )
 from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.variance_kernels import noise_at_correlations, step_inside, sums_without_deviations
 from vinetrack.inference.whitening import at_correlation
 
 LARGEST_SPREAD = (0.04, 0.15)
@@ -131,12 +131,13 @@ def normal_equations(
         Sum of squares at the current numbers.
     log_det : float
     """
-    left, inner = left_to_keys(part, problem, spread)
-    information = cross_products(left[:, :-1, :-1], problem) + np.diag(problem.prior_precision)
+    root = spreads(problem, spread) * problem.feels
+    size = problem.prior_mean.size
+    information, slope, square, log_det = sums_without_deviations(part.blocks, key_places(problem), root, size)
     away = state.theta - problem.prior_mean
-    slope = cross_products_vector(left[:, :-1, -1], problem) - problem.prior_precision * away
-    square = float(np.sum(left[:, -1, -1]) + np.sum(problem.prior_precision * away**2))
-    return information, slope, square, float(np.sum(np.linalg.slogdet(inner)[1]))
+    information[np.diag_indices(size)] += problem.prior_precision
+    slope -= problem.prior_precision * away
+    return information, slope, square + float(np.sum(problem.prior_precision * away**2)), log_det
 
 
 def deviance(
@@ -159,9 +160,38 @@ def deviance(
     float
     """
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
+    constant = square + log_det + part.log_constant
+    return deviance_left(information, slope, constant, problem, state, restricted=restricted)
+
+
+def deviance_left(
+    information: Floats, slope: Floats, constant: float, problem: MixedProblem, state: FitState, *, restricted: bool
+) -> float:
+    """The end of `deviance`: what is left once the free numbers are at their best.
+
+    Parameters
+    ----------
+    information : array, shape (n_free, n_free)
+    slope : array, shape (n_free,)
+    constant : float
+        −2 ln L at the current numbers.
+    problem : what does not change during the fit.
+    state : where the fit stands.
+    restricted : bool
+        Whether the fitted numbers are counted (REML).
+
+    Returns
+    -------
+    float
+    """
+    if problem.free.all() and (restricted or problem.random is None):
+        room = problem.upper - state.theta
+        solved, decrease, log_information = step_inside(information, slope, state.theta - problem.lower, room)
+        if solved:
+            return constant - decrease + (log_information if restricted else 0.0)
     # What would rather lie beyond its bound must not be credited with what it would explain there.
     step, moving = bounded_solve(information, slope, problem, state.theta)
-    total = square + log_det + part.log_constant - float(step @ (2 * slope - information @ step))
+    total = constant - float(step @ (2 * slope - information @ step))
     k = np.flatnonzero(moving)
     if k.size:
         inside = information if moving.all() else information[np.ix_(k, k)]
@@ -272,23 +302,21 @@ def estimate_noise(
     if within:
         stiff = np.concatenate([stiff, _loose(grams, freed)], axis=1)
         pull_back = np.pad(pull_back, ((0, 0), (0, freed - OWN)))
-    scores, squares = [], []
-    for value in grid:
-        white = at_correlation(grams, float(value))
-        inner = white[:, :freed, :freed] + stiff[:, :, None] * np.eye(freed)
-        taken = np.einsum("nkk->n", solve_each(inner, white[:, :freed, :freed])) + shared
-        dof = np.maximum(problem.points - taken, 1.0)
-        pull = white[:, :freed, -1] - pull_back
-        gain = np.sum(pull * solve_each(inner, pull[:, :, None])[:, :, 0], axis=1)
-        least = WITHIN_LEAST if within else 0.2
-        square = np.maximum(white[:, -1, -1] - gain, least * white[:, -1, -1])
-        score = np.sum(dof * np.log(square / dof)) - np.sum(problem.stretches) * math.log(1 - value**2)
-        scores.append(score + np.sum(np.linalg.slogdet(inner)[1]))
-        squares.append((square, dof))
+    columns = [*range(freed), grams.shape[-1] - 1]
+    scores, squares, degrees = noise_at_correlations(
+        np.ascontiguousarray(grams[:, :, columns][:, :, :, columns]),
+        stiff,
+        pull_back,
+        problem.points,
+        grid,
+        shared,
+        WITHIN_LEAST if within else 0.2,
+    )
+    scores -= np.sum(problem.stretches) * np.log(1 - grid**2)
     best = int(np.argmin(scores))
     if rho is None:
-        return estimate_noise(grams, problem, state, _lowest(grid, np.array(scores), best), within=within)
-    return rho, _draw_together(*squares[0])
+        return estimate_noise(grams, problem, state, _lowest(grid, scores, best), within=within)
+    return rho, _draw_together(squares[0], degrees[0])
 
 
 def _loose(grams: Floats, freed: int) -> Floats:

@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, RELEASE
+from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation
 
 LEAST_SPREAD = 1e-5
@@ -176,8 +177,8 @@ def cross_products(blocks: Floats, problem: MixedProblem) -> Floats:
     array, shape (n_free, n_free)
     """
     p = problem.prior_mean.size
-    places = _places(problem)
-    flat = places[:, :, None] * (p + 1) + places[:, None, :]
+    among = key_places(problem)
+    flat = among[:, :, None] * (p + 1) + among[:, None, :]
     total = np.bincount(flat.ravel(), weights=blocks.ravel(), minlength=(p + 1) ** 2)
     return np.asarray(total.reshape(p + 1, p + 1)[:p, :p])
 
@@ -195,11 +196,20 @@ def cross_products_vector(blocks: Floats, problem: MixedProblem) -> Floats:
     array, shape (n_free,)
     """
     p = problem.prior_mean.size
-    return np.asarray(np.bincount(_places(problem).ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
+    return np.asarray(np.bincount(key_places(problem).ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
 
 
-def _places(problem: MixedProblem) -> NDArray[np.int_]:
-    """`index` with the place behind all numbers for keys that a trial does not feel."""
+def key_places(problem: MixedProblem) -> NDArray[np.int_]:
+    """`index` with the place behind all numbers for keys that a trial does not feel.
+
+    Parameters
+    ----------
+    problem : what does not change during the fit.
+
+    Returns
+    -------
+    array of int, shape (n_trials, n_keys)
+    """
     return np.where(problem.index < 0, problem.prior_mean.size, problem.index)
 
 
@@ -373,7 +383,7 @@ def solve_each(square: Floats, right: Floats) -> Floats:
     array, shape (n_trials, k, m)
     """
     scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
-    even = square * scale[:, :, None] * scale[:, None, :] + 1e-13 * np.eye(square.shape[1])
+    even = square * scale[:, :, None] * scale[:, None, :] + RIDGE * np.eye(square.shape[1])
     return np.asarray(scale[:, :, None] * np.linalg.solve(even, scale[:, :, None] * right))
 
 
@@ -417,7 +427,12 @@ def put_back(white: Floats, state: FitState, residual: int) -> Floats:
     -------
     array, shape (n_trials, k, k)
     """
-    turn = np.broadcast_to(np.eye(white.shape[1]), white.shape).copy()
-    for column in SPREAD_COLUMNS:
-        turn[:, column, residual] = state.trial_effects[:, column]
-    return np.asarray(np.swapaxes(turn, 1, 2) @ white @ turn)
+    columns = list(SPREAD_COLUMNS)
+    effects = state.trial_effects[:, columns, None]
+    explained = (white[:, :, columns] @ effects)[:, :, 0]
+    back = white.copy()
+    back[:, :, residual] += explained
+    back[:, residual, :] = back[:, :, residual]
+    # The product of the new column with itself: what it explains of itself counts twice, and its own square.
+    back[:, residual, residual] += explained[:, residual] + np.sum(explained[:, columns] * effects[:, :, 0], axis=1)
+    return np.asarray(back)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,13 @@ from vinetrack.inference.fit_problem import estimable, floor, track_correlation
 from vinetrack.inference.marginal_likelihood import estimate_noise, estimate_spreads, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_step, shared_penalty
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.trial_effects import follow_trial_effects, limited, search_releases, trial_costs
+from vinetrack.inference.trial_effects import (
+    follow_trial_effects,
+    limited,
+    residuals_in,
+    search_releases,
+    trial_costs,
+)
 from vinetrack.inference.whitening import at_correlation
 
 MOST_ITERATIONS = 60
@@ -149,7 +155,7 @@ def solve(
         settled = promised < SETTLED_DECREASE
         if looks and (settled or (promised < NEARLY_SETTLED and not in_vain) or iteration >= looked + PATIENCE):
             looked, in_vain = iteration, True
-            jumped = search_releases(predictor, problem, state)
+            jumped = search_releases(predictor, problem, state, residuals_in(columns))
             if jumped is not None:
                 state, (columns, grams) = jumped, _about(predictor, jumped)
                 looks, in_vain = looks - 1, False
@@ -158,7 +164,8 @@ def solve(
         if settled and moved < SETTLED_SPREAD and not early:
             converged = True
             break
-        taken, damping = _take_step(predictor, problem, grams, state, step, own_change, damping)
+        now = cost(predictor, problem, state, residuals_in(columns))
+        taken, damping = _take_step(predictor, problem, grams, state, step, own_change, damping, now)
         if taken is None:
             # No step helps: a corner of the cost, where a frame meets the end of growth. It is as low as it gets.
             converged = moved < SETTLED_SPREAD
@@ -252,12 +259,13 @@ def _take_step(
     step: Floats,
     own_change: Floats,
     damping: float,
+    now: float,
 ) -> tuple[FitState | None, float]:
     """The first of ever shorter, then ever more damped steps that lowers the sum of squares, and the damping to go on.
 
-    A step too long for a curved valley is right in its direction, which damping would turn across the valley.
+    A step too long for a curved valley is right in its direction, which damping would turn across the valley. `now` is
+    the sum of squares with what the priors add where the state stands.
     """
-    now = cost(predictor, problem, state)
     for part in SHORTER:
         tried = _tried(predictor, problem, state, part * step, part * own_change, now)
         if tried is not None:
@@ -284,7 +292,9 @@ def _tried(
     return there if float(np.sum(costs)) + shared_penalty(problem, there) < now else None
 
 
-def cost(predictor: Predictor, problem: MixedProblem, state: FitState) -> float:
+def cost(
+    predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
+) -> float:
     """Whitened sum of squares of all trials with what the priors add.
 
     Parameters
@@ -292,9 +302,11 @@ def cost(predictor: Predictor, problem: MixedProblem, state: FitState) -> float:
     predictor : of the trials to fit.
     problem : what does not change during the fit.
     state : where the fit stands.
+    residuals : sequence of arrays, shape (n_points,), m, optional
+        What is left of each trial there, where it is known.
 
     Returns
     -------
     float
     """
-    return float(np.sum(trial_costs(predictor, problem, state))) + shared_penalty(problem, state)
+    return float(np.sum(trial_costs(predictor, problem, state, residuals))) + shared_penalty(problem, state)

@@ -76,7 +76,8 @@ def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: Fit
             for pinned in (False, True)
         ),
     ]
-    costs = np.array([trial_costs(predictor, problem, way) for way in ways])
+    here = trial_costs(predictor, problem, state, residuals_in(columns))
+    costs = np.array([here, *(trial_costs(predictor, problem, way) for way in ways[1:])])
     best = np.argmin(costs, axis=0)
     trial_effects = np.array([ways[way].trial_effects[i] for i, way in enumerate(best)])
     return replace(state, trial_effects=trial_effects), np.min(costs, axis=0)
@@ -105,7 +106,9 @@ def limited(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats
     return moved
 
 
-def trial_costs(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
+def trial_costs(
+    predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
+) -> Floats:
     """Whitened sum of squares of every trial with what the priors of its own numbers add, shape (n_trials,).
 
     Parameters
@@ -113,17 +116,35 @@ def trial_costs(predictor: Predictor, problem: MixedProblem, state: FitState) ->
     predictor : of the trials to fit.
     problem : what does not change during the fit.
     state : where the fit stands.
+    residuals : sequence of arrays, shape (n_points,), m, optional
+        What is left of each trial there, where it is known: then nothing is simulated.
 
     Returns
     -------
     array, shape (n_trials,)
     """
-    residuals = predictor.residuals(state.theta, state.trial_effects)
+    if residuals is None:
+        residuals = predictor.residuals(state.theta, state.trial_effects)
     squares = [
         float(np.sum(whiten(residual, trial_data.first, state.rho, trial_data.relative_sd) ** 2)) / variance
         for trial_data, residual, variance in zip(predictor.data, residuals, state.variance, strict=True)
     ]
     return np.array(squares) + trial_effect_penalty(problem, state)
+
+
+def residuals_in(columns: Sequence[Floats]) -> list[Floats]:
+    """The residuals among the columns of a linear form: what is known there need not be simulated again.
+
+    Parameters
+    ----------
+    columns : sequence of arrays, shape (n_points, k), m
+        From `Predictor.linearise`.
+
+    Returns
+    -------
+    list of arrays, shape (n_points,), m
+    """
+    return [np.ascontiguousarray(column[:, -1]) for column in columns]
 
 
 RELEASES = 60
@@ -158,7 +179,9 @@ DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
 error and bends it by 1e-4."""
 
 
-def search_releases(predictor: Predictor, problem: MixedProblem, state: FitState) -> FitState | None:
+def search_releases(
+    predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats]
+) -> FitState | None:
     """The state with likelier releases; None if none is.
 
     Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than noise:
@@ -169,12 +192,14 @@ def search_releases(predictor: Predictor, problem: MixedProblem, state: FitState
     predictor : of the trials to fit.
     problem : what does not change during the fit.
     state : where the fit stands.
+    residuals : sequence of arrays, shape (n_points,), m
+        What is left of each trial there.
 
     Returns
     -------
     FitState or None
     """
-    missed = trial_costs(predictor, problem, state) * state.variance / (1 - state.rho**2) / problem.points
+    missed = trial_costs(predictor, problem, state, residuals) * state.variance / (1 - state.rho**2) / problem.points
     places = [
         i
         for i, trial_data in enumerate(predictor.data)
@@ -210,7 +235,7 @@ def _levels(predictor: Predictor, problem: MixedProblem, state: FitState) -> Flo
     square = white[:, :OWN, :OWN] / state.variance[:, None, None]
     precision = trial_effect_prior(problem, state)[1]
     log_volume = np.linalg.slogdet(square + precision[:, :, None] * np.eye(OWN))[1]
-    return np.asarray(trial_costs(predictor, problem, state) + log_volume)
+    return np.asarray(trial_costs(predictor, problem, state, residuals_in(columns)) + log_volume)
 
 
 def _best(

@@ -38,11 +38,15 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
     """
     if relative_sd is not None:
         columns = columns / relative_sd[:, None]
-    follows = np.flatnonzero(~first)
-    now, before = columns[follows], columns[follows - 1]
-    begin = columns[first]
-    cross = now.T @ before
-    return np.stack([columns.T @ columns, cross + cross.T, before.T @ before - begin.T @ begin])
+    if np.count_nonzero(first) == 1:
+        now, before = columns[1:], columns[:-1]
+    else:
+        follows = np.flatnonzero(~first)
+        now, before = columns[follows], columns[follows - 1]
+    begin, end = columns[first], columns[np.append(first[1:], True)]
+    whole, cross = columns.T @ columns, now.T @ before
+    # What has a follower is all but the last point of each stretch.
+    return np.stack([whole, cross + cross.T, whole - end.T @ end - begin.T @ begin])
 
 
 def all_products(
