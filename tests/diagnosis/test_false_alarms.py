@@ -20,7 +20,7 @@ from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, likelihood_ratio, weights_of
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, LATER_LEVEL, LOUD_PROBE, MisfitTests
-from vinetrack.diagnosis.score_test import Scores, Structure, _systematics_aside, structure_in
+from vinetrack.diagnosis.score_test import Scores, Structure, _beside_systematics, _systematics_turn, structure_in
 from vinetrack.inference.fit_result import Number
 
 QUIET = Structure(0.0, 0, 1.0, 0.0)
@@ -149,12 +149,13 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
 def test_systematic_errors_that_imitate_a_shape_are_integrated_out() -> None:
     """With prior N(0, 1) of the errors what is left of A is A − B(C + 1)⁻¹Bᵀ, and of its score s − B(C + 1)⁻¹t."""
     together = scores(np.random.default_rng(20609), 12, 5)
-    left = _systematics_aside(together, 3)
+    turn = _systematics_turn(together.information, 3)
+    score, information = _beside_systematics(together.score, together.information, turn)
     A, B, C = together.information[:3, :3], together.information[:3, 3:], together.information[3:, 3:]
     inner = np.linalg.inv(C + np.eye(2))
-    assert left.information == pytest.approx(A - B @ inner @ B.T)
-    assert left.score == pytest.approx(together.score[:3] - B @ inner @ together.score[3:])
-    assert left.scores.sum(axis=0) == pytest.approx(left.score)
+    assert information == pytest.approx(A - B @ inner @ B.T)
+    assert score == pytest.approx(together.score[:3] - B @ inner @ together.score[3:])
+    assert (together.scores @ turn).sum(axis=0) == pytest.approx(score)
 
 
 def known_fit(log_likelihood: float, numbers: tuple[Number, ...] = (), covariance: Floats | None = None) -> Any:

@@ -18,6 +18,7 @@ from vinetrack.diagnosis.linear_power import power_of, spread_widening
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.diagnosis.result import Diagnosis, Round
+from vinetrack.diagnosis.score_test import informations_at, scores_of
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
 from vinetrack.narrative.power_text import effect_sentence, frequency
 from vinetrack.narrative.verdict_summary import facts
@@ -74,6 +75,13 @@ def test_scatter_that_the_fit_estimates_takes_up_a_part_of_an_effect(six: Misfit
     widening = spread_widening(many)
     assert widening.max() > 1.2
     assert np.all(np.diff(widening, axis=0) > -1e-9)
+
+
+def test_information_at_other_spreads_is_that_of_scores_at_those_spreads() -> None:
+    many = planned_questions(planned(4))[0]
+    ways = [(0.002, 0.01), (0.01, 0.03), (0.03, 0.09)]
+    direct = [scores_of(many.fit, many.sums, replace(many.fit.state, spread=way)).information for way in ways]
+    assert informations_at(many.fit, many.sums, ways) == pytest.approx(np.array([np.diag(one) for one in direct]))
 
 
 def test_four_times_the_trials_halve_the_size(power: Power) -> None:

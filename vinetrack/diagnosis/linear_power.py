@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import norm, t
@@ -33,7 +33,7 @@ from vinetrack.diagnosis.expected_scores import score_ratio
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, CREDIBLE
 from vinetrack.diagnosis.misfit_tests import LOUD_PROBE, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
-from vinetrack.diagnosis.score_test import scores_of
+from vinetrack.diagnosis.score_test import informations_at
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_problem import estimable
 from vinetrack.inference.fit_result import Fit
@@ -322,15 +322,14 @@ def spread_widening(questions: MisfitTests) -> Floats:
     information = np.diag(scores.information)
     estimated = estimable(fit.solution.problem)
     factors = [np.array(FACTORS) if free else np.ones(1) for free in estimated]
-    kept, penalties = [], []
+    spreads, penalties = [], []
     for pressure in factors[0]:
         for damping in factors[1]:
-            spread = (fit.state.spread[0] * pressure, fit.state.spread[1] * damping)
-            widened = scores_of(fit, questions.sums, replace(fit.state, spread=spread)).information
-            kept.append(np.diag(widened) / np.maximum(information, 1e-300))
+            spreads.append((fit.state.spread[0] * pressure, fit.state.spread[1] * damping))
             squares = np.array([pressure, damping]) ** 2
             penalties.append(scores.degrees * float(np.sum(np.log(squares) + 1 / squares - 1)))
-    part = np.clip(np.array(kept), 1e-6, 1.0)
+    kept = informations_at(fit, questions.sums, spreads) / np.maximum(information, 1e-300)
+    part = np.clip(kept, 1e-6, 1.0)
     costs = np.array(penalties)[None, :, None] + SCORES[:, None, None] ** 2 * part
     best = np.argmin(costs, axis=1)
     return np.asarray(1 / np.sqrt(np.take_along_axis(part, best, axis=0)))

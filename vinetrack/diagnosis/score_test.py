@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +25,23 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect_sensitivities
 from vinetrack.diagnosis.initial_fit import probe
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
+    LEAST_SPREAD,
     FitState,
+    MixedProblem,
     cross_products,
     cross_products_vector,
     inverse_among,
+    solve_each,
     trial_effects_eliminated,
 )
+from vinetrack.inference.mixed_effects import spreads as spreads_of_trials
+from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.robust_covariance import scatter_of
 from vinetrack.inference.sensitivity import OWN
-from vinetrack.inference.whitening import products
+from vinetrack.inference.whitening import all_products, at_correlation
 
 BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
 """Probe bumps along growth, speed and time. Chosen: as fine as positions resolve."""
@@ -43,18 +50,56 @@ SHARE_LEFT = 1e-4
 """Part of its information that a shape must keep once everything else is fitted, to count as a shape of its own.
 Chosen: a hundredth of its amplitude."""
 
+IMITATED = 1e-9
+"""Part of its information that rounding leaves of a shape that others imitate exactly. Derived: products of some
+hundred points agree to 1e-13, and to 1e-10 once what others explain is taken off."""
+
+TRIALS_AT_ONCE = 64
+"""Trials whose products of all shapes are held at once, each of half a megabyte. Chosen for memory; no result depends
+on it."""
+
 
 @dataclass(frozen=True)
 class Products:
-    """Sums of products of a fit's columns and of answers, see `whitened`.
+    """Columns of a fit and of answers, shape (n_points, n_columns) a trial, and the sums of their products.
 
     In order: own numbers, keys, residual, shapes, doubts.
     """
 
-    grams: Floats
+    columns: tuple[Floats, ...]
+    data: Sequence[FitTrial]
     n_keys: int
     n_shapes: int
     n_doubts: int = 0
+
+    @cached_property
+    def parts(self) -> list[slice]:
+        """The trials in parts whose products are held at once."""
+        return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
+
+    def grams(self, part: slice) -> Floats:
+        """Sums of products of a part of the trials, shape (n_trials, 3, n_columns, n_columns), see `whitening`.
+
+        Kept where there is one part; those of more would be three times as large as the columns.
+
+        Parameters
+        ----------
+        part : one of `parts`.
+
+        Returns
+        -------
+        array, shape (n_trials, 3, n_columns, n_columns)
+        """
+        return self._whole if len(self.parts) == 1 else self._of(part)
+
+    @cached_property
+    def _whole(self) -> Floats:
+        return self._of(self.parts[0])
+
+    def _of(self, part: slice) -> Floats:
+        data = self.data[part]
+        first, relative = [one.first for one in data], [one.relative_sd for one in data]
+        return all_products(self.columns[part], first, relative)
 
 
 @dataclass(frozen=True)
@@ -127,7 +172,7 @@ def fit_columns(fit: Fit) -> list[Floats]:
 def products_of(
     fit: Fit, columns: Sequence[Floats], answers: EffectSensitivities, systematics: Sequence[Floats]
 ) -> Products:
-    """All sums of products that the tests need.
+    """All that the tests need the products of.
 
     Parameters
     ----------
@@ -141,36 +186,41 @@ def products_of(
     -------
     Products
     """
-    grams = np.stack(
-        [
-            products(np.column_stack([trial_effects, more, systematic]), trial_data.first, trial_data.relative_sd)
-            for trial_effects, more, systematic, trial_data in zip(
-                columns, answers.columns, systematics, fit.predictor.data, strict=True
-            )
-        ]
+    whole = tuple(
+        np.column_stack([of_fit, of_shapes, systematic])
+        for of_fit, of_shapes, systematic in zip(columns, answers.columns, systematics, strict=True)
     )
-    return Products(grams, columns[0].shape[1] - OWN - 1, len(answers.shapes), systematics[0].shape[1])
+    data = fit.predictor.data
+    return Products(whole, data, columns[0].shape[1] - OWN - 1, len(answers.shapes), systematics[0].shape[1])
 
 
-def _projected(fit: Fit, sums: Products, state: FitState) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.intp]]:
-    """Project shapes and residual on the free numbers of a fit, trial effects eliminated.
+@dataclass(frozen=True)
+class _Projected:
+    """Shapes and residual, trial effects eliminated, and what the free numbers of a fit explain of them.
 
-    Returns
-    -------
-    blocks : (n_trials, q, q)
-        Cross products: keys, residual, shapes, systematic errors.
-    cross, lever : (n_free, n_shapes + n_doubts)
-        I_θs, and I_θθ⁻¹ I_θs.
-    step : (n_free,)
-        Newton step of the free numbers.
-    moving : indices
-        Of the free numbers that can give way.
+    `blocks`, shape (n_trials, q, q), are cross products of keys, residual, shapes, systematic errors; `lever`, shape
+    (n_free, n_asked), is I_θθ⁻¹ I_θs; `step`, shape (n_free,), is the Newton step of the free
+    numbers; `moving` are places of those that can give way. `score`, shape (n_asked,), and `information`, squared, are
+    what is left of shapes and systematic errors; `gone` marks those of which that is nothing.
     """
+
+    blocks: Floats
+    lever: Floats
+    step: Floats
+    moving: NDArray[np.intp]
+    score: Floats
+    information: Floats
+    gone: NDArray[np.bool_]
+
+
+def _projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
+    """Project shapes and residual on the free numbers of a fit, trial effects eliminated."""
     problem = fit.solution.problem
-    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, problem, state)
-    p, size = sums.n_keys, problem.prior_mean.size
-    asked = sums.n_shapes + sums.n_doubts
+    p, size, asked = sums.n_keys, problem.prior_mean.size, sums.n_shapes + sums.n_doubts
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
+    blocks = np.empty((len(sums.columns), p + 1 + asked, p + 1 + asked))
+    for part in sums.parts:
+        blocks[part] = trial_effects_eliminated(sums.grams(part), p, *_of_trials(problem, state, part))
     square = cross_products(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
     slope = cross_products_vector(blocks[:, X, r], problem) - problem.prior_precision * (
         state.theta - problem.prior_mean
@@ -180,7 +230,21 @@ def _projected(fit: Fit, sums: Products, state: FitState) -> tuple[Floats, Float
     cross = cross[:size]
     moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(fit))
     inverse = inverse_among(square, moving)
-    return blocks, cross, inverse @ cross, inverse @ slope, moving
+    lever, step = inverse @ cross, inverse @ slope
+    total = blocks[:, C, C].sum(axis=0)
+    information, gone = _emptied(total - cross.T @ lever, total)
+    score = blocks[:, C, r].sum(axis=0) - cross.T @ step
+    score[gone] = 0.0
+    return _Projected(blocks, lever, step, moving, score, information, gone)
+
+
+def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[MixedProblem, FitState]:
+    """Problem and state of a part of the trials."""
+    arrays = ("index", "feels", "gauge_error", "own_centre", "own_precision", "points", "stretches")
+    return (
+        replace(problem, **{name: getattr(problem, name)[part] for name in arrays}),
+        replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part]),
+    )
 
 
 def levers_of(fit: Fit, sums: Products) -> Floats:
@@ -196,8 +260,8 @@ def levers_of(fit: Fit, sums: Products) -> Floats:
     ndarray, shape (n_numbers, n_shapes)
         I_θθ⁻¹ I_θs with systematic errors integrated out, in units of the number over those of the size.
     """
-    lever = _projected(fit, sums, fit.state)[2]
-    lever = lever @ _systematics_turn(_scores_with_systematics(fit, sums).information, sums.n_shapes)
+    projected = _projected(fit, sums, fit.state)
+    lever = projected.lever @ _systematics_turn(projected.information, sums.n_shapes)
     free = fit.predictor.layout.free
     slopes = [
         number.value if parameter.logarithmic else parameter.scale
@@ -220,32 +284,95 @@ def scores_of(fit: Fit, sums: Products, state: FitState | None = None) -> Scores
     -------
     Scores
     """
-    return _systematics_aside(_scores_with_systematics(fit, sums, state), sums.n_shapes)
-
-
-def _scores_with_systematics(fit: Fit, sums: Products, state: FitState | None = None) -> Scores:
-    """Scores of the shapes and, behind them, of the systematic errors, none integrated out."""
-    problem, state = fit.solution.problem, state or fit.state
-    blocks, cross, lever, step, moving = _projected(fit, sums, state)
-    index, asked, p = problem.index, sums.n_shapes + sums.n_doubts, sums.n_keys
+    projected = _projected(fit, sums, state or fit.state)
+    blocks, gone, index = projected.blocks, projected.gone, fit.solution.problem.index
+    asked, p = sums.n_shapes + sums.n_doubts, sums.n_keys
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
-    total = blocks[:, C, C].sum(axis=0)
-    information = total - cross.T @ lever
-    # What rounding leaves of a shape that the free numbers imitate exactly is nothing.
-    gone = np.diag(information) < 1e-9 * np.maximum(np.diag(total), 1e-300)
-    information[gone, :] = information[:, gone] = 0.0
-    levers = np.vstack([lever, np.zeros((1, asked))])[index]
-    steps = np.append(step, 0.0)[index]
-    left = blocks[:, :, r] - np.einsum("nqk,nk->nq", blocks[:, :, X], steps)
-    single = left[:, C] - np.einsum("nkj,nk->nj", levers, left[:, X])
-    mixed = np.swapaxes(levers, 1, 2) @ blocks[:, X, C]
-    alone = blocks[:, C, C] - mixed - np.swapaxes(mixed, 1, 2)
-    alone = alone + np.swapaxes(levers, 1, 2) @ blocks[:, X, X] @ levers
+    turn = _systematics_turn(projected.information, sums.n_shapes)
+    score, information = _beside_systematics(projected.score, projected.information, turn)
+    lever, step = np.vstack([projected.lever, np.zeros((1, asked))]), np.append(projected.step, 0.0)
+    single, informations = np.empty((len(blocks), asked)), np.empty((len(blocks), sums.n_shapes, sums.n_shapes))
+    for part in sums.parts:
+        of_part, levers, steps = blocks[part], lever[index[part]], step[index[part]]
+        left = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], steps)
+        single[part] = left[:, C] - np.einsum("nkj,nk->nj", levers, left[:, X])
+        mixed = np.swapaxes(levers, 1, 2) @ of_part[:, X, C]
+        alone = of_part[:, C, C] - mixed - np.swapaxes(mixed, 1, 2)
+        alone += np.swapaxes(levers, 1, 2) @ of_part[:, X, X] @ levers
+        informations[part] = turn.T @ alone[:, :, : sums.n_shapes]
     single[:, gone] = 0.0
-    score = blocks[:, C, r].sum(axis=0) - cross.T @ step
-    score[gone] = 0.0
-    degrees = max(len(single) - moving.size, 1)
-    return Scores(score, information, single, alone, float(degrees))
+    degrees = max(len(single) - projected.moving.size, 1)
+    return Scores(score, information, single @ turn, informations, float(degrees))
+
+
+def informations_at(fit: Fit, sums: Products, spreads: Sequence[tuple[float, float]]) -> Floats:
+    """Information of the size of every shape, alone, at other between-trial standard deviations.
+
+    That of `scores_of`, with the sum over trials taken first: between-trial standard deviations only change what the
+    two deviations of each trial explain, of rank two, so that no block of all shapes is made for any trial.
+
+    Parameters
+    ----------
+    fit : the fit that is questioned.
+    sums : from `products_of`.
+    spreads : sequence of (float, float)
+        Of pressure, relative, and of ln B.
+
+    Returns
+    -------
+    array, shape (n_spreads, n_shapes)
+    """
+    state, size, p = fit.state, fit.solution.problem.prior_mean.size, sums.n_keys
+    problem = with_shapes(fit.solution.problem, sums.n_shapes + sums.n_doubts)
+    total = problem.prior_mean.size
+    whole, squares, levers = np.zeros((total, total)), [], []
+    for part in sums.parts:
+        # The residual tells nothing of the information.
+        grams = np.delete(np.delete(sums.grams(part), OWN + p, axis=2), OWN + p, axis=3)
+        white = at_correlation(grams, state.rho) / state.variance[part, None, None]
+        flat = white[:, :2, :2] + problem.own_precision[part, :, None] * np.eye(2)
+        left = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_each(flat, white[:, :2, 2:])
+        whole += cross_products(left[:, 2:, 2:], replace(problem, index=problem.index[part]))
+        lever = np.zeros((len(left), 2, total + 1))
+        lever[:, :, size:total] = left[:, :2, 2 + p :]
+        for k in range(p):
+            lever[np.arange(len(left)), :, problem.index[part, k]] += left[:, :2, 2 + k]
+        squares.append(left[:, :2, :2])
+        levers.append(lever[:, :, :total])
+    square, lever = np.concatenate(squares), np.concatenate(levers)
+    found = []
+    for spread in spreads:
+        precision = 1 / np.maximum(spreads_of_trials(problem, spread), LEAST_SPREAD) ** 2
+        explained = solve_each(square + precision[:, :, None] * np.eye(2), lever)
+        information = whole - lever.reshape(-1, total).T @ explained.reshape(-1, total)
+        found.append(np.diag(_alone(fit, information, sums.n_shapes)))
+    return np.array(found)
+
+
+def _alone(fit: Fit, information: Floats, n_shapes: int) -> Floats:
+    """Information of the shapes, the free numbers projected off and systematic errors integrated out.
+
+    `information` is that of the free numbers, shapes and systematic errors together, without the priors of the numbers.
+    """
+    problem = fit.solution.problem
+    size = problem.prior_mean.size
+    square = information[:size, :size] + np.diag(problem.prior_precision)
+    moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(fit))
+    cross = information[:size, size:]
+    known = information[size:, size:]
+    left, _ = _emptied(known - cross.T @ inverse_among(square, moving) @ cross, known)
+    return _beside_systematics(np.zeros(len(left)), left, _systematics_turn(left, n_shapes))[1]
+
+
+def _emptied(information: Floats, before: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Information, and which shapes have none: what rounding leaves of one that others imitate exactly is nothing.
+
+    `before` is the information before the others were taken off.
+    """
+    gone = np.diag(information) < IMITATED * np.maximum(np.diag(before)[: len(information)], 1e-300)
+    left = information.copy()
+    left[gone, :] = left[:, gone] = 0.0
+    return left, gone
 
 
 def _systematics_turn(information: Floats, n_shapes: int) -> Floats:
@@ -262,15 +389,12 @@ def _systematics_turn(information: Floats, n_shapes: int) -> Floats:
     return turn
 
 
-def _systematics_aside(scores: Scores, n_shapes: int) -> Scores:
-    """What is left of the shapes once systematic errors are integrated out."""
-    turn = _systematics_turn(scores.information, n_shapes)
-    score, information = turn.T @ scores.score, scores.information[:n_shapes] @ turn
-    gone = np.diag(information) < 1e-9 * np.maximum(np.diag(scores.information)[:n_shapes], 1e-300)
-    information[gone, :] = information[:, gone] = 0.0
-    score[gone] = 0.0
-    informations = turn.T @ scores.informations[:, :, :n_shapes]
-    return Scores(score, information, scores.scores @ turn, informations, scores.degrees)
+def _beside_systematics(score: Floats, information: Floats, turn: Floats) -> tuple[Floats, Floats]:
+    """Score and information of the shapes once systematic errors are integrated out, see `_systematics_turn`."""
+    left, gone = _emptied(information[: turn.shape[1]] @ turn, information)
+    alone = turn.T @ score
+    alone[gone] = 0.0
+    return alone, left
 
 
 def _pressed(fit: Fit) -> NDArray[np.bool_]:
@@ -301,20 +425,20 @@ def linear_gains(fit: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
     variance = state.variance
     for _ in range(4):
         trial_state = FitState(state.theta, state.trial_effects, (0.01, 0.03), rho, variance)
-        scores = scores_of(fit, sums, trial_state)
-        left_over = _rest(fit, sums, trial_state)
+        projected = _projected(fit, sums, trial_state)
+        turn = _systematics_turn(projected.information, sums.n_shapes)
+        score, information = _beside_systematics(projected.score, projected.information, turn)
+        left_over = _rest(fit, projected.blocks, sums.n_keys, trial_state)
         variance = np.full_like(variance, float(np.mean(variance)) * max(left_over / total, 1e-6))
-    diagonal = np.maximum(np.diag(scores.information), 1e-300)
-    fall = np.where(np.diag(scores.information) > 0, scores.score**2 / diagonal, 0.0)
-    left = np.maximum(left_over - fall, 1e-3 * left_over)
-    return np.asarray(total * np.log(left_over / left)), scores.size
+    diagonal = np.maximum(np.diag(information), 1e-300)
+    size = np.where(np.diag(information) > 0, score / diagonal, 0.0)
+    left = np.maximum(left_over - score * size, 1e-3 * left_over)
+    return np.asarray(total * np.log(left_over / left)), size
 
 
-def _rest(fit: Fit, sums: Products, state: FitState) -> float:
+def _rest(fit: Fit, blocks: Floats, p: int, state: FitState) -> float:
     """Sum of squares that the fit's own numbers leave, with the priors' part."""
     problem = fit.solution.problem
-    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, problem, state)
-    p = sums.n_keys
     square = cross_products(blocks[:, :p, :p], problem) + np.diag(problem.prior_precision)
     away = state.theta - problem.prior_mean
     slope = cross_products_vector(blocks[:, :p, p], problem) - problem.prior_precision * away
