@@ -11,6 +11,7 @@ from grown import Pairs, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
+from vinetrack.diagnosis.between_gain import Difference, gains_from_each, linear_gain
 from vinetrack.diagnosis.between_trials import confounded, differences
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
@@ -19,6 +20,7 @@ from vinetrack.effects import find_effect
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.parameters import DAMPING, BetweenTerm
+from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.laboratory.tracks import BASE, Nature, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 
@@ -70,6 +72,32 @@ def test_wear_with_rising_pressures_is_not_called_physics(worn: Pairs) -> None:
     assert "order_drift" in result.answer_set
     assert "made in the order of pressure" in result.explanation
     assert "Repeat six trials in random order" in result.explanation
+
+
+def test_gains_of_a_later_tube_from_every_trial_on_are_those_of_one_change_after_the_other(worn: Pairs) -> None:
+    of_pairs = fit(vt.base_model(), worn, profile=False)
+    smooth = smooth_errors(of_pairs.predictor, of_pairs.solution)
+    base = smooth.solution if smooth else of_pairs.solution
+    order = [i for i, trial in enumerate(of_pairs.trials) if trial.trial.vine == of_pairs.trials[0].trial.vine]
+    members, elsewhere = order[::-1], next(i for i in range(len(worn)) if i not in order)
+
+    def later(begin: int) -> Difference:
+        groups = tuple(
+            "later" if i in members[begin:] else "other" * (i == elsewhere) for i in range(len(of_pairs.trials))
+        )
+        ones = np.ones(len(groups))
+        return Difference(
+            "specimen",
+            (
+                BetweenTerm("specimen.B", "ΔlnB", "", False, groups, ones, 0.05, 0.05),
+                BetweenTerm("specimen.P", "ΔP", "Pa", True, groups, 1e-4 * ones, 200.0, 200.0),
+            ),
+        )
+
+    begins = range(2, len(members) - 1)
+    each = [linear_gain(of_pairs, base, later(begin), spread=base.state.spread) for begin in begins]
+    assert gains_from_each(of_pairs, base, later(0), members, begins) == pytest.approx(each, abs=1e-6)
+    assert np.ptp(each) > 1.0
 
 
 def test_the_order_of_the_rows_is_taken_and_said_where_the_sheet_has_none(worn: Pairs) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,8 +12,15 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.result import N_BY_VINE
 from vinetrack.inference.fit_problem import make_problem
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.marginal_likelihood import deviance, estimate_spreads, marginal
-from vinetrack.inference.mixed_effects import FitState, MixedProblem
+from vinetrack.inference.marginal_likelihood import (
+    deviance,
+    deviance_left,
+    estimate_spreads,
+    left_to_keys,
+    marginal,
+    normal_equations,
+)
+from vinetrack.inference.mixed_effects import FitState, MixedProblem, key_places
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import BetweenTerm, ParameterMap, make_layout
 from vinetrack.inference.position_errors import with_shapes
@@ -106,6 +113,55 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
         old = new = spread
     plain = deviance(before, base.problem, base.state, old, restricted=False)
     return plain - deviance(part, problem, state, new, restricted=False)
+
+
+def gains_from_each(
+    fit: Fit, base: Solution, difference: Difference, members: Sequence[int], begins: Iterable[int]
+) -> list[float]:
+    """`linear_gain` of a difference one of whose groups begins at each of several places of its members.
+
+    Between-trial standard deviations stay those of the solution. The part that each trial adds to the sums over trials
+    is taken out in turn, so that all places take little longer than one.
+
+    Parameters
+    ----------
+    fit : the fit without the difference.
+    base : its solution, smooth errors of position among its numbers where there are any.
+    difference : the difference, with all members in the group.
+    members : sequence of int
+        Places of the trials of the group, in the order in which they were made.
+    begins : iterable of int
+        Places among the members from which on a trial is of the group, increasing.
+
+    Returns
+    -------
+    list of float
+        Falls of −2 ln L.
+    """
+    grams, problem, state = _widened(fit, base, difference)
+    spread = base.state.spread
+    plain = deviance(marginal(base.grams, base.problem, base.state), base.problem, base.state, spread, restricted=False)
+    part = marginal(grams, problem, state)
+    information, slope, square, log_det = normal_equations(part, problem, state, spread)
+    constant = square + log_det + part.log_constant
+    blocks, _ = left_to_keys(part, problem, spread)
+    places, shapes = key_places(problem), base.problem.index.shape[1] - len(fit.predictor.layout.keys)
+    last = places.shape[1] - shapes
+    of_term = np.zeros(places.shape[1], dtype=bool)
+    of_term[last - len(difference.terms) : last] = True
+    felt = of_term[:, None] | of_term
+    # One place more for keys that a trial does not feel.
+    information, slope = np.pad(information, (0, 1)), np.append(slope, 0.0)
+    gains: list[float] = []
+    taken = 0
+    for begin in begins:
+        for i in members[taken:begin]:
+            np.subtract.at(information, (places[i][:, None], places[i]), np.where(felt, blocks[i, :-1, :-1], 0.0))
+            np.subtract.at(slope, places[i][of_term], blocks[i, :-1, -1][of_term])
+        taken = begin
+        left = deviance_left(information[:-1, :-1], slope[:-1], constant, problem, state, restricted=False)
+        gains.append(plain - left)
+    return gains
 
 
 def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, MixedProblem, FitState]:

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.between_gain import Difference, chance_of_gain, linear_gain
+from vinetrack.diagnosis.between_gain import Difference, chance_of_gain, gains_from_each, linear_gain
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
@@ -287,15 +287,15 @@ def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Differen
     groups = [""] * len(trials)
     for vine in dict.fromkeys(trial.vine for trial in trials):
         members = sorted((i for i, trial in enumerate(trials) if trial.vine == vine), key=lambda i: ranks[i])
-        ways = []
-        for begin in range(2, len(members) - 1):
-            later = set(members[begin:])
-            way = [f"{vine}, later tube" if i in later else group for i, group in enumerate(groups)]
-            form = _forms(SPECIMEN, way, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
-            gain = linear_gain(fit, base, form, spread=base.state.spread)
-            ways.append((gain, way))
-        if ways:
-            groups = max(ways, key=lambda candidate_way: candidate_way[0])[1]
+        begins = range(2, len(members) - 1)
+        if not begins:
+            continue
+        tube = f"{vine}, later tube"
+        whole = [tube if trial.vine == vine else group for trial, group in zip(trials, groups, strict=True)]
+        form = _forms(SPECIMEN, whole, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
+        first = begins[int(np.argmax(gains_from_each(fit, base, form, members, begins)))]
+        for i in members[first:]:
+            groups[i] = tube
     conditions = [trial.condition for trial in trials]
     changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
     if _in_turn(ranks, conditions):
