@@ -26,10 +26,9 @@ from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_questions
 from vinetrack.diagnosis.linear_power import effect_power, typical_place
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials
-from vinetrack.diagnosis.score_test import scores_of
+from vinetrack.diagnosis.score_test import blocks_of, scores_of
 from vinetrack.dynamics.model import Value
 from vinetrack.experiment.settings import Limits
-from vinetrack.inference.mixed_effects import trial_effects_eliminated
 from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.planning.campaign_information import FEWEST_MOVING
@@ -268,7 +267,7 @@ def _questions(design: CampaignDesign, added: Sequence[Condition], candidates: t
 def _wide(asked: MisfitTests, effect: str) -> Floats:
     """Cross products of each trial among free numbers, shared systematic errors and the effect, in this order."""
     fit, sums, problem = asked.fit, asked.sums, asked.fit.solution.problem
-    blocks = trial_effects_eliminated(sums.grams, sums.n_keys, problem, fit.state)
+    blocks = blocks_of(fit, sums, fit.state)
     keys, free, n = sums.n_keys, problem.prior_mean.size, len(blocks)
     shape = keys + 1 + typical_place(asked, effect)
     systematics = np.arange(keys + 1 + sums.n_shapes, keys + 1 + sums.n_shapes + sums.n_doubts)
@@ -352,6 +351,6 @@ def _of_trials(asked: MisfitTests, places: Sequence[int]) -> MisfitTests:
         columns=tuple(fit.solution.columns[k] for k in where),
     )
     part = replace(fit, predictor=predictor, solution=solution, trials=tuple(fit.trials[k] for k in where), smooth=None)
-    sums = replace(asked.sums, grams=asked.sums.grams[where])
+    sums = asked.sums.of(where)
     answers = replace(asked.answers, columns=tuple(asked.answers.columns[k] for k in where))
     return replace(asked, fit=part, sums=sums, answers=answers, scores=scores_of(part, sums))

@@ -92,6 +92,19 @@ class Products:
         """
         return self._whole if len(self.parts) == 1 else self._of(part)
 
+    def of(self, places: Sequence[int]) -> Products:
+        """The same of some of the trials, some of them several times.
+
+        Parameters
+        ----------
+        places : of the trials, in their new order.
+
+        Returns
+        -------
+        Products
+        """
+        return replace(self, columns=tuple(self.columns[k] for k in places), data=[self.data[k] for k in places])
+
     @cached_property
     def _whole(self) -> Floats:
         return self._of(self.parts[0])
@@ -218,9 +231,7 @@ def _projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
     problem = fit.solution.problem
     p, size, asked = sums.n_keys, problem.prior_mean.size, sums.n_shapes + sums.n_doubts
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
-    blocks = np.empty((len(sums.columns), p + 1 + asked, p + 1 + asked))
-    for part in sums.parts:
-        blocks[part] = trial_effects_eliminated(sums.grams(part), p, *_of_trials(problem, state, part))
+    blocks = blocks_of(fit, sums, state)
     square = cross_products(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
     slope = cross_products_vector(blocks[:, X, r], problem) - problem.prior_precision * (
         state.theta - problem.prior_mean
@@ -236,6 +247,27 @@ def _projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
     score = blocks[:, C, r].sum(axis=0) - cross.T @ step
     score[gone] = 0.0
     return _Projected(blocks, lever, step, moving, score, information, gone)
+
+
+def blocks_of(fit: Fit, sums: Products, state: FitState) -> Floats:
+    """Products of keys, residual, shapes and systematic errors of every trial, its own numbers integrated out.
+
+    Parameters
+    ----------
+    fit : the fit that is questioned.
+    sums : from `products_of`.
+    state : noise and spreads.
+
+    Returns
+    -------
+    array, shape (n_trials, n_keys + 1 + n_asked, n_keys + 1 + n_asked)
+    """
+    size = sums.n_keys + 1 + sums.n_shapes + sums.n_doubts
+    blocks = np.empty((len(sums.columns), size, size))
+    for part in sums.parts:
+        of_part = _of_trials(fit.solution.problem, state, part)
+        blocks[part] = trial_effects_eliminated(sums.grams(part), sums.n_keys, *of_part)
+    return blocks
 
 
 def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[MixedProblem, FitState]:
