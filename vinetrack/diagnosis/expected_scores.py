@@ -18,7 +18,8 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.score_test import fit_columns, products_of, scores_of
+from vinetrack.diagnosis.score_test import scores_of
+from vinetrack.diagnosis.shape_products import fit_columns, products_of
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import Fit

@@ -26,7 +26,8 @@ from vinetrack.diagnosis.campaign_power import CampaignDesign, planned_questions
 from vinetrack.diagnosis.linear_power import effect_power, typical_place
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import AddedTrial, EffectPower, FurtherTrials
-from vinetrack.diagnosis.score_test import blocks_of, scores_of
+from vinetrack.diagnosis.score_test import scores_of
+from vinetrack.diagnosis.shape_products import blocks_of
 from vinetrack.dynamics.model import Value
 from vinetrack.experiment.settings import Limits
 from vinetrack.inference.parameters import DAMPING

@@ -16,32 +16,29 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape
-from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect_sensitivities
+from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
 from vinetrack.diagnosis.initial_fit import probe
-from vinetrack.inference.fit_data import FitTrial
+from vinetrack.diagnosis.shape_products import Products, blocks_of, products_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
     LEAST_SPREAD,
     FitState,
-    MixedProblem,
     cross_products,
     cross_products_vector,
     inverse_among,
     solve_each,
-    trial_effects_eliminated,
 )
 from vinetrack.inference.mixed_effects import spreads as spreads_of_trials
 from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.robust_covariance import scatter_of
 from vinetrack.inference.sensitivity import OWN
-from vinetrack.inference.whitening import all_products, at_correlation
+from vinetrack.inference.whitening import at_correlation
 
 BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
 """Probe bumps along growth, speed and time. Chosen: as fine as positions resolve."""
@@ -53,66 +50,6 @@ Chosen: a hundredth of its amplitude."""
 IMITATED = 1e-9
 """Part of its information that rounding leaves of a shape that others imitate exactly. Derived: products of some
 hundred points agree to 1e-13, and to 1e-10 once what others explain is taken off."""
-
-TRIALS_AT_ONCE = 64
-"""Trials whose products of all shapes are held at once, each of half a megabyte. Chosen for memory; no result depends
-on it."""
-
-
-@dataclass(frozen=True)
-class Products:
-    """Columns of a fit and of answers, shape (n_points, n_columns) a trial, and the sums of their products.
-
-    In order: own numbers, keys, residual, shapes, doubts.
-    """
-
-    columns: tuple[Floats, ...]
-    data: Sequence[FitTrial]
-    n_keys: int
-    n_shapes: int
-    n_doubts: int = 0
-
-    @cached_property
-    def parts(self) -> list[slice]:
-        """The trials in parts whose products are held at once."""
-        return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
-
-    def grams(self, part: slice) -> Floats:
-        """Sums of products of a part of the trials, shape (n_trials, 3, n_columns, n_columns), see `whitening`.
-
-        Kept where there is one part; those of more would be three times as large as the columns.
-
-        Parameters
-        ----------
-        part : one of `parts`.
-
-        Returns
-        -------
-        array, shape (n_trials, 3, n_columns, n_columns)
-        """
-        return self._whole if len(self.parts) == 1 else self._of(part)
-
-    def of(self, places: Sequence[int]) -> Products:
-        """The same of some of the trials, some of them several times.
-
-        Parameters
-        ----------
-        places : of the trials, in their new order.
-
-        Returns
-        -------
-        Products
-        """
-        return replace(self, columns=tuple(self.columns[k] for k in places), data=[self.data[k] for k in places])
-
-    @cached_property
-    def _whole(self) -> Floats:
-        return self._of(self.parts[0])
-
-    def _of(self, part: slice) -> Floats:
-        data = self.data[part]
-        first, relative = [one.first for one in data], [one.relative_sd for one in data]
-        return all_products(self.columns[part], first, relative)
 
 
 @dataclass(frozen=True)
@@ -166,47 +103,6 @@ class Scores:
         return np.asarray(np.clip(self.information / root[:, None] / root, -1, 1))
 
 
-def fit_columns(fit: Fit) -> list[Floats]:
-    """Columns of a fit's own numbers and residual, with derivatives as those of the candidates are taken.
-
-    Parameters
-    ----------
-    fit : the fit that is questioned.
-
-    Returns
-    -------
-    list of arrays, shape (n_points, 4 + n_keys + 1)
-        As `Predictor.linearise`, past the end of growth.
-    """
-    state = fit.solution.state
-    return fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
-
-
-def products_of(
-    fit: Fit, columns: Sequence[Floats], answers: EffectSensitivities, systematics: Sequence[Floats]
-) -> Products:
-    """All that the tests need the products of.
-
-    Parameters
-    ----------
-    fit : the fit that is questioned.
-    columns : its own, from `fit_columns`.
-    answers : how positions answer to the candidates.
-    systematics : sequence of arrays, shape (n_points, n_systematics), m
-        From `vinetrack.inference.systematics`.
-
-    Returns
-    -------
-    Products
-    """
-    whole = tuple(
-        np.column_stack([of_fit, of_shapes, systematic])
-        for of_fit, of_shapes, systematic in zip(columns, answers.columns, systematics, strict=True)
-    )
-    data = fit.predictor.data
-    return Products(whole, data, columns[0].shape[1] - OWN - 1, len(answers.shapes), systematics[0].shape[1])
-
-
 @dataclass(frozen=True)
 class _Projected:
     """Shapes and residual, trial effects eliminated, and what the free numbers of a fit explain of them.
@@ -247,36 +143,6 @@ def _projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
     score = blocks[:, C, r].sum(axis=0) - cross.T @ step
     score[gone] = 0.0
     return _Projected(blocks, lever, step, moving, score, information, gone)
-
-
-def blocks_of(fit: Fit, sums: Products, state: FitState) -> Floats:
-    """Products of keys, residual, shapes and systematic errors of every trial, its own numbers integrated out.
-
-    Parameters
-    ----------
-    fit : the fit that is questioned.
-    sums : from `products_of`.
-    state : noise and spreads.
-
-    Returns
-    -------
-    array, shape (n_trials, n_keys + 1 + n_asked, n_keys + 1 + n_asked)
-    """
-    size = sums.n_keys + 1 + sums.n_shapes + sums.n_doubts
-    blocks = np.empty((len(sums.columns), size, size))
-    for part in sums.parts:
-        of_part = _of_trials(fit.solution.problem, state, part)
-        blocks[part] = trial_effects_eliminated(sums.grams(part), sums.n_keys, *of_part)
-    return blocks
-
-
-def _of_trials(problem: MixedProblem, state: FitState, part: slice) -> tuple[MixedProblem, FitState]:
-    """Problem and state of a part of the trials."""
-    arrays = ("index", "feels", "gauge_error", "own_centre", "own_precision", "points", "stretches")
-    return (
-        replace(problem, **{name: getattr(problem, name)[part] for name in arrays}),
-        replace(state, trial_effects=state.trial_effects[part], variance=state.variance[part]),
-    )
 
 
 def levers_of(fit: Fit, sums: Products) -> Floats:
