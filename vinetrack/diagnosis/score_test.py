@@ -238,13 +238,13 @@ def informations_at(fit: Fit, sums: Products, spreads: Sequence[tuple[float, flo
         squares.append(left[:, :2, :2])
         levers.append(lever[:, :, :total])
     square, lever = np.concatenate(squares), np.concatenate(levers)
-    found = []
+    alone = []
     for spread in spreads:
         precision = 1 / np.maximum(spreads_of_trials(problem, spread), LEAST_SPREAD) ** 2
         explained = solve_each(square + precision[:, :, None] * np.eye(2), lever)
         information = whole - lever.reshape(-1, total).T @ explained.reshape(-1, total)
-        found.append(np.diag(_alone(fit, information, sums.n_shapes)))
-    return np.array(found)
+        alone.append(np.diag(_alone(fit, information, sums.n_shapes)))
+    return np.array(alone)
 
 
 def _alone(fit: Fit, information: Floats, n_shapes: int) -> Floats:

@@ -76,7 +76,8 @@ class Products:
 
     def _of(self, part: slice) -> Floats:
         data = self.data[part]
-        first, relative = [one.first for one in data], [one.relative_sd for one in data]
+        first = [trial_data.first for trial_data in data]
+        relative = [trial_data.relative_sd for trial_data in data]
         return all_products(self.columns[part], first, relative)
 
 

@@ -110,10 +110,10 @@ def sums_without_deviations(
         b = -s * side / first * t / second
         a = s * s / first + (s * side / first) * (s * side / first) / second
         for u in range(2, last + 1):
-            one = a * block[0, u] + b * block[1, u]
-            other = b * block[0, u] + c * block[1, u]
+            of_pressure = a * block[0, u] + b * block[1, u]
+            of_damping = b * block[0, u] + c * block[1, u]
             for v in range(2, u + 1):
-                left = block[u, v] - one * block[0, v] - other * block[1, v]
+                left = block[u, v] - of_pressure * block[0, v] - of_damping * block[1, v]
                 if u < last:
                     information[of[u - 2], of[v - 2]] += left
                     if v < u:
