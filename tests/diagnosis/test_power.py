@@ -13,7 +13,7 @@ from scipy.stats import norm
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_questions
-from vinetrack.diagnosis.expected_scores import score_ratio
+from vinetrack.diagnosis.expected_scores import beyond, displacements, fitted_without, score_ratio
 from vinetrack.diagnosis.linear_power import power_of, spread_widening
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
@@ -128,6 +128,23 @@ def test_a_sheet_that_states_days_has_one_more_test() -> None:
 def test_a_small_size_has_the_score_of_linear_theory(six: MisfitTests, power: Power) -> None:
     k = place_of(six, "leak")
     assert score_ratio(six, k, 0.3 * power["leak"].size_at(0.5)) == pytest.approx(1.0, abs=0.03)
+
+
+def test_how_far_an_effect_moves_positions_is_what_a_refit_without_it_leaves(six: MisfitTests, power: Power) -> None:
+    k, size = place_of(six, "leak"), 0.5 * power["leak"].size_at(0.5)
+    moved_m = size * displacements(six.fit, six.sums)[k]
+    left = [block[:, -1] for block in fitted_without(six.fit, six.answers.shapes[k], size).solution.columns]
+    assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
+
+
+def test_an_effect_within_the_errors_of_positions_counts_half() -> None:
+    sizes = 1 + 0.1 * norm.ppf(PROBABILITIES)
+    found = beyond(1.12, sizes)
+    assert found[PROBABILITIES.index(0.9)] == pytest.approx(sizes[PROBABILITIES.index(0.9)])
+    assert found[PROBABILITIES.index(0.4)] == pytest.approx(sizes[PROBABILITIES.index(0.8)])
+    assert found[PROBABILITIES.index(0.6)] == pytest.approx(1.12)
+    assert beyond(0.0, sizes) == pytest.approx(sizes)
+    assert beyond(1.12, -sizes) == pytest.approx(-found)
 
 
 def test_power_survives_its_file(power: Power) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from vinetrack.cli.main import app
 from vinetrack.core.problems import ExperimentError
 from vinetrack.diagnosis.campaign_power import CampaignDesign
+from vinetrack.diagnosis.null_calibration import TESTS, TestChances
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer
 from vinetrack.figures.registry import draw
 from vinetrack.pipeline import simulated_answers
@@ -72,6 +74,29 @@ def test_the_trials_to_add_are_printed_and_written_as_rows_of_the_sheet(folder: 
     )
     again = power_of_target(PowerAsked(tmp_path))["leak"]
     assert again.probability_at(0.7 * now.size_at(0.9)) > 0.88
+
+
+def test_null_campaigns_are_kept_and_not_simulated_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked_for: list[int] = []
+
+    def chances(design: CampaignDesign, seed: int) -> TestChances:  # noqa: ARG001
+        asked_for.append(seed)
+        return TestChances(seed, dict.fromkeys(TESTS, 0.1 * (seed + 1)))
+
+    monkeypatch.setattr(simulated_answers, "null_chances", chances)
+    monkeypatch.setattr(simulated_answers, "fingerprint", lambda _: "design")
+    how = simulated_answers.Simulation(2, 0, 1, tmp_path / "chances.csv")
+    design: Any = None
+    first = simulated_answers.simulated_chances(design, how)
+    again = simulated_answers.simulated_chances(design, replace(how, campaigns=3))
+    assert asked_for == [0, 1, 2]
+    assert again[:2] == first
+    assert again[2].chances["any smooth force"] == pytest.approx(0.3)
+
+
+def test_a_sheet_that_nobody_has_filmed_cannot_be_calibrated(folder: Path) -> None:
+    with pytest.raises(ExperimentError, match="needs measured trials"):
+        power_of_target(PowerAsked(folder, calibrate=3))
 
 
 def test_trials_to_add_need_a_size(folder: Path) -> None:

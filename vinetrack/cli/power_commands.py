@@ -74,6 +74,11 @@ def _power(
         typer.Option("--simulate", min=0, max=100_000, rich_help_panel=SIMULATION,
                      help="Campaigns to simulate and diagnose: with nothing missing, and with every --effect."),
     ] = 0,
+    calibrate: Annotated[
+        int,
+        typer.Option("--calibrate", min=0, max=100_000, rich_help_panel=SIMULATION,
+                     help="Campaigns with nothing missing that the thresholds of a verdict are held against."),
+    ] = 0,
     jobs: Annotated[int, typer.Option("--jobs", min=1, rich_help_panel=SIMULATION, help="Processes.")] = 2,
     seed: Annotated[
         int, typer.Option("--seed", min=0, rich_help_panel=SIMULATION, help="Of the first simulated campaign.")
@@ -127,6 +132,7 @@ def _power(
                 B=_or_nan(B),
                 n=_or_nan(n),
                 simulate=simulate,
+                calibrate=calibrate,
                 jobs=jobs,
                 first_seed=seed,
                 answers=answers,

@@ -9,6 +9,7 @@ Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011).
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -18,14 +19,17 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-from vinetrack.diagnosis.score_test import scores_of
-from vinetrack.diagnosis.shape_products import fit_columns, products_of
+from vinetrack.diagnosis.power import PROBABILITIES
+from vinetrack.diagnosis.score_test import projected, scores_of
+from vinetrack.diagnosis.shape_products import Products, fit_columns, products_of
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.mixed_effects import solve_each, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.systematics import systematics_of
+from vinetrack.inference.whitening import at_correlation
 
 ITERATIONS = 4
 """Gauss–Newton steps of the fit without the effect. Chosen: begun at the truth it settles in two or three; at half
@@ -51,7 +55,7 @@ def score_ratio(questions: MisfitTests, place: int, size: float) -> float:
     if shape.whole or not shape.effect.parameters:
         return 1.0
     try:
-        after = _fitted_without(fit, shape, size)
+        after = fitted_without(fit, shape, size)
         answers = effect_sensitivities(after, [shape])
         systematics = systematics_of(after.predictor, after.solution, after.trials)
     except (SimulationError, np.linalg.LinAlgError):
@@ -62,8 +66,95 @@ def score_ratio(questions: MisfitTests, place: int, size: float) -> float:
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
 
 
-def _fitted_without(fit: Fit, shape: CandidateShape, size: float) -> Fit:
-    """The model of a fit, fitted to noise-free trajectories with the effect; noise and spreads stay as they are."""
+def least_sizes(questions: MisfitTests) -> Floats:
+    """Sizes at which an effect moves positions by as much as their systematic errors.
+
+    Parameters
+    ----------
+    questions : the fit, held against all candidates.
+
+    Returns
+    -------
+    array, shape (n_shapes,)
+        Deviations from absence, SI, positive; 0 where positions have no such errors.
+    """
+    fit = questions.fit
+    systematic_m = float(np.median([trial_data.position_systematic_m for trial_data in fit.predictor.data]))
+    if not systematic_m > 0:
+        return np.zeros(len(questions.answers.shapes))
+    moved_m = displacements(fit, questions.sums)
+    return np.asarray(systematic_m / np.maximum(moved_m, 1e-300))
+
+
+def displacements(fit: Fit, sums: Products) -> Floats:
+    """How far a fit without an effect stays from trajectories with a unit of its size, to first order.
+
+    Parameters
+    ----------
+    fit : the fit that is questioned.
+    sums : its columns and those of the candidates.
+
+    Returns
+    -------
+    array, shape (n_shapes,), m per unit of each size
+        Root mean square over trials of the largest distance, all free numbers and those of each trial fitted.
+    """
+    problem, state, n_shapes = fit.solution.problem, fit.state, sums.n_shapes
+    levers = np.vstack([projected(fit, sums, state).lever[:, :n_shapes], np.zeros((1, n_shapes))])[problem.index]
+    precision = trial_effect_prior(problem, state)[1]
+    keys, shapes = slice(OWN, OWN + sums.n_keys), slice(OWN + sums.n_keys + 1, OWN + sums.n_keys + 1 + n_shapes)
+    largest = []
+    for part in sums.parts:
+        white = at_correlation(sums.grams(part), state.rho) / state.variance[part, None, None]
+        within_trial = white[:, :OWN, :OWN] + precision[part][:, :, None] * np.eye(OWN)
+        deviations = solve_each(within_trial, white[:, :OWN, shapes] - white[:, :OWN, keys] @ levers[part])
+        largest += [
+            np.max(np.abs(columns[:, shapes] - columns[:, :OWN] @ mine - columns[:, keys] @ shared), axis=0)
+            for columns, mine, shared in zip(sums.columns[part], deviations, levers[part], strict=True)
+        ]
+    return np.asarray(np.sqrt(np.mean(np.square(largest), axis=0)))
+
+
+def beyond(least: float, sizes: Floats) -> Floats:
+    """Return sizes by probability where a finding below the least size counts half.
+
+    Parameters
+    ----------
+    least : float
+        Deviation from absence, SI, positive.
+    sizes : array
+        Deviations at `PROBABILITIES`.
+
+    Returns
+    -------
+    array
+        Of the same shape.
+    """
+    away = np.abs(sizes)
+    half = np.interp(2 * np.array(PROBABILITIES), PROBABILITIES, away, right=math.inf)
+    return np.asarray(np.sign(sizes) * np.where(away >= least, away, np.minimum(half, least)))
+
+
+def fitted_without(fit: Fit, shape: CandidateShape, size: float) -> Fit:
+    """Fit the model of a fit to noise-free trajectories with an effect; noise and spreads stay as they are.
+
+    Parameters
+    ----------
+    fit : of the model without the effect.
+    shape : in which the effect is put in.
+    size : float
+        Deviation from absence, SI.
+
+    Returns
+    -------
+    Fit
+        What its solution's columns leave is what the model cannot follow.
+
+    Raises
+    ------
+    SimulationError
+        If a trial does not move with the effect.
+    """
     state = fit.state
     trial_effects = state.trial_effects.copy()
     trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0

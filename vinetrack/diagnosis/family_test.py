@@ -142,9 +142,39 @@ def family_test(cosines: Floats, signs: Sequence[int], effects: Sequence[str], l
     return FamilyTest(level, math.exp(low), thresholds(low))
 
 
+def family_chance(cosines: Floats, signs: Sequence[int], effects: Sequence[str], observed: Floats) -> float:
+    """Chance that any candidate stands out as far as the one that does so most: the p-value of the family.
+
+    Parameters
+    ----------
+    cosines, signs, effects
+        As in `family_test`.
+    observed : array, shape (n_shapes,)
+        Scores where they count in their direction, 0 where they do not.
+
+    Returns
+    -------
+    float
+        1 where there is no candidate. Below 1e-12 it is no more than an order of magnitude.
+    """
+    scores = _Scores(cosines, signs) if effects else None
+    if scores is None or not scores.live.any():
+        return 1.0
+    of = np.array(effects)
+    places = [where for name in dict.fromkeys(effects) if (where := np.flatnonzero((of == name) & scores.live)).size]
+    alone = [scores.chance(where, np.full(where.size, max(float(observed[where].max()), 0.0))) for where in places]
+    least = min(alone)
+    limits = []
+    for where in places:
+        nodes, logs = _own_chances(scores, where, least, len(places))
+        limits.append(math.sqrt(float(np.interp(-math.log(max(least, 1e-300)), -logs, nodes))))
+    asked = np.concatenate([np.full(where.size, limit) for where, limit in zip(places, limits, strict=True)])
+    return min(scores.chance(np.concatenate(places), asked), 1.0)
+
+
 def _own_chances(scores: _Scores, places: NDArray[np.intp], level: float, candidates: int) -> tuple[Floats, Floats]:
     """Squares of thresholds of a candidate, increasing, and ln of the chance at which it exceeds each."""
     most = 2.0 * len(places) * candidates
-    nodes = np.linspace(-float(ndtri(min(level, 0.4))), -float(ndtri(level / most)), NODES)
+    nodes = np.linspace(-float(ndtri(min(level, 0.4))), -float(ndtri(max(level, 1e-290) / most)), NODES)
     chances = [scores.chance(places, np.full(places.size, node)) for node in nodes]
     return nodes**2, np.log(np.maximum(chances, 1e-300))

@@ -6,13 +6,16 @@ candidate (`family_test`). With an effect of size a the score of shape j is norm
     z_j ~ N(μ_j(a), 1),   μ_j(a) = I_jk a / √I_jj,   corr(z_i, z_j) = I_ij / √(I_ii I_jj)
 
 where k is the shape of the effect and I the information between shapes, free numbers and trial effects projected off.
-So a size is found with probability p at a_p = σ (c + Φ⁻¹(p)), σ = 1/√I_kk. Two refinements:
+So a size is found with probability p at a_p = σ (c + Φ⁻¹(p)), σ = 1/√I_kk. Refinements:
 
 - The diagnosis also asks that the score exceed what the scatter of single trials allows (Student's t). With the scores
   of single trials independent, s_i ~ N(I_i a, I_i), the mean that is needed, μ > c max(1, t_c r / c) − z₀ with r the
   ratio of both errors, is drawn jointly with z₀; its quantiles replace c + Φ⁻¹(p).
 - The fit without the effect takes a part of it for scatter between trials, which widens σ (`spread_widening`): the
   score x that would be seen at the true spreads must exceed c g(x), g the ratio of the errors.
+- A diagnosis does not count an effect that moves positions by less than their systematic errors, unless it predicts
+  left-out conditions better (`contradictions`). So small an effect does that about as often as not: below the size that
+  moves positions so far, the probability counts half (`expected_scores.beyond`).
 - An effect whose small sizes do nothing is followed at finite sizes, between which μ_j(a) is interpolated.
 
 What an effect is taken for follows from draws of the joint normal distribution at that size.
@@ -29,7 +32,7 @@ from scipy.stats import norm, t
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, plausible_range
-from vinetrack.diagnosis.expected_scores import score_ratio
+from vinetrack.diagnosis.expected_scores import beyond, least_sizes, score_ratio
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, CREDIBLE
 from vinetrack.diagnosis.misfit_tests import LOUD_PROBE, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
@@ -64,12 +67,13 @@ name that turns up once in ten is passed over."""
 class _Response:
     """Expected scores of all shapes while an effect has one of several sizes.
 
-    `sizes`, shape (n_sizes,), are deviations from absence in SI, increasing in absolute value; `scores`, shape
-    (n_sizes, n_shapes), the means of the scores in standard errors.
+    `place` is that of `shape` among all. `sizes`, shape (n_sizes,), are deviations from absence in SI, increasing in
+    absolute value; `scores`, shape (n_sizes, n_shapes), the means of the scores in standard errors.
     """
 
     effect: Effect
     shape: CandidateShape
+    place: int
     sizes: Floats
     scores: Floats
 
@@ -101,11 +105,11 @@ def power_of(
     -------
     Power
     """
-    joint, widening = _joint_draws(questions), spread_widening(questions)
+    joint, widening, least = _joint_draws(questions), spread_widening(questions), least_sizes(questions)
     effects = [
         power
         for response in _responses(questions, curved=curved)
-        if (power := _effect_power(questions, response, joint, widening)) is not None
+        if (power := _effect_power(questions, response, joint, widening, least)) is not None
     ]
     silent = dict.fromkeys(questions.answers.silent, "no trial responds to it at any plausible size")
     wary = ""
@@ -140,7 +144,9 @@ def effect_power(questions: MisfitTests, name: str) -> EffectPower | None:
     responses = _responses(questions, curved=True, only=name)
     if not responses:
         return None
-    return _effect_power(questions, responses[0], _joint_draws(questions), spread_widening(questions))
+    return _effect_power(
+        questions, responses[0], _joint_draws(questions), spread_widening(questions), least_sizes(questions)
+    )
 
 
 def typical_place(questions: MisfitTests, name: str) -> int:
@@ -198,7 +204,9 @@ def _responses(questions: MisfitTests, *, curved: bool, only: str = "") -> list[
         if curved and not shapes[0].whole:
             sizes, bend = _curve(questions, places[0], float(sizes[0]))
             scores = scores[0] * (bend * np.abs(sizes / sizes[0]))[:, None]
-        responses.append(_Response(effect, shapes[0], sizes, np.where(np.diag(information) > 0, scores, 0.0)))
+        responses.append(
+            _Response(effect, shapes[0], places[0], sizes, np.where(np.diag(information) > 0, scores, 0.0))
+        )
     return responses
 
 
@@ -234,7 +242,9 @@ def _one_way(scores: Floats, signs: Sequence[int]) -> Floats:
     return np.asarray(np.where(sided == 0, np.abs(scores), scores * sided))
 
 
-def _effect_power(questions: MisfitTests, response: _Response, joint: Floats, widening: Floats) -> EffectPower | None:
+def _effect_power(
+    questions: MisfitTests, response: _Response, joint: Floats, widening: Floats, least: Floats
+) -> EffectPower | None:
     """Detectable sizes of one effect, and what it is taken for at the size found with 90 %."""
     places = [k for k, name in enumerate(questions.answers.effects) if name == response.effect.name]
     expected = _one_way(response.scores, questions.signs)
@@ -244,6 +254,8 @@ def _effect_power(questions: MisfitTests, response: _Response, joint: Floats, wi
         return None
     needed = np.quantile(_needed_means(questions, place, widening[:, place]), PROBABILITIES)
     steps = np.array([_between(means, response.sizes, mean) for mean in needed])
+    if not response.shape.whole and np.isfinite(steps).all():
+        steps = beyond(float(least[response.place]), steps)
     taken_for, alone = _taken_for(questions, response, float(steps[PROBABILITIES.index(0.9)]), joint)
     effect, shape = response.effect, response.shape
     if not effect.parameters:

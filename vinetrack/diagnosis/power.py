@@ -20,6 +20,8 @@ from vinetrack.experiment.schema import COLUMNS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from vinetrack.diagnosis.null_calibration import Calibration
+
 STATED_95 = 0.95
 """Confidence of the intervals of rates; a convention."""
 
@@ -312,7 +314,8 @@ class Power:
     each test to the chance at which it takes nothing for something; they add up at most. `not_testable` maps other
     candidates to the reason why they cannot be seen. `wary` tells why the sizes are not to be trusted, blank where
     they are. `simulated` are rates of complete diagnoses, where campaigns were simulated, and `further` the trials that
-    would find an effect more often, where they were asked for.
+    would find an effect more often, where they were asked for; `calibration` holds the tests of a first model against
+    null campaigns.
     """
 
     n_trials: int
@@ -326,6 +329,7 @@ class Power:
     wary: str = ""
     simulated: tuple[SimulatedRates, ...] = ()
     further: tuple[FurtherTrials, ...] = ()
+    calibration: Calibration | None = None
 
     @property
     def false_alarm_rate(self) -> float:
@@ -380,6 +384,7 @@ class Power:
             "wary": self.wary,
             "simulated": [rates.to_json() for rates in self.simulated],
             "in_words": [false_alarm_sentence(self), *could_have_seen(self)],
+            **({"calibration": self.calibration.to_json()} if self.calibration else {}),
             **({"further_trials": [plan.to_json() for plan in self.further]} if self.further else {}),
         }
 

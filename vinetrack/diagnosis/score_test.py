@@ -3,8 +3,7 @@
 About a fitted model, measured minus predicted positions of trial i are r_i = X_i Δθ + C_i a + Z_i u_i + e_i, with C_i
 the answers to the candidates' sizes a (`vinetrack.diagnosis.effect_sensitivities`). Release, origin and the
 deviations of pressure and B of every trial are integrated out, the free numbers projected off. What remains of a
-candidate has a score, an
-information, and a cosine with every other.
+candidate has a score, an information, and a cosine with every other.
 
 The information is taken twice: from the noise and spreads of the fit, and from how much the scores of single trials
 scatter (White, Econometrica 48, 817, 1980, with trials as clusters), which holds whatever the noise within a trial is
@@ -122,8 +121,18 @@ class _Projected:
     gone: NDArray[np.bool_]
 
 
-def _projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
-    """Project shapes and residual on the free numbers of a fit, trial effects eliminated."""
+def projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
+    """Project shapes and residual on the free numbers of a fit, trial effects eliminated.
+
+    Parameters
+    ----------
+    fit, sums, state
+        As of `scores_of`.
+
+    Returns
+    -------
+    _Projected
+    """
     problem = fit.solution.problem
     p, size, asked = sums.n_keys, problem.prior_mean.size, sums.n_shapes + sums.n_doubts
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
@@ -158,8 +167,8 @@ def levers_of(fit: Fit, sums: Products) -> Floats:
     ndarray, shape (n_numbers, n_shapes)
         I_θθ⁻¹ I_θs with systematic errors integrated out, in units of the number over those of the size.
     """
-    projected = _projected(fit, sums, fit.state)
-    lever = projected.lever @ _systematics_turn(projected.information, sums.n_shapes)
+    projection = projected(fit, sums, fit.state)
+    lever = projection.lever @ _systematics_turn(projection.information, sums.n_shapes)
     free = fit.predictor.layout.free
     slopes = [
         number.value if parameter.logarithmic else parameter.scale
@@ -182,13 +191,13 @@ def scores_of(fit: Fit, sums: Products, state: FitState | None = None) -> Scores
     -------
     Scores
     """
-    projected = _projected(fit, sums, state or fit.state)
-    blocks, gone, index = projected.blocks, projected.gone, fit.solution.problem.index
+    projection = projected(fit, sums, state or fit.state)
+    blocks, gone, index = projection.blocks, projection.gone, fit.solution.problem.index
     asked, p = sums.n_shapes + sums.n_doubts, sums.n_keys
     X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
-    turn = _systematics_turn(projected.information, sums.n_shapes)
-    score, information = _beside_systematics(projected.score, projected.information, turn)
-    lever, step = np.vstack([projected.lever, np.zeros((1, asked))]), np.append(projected.step, 0.0)
+    turn = _systematics_turn(projection.information, sums.n_shapes)
+    score, information = _beside_systematics(projection.score, projection.information, turn)
+    lever, step = np.vstack([projection.lever, np.zeros((1, asked))]), np.append(projection.step, 0.0)
     single, informations = np.empty((len(blocks), asked)), np.empty((len(blocks), sums.n_shapes, sums.n_shapes))
     for part in sums.parts:
         of_part, levers, steps = blocks[part], lever[index[part]], step[index[part]]
@@ -199,7 +208,7 @@ def scores_of(fit: Fit, sums: Products, state: FitState | None = None) -> Scores
         alone += np.swapaxes(levers, 1, 2) @ of_part[:, X, X] @ levers
         informations[part] = turn.T @ alone[:, :, : sums.n_shapes]
     single[:, gone] = 0.0
-    degrees = max(len(single) - projected.moving.size, 1)
+    degrees = max(len(single) - projection.moving.size, 1)
     return Scores(score, information, single @ turn, informations, float(degrees))
 
 
@@ -323,10 +332,10 @@ def linear_gains(fit: Fit, sums: Products, rho: float) -> tuple[Floats, Floats]:
     variance = state.variance
     for _ in range(4):
         trial_state = FitState(state.theta, state.trial_effects, (0.01, 0.03), rho, variance)
-        projected = _projected(fit, sums, trial_state)
-        turn = _systematics_turn(projected.information, sums.n_shapes)
-        score, information = _beside_systematics(projected.score, projected.information, turn)
-        left_over = _rest(fit, projected.blocks, sums.n_keys, trial_state)
+        projection = projected(fit, sums, trial_state)
+        turn = _systematics_turn(projection.information, sums.n_shapes)
+        score, information = _beside_systematics(projection.score, projection.information, turn)
+        left_over = _rest(fit, projection.blocks, sums.n_keys, trial_state)
         variance = np.full_like(variance, float(np.mean(variance)) * max(left_over / total, 1e-6))
     diagonal = np.maximum(np.diag(information), 1e-300)
     size = np.where(np.diag(information) > 0, score / diagonal, 0.0)

@@ -113,7 +113,8 @@ def power(source: Fit | Source, *effects: str, **options: Any) -> Power:
     **options
         Of `vinetrack.pipeline.power_stage.PowerAsked`: `noise_mm`, `noise_correlation`, `spread_P` and `spread_B`
         (relative), `capture_fps`, `B`, `n`; and `simulate`, `jobs`, `first_seed`, `answers` for complete diagnoses of
-        simulated campaigns; `reach`, a probability, for the fewest further trials that find `name=size` so often.
+        simulated campaigns; `calibrate`, how many null campaigns a verdict's tests are held against; `reach`, a
+        probability, for the fewest further trials that find `name=size` so often.
 
     Returns
     -------

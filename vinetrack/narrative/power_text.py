@@ -255,6 +255,10 @@ def power_lines(power: Power) -> list[str]:
     lines += [false_alarm_sentence(power)]
     if power.numbers:
         lines.append(f"95 % intervals: {', '.join(map(width_text, power.numbers))}.")
+    if power.calibration is not None:
+        from vinetrack.narrative.calibration_text import calibration_lines
+
+        lines += ["", *calibration_lines(power.calibration)]
     for plan in power.further:
         lines += ["", *further_lines(plan)]
     return lines + simulated_lines(power)

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, design_power, fit_power
+from vinetrack.diagnosis.null_calibration import Calibration, calibrated, chances_of
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.diagnosis.simulated_power import rates_of
 from vinetrack.effects import BASE_EFFECTS
 from vinetrack.experiment.provenance import PROVENANCE
 from vinetrack.experiment.settings import Limits
-from vinetrack.pipeline.simulated_answers import Simulation, key_of, simulated
+from vinetrack.pipeline.simulated_answers import Simulation, key_of, simulated, simulated_chances
 from vinetrack.planning.campaign_information import FilmingPlan, joint_model
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class PowerAsked:
 
     `effects` are names, or `name=size` in the unit of the parameter; with `simulate`, campaigns are made with them.
     With `reach`, a probability, the fewest further trials are looked for that find each of them so often.
+    `calibrate` null campaigns hold the thresholds of the first model's tests to account.
     """
 
     target: Path
@@ -52,6 +54,7 @@ class PowerAsked:
     first_seed: int = 1
     answers: Path | None = None
     reach: float = math.nan
+    calibrate: int = 0
     experiment: Path | None = None
 
 
@@ -93,6 +96,8 @@ def power_of_target(asked: PowerAsked, given: Fit | Pairs | None = None) -> Powe
             _refuse(name, power)
     if asked.simulate:
         power = replace(power, simulated=tuple(_simulated(asked, campaign)))
+    if asked.calibrate:
+        power = replace(power, calibration=_calibrated(asked, given))
     if math.isfinite(asked.reach):
         power = replace(power, further=tuple(_further(asked, campaign)))
     return power.of_effects(names)
@@ -360,6 +365,38 @@ def _simulated(asked: PowerAsked, campaign: _Campaign) -> Iterator[SimulatedRate
     answers = simulated(campaign.design, [(effect, value) for effect, value, _ in wanted], how)
     for effect, value, promised in wanted:
         yield rates_of([answers[effect, key_of(value), seed] for seed in how.seeds], promised)
+
+
+def _calibrated(asked: PowerAsked, given: Fit | Pairs | None) -> Calibration:
+    """The tests of the first model of measured trials, held against null campaigns of their design."""
+    from vinetrack.diagnosis.candidates import testable
+    from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
+    from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, misfit_tests
+    from vinetrack.dynamics.model import make_model
+    from vinetrack.inference.fit_result import Fit
+
+    candidates: Sequence[str] | None = None
+    if isinstance(given, Fit):
+        questioned = candidates_of(given.model, None, given.model.user_effects)
+        fitted = with_host(given, host_for(given.model, questioned))
+    else:
+        measured = _measured(asked) if given is None else _Measured(list(given), BASE_EFFECTS)
+        if measured is None:
+            problem = Problem(
+                message="needs measured trials", column="--calibrate", value=str(asked.target),
+                remedy="film first, or ask with --simulate how often such trials raise a false alarm",
+            )  # fmt: skip
+            raise ExperimentError([problem])
+        names = tuple(name for name in measured.names if name not in measured.added)
+        model, candidates = make_model(names, measured.user_effects), measured.candidates
+        questioned = candidates_of(model, candidates, measured.user_effects)
+        fitted = initial_fit(model, measured.pairs, questioned, profile=False)
+    effects, _ = testable(questioned, fitted.predictor.data)
+    observed = chances_of(misfit_tests(fitted, effects, FIRST_LEVEL))
+    path = asked.answers or _answers_file(asked.target)
+    path = path.with_name(f"{path.stem}_calibration.csv")
+    how = Simulation(asked.calibrate, asked.first_seed, asked.jobs, path)
+    return calibrated(observed, simulated_chances(design_of_fit(fitted, candidates), how), fitted.model.names)
 
 
 def _answers_file(target: Path) -> Path:

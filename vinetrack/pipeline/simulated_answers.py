@@ -13,11 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vinetrack.diagnosis.campaign_power import CampaignDesign
+from vinetrack.diagnosis.null_calibration import TESTS, TestChances, null_chances
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer, simulated_answer
 from vinetrack.pipeline.pool import as_they_come
 
 Task = tuple[CampaignDesign, str, float, int]
 COLUMNS_KEPT = ("design", "effect", "value", "seed", "verdict", "answer_set", "effects", "seconds", "failed")
+CHANCES_KEPT = ("design", "seed", *TESTS, "failed")
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,35 @@ def simulated(
     return kept
 
 
+def simulated_chances(design: CampaignDesign, how: Simulation) -> list[TestChances]:
+    """Ask every test of simulated campaigns in which nothing is missing.
+
+    Parameters
+    ----------
+    design : of the campaigns.
+    how : campaigns, seeds, processes and file.
+
+    Returns
+    -------
+    list of TestChances
+        One a campaign, in the order of the seeds.
+    """
+    from vinetrack.core.terminal import Progress, progress
+
+    mark = fingerprint(design)
+    kept = {chances.seed: chances for chances in _kept_chances(how.path, mark)}
+    tasks = [(design, seed) for seed in how.seeds if seed not in kept]
+    bar: Progress[None]
+    with progress(how.campaigns, "calibrating", unit="campaign") as bar:
+        bar.advance(how.campaigns - len(tasks))
+        for chances in as_they_come(_chances, tasks, how.jobs):
+            values = [f"{chances.chances[name]:.6g}" if chances.chances else "" for name in TESTS]
+            _keep(how.path, CHANCES_KEPT, [mark, chances.seed, *values, chances.failed])
+            kept[chances.seed] = chances
+            bar.advance()
+    return [kept[seed] for seed in how.seeds]
+
+
 def key_of(value: float) -> str:
     """Return a size as it is written in the file of answers.
 
@@ -89,6 +120,10 @@ def key_of(value: float) -> str:
 
 def _answer(task: Task) -> SimulatedAnswer:
     return simulated_answer(*task)
+
+
+def _chances(task: tuple[CampaignDesign, int]) -> TestChances:
+    return null_chances(*task)
 
 
 def fingerprint(design: CampaignDesign) -> str:
@@ -134,6 +169,18 @@ def kept_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
             seconds=float(row["seconds"] or "nan"),
             failed=row["failed"],
         )
+        for row in rows
+    ]
+
+
+def _kept_chances(path: Path, mark: str) -> list[TestChances]:
+    """Chances that an earlier run has kept about this design."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
+    return [
+        TestChances(int(row["seed"]), {name: float(row[name]) for name in TESTS if row[name]}, row["failed"])
         for row in rows
     ]
 
