@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vinetrack.cli.campaign_commands import register as register_campaign
 from vinetrack.cli.design_commands import register as register_design
 from vinetrack.cli.diagnose_commands import register as register_diagnose
 from vinetrack.cli.explore_commands import register as register_explore
@@ -160,6 +161,7 @@ def _overlays(
 
 register_diagnose(app)
 register_power(app)
+register_campaign(app)
 register_design(app)
 
 

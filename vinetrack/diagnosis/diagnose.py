@@ -287,6 +287,7 @@ def _ranking(finding: SelectionStep, blind: Mapping[str, str]) -> list[Candidate
                     single.others if effect.name in finding.answer else (),
                     weights[effect.name],
                     tuple(single for single in finding.confounded if single.number.key.split(".")[0] == effect.name),
+                    single.log_bayes,
                 )
             )
         elif finding.verdict == ADEQUATE and not shows and z < questions.family.of(effect.name):

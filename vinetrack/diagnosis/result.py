@@ -61,7 +61,8 @@ class Candidate:
     each parameter to the largest size that could still hide, one-sided 95 %.
     `reason` says in words why it is not testable, or not plausible, or another's limit. `posterior_weight` is its
     probability among all that were refitted, had they been equally likely beforehand, with plausible ranges as priors.
-    `confounded_by` are other effects that its sizes may hold a part of.
+    `confounded_by` are other effects that its sizes may hold a part of. `log_bayes` is the logarithm of its marginal
+    likelihood over that of the model without it, with plausible ranges as priors.
     """
 
     effect: str
@@ -77,6 +78,7 @@ class Candidate:
     along: tuple[Number, ...] = ()
     posterior_weight: float = math.nan
     confounded_by: tuple[Confounder, ...] = ()
+    log_bayes: float = math.nan
 
     def to_json(self) -> dict[str, Any]:
         """As an entry of `ranking`."""
@@ -92,6 +94,7 @@ class Candidate:
             "reason": self.reason,
             "largest": dict(self.largest),
             "posterior_weight": self.posterior_weight,
+            "log_bayes": self.log_bayes,
             "confounded_by": [confounder.to_json() for confounder in self.confounded_by],
             "along": [number.to_json() for number in self.along],
         }
@@ -121,6 +124,7 @@ class Candidate:
             largest={str(name): or_nan(value) for name, value in (entry.get("largest") or {}).items()},
             along=tuple(Number.from_json(number) for number in entry.get("along") or ()),
             posterior_weight=or_nan(entry.get("posterior_weight")),
+            log_bayes=or_nan(entry.get("log_bayes")),
         )
 
 

@@ -1,0 +1,223 @@
+"""How many trials a campaign takes until one right name is left: next trials as advised, on a grid, or at random.
+
+    python benchmarks/closed_loop.py [--campaigns 3] [--first-seed 22000] [--effects inlet_loss,leak] [--answers FILE]
+                                     [--risk 0.03] [--most 30] [--ways advised,grid,random]
+
+A careful laboratory of a simulator that shares no code with the package (`benchmarks/hidden/`) begins with six trials
+of one vine at two pressures, with one effect at a size drawn from its plausible range, or with nothing missing. After
+each look (`vinetrack.diagnosis.stopping`) four trials are added: those that the diagnosis advises to tell what is tied,
+else replicates of those so far (advised); of pressures in equal ratios and all connectors and chambers in turn (grid);
+or of any of them at random (random). All ways have the same rig: 10 to 40 kPa, connectors of 5.5, 8 and 11 mm, chambers
+of 3.7 and 8 l. A campaign ends when one name is left at the stated risk, or with `--most` trials. The table holds the
+trials until one right name (those that did not get there count with `--most`), and the wrong stops.
+
+Nine candidates are asked about, so that a campaign takes minutes. Seeds 22000–22999 tune, 32500–32999 score.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import math
+import tempfile
+import time
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from hidden.designs import Setting, Vine
+from hidden.laboratory_folder import write_experiment
+from hidden.motion import Physics, Tube
+from hidden.shots import Camera, Campaign, Laboratory, Recording, Shot, film
+
+import vinetrack as vt
+from vinetrack.diagnosis.stopping import STOP, Look, look_at
+
+FIRST_TUNING_SEED, FIRST_SCORING_SEED = 22_000, 32_500
+EFFECTS = {
+    "": ("", 0.0, 0.0),
+    "inlet_loss": ("K", 0.5, 2.5),
+    "leak": ("leak_rate", 0.1, 1.0),
+    "reservoir_depletion": ("gamma", 1.0, 1.4),
+    "fold_inertia": ("eta", 0.2, 1.0),
+    "tail_friction": ("mu_w", 0.1, 0.4),
+    "linear_damping": ("b", 0.05, 0.4),
+}
+"""What the hidden simulator calls the size of each effect, and between which it is drawn."""
+CANDIDATES = [*(name for name in EFFECTS if name), "air_drag", "pressure_gain", "area_scale"]
+LOW_KPA, HIGH_KPA, INLETS_MM, CHAMBERS_L = 10.0, 40.0, (5.5, 8.0, 11.0), (3.7, 8.0)
+COLUMNS = ("seed", "effect", "way", "trials", "stopped", "right", "named", "looks", "seconds")
+Line = dict[str, object]
+
+
+@dataclass
+class Sequence:
+    """A campaign that goes on: its truth, and the trials made so far."""
+
+    seed: int
+    effect: str
+    vine: Vine
+    physics: dict[str, float]
+    scatter: tuple[float, float]
+    camera: Camera
+    recordings: list[Recording] = field(default_factory=list)
+    settings: list[Setting] = field(default_factory=list)
+
+    def make(self, pressure_kPa: float, chamber_l: float, inlet_mm: float, payload_g: float = 0.0) -> bool:
+        """Film one trial; whether it moved."""
+        count = len(self.settings)
+        draw = np.random.default_rng([self.seed, 5, count])
+        setting = Setting(
+            self.vine, round(pressure_kPa, 1), payload_g, count, 1000.0, 0.0, chamber_l, inlet_mm
+        )  # fmt: skip
+        self.settings.append(setting)
+        tube = Tube(
+            pressure=1e3 * setting.pressure_kPa * (1 + self.scatter[1] * draw.standard_normal()),
+            yield_pressure=1e3 * self.vine.yield_kPa,
+            diameter=self.vine.diameter_mm / 1e3, thickness=self.vine.thickness_um / 1e6,
+            length=self.vine.length_mm / 1e3, payload=payload_g / 1e3, cosine=1.0, chamber=chamber_l / 1e3,
+            inlet_area=math.pi * (inlet_mm / 1e3) ** 2 / 4,
+        )  # fmt: skip
+        B = self.vine.B * (1 + self.scatter[0] * float(np.clip(draw.standard_normal(), -3, 3)))
+        shot = Shot(setting, tube, Physics(B=B, n=self.vine.n, **self.physics))
+        filmed = film(Laboratory((shot,), self.camera), draw)
+        if filmed is None:
+            return False
+        name = f"t{count + 1:02d}"
+        cells = {**filmed[0].cells, "trial": name, "track": f"tracks/{name}.csv"}
+        self.recordings.append(replace(filmed[0], cells=cells))
+        return True
+
+    def diagnosed(self, *, advice: bool) -> vt.Diagnosis:
+        """What the diagnosis says of the trials so far."""
+        settings = {
+            "ambient_pressure_kPa": 101.325,
+            "candidates": CANDIDATES,
+            "limits": {
+                "pressure_kPa": [LOW_KPA, HIGH_KPA], "inlet_mm": list(INLETS_MM), "chamber_l": list(CHAMBERS_L),
+                "new_vines": False, "payload_g": [0, 0], "trials": 4,
+            },
+        }  # fmt: skip
+        with tempfile.TemporaryDirectory() as holder, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            write_experiment(Campaign(tuple(self.recordings), settings, {}), Path(holder))
+            return vt.diagnose(Path(holder), ladder=False, advice=advice)
+
+
+def begun(seed: int, effect: str) -> Sequence:
+    """A laboratory with six trials at two pressures."""
+    draw = np.random.default_rng([seed, 1, *effect.encode()])
+    vine = Vine(24.0, 200.0, 280.0, 3.0, 6.44 * math.exp(0.15 * draw.standard_normal()), float(draw.uniform(0.3, 0.45)))
+    key, low, high = EFFECTS[effect]
+    physics = {key: float(draw.uniform(low, high))} if key else {}
+    camera = Camera(float(np.exp(draw.uniform(math.log(4e-5), math.log(2e-4)))))
+    made = Sequence(
+        seed, effect, vine, physics, (float(draw.uniform(0.005, 0.03)), float(draw.uniform(0.002, 0.008))), camera
+    )
+    for pressure in (14.0, 28.0):
+        for _ in range(3):
+            made.make(pressure, 3.7, 8.0)
+    return made
+
+
+def four_more(made: Sequence, way: str, said: vt.Diagnosis, draw: np.random.Generator) -> None:
+    """Add four trials."""
+    advised = (said.next_experiment or {}).get("trials") or () if way == "advised" else ()
+    wanted = [
+        (entry["pressure_kPa"], entry["chamber_l"], entry["inlet_mm"])
+        for entry in advised
+        for _ in range(entry["replicates"])
+    ]
+    for k in range(4 - len(wanted)):
+        count = len(made.settings) + k
+        if way == "advised":
+            like = made.settings[-1 - k % len(made.settings)]
+            wanted.append((like.pressure_kPa, like.chamber_l, like.inlet_mm))
+        elif way == "grid":
+            pressure = LOW_KPA * (HIGH_KPA / LOW_KPA) ** ((count % 5) / 4)
+            wanted.append((pressure, CHAMBERS_L[count % 2], INLETS_MM[count % 3]))
+        else:
+            pressure = math.exp(draw.uniform(math.log(LOW_KPA), math.log(HIGH_KPA)))
+            wanted.append((pressure, float(draw.choice(CHAMBERS_L)), float(draw.choice(INLETS_MM))))
+    for pressure, chamber, inlet in wanted:
+        made.make(pressure, chamber, inlet)
+
+
+def sequence(seed: int, effect: str, way: str, risk: float, most: int) -> Line:
+    """One campaign from its first look to its end."""
+    begin, made = time.perf_counter(), begun(seed, effect)
+    draw, looks = np.random.default_rng([seed, 9]), []
+    while True:
+        said = made.diagnosed(advice=way == "advised")
+        look: Look = look_at(said, len(made.recordings), risk)
+        looks.append(f"{look.trials}:{look.verdict}:{'|'.join(look.names)}:{look.log_ratio:.1f}")
+        if look.decision == STOP or len(made.recordings) >= most:
+            break
+        four_more(made, way, said, draw)
+    stopped = look.decision == STOP
+    return {
+        "seed": seed, "effect": effect, "way": way, "trials": len(made.recordings), "stopped": stopped,
+        "right": stopped and look.names == (effect,), "named": "|".join(look.names), "looks": "; ".join(looks),
+        "seconds": round(time.perf_counter() - begin),
+    }  # fmt: skip
+
+
+def kept(path: Path | None) -> list[Line]:
+    """What an earlier run has written."""
+    if path is None or not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as stream:
+        return [dict(row) for row in csv.DictReader(stream)]
+
+
+def report(lines: list[Line], most: int) -> None:
+    """A row an effect and a way."""
+    print(f"{'effect':22s}{'way':10s}{'campaigns':>10s}{'right':>7s}{'wrong stops':>13s}{'trials, median':>16s}")
+    for effect in dict.fromkeys(str(line["effect"]) for line in lines):
+        for way in dict.fromkeys(str(line["way"]) for line in lines):
+            rows = [line for line in lines if (line["effect"], line["way"]) == (effect, way)]
+            if rows:
+                right = [str(line["right"]) == "True" for line in rows]
+                wrong = [str(line["stopped"]) == "True" and not good for line, good in zip(rows, right, strict=True)]
+                trials = [int(str(line["trials"])) if good else most for line, good in zip(rows, right, strict=True)]
+                print(
+                    f"{effect or 'nothing':22s}{way:10s}{len(rows):10d}{sum(right):7d}{sum(wrong):13d}"
+                    f"{float(np.median(trials)):16.0f}"
+                )
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--campaigns", type=int, default=3, help="seeds")
+    parser.add_argument("--first-seed", type=int, default=FIRST_TUNING_SEED)
+    parser.add_argument("--effects", default="inlet_loss,leak", help="names, comma-separated; blank for nothing")
+    parser.add_argument("--ways", default="advised,grid,random")
+    parser.add_argument("--risk", type=float, default=0.03)
+    parser.add_argument("--most", type=int, default=30)
+    parser.add_argument("--answers", type=Path, help="CSV that keeps every answer")
+    given = parser.parse_args()
+    lines = kept(given.answers)
+    done = {(int(str(line["seed"])), line["effect"], line["way"]) for line in lines}
+    for seed in range(given.first_seed, given.first_seed + given.campaigns):
+        for effect in given.effects.split(","):
+            for way in given.ways.split(","):
+                if (seed, effect, way) in done:
+                    continue
+                line = sequence(seed, effect, way, given.risk, given.most)
+                lines.append(line)
+                print(json.dumps(line), flush=True)
+                if given.answers is not None:
+                    fresh = not given.answers.is_file()
+                    with given.answers.open("a", newline="", encoding="utf-8") as stream:
+                        writer = csv.DictWriter(stream, COLUMNS)
+                        if fresh:
+                            writer.writeheader()
+                        writer.writerow(line)
+    report(lines, given.most)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""When a campaign that is looked at again and again may stop."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from vinetrack.cli.main import app
+from vinetrack.core.problems import ExperimentError
+from vinetrack.diagnosis.result import (
+    ADEQUATE,
+    AMBIGUOUS,
+    MISSING,
+    NOT_TESTABLE,
+    REFITTED,
+    SCREENED,
+    UNEXPLAINED,
+    Candidate,
+    Diagnosis,
+    Round,
+)
+from vinetrack.diagnosis.stopping import GO_ON, STOP, Look, look_at, trials_to_go
+from vinetrack.pipeline import sequence_stage
+from vinetrack.pipeline.sequence_stage import LEDGER, Ledger, look_at_folder, read_ledger
+
+
+def diagnosis(log_bayes: float = 30.0, rival: float = 1e-6, verdict: str = MISSING, final: str = ADEQUATE) -> Diagnosis:
+    """A leak was found, with another candidate refitted beside it, one screened, and one that no trial shows."""
+    ranking = (
+        Candidate("leak", "physical", REFITTED, 80.0, 8.9, posterior_weight=1 - rival, log_bayes=log_bayes),
+        Candidate("air_drag", "physical", REFITTED, 40.0, 6.3, posterior_weight=rival, log_bayes=10.0),
+        Candidate("fold_inertia", "physical", SCREENED, 2.0, 1.4),
+        Candidate("static_yield", "physical", NOT_TESTABLE),
+    )
+    answer = ("leak",) if verdict == MISSING else ("leak", "air_drag") if verdict == AMBIGUOUS else ()
+    rounds = [Round(("gravity",), verdict, answer, ranking, "")]
+    if verdict == MISSING:
+        rounds.append(Round(("gravity", "leak"), final, (), (), ""))
+    return Diagnosis(tuple(rounds), ("leak",) if verdict == MISSING else (), "")
+
+
+def test_one_name_with_enough_evidence_stops_the_campaign() -> None:
+    look = look_at(diagnosis(), 12, 0.03)
+    assert (look.decision, look.names) == (STOP, ("leak",))
+    assert look.needed == pytest.approx(math.log(3 / 0.03))
+    assert look.rival == "air_drag"
+    assert look.log_ratio == pytest.approx(math.log((1 - 1e-6) / 1e-6))
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        (diagnosis(rival=0.2), "air_drag is not excluded"),
+        (diagnosis(log_bayes=2.0), "nothing missing is not excluded"),
+        (diagnosis(final=UNEXPLAINED), "in no list"),
+        (diagnosis(verdict=UNEXPLAINED), "in no list"),
+        (diagnosis(verdict=AMBIGUOUS), "several names are left"),
+        (diagnosis(verdict=ADEQUATE), "nothing is found to be missing"),
+        (diagnosis(log_bayes=math.nan), "not known"),
+        (replace(diagnosis(), rounds=(), refused="no trial moves"), "no trial moves"),
+    ],
+)
+def test_what_keeps_a_campaign_going(given: Diagnosis, why: str) -> None:
+    look = look_at(given, 12, 0.03)
+    assert look.decision == GO_ON
+    assert why in look.why
+
+
+def test_the_first_few_trials_never_stop_it() -> None:
+    assert look_at(diagnosis(), 5, 0.03).decision == GO_ON
+
+
+def test_a_smaller_risk_asks_for_more() -> None:
+    assert look_at(diagnosis(rival=1e-3), 12, 0.03).decision == STOP
+    assert look_at(diagnosis(rival=1e-3), 12, 0.001).decision == GO_ON
+
+
+def test_a_richer_form_of_the_same_name_is_no_rival() -> None:
+    given = diagnosis()
+    richer = Candidate("slow_leak", "physical", SCREENED, 80.0, 8.9, reason="it holds leak as a limit")
+    first = replace(given.rounds[0], ranking=(*given.rounds[0].ranking, richer))
+    assert look_at(replace(given, rounds=(first, given.rounds[1])), 12, 0.03).decision == STOP
+
+
+def test_looking_after_every_observation_errs_no_more_often_than_stated() -> None:
+    # Two normal means a priori alike, the first true: the ratio of likelihoods ever exceeds (m − 1)/risk = 1/risk.
+    draw, risk = np.random.default_rng(3), 0.1
+    x = draw.standard_normal((4000, 400))
+    log_ratio = np.cumsum(0.3 * x - 0.045, axis=1)
+    wrong = np.mean(np.max(log_ratio, axis=1) >= math.log(1 / risk))
+    assert 0.03 < wrong <= risk
+
+
+def test_evidence_tells_how_many_trials_are_still_needed() -> None:
+    look = look_at(diagnosis(log_bayes=2.0, rival=1e-9), 12, 0.03)
+    assert trials_to_go(look) == math.ceil(12 * (look.needed / 2.0 - 1))
+    assert trials_to_go(look_at(diagnosis(), 12, 0.03)) == 0
+
+
+def test_a_ledger_keeps_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = [diagnosis(rival=0.2)]
+    data = [b"six trials"]
+
+    def diagnosed(target: Path, experiment: Path | None) -> tuple[Diagnosis, list[bytes], Path]:  # noqa: ARG001
+        return said[0], data * 8, tmp_path
+
+    monkeypatch.setattr(sequence_stage, "_diagnosed", diagnosed)
+    monkeypatch.setattr(sequence_stage, "_mark", lambda pairs: pairs[0].decode())
+    first = look_at_folder(tmp_path, 0.05)
+    assert [look.decision for look in first.looks] == [GO_ON]
+    again = look_at_folder(tmp_path)
+    assert len(again.looks) == 1
+    said[0], data[0] = diagnosis(), b"ten trials"
+    last = look_at_folder(tmp_path)
+    assert [look.decision for look in last.looks] == [GO_ON, STOP]
+    assert read_ledger(tmp_path / LEDGER) == last
+    with pytest.raises(ExperimentError, match="stated otherwise"):
+        look_at_folder(tmp_path, 0.01)
+
+
+def test_the_command_prints_looks_and_what_is_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    look = Look(8, AMBIGUOUS, ("leak", "air_drag"), math.nan, "", 6.9, GO_ON, "several names are left")
+    ledger = Ledger(0.03, (look,), ("x",), "Two trials at 30 kPa.")
+    monkeypatch.setattr(sequence_stage, "look_at_folder", lambda *_: ledger)
+    file = tmp_path / "ledger.json"
+    result = CliRunner().invoke(app, ["campaign", str(tmp_path), "--json", str(file)])
+    assert result.exit_code == 0, result.output
+    assert "leak or air_drag" in result.output
+    assert "Next: Two trials at 30 kPa." in result.output
+    assert json.loads(file.read_text())["looks"][0]["log_ratio"] is None
+
+
+def test_a_broken_ledger_is_refused(tmp_path: Path) -> None:
+    (tmp_path / LEDGER).write_text("{}")
+    with pytest.raises(ExperimentError, match="no ledger"):
+        read_ledger(tmp_path / LEDGER)

@@ -1,0 +1,47 @@
+"""The command `vinetrack campaign`: look after every few trials, stop when one name is left."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vinetrack.cli.output import MORE, JsonFile, tell
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line.
+
+    Parameters
+    ----------
+    app : typer.Typer
+        The command line.
+    """
+    app.command("campaign", rich_help_panel=MORE)(_campaign)
+
+
+def _campaign(
+    target: Annotated[
+        Path, typer.Argument(help="A results folder, or an experiment of measured tracks.", metavar="TARGET")
+    ],
+    risk: Annotated[
+        float | None,
+        typer.Option("--risk", min=1e-6, max=0.5, show_default=False,
+                     help="Of stopping with a wrong name, stated at the first look; 0.03 if not given."),
+    ] = None,
+    experiment: Annotated[
+        Path | None, typer.Option("--experiment", help="The experiment, if it has moved.", show_default=False)
+    ] = None,
+    json_file: JsonFile = None,
+    log: Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.",
+                                             show_default=False)] = None,
+) -> None:  # fmt: skip
+    """Look at a campaign that goes on: verdict, next trials, and whether one name is left at the stated risk."""
+    from vinetrack.cli.main import _sentences
+
+    with _sentences(log):
+        from vinetrack.pipeline.sequence_stage import ledger_lines, look_at_folder
+
+        ledger = look_at_folder(target, risk, experiment)
+        tell(ledger_lines(ledger), ledger.to_json(), json_file)
