@@ -33,7 +33,7 @@ from hidden.motion import Physics, Tube
 from hidden.shots import Camera, Campaign, Laboratory, Recording, Shot, film
 
 import vinetrack as vt
-from vinetrack.diagnosis.stopping import STOP, Look, look_at
+from vinetrack.diagnosis.stopping import STOP, CampaignLook, look_at
 
 FIRST_TUNING_SEED, FIRST_SCORING_SEED = 22_000, 32_500
 EFFECTS = {
@@ -151,7 +151,7 @@ def sequence(seed: int, effect: str, way: str, risk: float, most: int) -> Line:
     draw, looks = np.random.default_rng([seed, 9]), []
     while True:
         said = made.diagnosed(advice=way == "advised")
-        look: Look = look_at(said, len(made.recordings), risk)
+        look: CampaignLook = look_at(said, len(made.recordings), risk)
         looks.append(f"{look.trials}:{look.verdict}:{'|'.join(look.names)}:{look.log_ratio:.1f}")
         if look.decision == STOP or len(made.recordings) >= most:
             break

@@ -25,7 +25,7 @@ from vinetrack.diagnosis.result import (
     Diagnosis,
     Round,
 )
-from vinetrack.diagnosis.stopping import GO_ON, STOP, Look, look_at, trials_to_go
+from vinetrack.diagnosis.stopping import GO_ON, STOP, CampaignLook, look_at, trials_to_go
 from vinetrack.pipeline import sequence_stage
 from vinetrack.pipeline.sequence_stage import LEDGER, Ledger, look_at_folder, read_ledger
 
@@ -125,7 +125,7 @@ def test_a_ledger_keeps_the_looks_and_the_risk(tmp_path: Path, monkeypatch: pyte
 
 
 def test_the_command_prints_looks_and_what_is_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    look = Look(8, AMBIGUOUS, ("leak", "air_drag"), math.nan, "", 6.9, GO_ON, "several names are left")
+    look = CampaignLook(8, AMBIGUOUS, ("leak", "air_drag"), math.nan, "", 6.9, GO_ON, "several names are left")
     ledger = Ledger(0.03, (look,), ("x",), "Two trials at 30 kPa.")
     monkeypatch.setattr(sequence_stage, "look_at_folder", lambda *_: ledger)
     file = tmp_path / "ledger.json"

@@ -166,7 +166,7 @@ class CalibratedTest:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class NullCalibration:
     """All tests of a first model, calibrated. `failed` counts campaigns that could not be fitted.
 
     `model` names the effects that were taken for the truth of the null campaigns.
@@ -254,7 +254,7 @@ def null_chances(design: CampaignDesign, seed: int) -> TestChances:
         return TestChances(seed, {}, f"{type(error).__name__}: {error}")
 
 
-def calibrated(observed: Mapping[str, float], null: Sequence[TestChances], model: Sequence[str]) -> Calibration:
+def calibrated(observed: Mapping[str, float], null: Sequence[TestChances], model: Sequence[str]) -> NullCalibration:
     """Hold the p-values of a diagnosis against those of null campaigns.
 
     Parameters
@@ -265,11 +265,11 @@ def calibrated(observed: Mapping[str, float], null: Sequence[TestChances], model
 
     Returns
     -------
-    Calibration
+    NullCalibration
     """
     given = [campaign for campaign in null if not campaign.failed]
     tests = tuple(
         CalibratedTest(name, level, observed[name], tuple(campaign.chances[name] for campaign in given))
         for name, level in TESTS.items()
     )
-    return Calibration(tests, len(given), len(null) - len(given), tuple(model))
+    return NullCalibration(tests, len(given), len(null) - len(given), tuple(model))

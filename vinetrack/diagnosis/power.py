@@ -20,7 +20,7 @@ from vinetrack.experiment.schema import COLUMNS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from vinetrack.diagnosis.null_calibration import Calibration
+    from vinetrack.diagnosis.null_calibration import NullCalibration
 
 STATED_95 = 0.95
 """Confidence of the intervals of rates; a convention."""
@@ -329,7 +329,7 @@ class Power:
     wary: str = ""
     simulated: tuple[SimulatedRates, ...] = ()
     further: tuple[FurtherTrials, ...] = ()
-    calibration: Calibration | None = None
+    calibration: NullCalibration | None = None
 
     @property
     def false_alarm_rate(self) -> float:

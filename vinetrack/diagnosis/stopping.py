@@ -51,7 +51,7 @@ STOP, GO_ON = "stop", "go on"
 
 
 @dataclass(frozen=True)
-class Look:
+class CampaignLook:
     """What one look at a campaign said.
 
     `names` are those found, in order; `log_ratio` the logarithm of the least ratio of the marginal likelihood of a
@@ -73,7 +73,7 @@ class Look:
         return {**vars(self), "names": list(self.names)}
 
     @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Look:
+    def from_json(cls, entry: Mapping[str, Any]) -> CampaignLook:
         """Read what `to_json` wrote.
 
         Parameters
@@ -82,7 +82,7 @@ class Look:
 
         Returns
         -------
-        Look
+        CampaignLook
         """
         return cls(
             trials=int(entry["trials"]),
@@ -96,7 +96,7 @@ class Look:
         )
 
 
-def look_at(diagnosis: Diagnosis, trials: int, risk: float) -> Look:
+def look_at(diagnosis: Diagnosis, trials: int, risk: float) -> CampaignLook:
     """Decide whether a campaign may stop.
 
     Parameters
@@ -109,7 +109,7 @@ def look_at(diagnosis: Diagnosis, trials: int, risk: float) -> Look:
 
     Returns
     -------
-    Look
+    CampaignLook
     """
     testable = [candidate for candidate in diagnosis.ranking if candidate.status != NOT_TESTABLE]
     needed = math.log(max(len(testable), 1) / risk)
@@ -137,10 +137,10 @@ def look_at(diagnosis: Diagnosis, trials: int, risk: float) -> Look:
         why = f"{rival} is not excluded at the risk that was stated"
     else:
         done, why = True, f"every other of {len(testable)} candidates, and nothing missing, are excluded"
-    return Look(trials, verdict, tuple(names), log_ratio, rival, needed, STOP if done else GO_ON, why)
+    return CampaignLook(trials, verdict, tuple(names), log_ratio, rival, needed, STOP if done else GO_ON, why)
 
 
-def trials_to_go(look: Look) -> int:
+def trials_to_go(look: CampaignLook) -> int:
     """How many further trials of the same kinds it takes, evidence growing with the number of trials.
 
     Parameters

@@ -9,10 +9,10 @@ from vinetrack.narrative.power_text import percent
 from vinetrack.narrative.verdict_summary import listed
 
 if TYPE_CHECKING:
-    from vinetrack.diagnosis.null_calibration import CalibratedTest, Calibration
+    from vinetrack.diagnosis.null_calibration import CalibratedTest, NullCalibration
 
 
-def calibration_lines(calibration: Calibration) -> list[str]:
+def calibration_lines(calibration: NullCalibration) -> list[str]:
     """Return what the thresholds of a verdict are worth for this very design, a row a test, and what that changes.
 
     Parameters
@@ -56,7 +56,7 @@ def calibration_lines(calibration: Calibration) -> list[str]:
     return lines
 
 
-def _verdict_of(calibration: Calibration) -> str:
+def _verdict_of(calibration: NullCalibration) -> str:
     """What changes with respect to the nominal levels."""
     now = calibration.still_called
     if calibration.was_called:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, design_power, fit_power
-from vinetrack.diagnosis.null_calibration import Calibration, calibrated, chances_of
+from vinetrack.diagnosis.null_calibration import NullCalibration, calibrated, chances_of
 from vinetrack.diagnosis.power import EffectPower, FurtherTrials, Power, PowerInput, SimulatedRates, sheet_cells
 from vinetrack.diagnosis.simulated_power import rates_of
 from vinetrack.effects import BASE_EFFECTS
@@ -367,7 +367,7 @@ def _simulated(asked: PowerAsked, campaign: _Campaign) -> Iterator[SimulatedRate
         yield rates_of([answers[effect, key_of(value), seed] for seed in how.seeds], promised)
 
 
-def _calibrated(asked: PowerAsked, given: Fit | Pairs | None) -> Calibration:
+def _calibrated(asked: PowerAsked, given: Fit | Pairs | None) -> NullCalibration:
     """The tests of the first model of measured trials, held against null campaigns of their design."""
     from vinetrack.diagnosis.candidates import testable
     from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_json
-from vinetrack.diagnosis.stopping import STOP, Look, look_at, trials_to_go
+from vinetrack.diagnosis.stopping import STOP, CampaignLook, look_at, trials_to_go
 from vinetrack.experiment.provenance import PROVENANCE
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class Ledger:
     """The looks at a campaign, in order. `risk` was stated at the first and stays; `marks` tell the data of each."""
 
     risk: float
-    looks: tuple[Look, ...] = ()
+    looks: tuple[CampaignLook, ...] = ()
     marks: tuple[str, ...] = ()
     next_text: str = ""
 
@@ -41,7 +41,7 @@ class Ledger:
 
 
 def look_at_folder(target: Path, risk: float | None = None, experiment: Path | None = None) -> Ledger:
-    """Look at a campaign once more, and write its ledger.
+    """CampaignLook at a campaign once more, and write its ledger.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def _mark(pairs: Sequence[tuple[Trial, Track]]) -> str:
     return code.hexdigest()[:12]
 
 
-def _next(diagnosis: Diagnosis, look: Look) -> str:
+def _next(diagnosis: Diagnosis, look: CampaignLook) -> str:
     """What to do next, in a sentence or two."""
     if look.decision == STOP:
         return "Stop: film no more for this question."
@@ -153,7 +153,7 @@ def read_ledger(path: Path) -> Ledger | None:
         content = json.loads(path.read_text(encoding="utf-8"))
         return Ledger(
             float(content["risk"]),
-            tuple(Look.from_json(entry) for entry in content["looks"]),
+            tuple(CampaignLook.from_json(entry) for entry in content["looks"]),
             tuple(str(entry["data"]) for entry in content["looks"]),
             str(content.get("next") or ""),
         )
