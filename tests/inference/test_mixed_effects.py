@@ -25,7 +25,7 @@ from vinetrack.inference.mixed_effects import (
 )
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.variance_kernels import step_inside
+from vinetrack.inference.variance_kernels import decrease_within_bounds
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
 RHO, SIGMA = 0.45, 0.3
@@ -117,21 +117,31 @@ def test_what_deviations_explain_so_far_is_put_back() -> None:
     assert put_back(white, state, -1) == pytest.approx(at_correlation(all_products(whole, first), RHO), rel=1e-9)
 
 
-def test_a_step_inside_all_bounds_is_that_of_least_squares() -> None:
-    draw = np.random.default_rng(10)
-    rows, size = draw.standard_normal((30, 5)) * [1, 10, 0.1, 1e3, 1], 5
+@pytest.mark.parametrize("seed", range(20))
+def test_the_decrease_within_bounds_is_that_of_the_bounded_step(seed: int) -> None:
+    draw, size = np.random.default_rng(seed), 6
+    rows = draw.standard_normal((30, size)) * [1, 10, 0.1, 1e3, 1, 1]
     square, slope = rows.T @ rows, rows.T @ draw.standard_normal(30)
-    step = np.linalg.solve(square, slope)
-    wide = np.full(size, np.inf)
-    solved, decrease, log_det = step_inside(square, slope, wide, wide)
+    reach = np.abs(np.linalg.solve(square, slope))
+    theta = draw.uniform(-1, 1, size) * reach
+    held = np.arange(size) == (seed % 9)
+    problem = replace(frame_of(1, 5, size), lower=-1.1 * reach, upper=1.3 * reach, free=~held)
+    step, moving = bounded_solve(square, slope, problem, theta)
+    solved, decrease, log_det = decrease_within_bounds(
+        square, slope, theta - problem.lower, problem.upper - theta, problem.free
+    )
+    k = np.flatnonzero(moving)
     assert solved
-    assert decrease == pytest.approx(step @ slope)
-    assert log_det == pytest.approx(np.linalg.slogdet(square)[1])
-    near = np.where(np.arange(size) == 2, 0.9 * np.abs(step), wide)
-    assert not step_inside(square, slope, near, near)[0]
-    # Of two numbers that only move together least squares has to choose.
-    twice = np.column_stack([rows, rows[:, 1] * (1 + 1e-9)])
-    assert not step_inside(twice.T @ twice, np.append(slope, slope[1]), np.append(wide, 1.0), np.append(wide, 1.0))[0]
+    assert decrease == pytest.approx(step @ (2 * slope - square @ step))
+    assert log_det == pytest.approx(np.linalg.slogdet(square[np.ix_(k, k)])[1])
+
+
+def test_two_numbers_that_only_move_together_are_left_to_least_squares() -> None:
+    draw = np.random.default_rng(10)
+    rows = draw.standard_normal((30, 4))
+    twice = np.column_stack([rows, rows[:, 1]])
+    wide, free = np.full(5, np.inf), np.ones(5, dtype=bool)
+    assert not decrease_within_bounds(twice.T @ twice, twice.T @ draw.standard_normal(30), wide, wide, free)[0]
 
 
 def test_the_restricted_likelihood_adds_the_information() -> None:

@@ -25,7 +25,7 @@ from vinetrack.inference.mixed_effects import (
     trial_effect_prior,
 )
 from vinetrack.inference.sensitivity import OWN
-from vinetrack.inference.variance_kernels import noise_at_correlations, step_inside, sums_without_deviations
+from vinetrack.inference.variance_kernels import decrease_within_bounds, noise_at_correlations, sums_without_deviations
 from vinetrack.inference.whitening import at_correlation
 
 LARGEST_SPREAD = (0.04, 0.15)
@@ -184,9 +184,9 @@ def deviance_left(
     -------
     float
     """
-    if problem.free.all() and (restricted or problem.random is None):
-        room = problem.upper - state.theta
-        solved, decrease, log_information = step_inside(information, slope, state.theta - problem.lower, room)
+    if restricted or problem.random is None:
+        below, above = state.theta - problem.lower, problem.upper - state.theta
+        solved, decrease, log_information = decrease_within_bounds(information, slope, below, above, problem.free)
         if solved:
             return constant - decrease + (log_information if restricted else 0.0)
     # What would rather lie beyond its bound must not be credited with what it would explain there.
