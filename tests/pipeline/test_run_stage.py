@@ -83,9 +83,10 @@ def test_progress_is_a_line_a_step_and_a_failure_names_stage_and_reason() -> Non
     assert words == ["tracks: the disk is full"]
 
 
-def test_a_run_that_fails_says_why(tmp_path: Path) -> None:
-    folder = experiment(tmp_path / "v")
-    paths = RunPaths(folder, tmp_path / "out" / "v")
+def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path: Path) -> None:
+    experiment(tmp_path / "vines: ü & 'q'")
+    folder = experiment(tmp_path / "vines: ü & 'q' #2 $(x);")
+    paths = RunPaths(folder, tmp_path / "out" / folder.name)
     (folder / "trials.csv").write_text("nothing\n")
     with pytest.raises(RunError, match="trial is missing"):
         run_chain(paths, 1, print)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import TextIO
 
 from vinetrack.core.problems import ExperimentError, UserError
+from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import Progress, progress
 from vinetrack.pipeline.run_lock import TAKEN_AWAY, refuse_running
 from vinetrack.pipeline.workflow import (
@@ -141,10 +143,13 @@ def run_chain(paths: RunPaths, cores: int, say: Say) -> None:
     claim_results(paths.results, paths.experiment)
     log = paths.results / "logs" / "run.log"
     log.parent.mkdir(parents=True, exist_ok=True)
+    # On the command line Snakemake reads values as YAML: ` #2` of a folder's name would be a comment.
+    named = log.with_name("run.json")
+    write_text(named, json.dumps({"experiment": str(paths.experiment), "results": str(paths.results)}))
     command = [
         sys.executable, "-m", "snakemake", "--snakefile", str(SNAKEFILE), "--directory", str(paths.results),
         "--cores", str(cores), "--rerun-incomplete", "--quiet", "rules", "host",
-        "--config", f"experiment={paths.experiment}", f"results={paths.results}",
+        "--configfile", str(named),
     ]  # fmt: skip
     with log.open("w", encoding="utf-8") as kept:
         # A process of its own, so that Snakemake stops its jobs by itself when the user breaks off.
