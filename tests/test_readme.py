@@ -83,3 +83,12 @@ def test_every_command_that_a_page_runs_shows_what_it_prints(name: str) -> None:
     shown = [piece for piece in pieces((ROOT / "docs" / f"{name}.md").read_text("utf-8")) if isinstance(piece, Shown)]
     assert shown
     assert [one.lines[0] for one in shown if not one.output] == []
+
+
+def test_the_citation_and_the_changelog_name_the_version_of_the_package() -> None:
+    import vinetrack
+
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    released = re.findall(r"^## (\d+\.\d+\.\d+)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert re.findall(r"^version: (.+)$", citation, re.MULTILINE) == [vinetrack.__version__]
+    assert released[:1] == [vinetrack.__version__]
