@@ -6,10 +6,11 @@
 A careful laboratory of a simulator that shares no code with the package (`benchmarks/hidden/`) begins with six trials
 of one vine at two pressures, with one effect at a size drawn from its plausible range, or with nothing missing. After
 each look (`vinetrack.diagnosis.stopping`) four trials are added: those that the diagnosis advises to tell what is tied,
-else replicates of those so far (advised); of pressures in equal ratios and all connectors and chambers in turn (grid);
-or of any of them at random (random). All ways have the same rig: 10 to 40 kPa, connectors of 5.5, 8 and 11 mm, chambers
-of 3.7 and 8 l. A campaign ends when one name is left at the stated risk, or with `--most` trials. The table holds the
-trials until one right name (those that did not get there count with `--most`), and the wrong stops.
+else replicates of those so far, or those of the grid as long as nothing is found (advised); of pressures in equal
+ratios and all connectors and chambers in turn (grid); or of any of them at random (random). All ways have the same rig:
+10 to 40 kPa, connectors of 5.5, 8 and 11 mm, chambers of 3.7 and 8 l. A campaign ends when one name is left at the
+stated risk, or with `--most` trials. The table holds the trials until one right name (those that did not get there
+count with `--most`), and the wrong stops.
 
 Nine candidates are asked about, so that a campaign takes minutes. Seeds 22000–22999 tune, 32500–32999 score.
 """
@@ -132,10 +133,10 @@ def four_more(made: Sequence, way: str, said: vt.Diagnosis, draw: np.random.Gene
     ]
     for k in range(4 - len(wanted)):
         count = len(made.settings) + k
-        if way == "advised":
+        if way == "advised" and said.verdict != "adequate":
             like = made.settings[-1 - k % len(made.settings)]
             wanted.append((like.pressure_kPa, like.chamber_l, like.inlet_mm))
-        elif way == "grid":
+        elif way in ("grid", "advised"):
             pressure = LOW_KPA * (HIGH_KPA / LOW_KPA) ** ((count % 5) / 4)
             wanted.append((pressure, CHAMBERS_L[count % 2], INLETS_MM[count % 3]))
         else:

@@ -122,8 +122,8 @@ def _next(diagnosis: Diagnosis, look: CampaignLook) -> str:
         return f"About {further} further trials like those so far, by how the evidence has grown."
     if look.verdict == "adequate":
         return (
-            "Choose the effect and the size that matter: `vinetrack power TARGET --effect NAME=SIZE --reach 0.9` says "
-            "which trials would show it."
+            "Widen what varies: other pressures, payloads, chambers, connectors or vines. Or choose the effect and the "
+            "size that matter: `vinetrack power TARGET --effect NAME=SIZE --reach 0.9` says which trials would show it."
         )
     return "Widen what varies from trial to trial: other pressures, payloads, chambers, connectors or vines."
 
