@@ -41,7 +41,7 @@ def calibration_lines(calibration: NullCalibration) -> list[str]:
     low, high = calibration.alarms.interval
     lines = [
         f"{count} campaigns of this design, {' + '.join(calibration.model)} their truth, fitted and tested alike:",
-        *(f"  {line}" for line in table(rows, head, ("",) * len(head), align="<>>>>>><")),
+        *(f"  {line}" for line in table(rows, head, align="<>>>>>><")),
         f"At the levels as they stand, {calibration.alarms.count} of them raise an alarm ({percent(low)} to "
         f"{percent(high)} with 95 % confidence).",
     ]

@@ -186,7 +186,7 @@ def ledger_lines(ledger: Ledger) -> list[str]:
     last = ledger.looks[-1]
     why = f"{last.decision.capitalize()}: {last.why}."
     return [
-        *table(rows, head, ("",) * len(head), align=">><<>><"),
+        *table(rows, head, align=">><<>><"),
         f"Risk of stopping with a wrong name, at any of the looks: {100 * ledger.risk:g} %.",
         why,
         *([] if last.decision == STOP else [f"Next: {ledger.next_text}"]),
