@@ -26,19 +26,41 @@ LAWS = [
     SeenLaw(Law("fading_in_time", shapes=1, scale=0.04), (-0.2,), 0.9, "a force that fades in time"),
     SeenLaw(Law("fading_along", shapes=1, scale=0.07), (-0.2,), 0.9, "a force that fades along the growth"),
     SeenLaw(Law("patch", shapes=2, low=0.08, high=0.11), (-0.2,), 0.9, "a force between 80 and 110 mm"),
+    SeenLaw(Law("position_squared", largest=0.25), (-0.2,), 0.9, "a force in proportion to x²"),
+    SeenLaw(Law("beyond_a_place", shapes=1, scale=0.06, largest=0.1), (-0.2,), 0.9, "a force beyond 60 mm"),
+    SeenLaw(Law("speed_cubed", largest=729.0), (-0.2,), 0.9, "a force in proportion to ẋ³"),
+    SeenLaw(Law("beyond_a_speed", shapes=1, scale=1.2, largest=7.8), (-0.2,), 0.9, "a force beyond 1.2 m/s"),
+    SeenLaw(Law("squared_beyond_a_speed", shapes=1, scale=1.2, largest=61.0), (-0.2,), 0.9, "a square beyond 1.2 m/s"),
+    SeenLaw(Law("position", times="speed", largest=4.0), (-0.2,), 0.9, "a force in proportion to x ẋ"),
+    SeenLaw(Law("patch", shapes=2, low=0.08, high=0.11, times="pressure", largest=3e4), (-0.2,), 0.9, "a patch by P"),
+    SeenLaw(Law("falling_with_speed", shapes=1, scale=1.5, times="position"), (-0.2,), 0.9, "falling, by x"),
+    SeenLaw(Law("speed_squared", times="pressure", largest=2e6, by_area=3e-4), (-0.2,), 0.9, "ẋ² by P"),
     SeenLaw(Law("periodic", columns=2, shapes=1, scale=0.03), (0.1, -0.2), 0.9, "a force every 30 mm"),
 ]
 
 
-@pytest.mark.parametrize("seen", LAWS, ids=lambda seen: seen.law.kind)
+@pytest.mark.parametrize("seen", LAWS, ids=lambda seen: seen.law.name)
 def test_the_file_of_a_law_does_what_the_law_says(seen: SeenLaw, tmp_path: Path) -> None:
-    path = tmp_path / f"proposed_{seen.law.kind}.py"
+    path = tmp_path / f"proposed_{seen.law.name}.py"
     path.write_text(effect_text(seen, "From 24 trials of a bench."), encoding="utf-8")
     # Its worked number comes from the law, its function from the formula: reading it holds one against the other.
     effect = own_effects([path])[path.stem]
     assert effect.worked[0].expected != 0
     assert "From 24 trials of a bench." in effect.text
     assert effect.formula.startswith("tail force")
+
+
+@pytest.mark.parametrize(
+    ("law", "unit"),
+    [
+        (Law("position", times="speed"), "N·s/m²"),
+        (Law("speed_squared", times="pressure"), "N·s²/(m²·Pa)"),
+        (Law("falling_with_speed", shapes=1, scale=1.5, times="position"), "N/m"),
+        (Law("speed_cubed"), "N·s³/m³"),
+    ],
+)
+def test_sizes_have_the_unit_that_makes_a_force(law: Law, unit: str) -> None:
+    assert f'"{unit}"' in effect_text(SeenLaw(law, (-0.2,), 0.9, "a law"))
 
 
 def test_a_force_that_grows_with_time_is_proposed_and_mends_left_out_conditions(tmp_path: Path) -> None:

@@ -46,6 +46,10 @@ LEAST_PATCH_M = 1e-3
 """Least width of a local force that is named. Chosen: its ends are printed in millimetres; at half of it both ends
 could be the same number, at twice a narrow obstacle goes unnamed."""
 
+PLACES_BEYOND, SPEEDS_BEYOND = 8, 8
+"""Places and speeds beyond which a force may set in. Chosen: each is then found between its neighbours by the fit in
+full. Powers of the speed are 1, 2 and 3 only: one near n is the damping itself, and takes any size with B."""
+
 SAME_AREA = 1.02
 """Ratio of areas up to which two vines count as one. Chosen: twice the error of a diameter of 0.5 %."""
 
@@ -54,9 +58,10 @@ SAME_AREA = 1.02
 class Law:
     """One shape of force along a motion.
 
-    `kind` names it; `low` and `high` are its place (m of growth), `scale` its period or range, where it has them.
-    `shapes` counts the numbers that shape it, `columns` its amplitudes. `by_area` tells a force that is larger on a
-    wider vine, as the cross-section; `largest` is what the bare expression reaches along the motions at hand.
+    `kind` names it; `low` and `high` are its place (m of growth), `scale` its period, range or where it sets in.
+    `times` is what it is multiplied by: "position", "speed", "pressure" or nothing. `shapes` counts the numbers that
+    shape it, `columns` its amplitudes. `by_area` tells a force that is larger on a wider vine, as the cross-section;
+    `largest` is what the bare expression reaches along the motions at hand.
     """
 
     kind: str
@@ -67,6 +72,23 @@ class Law:
     scale: float = math.nan
     by_area: float = 0.0
     largest: float = 1.0
+    times: str = ""
+
+    @property
+    def name(self) -> str:
+        """What it is told from others by."""
+        return f"{self.kind}_by_{self.times}" if self.times else self.kind
+
+    @property
+    def numbers(self) -> int:
+        """Numbers that it has, a second factor counted as one: it was chosen among several."""
+        return self.columns + self.shapes + bool(self.times)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """What it hangs on: growth, speed, time or pressure; nothing where it is constant."""
+        both = {VARIABLE[kind] for kind in (self.kind, self.times) if kind in VARIABLE}
+        return tuple(name for name in ("growth", "speed", "time", "pressure") if name in both)
 
     @property
     def is_a_point(self) -> bool:
@@ -138,7 +160,8 @@ class Law:
         array, shape (n_times, n_columns), N
         """
         size = (motion.trial.area_m2 / self.by_area if self.by_area else 1.0) / self.largest
-        return size * _EXPRESSIONS[self.kind](self, motion)
+        force = size * _EXPRESSIONS[self.kind](self, motion)
+        return force * _EXPRESSIONS[self.times](self, motion) if self.times else force
 
     def words(self, amplitude_N: Sequence[float], sigma_N: float) -> str:
         """What it looks like, with its size.
@@ -158,8 +181,11 @@ class Law:
         else:
             size = f"{'+' if amplitude_N[0] > 0 else ''}{_sized(amplitude_N[0], sigma_N)}".replace("-", "−")
         wide = ", larger on a wider vine as its cross-section" if self.by_area else ""
+        words = _WORDS[self.kind]
+        if self.times:
+            words = f"{words.partition(', {size}')[0]}, times {_TIMES[self.times]}, {{size}} at its largest"
         return (
-            _WORDS[self.kind].format(
+            words.format(
                 size=size,
                 low=f"{1e3 * max(self.low, 0.0):.0f}",
                 high=f"{1e3 * self.high:.0f}",
@@ -198,6 +224,11 @@ _EXPRESSIONS = {
     "position": lambda _, m: m.tail_position_m[:, None],
     "speed": lambda _, m: m.tail_velocity_m_s[:, None],
     "speed_squared": lambda _, m: m.tail_velocity_m_s[:, None] ** 2,
+    "position_squared": lambda _, m: m.tail_position_m[:, None] ** 2,
+    "beyond_a_place": lambda law, m: np.maximum(m.lead_position_m - law.scale, 0.0)[:, None],
+    "speed_cubed": lambda _, m: m.tail_velocity_m_s[:, None] ** 3,
+    "beyond_a_speed": lambda law, m: np.maximum(m.tail_velocity_m_s - law.scale, 0.0)[:, None],
+    "squared_beyond_a_speed": lambda law, m: np.maximum(m.tail_velocity_m_s - law.scale, 0.0)[:, None] ** 2,
     "pressure": lambda _, m: m.pressure_Pa[:, None],
     "time": lambda _, m: m.time_s[:, None],
     "inverse_speed": lambda law, m: 1 / np.maximum(m.tail_velocity_m_s, law.scale)[:, None],
@@ -207,6 +238,15 @@ _EXPRESSIONS = {
     "patch": _patch,
     "periodic": _periodic,
 }
+VARIABLE = {
+    **dict.fromkeys(("position", "position_squared", "beyond_a_place", "fading_along", "patch", "periodic"), "growth"),
+    **dict.fromkeys(("speed", "speed_squared", "speed_cubed", "beyond_a_speed", "squared_beyond_a_speed"), "speed"),
+    **dict.fromkeys(("inverse_speed", "falling_with_speed"), "speed"),
+    **dict.fromkeys(("time", "fading_in_time"), "time"),
+    "pressure": "pressure",
+}
+"""What every kind but the constant hangs on."""
+
 _OF_SPEED = ("inverse_speed", "falling_with_speed")
 """Largest at rest, where no speed tells: their size is that at the slowest that is seen."""
 
@@ -215,6 +255,11 @@ _WORDS = {
     "position": "a force in proportion to the tail's travel x, {size} at the end",
     "speed": "a force in proportion to the speed ẋ, {size} at the highest",
     "speed_squared": "a force in proportion to ẋ², {size} at the highest speed",
+    "position_squared": "a force in proportion to x², {size} at the end",
+    "beyond_a_place": "a force that rises in proportion to the growth beyond {scale_mm} mm, {size} at the end",
+    "speed_cubed": "a force in proportion to ẋ³, {size} at the highest speed",
+    "beyond_a_speed": "a force in proportion to what ẋ has beyond {scale} m/s, {size} at the highest",
+    "squared_beyond_a_speed": "a force with the square of what ẋ has beyond {scale} m/s, {size} at the highest",
     "pressure": "a force in proportion to the pressure, {size} at the highest",
     "time": "a force that grows in proportion to time, {size} at the end of the longest trial",
     "inverse_speed": "a force that falls with speed as 1/ẋ, {size} at {scale} m/s and below",
@@ -224,6 +269,19 @@ _WORDS = {
     "patch": "a force that acts between {low} and {high} mm of growth, {size}",
     "periodic": "a force that comes back every {scale_mm} mm of growth, {size}",
 }
+
+
+_TIMES_OF = {
+    **dict.fromkeys(("position", "position_squared", "fading_along", "beyond_a_place"), ("speed", "pressure")),
+    **dict.fromkeys(("speed", "speed_squared", "inverse_speed"), ("pressure",)),
+    "speed_squared": ("position", "pressure"),
+    "falling_with_speed": ("pressure",),
+}
+"""Products that are tried: a function of the growth with the speed or the pressure, of the speed with travel or
+pressure. One that reads the same either way stands once. Chosen: a fall with speed times the travel is left out, for
+x exp(−ẋ/v₀) is nearly x/ẋ, which is time, and takes its place."""
+
+_TIMES = {"position": "the tail's travel x", "speed": "the speed ẋ", "pressure": "the pressure"}
 
 
 @dataclass(frozen=True)
@@ -247,8 +305,13 @@ def coarse_laws(motions: Sequence[FittedMotion]) -> list[Law]:
     list of Law
     """
     reach = _reach(motions)
-    plain = ["constant", "position", "speed", "speed_squared", "pressure", "time"]
+    plain = ["constant", "position", "speed", "speed_squared", "pressure", "time", "position_squared", "speed_cubed"]
     laws = [Law(kind) for kind in plain]
+    for k in range(PLACES_BEYOND):
+        laws.append(Law("beyond_a_place", shapes=1, scale=(k + 0.5) / PLACES_BEYOND * reach.growth_m))
+    for k in range(SPEEDS_BEYOND):
+        beyond_m_s = (k + 0.5) / SPEEDS_BEYOND * reach.speed_m_s
+        laws += [Law(kind, shapes=1, scale=beyond_m_s) for kind in ("beyond_a_speed", "squared_beyond_a_speed")]
     laws.append(Law("inverse_speed", scale=LEAST_SPEED * reach.speed_m_s))
     for part in SCALES:
         laws.append(Law("falling_with_speed", shapes=1, scale=part * reach.speed_m_s))
@@ -259,9 +322,10 @@ def coarse_laws(motions: Sequence[FittedMotion]) -> list[Law]:
             laws.append(_patch_at(float(centre), width * reach.growth_m))
     for period in np.geomspace(SHORTEST_PERIOD, LONGEST_PERIOD, PERIODS) * reach.growth_m:
         laws.append(Law("periodic", columns=2, shapes=1, scale=float(period)))
+    laws += [replace(law, times=other) for law in laws for other in _TIMES_OF.get(law.kind, ())]
     areas = [motion.trial.area_m2 for motion in motions]
     if max(areas) > SAME_AREA * min(areas):
-        laws += [_by_area(law, float(np.mean(areas))) for law in laws if law.kind != "pressure"]
+        laws += [_by_area(law, float(np.mean(areas))) for law in laws if "pressure" not in law.variables]
     return _scaled(laws, motions)
 
 
@@ -280,14 +344,15 @@ def finer_laws(law: Law, motions: Sequence[FittedMotion]) -> list[Law]:
     if law.kind == "patch":
         centre, width = (law.low + law.high) / 2, law.high - law.low
         step = _reach(motions).growth_m / PLACES
-        near = [
-            _patch_at(centre + shift * step, stretch * width)
+        near = [law] if law.times else [replace(law, times="speed"), replace(law, times="pressure")]
+        near += [
+            replace(_patch_at(centre + shift * step, stretch * width), times=law.times)
             for shift in np.linspace(-0.75, 0.75, 7)
             for stretch in (0.5, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8)
         ]
     elif law.shapes:
         near = [
-            Law(law.kind, columns=law.columns, shapes=law.shapes, scale=law.scale * factor)
+            replace(law, scale=law.scale * factor)
             for factor in (
                 np.geomspace(0.9, 1.11, 17) if law.kind == "periodic" else np.geomspace(0.5, 2.0, 13)
             ).tolist()
@@ -302,13 +367,13 @@ def _patch_at(centre: float, width: float) -> Law:
 
 
 def _by_area(law: Law, mean_area: float) -> Law:
-    return Law(law.kind, law.columns, law.shapes, law.low, law.high, law.scale, mean_area)
+    return replace(law, by_area=mean_area)
 
 
 def _scaled(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
     """The laws with the largest force that they reach along the motions as their unit."""
     scaled = []
-    for law in laws:
+    for law in (replace(law, largest=1.0) for law in laws):
         everywhere = [np.abs(law.along(motion)) for motion in motions]
         largest = max(float(course.max()) for course in everywhere)
         seen = max(float(course[_grown(motion)].max()) for course, motion in zip(everywhere, motions, strict=True))
@@ -318,7 +383,7 @@ def _scaled(laws: Sequence[Law], motions: Sequence[FittedMotion]) -> list[Law]:
             largest = seen
         elif law.kind == "patch" and seen < 0.5 * largest:
             continue
-        scaled.append(Law(law.kind, law.columns, law.shapes, law.low, law.high, law.scale, law.by_area, largest or 1.0))
+        scaled.append(replace(law, largest=largest or 1.0))
     return scaled
 
 

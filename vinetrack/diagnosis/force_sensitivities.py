@@ -246,7 +246,7 @@ def pushed(motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floa
     """The motions with a further force on the tail, N, shape (STEPS + 1,), that need not be small.
 
     Every round leaves about a tenth of the error of the one before; the motions are corrected to those of their models,
-    if they are not that.
+    if they are not that. Their stiffness and friction are then those with the force.
 
     Parameters
     ----------
@@ -261,10 +261,26 @@ def pushed(motions: Sequence[FittedMotion], force: Callable[[FittedMotion], Floa
     list of FittedMotion
     """
     for _ in range(rounds):
+        motions = [_answering(motion, force) for motion in motions]
         lacks = np.array([motion.free + force(motion) / motion.mass_kg - motion.actual for motion in motions])
         moved, sped = (answer[:, :, 0] for answer in _followed(motions, lacks[:, :, None]))
         motions = [_moved(*step) for step in zip(motions, lacks, moved, sped, strict=True)]
-    return list(motions)
+    return [_answering(motion, force) for motion in motions]
+
+
+def _answering(motion: FittedMotion, force: Callable[[FittedMotion], Floats]) -> FittedMotion:
+    """The motion with what the further force changes along it in stiffness and friction."""
+    y, v = motion.lead_position_m, motion.lead_velocity_m_s
+    step_y, step_v = 1e-4 * max(float(y.max()), 1e-9), 1e-4 * max(float(v.max()), 1e-9)
+    plain, r = force(motion), motion.trial.travel_ratio
+    further = (force(replace(motion, lead_position_m=y + step_y)) - plain) / (r * step_y * motion.mass_kg)
+    faster = (force(replace(motion, lead_velocity_m_s=v + step_v)) - plain) / (r * step_v * motion.mass_kg)
+    moves = v >= SLOWEST * v.max()
+    return replace(
+        motion,
+        stiffness=motion.stiffness + np.where(moves, further, 0.0),
+        friction=np.where(moves, np.minimum(motion.friction + faster, 0.0), motion.friction),
+    )
 
 
 def _moved(motion: FittedMotion, lacks: Floats, moved: Floats, sped: Floats) -> FittedMotion:

@@ -104,8 +104,7 @@ class MissingForce:
     `table`, columns `FORCE_COLUMNS`: the force of every condition (blank: mean over all) against `lead_position_m`,
     `tail_velocity_m_s`, `time_s` and `pressure_Pa`. `laws`, columns `LAW_COLUMNS`, the best of each kind, best first;
     `explained` is the part of what any smooth force could explain. `depends_on` gives the same for a force that hangs
-    on one thing alone. `seen` are the laws whose force is more than errors could make, best first; none where no smooth
-    force mends the misfit.
+    on one thing alone. `seen` are the laws whose force is more than errors could make, best first.
     """
 
     table: pd.DataFrame
@@ -167,7 +166,7 @@ def missing_force(model_fit: Fit) -> MissingForce:
         laws=_law_table(laws),
         depends_on=depends,
         sentence=_sentence(laws, depends, _mended(fit, whole)),
-        seen=() if _mended(fit, whole) < MENDS else tuple(_seen(law) for law in laws if law.seen),
+        seen=tuple(_seen(law) for law in laws if law.seen),
     )
 
 
@@ -288,8 +287,7 @@ def _in_full(model_fit: Fit, fit: ForceFit, motions: Sequence[FittedMotion], law
 
 def _judged(fit: ForceFit, laws_and_gains: Sequence[tuple[Law, Gain]], most: float, largest_N: float) -> list[_Judged]:
     return [
-        _Judged(law, gain, fit.bic(gain.chi2, law.columns + law.shapes, most), largest_N=largest_N)
-        for law, gain in laws_and_gains
+        _Judged(law, gain, fit.bic(gain.chi2, law.numbers, most), largest_N=largest_N) for law, gain in laws_and_gains
     ]
 
 
@@ -306,9 +304,9 @@ def _largest_N(motions: Sequence[FittedMotion]) -> float:
 def _best_of_kinds(judged: Sequence[_Judged]) -> list[_Judged]:
     best: dict[str, _Judged] = {}
     for law in judged:
-        before = best.get(law.law.kind)
+        before = best.get(law.law.name)
         if before is None or (not law.seen, law.bic) < (not before.seen, before.bic):
-            best[law.law.kind] = law
+            best[law.law.name] = law
     return list(best.values())
 
 
@@ -388,7 +386,7 @@ def _law_table(laws: Sequence[_Judged]) -> pd.DataFrame:
 
     rows = [
         (
-            law.law.kind,
+            law.law.name,
             law.law.words(law.gain.amplitude.tolist(), law.gain.sigma),
             law.explained,
             float(law.gain.amplitude[0]) if law.law.columns == 1 else float(np.hypot(*law.gain.amplitude)),

@@ -19,10 +19,18 @@ import numpy as np
 
 from vinetrack.diagnosis.add import both_fits
 from vinetrack.diagnosis.force_laws import EDGE
-from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
+from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit, with_host
 from vinetrack.diagnosis.ladder import left_out
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, likelihood_ratio
-from vinetrack.diagnosis.missing_force import SeenLaw, missing_force
+from vinetrack.diagnosis.likelihood_ratio import (
+    ANSWER_SET,
+    MOST_INFLATION,
+    LikelihoodRatio,
+    answer_set,
+    likelihood_ratio,
+)
+from vinetrack.diagnosis.misfit_tests import FAR_OFF
+from vinetrack.diagnosis.missing_force import MENDS, SeenLaw, missing_force
+from vinetrack.diagnosis.multi_start import from_other_starts
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, load_effect, remember
 from vinetrack.inference.fit_data import FitError, Pairs
@@ -44,23 +52,43 @@ alone."""
 
 @dataclass(frozen=True)
 class _Expression:
-    """How a law is written: its size, the shape in code and in symbols, and the numbers that shape it."""
+    """How a law is written: its size, the shape in code and in symbols, and the numbers that shape it.
 
-    size: tuple[str, str, str]
+    The size has a name, a symbol and a unit, by its exponents of N, m, s and Pa.
+    """
+
+    size: tuple[str, str, tuple[int, int, int, int]]
     code: str
     formula: str
     shapes: tuple[tuple[str, str, str], ...] = ()
 
 
 _SPEED, _TIME, _LENGTH = ("v_0", "v₀", "m/s"), ("t_0", "t₀", "s"), ("reach", "ℓ", "m")
-_FORCE = ("F", "F", "N")
+_THRESHOLD = ("v_1", "v₁", "m/s")
+_FORCE = ("F", "F", (1, 0, 0, 0))
 _EXPRESSIONS = {
     "constant": _Expression(_FORCE, "1.0", "F"),
-    "position": _Expression(("k", "k", "N/m"), "s.tail_position", "k x"),
-    "speed": _Expression(("b", "b", "N·s/m"), "s.tail_velocity", "b ẋ"),
-    "speed_squared": _Expression(("c", "c", "N·s²/m²"), "s.tail_velocity * s.tail_velocity", "c ẋ²"),
-    "pressure": _Expression(("a", "a", "m²"), "s.pressure", "a P"),
-    "time": _Expression(("r", "r", "N/s"), "s.time", "r t"),
+    "position": _Expression(("k", "k", (1, -1, 0, 0)), "s.tail_position", "k x"),
+    "speed": _Expression(("b", "b", (1, -1, 1, 0)), "s.tail_velocity", "b ẋ"),
+    "speed_squared": _Expression(("c", "c", (1, -2, 2, 0)), "s.tail_velocity * s.tail_velocity", "c ẋ²"),
+    "position_squared": _Expression(("q", "q", (1, -2, 0, 0)), "s.tail_position * s.tail_position", "q x²"),
+    "beyond_a_place": _Expression(
+        ("k", "k", (1, -1, 0, 0)),
+        "np.maximum(s.lead_position - y_0, 0.0)",
+        "k max(0, y − y₀)",
+        (("y_0", "y₀", "m"),),
+    ),
+    "speed_cubed": _Expression(
+        ("c", "c", (1, -3, 3, 0)), "s.tail_velocity * s.tail_velocity * s.tail_velocity", "c ẋ³"
+    ),
+    "beyond_a_speed": _Expression(
+        ("b", "b", (1, -1, 1, 0)), "np.maximum(s.tail_velocity - v_1, 0.0)", "b max(0, ẋ − v₁)", (_THRESHOLD,)
+    ),
+    "squared_beyond_a_speed": _Expression(
+        ("c", "c", (1, -2, 2, 0)), "np.maximum(s.tail_velocity - v_1, 0.0) ** 2", "c max(0, ẋ − v₁)²", (_THRESHOLD,)
+    ),
+    "pressure": _Expression(("a", "a", (1, 0, 0, -1)), "s.pressure", "a P"),
+    "time": _Expression(("r", "r", (1, 0, -1, 0)), "s.time", "r t"),
     "inverse_speed": _Expression(_FORCE, "v_0 / np.maximum(s.tail_velocity, v_0)", "F v₀/max(ẋ, v₀)", (_SPEED,)),
     "falling_with_speed": _Expression(_FORCE, "np.exp(-s.tail_velocity / v_0)", "F exp(−ẋ/v₀)", (_SPEED,)),
     "fading_in_time": _Expression(_FORCE, "np.exp(-s.time / t_0)", "F exp(−t/t₀)", (_TIME,)),
@@ -80,6 +108,13 @@ _EXPRESSIONS = {
     ),
 }
 
+_TIMES = {
+    "position": ("s.tail_position", "x", (0, -1, 0, 0)),
+    "speed": ("s.tail_velocity", "ẋ", (0, -1, 1, 0)),
+    "pressure": ("s.pressure", "P", (0, 0, 0, -1)),
+}
+"""What a law may be multiplied by: code, symbol, and what it does to the unit of the size."""
+
 _AT = {"lead_position": 0.1, "tail_position": 0.2, "tail_velocity": 2.0, "pressure": 20e3, "time": 0.05}
 """State of the worked number; a convention of this file."""
 
@@ -89,7 +124,10 @@ _UNITS = {"lead_position": "_m", "tail_position": "_m", "tail_velocity": "_m_s",
 
 @dataclass(frozen=True)
 class ProposedLaw:
-    """A law as an effect that was fitted; `rms_left_out_m` is its error on conditions left out, m."""
+    """A law as an effect that was fitted.
+
+    `rms_left_out_m` is its error on conditions left out, m; NaN where others fit far better.
+    """
 
     seen: SeenLaw
     effect: Effect
@@ -121,8 +159,12 @@ class Proposal:
             return [self.reason]
         best = self.tied[0]
         lines = [
-            f"{law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ), error on left-out conditions "
-            f"{1e3 * self.rms_left_out_m:.2f} → {1e3 * law.rms_left_out_m:.2f} mm"
+            f"{law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
+            + (
+                f", error on left-out conditions {1e3 * self.rms_left_out_m:.2f} → {1e3 * law.rms_left_out_m:.2f} mm"
+                if math.isfinite(law.rms_left_out_m)
+                else ""
+            )
             + (" (not excluded)" if law in self.tied and law is not best else "")
             for law in self.laws
         ]
@@ -153,6 +195,8 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     questioned = candidates_of(model, None, {})
     report("fitting the model")
     before = initial_fit(model, pairs, questioned, profile=False)
+    if before.chi2_per_dof > FAR_OFF:
+        before = from_other_starts(before)
     report("drawing the missing force")
     seen = missing_force(before).seen
     if not seen:
@@ -161,24 +205,42 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     near = [law for law in seen if law.explained > seen[0].explained - BEHIND][:MOST_PROPOSED]
     with tempfile.TemporaryDirectory() as folder:
         effects = [_written(law, Path(folder)) for law in near]
-        before = initial_fit(model, pairs, (*questioned, *effects), profile=False)
-        laws = []
+        # Compiled without the catalogue, which nothing here asks for.
+        before = with_host(before, Model((*model, *effects)))
+        fitted = []
         for law, effect in zip(near, effects, strict=True):
             try:
                 start, after = both_fits(before, effect, report)
             except FitError:
                 continue
             before = max((before, start), key=lambda fit: fit.log_likelihood)
-            ratio = likelihood_ratio(before, (effect,), after)
-            laws.append(ProposedLaw(law, effect, ratio, left_out(after).rms_m))
+            fitted.append((law, effect, likelihood_ratio(before, (effect,), after)))
+        report("errors on left-out conditions")
+        most = max((ratio.fit.log_likelihood for _, _, ratio in fitted), default=-math.inf)
+        laws = [
+            ProposedLaw(law, effect, ratio, left_out(ratio.fit).rms_m if _may_tie(ratio, most) else math.nan)
+            for law, effect, ratio in fitted
+        ]
     return _judged(before, laws)
+
+
+def _may_tie(ratio: LikelihoodRatio, most: float) -> bool:
+    """Whether a law can be in the answer set, however much single trials disagree; of others nothing more is asked."""
+    return 2 * (most - ratio.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
 
 
 def _judged(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
     """The laws in the order of their likelihood, with those that cannot be excluded."""
     error_m = left_out(before).rms_m
     laws = tuple(sorted(laws, key=lambda law: -law.ratio.fit.log_likelihood))
-    worth = [law for law in laws if law.ratio.sigma > WORTH and law.rms_left_out_m < error_m]
+    misfit = max(before.chi2_per_dof - 1, 0.0)
+    worth = [
+        law
+        for law in laws
+        if law.ratio.sigma > WORTH
+        and law.rms_left_out_m < error_m
+        and (misfit < 1 or before.chi2_per_dof - law.ratio.fit.chi2_per_dof > MENDS * misfit)
+    ]
     if not worth:
         reason = "No simple law of force mends the model and predicts left-out conditions better; nothing is proposed."
         return Proposal(before, error_m, laws, (), reason)
@@ -189,7 +251,7 @@ def _judged(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
 
 def _written(law: SeenLaw, folder: Path) -> Effect:
     """A law as an effect, its file in this folder."""
-    path = folder / f"proposed_{law.law.kind}.py"
+    path = folder / f"proposed_{law.law.name}.py"
     path.write_text(effect_text(law), encoding="utf-8")
     remember(path)
     return load_effect(path)
@@ -208,12 +270,18 @@ def effect_text(seen: SeenLaw, remark: str = "") -> str:
     str
     """
     law, written = seen.law, _EXPRESSIONS[seen.law.kind]
+    by_code, by_symbol, by_unit = _TIMES.get(law.times, ("", "", (0, 0, 0, 0)))
+    unit = _unit([a + b for a, b in zip(written.size[2], by_unit, strict=True)])
     size, shapes = _values(seen)
     names = [written.size[0], *(name for name, _, _ in written.shapes)]
     area = " * (s.area / AREA)" if law.by_area else ""
     at = _AT | ({"area": law.by_area} if law.by_area else {})
     worked = _force_N(seen)
-    formula = f"tail force {written.formula}" + (" A/A₀, A₀ the mean cross-section of these vines" if area else "")
+    times = f" * {by_code}" if by_code else ""
+    symbols = f" {by_symbol}" if by_symbol else ""
+    formula = f"tail force {written.formula}{symbols}" + (
+        " A/A₀, A₀ the mean cross-section of these vines" if area else ""
+    )
     parts = [
         f'"""Proposed law: {seen.words}.\n',
         *textwrap.wrap(remark, 118),
@@ -227,11 +295,11 @@ def effect_text(seen: SeenLaw, remark: str = "") -> str:
         "from vinetrack.effects import Parameter, Worked\n",
         f"AREA = {law.by_area:.6g}  # m²\n" if area else None,
         "PARAMETERS = (",
-        f"    {_size_parameter(written.size, size)},",
+        f"    {_size_parameter(written.size[0], written.size[1], unit, size)},",
         *(f"    {_shape_parameter(*number)}," for number in zip(written.shapes, shapes, strict=True)),
         ")\n\n",
         f"def tail_force(s, rig, {', '.join(names)}):",
-        f"    return {names[0]} * ({written.code}){area}\n\n",
+        f"    return {names[0]} * ({written.code}){times}{area}\n\n",
         "WORKED = (",
         "    Worked(",
         '        "tail_force",',
@@ -268,8 +336,22 @@ def _force_N(seen: SeenLaw) -> float:
     return float((seen.law.along(motion) @ np.array(seen.amplitude_N))[0])  # type: ignore[arg-type]
 
 
-def _size_parameter(names: tuple[str, str, str], value: float) -> str:
-    name, symbol, unit = names
+def _unit(powers: Sequence[int]) -> str:
+    """A unit by its exponents of N, m, s and Pa."""
+
+    def joined_up(sign: int) -> list[str]:
+        raised = {2: "²", 3: "³", 4: "⁴"}
+        return [
+            name + raised.get(sign * power, "")
+            for name, power in zip(("N", "m", "s", "Pa"), powers, strict=True)
+            if sign * power > 0
+        ]
+
+    below = "·".join(joined_up(-1))
+    return "·".join(joined_up(1)) + (f"/({below})" if "·" in below else f"/{below}" if below else "")
+
+
+def _size_parameter(name: str, symbol: str, unit: str, value: float) -> str:
     low, high = sorted((0.0, 10 * value))
     most = 100 * abs(value)
     return (
