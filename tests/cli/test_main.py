@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -28,6 +30,16 @@ def experiment(folder: Path, rows: str = "a,a.csv,12,100,300,20,3\n") -> Path:
 
 def test_version_is_that_of_the_package() -> None:
     assert run("--version").output == f"vinetrack {vinetrack.__version__}\n"
+
+
+def test_a_page_ends_without_waiting_for_its_thread() -> None:
+    program = (
+        "import atexit, sys, threading, time; atexit.register(print, 'waited')\n"
+        "threading.Thread(target=time.sleep, args=(60,), daemon=True, name='vinetrack-fit').start()\n"
+        "from vinetrack.cli.main import main; sys.argv = ['vinetrack', '--version']; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, f"vinetrack {vinetrack.__version__}\n")
 
 
 def test_check_of_a_sound_experiment_exits_with_0(tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,7 @@ from vinetrack.cli.output import MORE, JsonFile, tell
 from vinetrack.cli.power_commands import register as register_power
 from vinetrack.cli.run_commands import register as register_run
 from vinetrack.cli.setup_commands import register as register_setup
+from vinetrack.core.local_page import THREAD_PREFIX
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -47,7 +49,26 @@ LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages a
 
 def main() -> None:
     """Entry of the `vinetrack` command."""
-    app()
+    try:
+        app()
+    except SystemExit as ending:
+        _leave_threads_behind(ending.code)
+        raise
+
+
+def _leave_threads_behind(status: str | int | None) -> None:
+    """End at once where a page's fit or film is still at work in a thread.
+
+    The interpreter takes such a thread down in the middle of compiled code, which then aborts the whole process
+    (status -6) now and then. Files are written whole or not at all, so nothing is lost by not waiting.
+    """
+    if isinstance(status, str) or not any(thread.name.startswith(THREAD_PREFIX) for thread in threading.enumerate()):
+        return
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status or 0)
 
 
 def _show_version(wanted: bool) -> None:

@@ -17,6 +17,9 @@ FIRST_PORT, PORTS = 5070, 30
 TOKEN_BYTES = 16
 """Chosen: 128 bits, which nobody guesses; half would do."""
 
+THREAD_PREFIX = "vinetrack-"
+"""Threads of a page whose work need not be waited for when it ends are named so."""
+
 Server = TypeVar("Server")
 
 

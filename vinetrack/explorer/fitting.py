@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.diagnosis.compare import compare
 from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
@@ -207,7 +208,7 @@ class FitJob:
         self._work, self._told, self._done, self._failed = work, told, done, failed
         self._unwanted = threading.Event()
         self.begun = time.monotonic()
-        self._thread = threading.Thread(target=self._run, daemon=True, name="vinetrack-fit")
+        self._thread = threading.Thread(target=self._run, daemon=True, name=f"{THREAD_PREFIX}fit")
         self._thread.start()
 
     @property
@@ -271,7 +272,7 @@ class BackgroundFit:
         self.step: Step | None = None
         self.trouble = ""
         self._listeners: list[Callable[[], None]] = []
-        self._thread = threading.Thread(target=self._grow, daemon=True, name="vinetrack-ground")
+        self._thread = threading.Thread(target=self._grow, daemon=True, name=f"{THREAD_PREFIX}ground")
 
     def begin(self) -> BackgroundFit:
         """Start growing."""

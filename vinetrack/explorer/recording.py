@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vinetrack.core.local_page import THREAD_PREFIX
 from vinetrack.core.records import Floats, Trial, hand_corrected
 from vinetrack.pipeline.overlays_stage import shake_along
 from vinetrack.results.folder_layout import Results, ResultsError, read_json, read_result
@@ -210,7 +211,7 @@ class DecodedRecording:
         ----------
         told : as of `decode`.
         """
-        threading.Thread(target=self.decode, args=(told,), daemon=True, name="vinetrack-film").start()
+        threading.Thread(target=self.decode, args=(told,), daemon=True, name=f"{THREAD_PREFIX}film").start()
 
     def give_up(self) -> None:
         """Stop decoding: another recording is wanted."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from vinetrack.core.local_page import LOOPBACK, ended_by_signals, on_a_free_port, own_hosts, secret_path
+from vinetrack.core.local_page import LOOPBACK, THREAD_PREFIX, ended_by_signals, on_a_free_port, own_hosts, secret_path
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.experiment.corrections import corrections_text
 from vinetrack.setup_page.clip_views import ClipStore, jpeg, track_row, warm_up
@@ -222,7 +222,7 @@ def serve(folder: Path, say: Callable[[str], None], port: int | None = None, *, 
     """
     page_state(folder)
     server = start_server(folder, port)
-    threading.Thread(target=warm_up, daemon=True).start()
+    threading.Thread(target=warm_up, daemon=True, name=f"{THREAD_PREFIX}warm-up").start()
     say(f"Set-up: {server.address}")
     say("For this machine alone. Ctrl-C ends it.")
     if browser:
