@@ -110,6 +110,17 @@ def test_a_value_that_stands_in_the_settings_alone_is_faulted_there_and_once(fol
     assert format_problems(found) == ["error: experiment.yaml, trial a and 1 more: capture_fps is the rate of playback"]
 
 
+def test_what_was_measured_otherwise_on_every_trial_is_said_once() -> None:
+    def seen(trial: str, width_mm: float, remedy: str = "check the scale") -> Problem:
+        message = f"differs: the tube is {width_mm} mm wide"
+        return Problem(message=message, column="diameter_mm", trial=trial, remedy=remedy, of_a_measurement=True)
+
+    assert format_problems([seen("a", 2.38), seen("b", 2.41), seen("c", 2.38, "check it")]) == [
+        "error: trial a and 1 more: diameter_mm differs: the tube is 2.38 mm wide: check the scale",
+        "error: trial c: diameter_mm differs: the tube is 2.38 mm wide: check it",
+    ]
+
+
 def test_check_finds_a_missing_calibration_picture(folder: Path) -> None:
     write(folder, GOOD, "calibration: {kind: checkerboard, image: c.png, squares: [5, 5], square_mm: 5}\n")
     (problem,) = check_experiment(folder)

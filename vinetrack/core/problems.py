@@ -21,7 +21,8 @@ class Problem:
     """One fault (`severity` "error") or oddity ("warning"): where it is, what was given, what is allowed, what to do.
 
     `file` is relative to the experiment; `line` counts from 1, 0 where it makes no sense; other fields are blank
-    where they do not apply. `value` is None where there is none, "" for a blank cell.
+    where they do not apply. `value` is None where there is none, "" for a blank cell. `of_a_measurement`: the message
+    quotes what was measured on this very trial; of another trial it is the same problem with another number.
     """
 
     message: str
@@ -33,6 +34,7 @@ class Problem:
     value: str | None = None
     allowed: str = ""
     remedy: str = ""
+    of_a_measurement: bool = False
 
     @property
     def reason(self) -> str:
@@ -96,10 +98,11 @@ def format_problems(problems: Sequence[Problem], limit: int = 20) -> list[str]:
 
 
 def _once(problems: Iterable[Problem]) -> list[Problem]:
-    """Problems that differ in trial and line alone as one that names the first and counts the rest."""
+    """Problems that differ in trial, line and what was measured alone as one that names the first, counting others."""
     alike: dict[Problem, list[Problem]] = {}
     for problem in problems:
-        alike.setdefault(replace(problem, trial="", line=0), []).append(problem)
+        message = "" if problem.of_a_measurement else problem.message
+        alike.setdefault(replace(problem, trial="", line=0, message=message), []).append(problem)
     return [
         group[0] if len(group) == 1 else replace(group[0], line=0, trial=f"{group[0].trial} and {len(group) - 1} more")
         for group in alike.values()

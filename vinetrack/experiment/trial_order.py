@@ -89,7 +89,10 @@ def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
         message = f"follows the pressure (rank correlation {correlation:.2f}): any drift looks like physics"
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
     elif abs(correlation) >= FOLLOWS_PRESSURE:
-        message = f"is blank, and rows follow the pressure (rank correlation {correlation:.2f}): their order is taken"
+        message = (
+            f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if the trials were made "
+            "in this order, any drift looks like physics"
+        )
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
     for column in ("specimen", "day"):
         if _one_a_condition(trials, column):

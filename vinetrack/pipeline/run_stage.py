@@ -233,6 +233,6 @@ def run_lines(results: Path) -> list[str]:
     failed = trials[trials["status"] == "failed"]
     lines = [f"{row.trial} failed: {row.reason}" for row in failed.head(5).itertuples()]
     if len(failed) > 5:
-        lines.append(f"… and {len(failed) - 5} more trials failed")
+        lines.append(f"… and {len(failed) - 5} more trial{'s' if len(failed) > 6 else ''} failed")
     verdict, *reasons = diagnosis_lines(results)
     return [*lines, f"Report: {Results(results).report}", *reasons, verdict]

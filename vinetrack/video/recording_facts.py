@@ -163,7 +163,16 @@ def exposure_problems(trial: Trial, tracking: Tracking) -> list[Problem]:
     )
     severity = "error" if apart_px > 2 * BLUR_PX else "warning"
     remedy = "check exposure_us, its unit and capture_fps"
-    return [Problem(message=message, severity=severity, column="exposure_us", value=f"{stated_us:g}", remedy=remedy)]
+    return [
+        Problem(
+            message=message,
+            severity=severity,
+            column="exposure_us",
+            value=f"{stated_us:g}",
+            remedy=remedy,
+            of_a_measurement=True,
+        )
+    ]
 
 
 def _near(ratio: float) -> bool:
@@ -176,7 +185,14 @@ def _factor(ratio: float) -> str:
 
 def _problem(column: str, stated_mm: float, seen: str, ratio: float, remedy: str) -> Problem:
     severity = "error" if max(ratio, 1 / ratio) > ERROR_FACTOR else "warning"
-    return Problem(message=f"differs: {seen}", severity=severity, column=column, value=f"{stated_mm:g}", remedy=remedy)
+    return Problem(
+        message=f"differs: {seen}",
+        severity=severity,
+        column=column,
+        value=f"{stated_mm:g}",
+        remedy=remedy,
+        of_a_measurement=True,
+    )
 
 
 def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], blank: Collection[str]) -> list[str]:
