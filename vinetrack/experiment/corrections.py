@@ -83,8 +83,15 @@ def _read_line(table: Table, index: int, problems: list[Problem]) -> Correction 
 
 def _problem(table: Table, index: int, column: str, message: str, remedy: str) -> Problem:
     row = table.rows[index]
-    place = {"file": CORRECTIONS, "column": column, "trial": row["trial"], "value": row[column]}
-    return Problem(message=message, line=table.lines[index], remedy=remedy, **place)
+    return Problem(
+        message=message,
+        file=CORRECTIONS,
+        line=table.lines[index],
+        trial=row["trial"],
+        column=column,
+        value=row[column],
+        remedy=remedy,
+    )
 
 
 def strangers(corrections: Mapping[str, object], names: Iterable[str], filmed: Iterable[str]) -> list[Problem]:

@@ -90,7 +90,7 @@ def order_problems(trials: Sequence[Trial], file: str) -> Iterator[Problem]:
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
     elif abs(correlation) >= FOLLOWS_PRESSURE:
         message = (
-            f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if the trials were made "
+            f"is blank and the rows are sorted by pressure (rank correlation {correlation:.2f}): if they were made "
             "in this order, any drift looks like physics"
         )
         yield Problem(message=message, file=file, column="order", severity="warning", remedy=REMEDY)
