@@ -56,8 +56,8 @@ def test_frames_are_pictures_and_the_axis_lies_along_the_tube(server: SetupServe
     clip = json.loads(ask(server, "/api/clip?recording=d15%2024kPa%201.mp4")[1])
     (x0, y0), (x1, y1) = clip["axis"]["from_px"], clip["axis"]["to_px"]
     assert x1 - x0 > 300
-    assert abs(y0 - 80) < 3
-    assert abs(y1 - 80) < 3
+    assert abs(y0 - 80) < 1.5
+    assert abs(y1 - 80) < 1.5
 
 
 def test_one_row_is_tracked_before_the_sheet_is_filled_in(server: SetupServer, clips: Path) -> None:

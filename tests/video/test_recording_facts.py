@@ -18,8 +18,8 @@ from vinetrack.pipeline.recordings_stage import analyse_recording
 from vinetrack.results.folder_layout import Results, read_json
 from vinetrack.video.axis import Axis
 from vinetrack.video.capture_clock import capture_rate
-from vinetrack.video.frames import RecordingError, inspect_recording
-from vinetrack.video.quick_look import look_at
+from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
+from vinetrack.video.quick_look import look_at, proposed_axis
 from vinetrack.video.recording_facts import RecordingFacts, direction_notes, exposure_problems, size_problems
 from vinetrack.video.survey import Surveyor
 from vinetrack.video.track import track_recording
@@ -113,6 +113,14 @@ def test_a_look_sees_width_and_growth_without_the_sheet(clip: Path) -> None:
     assert look.tube_width_px * SCALE_MM == pytest.approx(12, rel=0.04)
     assert look.growth_px * SCALE_MM == pytest.approx(140, rel=0.06)
     assert look.px_per_frame * SCALE_MM * FPS / 1e3 == pytest.approx(6, rel=0.1)
+
+
+def test_the_axis_proposed_runs_along_the_middle_of_the_tube_as_tracked(clip: Path) -> None:
+    axis = proposed_axis(read_frames(clip).luma)
+    tracked_axis = track_recording(replace(VINE, video=clip, capture_fps=FPS, m_per_px=SCALE_MM / 1e3)).axis
+    assert axis.from_px[1] == pytest.approx(tracked_axis.from_px[1], abs=1.5)
+    assert axis.to_px[1] == pytest.approx(tracked_axis.to_px[1], abs=1.5)
+    assert axis.width_px * SCALE_MM == pytest.approx(12, rel=0.1)
 
 
 def test_the_rate_of_playback_is_refused_unless_it_is_said_to_be_that_of_capture(clip: Path) -> None:

@@ -21,10 +21,11 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import ExperimentSettings, read_experiment_settings
 from vinetrack.experiment.sheet import SHEET, read_row
 from vinetrack.tracks.importers import TrackError, read_pressure_trace
-from vinetrack.video.axis import Axis, find_axis
+from vinetrack.video.axis import Axis
 from vinetrack.video.board_search import find_board
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames, read_frames
 from vinetrack.video.measure import Measurement, measure_recording
+from vinetrack.video.quick_look import proposed_axis
 from vinetrack.video.recording_facts import size_problems, tracked_facts
 from vinetrack.video.track import Tracking, track_recording
 
@@ -161,7 +162,7 @@ def _decoded(path: Path) -> DecodedClip:
     frames = read_frames(path)
     height, width = frames.luma.shape[1:]
     try:
-        axis, no_axis = find_axis(frames.luma), ""
+        axis, no_axis = proposed_axis(frames.luma), ""
     except RecordingError as error:
         axis, no_axis = None, str(error)
     top = float(np.quantile(frames.luma[0], 0.999)) if frames.luma.dtype != np.uint8 else 255.0

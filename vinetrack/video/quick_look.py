@@ -8,14 +8,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
-from vinetrack.video.axis import Axis
-from vinetrack.video.edge import outline, rough_growth
+from vinetrack.video.axis import Axis, SmallPictures, find_axis, is_orderly
+from vinetrack.video.edge import Outline, outline, rough_growth
 from vinetrack.video.frames import Recording, RecordingError, iterate_frames
-from vinetrack.video.strip import cut_strip, squared
+from vinetrack.video.strip import Strip, cut_strip, squared
 from vinetrack.video.track import CENTRINGS, centred, whereabouts
 
 LOOKED_AT = 100
@@ -65,12 +67,7 @@ def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | 
         axis_found, orderly = whereabouts(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
         if trial.travel_ratio == 1 or not orderly:
             return Look(axis_found)
-        strip = cut_strip(luma, squared(axis_found), 0.65 * axis_found.width_px + 3)
-        for _ in range(2 * CENTRINGS):
-            before, sides = strip, outline(strip)
-            strip = centred(luma, strip, sides)
-            if strip is before:
-                break
+        strip, sides = _about_the_tube(luma, axis_found)
         growth_px, px_per_frame = rough_growth(strip)
     except (RecordingError, ValueError):
         return Look()
@@ -78,3 +75,41 @@ def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | 
     return Look(
         strip.axis, sides.width_px, sides.width_sigma_px, growth_px if whole else math.nan, px_per_frame / every
     )
+
+
+def proposed_axis(luma: NDArray[Any]) -> Axis:
+    """The growth axis as the motion shows it, along the middle of the tube where one front passes once.
+
+    Parameters
+    ----------
+    luma : brightness, shape (n_frames, height, width).
+
+    Returns
+    -------
+    axis : in the picture, px.
+
+    Raises
+    ------
+    RecordingError
+        Where nothing moves along one line.
+    """
+    small = SmallPictures(luma)
+    axis = find_axis(small)
+    if not is_orderly(small, axis):
+        return axis
+    try:
+        return _about_the_tube(luma, axis)[0].axis
+    except ValueError:
+        return axis
+
+
+def _about_the_tube(luma: NDArray[Any], axis: Axis) -> tuple[Strip, Outline]:
+    """A strip that is centred on the tube, and the tube's outline in it."""
+    strip = cut_strip(luma, squared(axis), 0.65 * axis.width_px + 3)
+    sides = outline(strip)
+    for _ in range(2 * CENTRINGS):
+        before, strip = strip, centred(luma, strip, sides)
+        if strip is before:
+            break
+        sides = outline(strip)
+    return strip, sides
