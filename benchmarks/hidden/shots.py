@@ -28,8 +28,9 @@ FINER = 16
 class Shot:
     """One trial: `setting` is what the sheet says, `tube` and `physics` what is true, SI.
 
-    `valve_s` is the time in which a valve opens, after `valve_law`: "exponential" with this time constant, or "smooth"
-    over this time. `specimen` says which tube of its vine, `day` when.
+    `valve_s` is the time in which a valve opens, after `valve_law`: "exponential" with this time constant and the power
+    `valve_power` of the time in the exponent, or "smooth" over this time. `specimen` says which tube of its vine, `day`
+    when.
     """
 
     setting: Setting
@@ -39,6 +40,7 @@ class Shot:
     day: str = "1"
     valve_s: float = 0.0
     valve_law: str = "exponential"
+    valve_power: float = 1.0
     slack: bool = False
 
 
@@ -48,8 +50,9 @@ class Camera:
 
     Noise is `noise_m` with correlation `rho` from frame to frame, and white noise of `blur_s` times the speed of the
     edge. `wild_share` of the points are off by `wild_m`, evenly drawn. The lens adds k₃ u³ + k₅ u⁵, u from
-    `lens_centre_m`. The rows of the picture are read `row_delay_s_m` later by the metre; `scale` and `clock` are
-    relative errors. `trace_late_s`: by how much the clock of a recorded pressure is ahead (NaN: none is recorded).
+    `lens_centre_m`; a camera that is tilted shows y (1 + `bow_per_m` y). The rows of the picture are read
+    `row_delay_s_m` later by the metre; `scale` and `clock` are relative errors. `trace_late_s`: by how much the clock
+    of a recorded pressure is ahead (NaN: none is recorded).
     """
 
     noise_m: float
@@ -60,6 +63,7 @@ class Camera:
     lens_k3: float = 0.0
     lens_k5: float = 0.0
     lens_centre_m: float = 0.0
+    bow_per_m: float = 0.0
     row_delay_s_m: float = 0.0
     scale: float = 0.0
     clock: float = 0.0
@@ -219,7 +223,8 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
 
 
 def imaged(y: Floats, camera: Camera) -> Floats:
-    """Positions, m, as lens and scale have them; the zero is arbitrary."""
+    """Positions, m, as tilt, lens and scale have them; the zero is arbitrary."""
+    y = y * (1 + camera.bow_per_m * y)
     u = y - camera.lens_centre_m
     return (y + camera.lens_k3 * u**3 + camera.lens_k5 * u**5) * (1 + camera.scale)
 
@@ -255,17 +260,17 @@ def _moved(shot: Shot, since: Floats) -> tuple[Floats, Floats, Floats]:
     opening: tuple[Floats, Floats] | tuple[()] = ()
     if shot.valve_s > 0:
         grid = np.linspace(0, 12 * shot.valve_s, 2000)
-        opening = grid, shot.tube.pressure * opened(grid / shot.valve_s, shot.valve_law)
+        opening = grid, shot.tube.pressure * opened(grid / shot.valve_s, shot.valve_law, shot.valve_power)
     out, _ = follow(since, shot.tube, shot.physics, np.empty((0, 3)), *opening)
     return out[:, 0], 0.5 * out[:, 2], out[:, 3]
 
 
-def opened(part: Floats, law: str) -> Floats:
+def opened(part: Floats, law: str, power: float = 1.0) -> Floats:
     """Share of the pressure behind a valve, by the time since it began to open in its own time."""
     if law == "smooth":
         u = np.clip(part, 0, 1)
         return u * u * (3 - 2 * u)
-    return 1 - np.exp(-part)
+    return 1 - np.exp(-(part**power))
 
 
 def _correlated(draw: Draw, rho: float, count: int) -> NDArray[np.float64]:

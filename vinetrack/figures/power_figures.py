@@ -65,8 +65,8 @@ def draw_power(power: Power) -> Figure:
         _mark_rows(ax, entries)
         _list_sizes(told, entries)
         bar = fig.colorbar(mesh, ax=ax, location="bottom", fraction=0.06, pad=0.02, aspect=50)
-        bar.set_label("probability of finding it")
-        bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50 %", "90 %", "100 %"])
+        bar.set_label("probability of finding it (%)")
+        bar.set_ticks([0, 0.5, 0.9, 1], labels=["0", "50", "90", "100"])
         bar.outline.set_visible(False)
         trials = f"{power.n_trials} trial{'s' if power.n_trials != 1 else ''}"
         ax.set_title(f"What {trials} can show", loc="left", pad=26)
