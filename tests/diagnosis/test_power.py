@@ -167,9 +167,15 @@ def test_a_verdict_never_stands_alone(power: Power) -> None:
     beside = "(false alarms in at most 0.42 % of such campaigns; "
     assert str(diagnosis).startswith(f"adequate: no missing effect can be detected {beside}")
     assert "Could not have been seen: air drag" in str(diagnosis)
-    fact = {fact.question: fact for fact in facts(diagnosis, None)}["False alarms"]
-    assert fact.answer == "at most 0.42 %"
-    assert "of 8 effects would have been found" in fact.note
+    said = {fact.question: fact for fact in facts(diagnosis, None)}
+    assert said["False alarms"].answer == "at most 0.42 %"
+    assert said["Could have been seen"].answer.endswith("of 8 effects")
+    assert said["Could have been seen"].note.startswith("nine times in ten at their largest plausible size; not even")
+    assert "air drag" in said["Could have been seen"].note
+    wary = replace(diagnosis, power=replace(power, wary="the model is far off"))
+    assert [fact.note for fact in facts(wary, None) if fact.question == "Could have been seen"] == [
+        "the model is far off"
+    ]
     again = Diagnosis.from_json(json.loads(json.dumps(diagnosis.to_json())))
     assert again.power == power
 

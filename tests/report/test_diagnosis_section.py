@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pandas as pd
 import pytest
 from hand_diagnosis import VERDICTS, candidate, diagnosis, ladder, laws, moved, next_experiment, number, refused
 from test_report import EVIL, SVG, Tags, page
 
+from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power
 from vinetrack.diagnosis.result import Candidate, Diagnosis, Round
 from vinetrack.figures.registry import DIAGNOSIS_FIGURES
 from vinetrack.inference.fit_result import Number
@@ -313,3 +315,25 @@ def test_the_next_experiment_may_be_a_sentence_alone() -> None:
     assert entry is not None
     assert (entry["trials"], entry["separations"]) == (None, None)
     assert next_entry(None) is None
+
+
+def test_the_page_says_what_the_trials_could_have_seen() -> None:
+    sizes = tuple(1 + 0.1 * (probability - 0.9) for probability in PROBABILITIES)
+    drag = EffectPower("air_drag", "physical", "air_drag.C_D", "C_D", "1", 0.0, 0.0, 3.0, sizes, {"inlet_loss": 0.26})
+    leak = replace(drag, effect="leak", symbol="1/τ", unit="1/s", largest=0.5)
+    power = Power(24, 3.6, {"scores of all candidates": 0.003}, (leak, drag), {"static_yield": "no trace"})
+    told = replace(read(diagnosis("adequate")), power=power)
+    html = page(diagnosis=DiagnosisResult(told))
+    part = html.partition('<h2 id="power">')[2].partition("<h2")[0]
+    assert "raise a false alarm in at most 0.30 % of campaigns" in part
+    assert "Found nine times in ten: air drag from C_D = 1.0." in part
+    assert "Could not have been seen: leak and static yield." in part
+    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", part)]
+    assert [row[0] for row in rows if row] == ["air drag", "leak"]
+    assert rows[1][3:] == ["1.0", "3.0", "100 %", "inlet loss 26 %"]
+    assert '<a href="#power">' in html
+    assert 'id="power"' not in page(diagnosis=DiagnosisResult(read(diagnosis("adequate"))))
+    wary = diagnosis_section(DiagnosisResult(replace(told, power=replace(power, wary="the model is far off"))))
+    assert wary is not None
+    assert wary["power"]["table"] is None
+    assert "the model is far off" in wary["power"]["sentences"][1]

@@ -167,7 +167,6 @@ def could_have_seen(power: Power) -> list[str]:
     physical = [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
     seen = [entry for entry in physical if entry.probability_at(entry.largest) >= 0.9]
     at_times = [entry for entry in physical if HARDLY_EVER <= entry.probability_at(entry.largest) < 0.9]
-    never = [entry.effect for entry in physical if entry.probability_at(entry.largest) < HARDLY_EVER]
     lines = []
     if seen:
         sizes = "; ".join(
@@ -181,10 +180,26 @@ def could_have_seen(power: Power) -> list[str]:
             for entry in at_times
         ]
         lines.append(f"Found at times, at the largest plausible size: {joined(parts)}.")
-    blind = [*never, *(name for name in power.not_testable if name not in never)]
-    if blind:
+    if blind := unseen(power):
         lines.append(f"Could not have been seen: {listed(blind)}.")
     return lines
+
+
+def unseen(power: Power) -> list[str]:
+    """Return the physical effects that the trials show hardly ever even at their largest plausible size, or not at all.
+
+    Parameters
+    ----------
+    power : of the trials.
+
+    Returns
+    -------
+    list of str
+        Names of effects; of all kinds where none is physical.
+    """
+    physical = [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
+    never = [entry.effect for entry in physical if entry.probability_at(entry.largest) < HARDLY_EVER]
+    return [*never, *(name for name in power.not_testable if name not in never)]
 
 
 def width_text(width: NumberWidth) -> str:

@@ -55,6 +55,9 @@ THEREAFTER = {
 }
 """The verdict on the model with all added effects."""
 
+MOST_UNSEEN_LISTED = 6
+"""Effects that are listed on the first screen as not visible. Chosen: two lines; all are in the table of the page."""
+
 NONE_SEEN = 2.0
 """Standard errors below which a size is said to be none. Chosen: the usual 95 %; at half sizes of pure noise would be
 quoted as sizes once in three, at twice some that are there would be called none."""
@@ -179,7 +182,7 @@ def facts(diagnosis: Diagnosis, ladder: pd.DataFrame | None) -> list[Fact]:
         _significance(diagnosis),
         *_sizes(diagnosis),
         _upper_limits(diagnosis),
-        _false_alarms(diagnosis),
+        *_power_facts(diagnosis),
         *_errors(ladder),
         *_exponent(diagnosis),
     ]
@@ -315,14 +318,21 @@ def _upper_limits(diagnosis: Diagnosis) -> Fact | None:
     return Fact("Upper limits", f"{len(bounded)} candidates", "the largest undetected size of each is listed below")
 
 
-def _false_alarms(diagnosis: Diagnosis) -> Fact | None:
-    """How often such trials say that something is missing where nothing is, and what they would have shown."""
+def _power_facts(diagnosis: Diagnosis) -> list[Fact]:
+    """How often such trials say that something is missing where nothing is, and what they could have shown."""
     if diagnosis.power is None:
-        return None
-    from vinetrack.narrative.power_text import power_brief
+        return []
+    from vinetrack.narrative.power_text import power_brief, unseen
 
     alarms, _, shown = power_brief(diagnosis.power).partition("; ")
-    return Fact("False alarms", alarms.removeprefix("false alarms in ").partition(" of such")[0], shown)
+    rate = alarms.removeprefix("false alarms in ").partition(" of such")[0]
+    alarm = Fact("False alarms", rate, "of such campaigns, where nothing is missing")
+    seen, _, how = shown.partition(" would have been found ")
+    if not how:
+        return [alarm, Fact("Could have been seen", "not worked out", diagnosis.power.wary)]
+    blind = unseen(diagnosis.power)
+    beyond = f"; not even then: {listed(blind)}" if 0 < len(blind) <= MOST_UNSEEN_LISTED else ""
+    return [alarm, Fact("Could have been seen", seen, f"{how}{beyond}")]
 
 
 def _errors(ladder: pd.DataFrame | None) -> list[Fact]:

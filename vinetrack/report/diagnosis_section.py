@@ -13,16 +13,26 @@ from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.law_text import PREFERRED
+from vinetrack.narrative.power_text import HEAD as POWER_HEAD
+from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence, power_rows
 from vinetrack.narrative.verdict_summary import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
 from vinetrack.report.section import ReportTable
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.power import Power
+
 
 ABOUT_SIGMA = (
     "● in the answer set. Δχ² counts the noise of the tracks alone, σ also how much trials disagree: of a fitted "
     "candidate it is √Δχ² or less."
+)
+
+
+ABOUT_POWER = (
+    "By linear theory, with the noise and scatter of the fit, beside all effects of the last model. Found there: at "
+    "the largest plausible size. Taken for: which other candidate has the highest score, at the size found in 90 %."
 )
 
 
@@ -73,6 +83,7 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
         "force": missing_force(diagnosis.missing_force),
         "rounds": [_round(i, entry) for i, entry in enumerate(diagnosis.rounds)],
         "hidden": _hidden(diagnosis, result.units),
+        "power": power_entry(diagnosis.power),
         "tied": tied_pairs(diagnosis.rounds[0]) if diagnosis.rounds else [],
         "next": next_experiment(diagnosis.next_experiment),
         "drift": drifting,
@@ -194,6 +205,27 @@ def hidden_table(
     return ReportTable(
         "Upper limits on undetected effects", ("Candidate", "number", "upper limit"), rows, frozenset({2}), note
     )
+
+
+def power_entry(power: Power | None) -> dict[str, Any] | None:
+    """Return what the trials could have seen for the template: sentences, and a table of sizes; None where unknown.
+
+    Parameters
+    ----------
+    power : of a diagnosis.
+
+    Returns
+    -------
+    dict for the template, or None
+    """
+    if power is None:
+        return None
+    table = None
+    if power.effects and not power.wary:
+        order = sorted(power.effects, key=lambda entry: -entry.probability_at(entry.largest))
+        head = ("Effect", "number", *POWER_HEAD[2:])
+        table = ReportTable("", head, power_rows(order), frozenset({2, 3, 4, 5}), ABOUT_POWER)
+    return {"sentences": [false_alarm_sentence(power), *could_have_seen(power)], "table": table}
 
 
 def _blind(ranking: Sequence[Candidate]) -> list[str]:
