@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
+from vinetrack.diagnosis import linear_power
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_questions
 from vinetrack.diagnosis.expected_scores import beyond, displacements, fitted_without, score_ratio
 from vinetrack.diagnosis.linear_power import power_of, spread_widening
@@ -145,6 +146,33 @@ def test_an_effect_within_the_errors_of_positions_counts_half() -> None:
     assert found[PROBABILITIES.index(0.6)] == pytest.approx(1.12)
     assert beyond(0.0, sizes) == pytest.approx(sizes)
     assert beyond(1.12, -sizes) == pytest.approx(-found)
+
+
+def test_an_effect_is_followed_at_a_second_size_only_where_its_score_bends(
+    six: MisfitTests, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def followed(ratio_at_7: float, ratio_at_4: float) -> tuple[int, EffectPower]:
+        asked: list[float] = []
+
+        def ratio(_: MisfitTests, __: int, size: float) -> float:
+            asked.append(abs(size))
+            return ratio_at_7 if len(asked) == 1 else ratio_at_4
+
+        monkeypatch.setattr(linear_power, "score_ratio", ratio)
+        power = linear_power.effect_power(six, "leak")
+        assert power is not None
+        assert asked == pytest.approx([asked[0], asked[0] * 4 / 7][: len(asked)])
+        return len(asked), power
+
+    calls, straight = followed(1.01, math.nan)
+    assert calls == 1
+    calls, bent = followed(0.7, 0.8)
+    assert calls == 2
+    assert 1.01 / 0.8 < bent.size_at(0.5) / straight.size_at(0.5) < 1.01 / 0.7
+    calls, wild = followed(5.0, 0.8)
+    assert calls == 2
+    assert wild.size_at(0.5) == pytest.approx(1.01 * straight.size_at(0.5))
+    assert followed(1.0, 0.8)[0] == 2
 
 
 def test_power_survives_its_file(power: Power) -> None:
