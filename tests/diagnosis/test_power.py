@@ -12,10 +12,10 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis import linear_power
+from vinetrack.diagnosis import expected_scores
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_questions
 from vinetrack.diagnosis.expected_scores import beyond, displacements, fitted_without, score_ratio
-from vinetrack.diagnosis.linear_power import power_of, spread_widening
+from vinetrack.diagnosis.linear_power import effect_power, power_of, spread_widening
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.diagnosis.result import Diagnosis, Round
@@ -158,8 +158,8 @@ def test_an_effect_is_followed_at_a_second_size_only_where_its_score_bends(
             asked.append(abs(size))
             return ratio_at_7 if len(asked) == 1 else ratio_at_4
 
-        monkeypatch.setattr(linear_power, "score_ratio", ratio)
-        power = linear_power.effect_power(six, "leak")
+        monkeypatch.setattr(expected_scores, "score_ratio", ratio)
+        power = effect_power(six, "leak")
         assert power is not None
         assert asked == pytest.approx([asked[0], asked[0] * 4 / 7][: len(asked)])
         return len(asked), power

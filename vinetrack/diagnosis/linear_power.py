@@ -32,7 +32,7 @@ from scipy.stats import norm, t
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, plausible_range
-from vinetrack.diagnosis.expected_scores import beyond, least_sizes, score_ratio
+from vinetrack.diagnosis.expected_scores import beyond, followed_sizes, least_sizes
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, CREDIBLE
 from vinetrack.diagnosis.misfit_tests import LOUD_PROBE, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
@@ -53,15 +53,6 @@ detectable size is known to some per cent; beyond 3 the fit would scatter so muc
 
 SCORES = np.linspace(0.0, 40.0, 401)
 """Scores at the true spreads for which the widening is tabulated. Chosen: ten times any threshold."""
-
-IN_PROPORTION = 0.02
-"""Relative deviation of an expected score from proportion to the size that is passed over. Chosen: 2 % of a size, where
-the draws leave 0.5 %; at half more effects are followed at two sizes, and at twice sizes err by as much as noise and
-scatter are known from 24 trials."""
-
-BELIEVABLE = 2.0
-"""Ratio of an expected score to that in proportion to the size beyond which neither is trusted. Chosen: a fit without
-the effect that has not settled gives any ratio; at half most curvature is passed over, at twice some of those count."""
 
 LEAST_TAKEN_FOR = 0.05
 """Probability from which another candidate is listed. Chosen: one time in twenty; at half lists grow long, at twice a
@@ -208,27 +199,12 @@ def _responses(questions: MisfitTests, *, curved: bool, only: str = "") -> list[
         scores = information[places] * sizes[:, None] / root
         if curved and not shapes[0].whole:
             unit = float(sizes[0])
-            sizes, bend = _curve(questions, places[0], unit)
+            sizes, bend = followed_sizes(questions, places[0], unit)
             scores = scores[0] * (bend * sizes / unit)[:, None]
         responses.append(
             _Response(effect, shapes[0], places[0], sizes, np.where(np.diag(information) > 0, scores, 0.0))
         )
     return responses
-
-
-def _curve(questions: MisfitTests, place: int, unit: float) -> tuple[Floats, Floats]:
-    """Multiples of a size, and by what its expected scores there differ from those in proportion to it.
-
-    `unit` is the size whose score is one standard error. Where the score at seven of them, beyond any threshold, is in
-    proportion, no other size is tried; else, and where it cannot be followed (exactly 1), one about a threshold too.
-    Beyond what is believable of a ratio, proportion stands.
-    """
-    large = score_ratio(questions, place, 7 * unit)
-    if 0 < abs(large - 1) < IN_PROPORTION:
-        return np.array([7 * unit]), np.array([large])
-    ratios = np.array([score_ratio(questions, place, 4 * unit), large])
-    believable = np.all((ratios > 1 / BELIEVABLE) & (ratios < BELIEVABLE))
-    return unit * np.array([4.0, 7.0]), ratios if believable else np.ones(2)
 
 
 def _typical_places(questions: MisfitTests, effect: Effect) -> list[int]:
