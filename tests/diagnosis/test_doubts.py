@@ -12,13 +12,15 @@ import pytest
 from hidden_truth import Pairs, sheet
 
 import vinetrack as vt
-from vinetrack.core.records import Floats
 from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis import misfit_tests as questions
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.score_test import informations_at, scores_of
+from vinetrack.diagnosis.shape_products import fit_columns, products_of
 from vinetrack.inference.fit import fit
 from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.systematics import Systematics, systematics_of
 from vinetrack.laboratory.tracks import BASE, Nature, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 
@@ -49,8 +51,8 @@ def asked(pairs: Pairs) -> MisfitTests:
 
 @pytest.fixture
 def without_doubts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    def none(*about: Any) -> list[Floats]:
-        return [np.zeros((trial.time_s.size, 0)) for trial in about[-1]]
+    def none(*about: Any) -> Systematics:
+        return Systematics.none([trial.time_s.size for trial in about[-1]])
 
     monkeypatch.setattr(questions, "systematics_of", none)
     return
@@ -130,3 +132,28 @@ def test_the_smooth_error_of_position_is_found_along_with_n_and_b():
     without = fit(model, through_a_lens(0.0), profile=False)
     assert found.log_likelihood > without.log_likelihood + 50
     assert found["n"].sigma > without["n"].sigma
+
+
+def test_errors_that_few_trials_feel_count_as_if_every_trial_had_a_column_for_them() -> None:
+    """One payload and one set pressure a trial, and the same with columns of zeros for all others."""
+    questioned = asked([*careful(20.0, 8), *careful(60.0, 9)])
+    fitted, answers = questioned.fit, questioned.answers
+    felt = systematics_of(fitted.predictor, fitted.solution, fitted.trials)
+    assert felt.n_felt < felt.count
+    wide = [np.zeros((len(columns), felt.count + 1)) for columns in felt.columns]
+    for column, columns, places in zip(wide, felt.columns, felt.places, strict=True):
+        column[:, places] = columns
+    every = np.tile(np.arange(felt.count), (len(wide), 1))
+    dense = products_of(
+        fitted, fit_columns(fitted), answers, Systematics([column[:, :-1] for column in wide], every, felt.count)
+    )
+    one_by_one = scores_of(fitted, dense)
+    for name in ("score", "information", "scores", "informations"):
+        expected = getattr(one_by_one, name)
+        assert np.allclose(
+            getattr(questioned.scores, name), expected, rtol=1e-6, atol=1e-9 * np.max(np.abs(expected))
+        ), name
+    spreads = [(0.01, 0.03), (1e-3, 0.1)]
+    assert np.allclose(
+        informations_at(fitted, questioned.sums, spreads), informations_at(fitted, dense, spreads), rtol=1e-6
+    )

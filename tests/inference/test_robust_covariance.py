@@ -16,7 +16,7 @@ from vinetrack.core.records import Track, Trial
 from vinetrack.inference.fit_result import Number
 from vinetrack.inference.intervals import precision
 from vinetrack.inference.robust_covariance import _few_trials, robust_covariance, widened_covariance
-from vinetrack.inference.systematics import PRESSURE_ERROR_PA
+from vinetrack.inference.systematics import PRESSURE_ERROR_PA, Systematics
 
 Pairs = list[tuple[Trial, Track]]
 
@@ -80,7 +80,7 @@ def test_no_error_is_smaller_than_what_the_scatter_of_trials_shows(monkeypatch: 
     plain, robust = (np.diag(matrix) for matrix in robust_covariance(found.predictor, found.solution))
     assert np.max(robust / plain) > 1.5
     known = precision(found.solution)
-    nothing = [np.zeros((trial.time_s.size, 0)) for trial in found.predictor.data]
+    nothing = Systematics.none([trial.time_s.size for trial in found.predictor.data])
     monkeypatch.setattr("vinetrack.inference.robust_covariance.systematics_of", lambda *_, **__: nothing)
     stated = np.diag(widened_covariance(found.predictor, found.solution, found.trials, known).covariance)
     assert np.all(stated / np.diag(known.covariance) >= 0.99 * robust / plain)

@@ -13,6 +13,8 @@ from vinetrack.inference.assemble import log_likelihood
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import FixedTerms, solve
+from vinetrack.inference.release_kernels import products_at_releases
+from vinetrack.inference.whitening import whiten
 
 
 @pytest.fixture(scope="module")
@@ -42,3 +44,19 @@ def test_the_same_likelihood_is_reached_wherever_the_releases_begin(only_in_moti
     found = vt.refit(replace(only_in_motion, solution=elsewhere))
     assert log_likelihood(found.solution) == pytest.approx(log_likelihood(solution), abs=0.5)
     assert np.isfinite(found["n"].sigma)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho: float) -> None:
+    draw = np.random.default_rng(5)
+    time_s, grid_s = np.linspace(0.0, 0.3, 41), 0.4 * np.linspace(0, 1, 60) ** 1.5
+    curves, position_m, relative = draw.standard_normal((5, 60)), draw.standard_normal(41), draw.uniform(1, 3, 41)
+    first = np.zeros(41, dtype=bool)
+    first[[0, 17]] = True
+    releases_s = np.array([-0.2, 0.0, 0.013, 0.25])
+    products = products_at_releases(time_s, position_m, first, relative, releases_s, grid_s, curves, rho)
+    for release_s, product in zip(releases_s, products, strict=True):
+        columns = np.array([np.interp(np.maximum(time_s - release_s, 0.0), grid_s, curve) for curve in curves]).T
+        columns[:, -1] = position_m - columns[:, -1]
+        white = whiten(columns, first, rho, relative)
+        assert np.allclose(product, white.T @ white, rtol=1e-12, atol=1e-12)

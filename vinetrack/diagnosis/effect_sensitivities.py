@@ -75,13 +75,18 @@ def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSe
             answered = [answer for shape in finite if (answer := _answer(fit, shape, plain)) is not None]
         kept += answered
         heard |= {name} if answered else set()
-    columns = tuple(
-        np.column_stack([column[i] for _, column in kept]) if kept else np.zeros((trajectory.time_s.size, 0))
-        for i, trajectory in enumerate(plain)
-    )
+    columns = tuple(_beside_each_other(kept, i, trajectory.time_s.size) for i, trajectory in enumerate(plain))
     return EffectSensitivities(
         tuple(shape for shape, _ in kept), columns, tuple(name for name in names if name not in heard)
     )
+
+
+def _beside_each_other(kept: Sequence[tuple[CandidateShape, list[Floats]]], i: int, points: int) -> Floats:
+    """Answers of one trial, shape (n_points, n_shapes); they are let go where they came from, for memory."""
+    columns = np.empty((points, len(kept)))
+    for k, (_, answers) in enumerate(kept):
+        columns[:, k], answers[i] = answers[i], np.empty(0)
+    return columns
 
 
 def _answer(fit: Fit, shape: CandidateShape, plain: Sequence[Trajectory]) -> tuple[CandidateShape, list[Floats]] | None:

@@ -271,13 +271,13 @@ def _wide(asked: MisfitTests, effect: str) -> Floats:
     blocks = blocks_of(fit, sums, fit.state)
     keys, free, n = sums.n_keys, problem.prior_mean.size, len(blocks)
     shape = keys + 1 + typical_place(asked, effect)
-    systematics = np.arange(keys + 1 + sums.n_shapes, keys + 1 + sums.n_shapes + sums.n_doubts)
+    systematics = np.arange(keys + 1 + sums.n_shapes, blocks.shape[1])
     columns = np.concatenate([np.arange(keys), systematics, [shape]])
     taken = blocks[:, columns[:, None], columns]
     size = free + sums.n_doubts + 1
-    others = np.broadcast_to(np.arange(free, size), (n, size - free))
-    # Numbers that a trial does not feel stand at -1: they go into a last row and column that is thrown away.
-    index = np.concatenate([np.where(problem.index < 0, size, problem.index), others], axis=1)
+    # What a trial does not feel, number or error, goes into a last row and column that is thrown away.
+    felt = np.where(sums.places < sums.n_doubts, free + sums.places, size)
+    index = np.concatenate([np.where(problem.index < 0, size, problem.index), felt, np.full((n, 1), size - 1)], axis=1)
     wide = np.zeros((n, size + 1, size + 1))
     np.add.at(wide, (np.arange(n)[:, None, None], index[:, :, None], index[:, None, :]), taken)
     return wide[:, :size, :size]

@@ -37,6 +37,7 @@ from vinetrack.inference.mixed_effects import spreads as spreads_of_trials
 from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.robust_covariance import scatter_of
 from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.systematics import Systematics
 from vinetrack.inference.whitening import at_correlation
 
 BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
@@ -106,10 +107,10 @@ class Scores:
 class _Projected:
     """Shapes and residual, trial effects eliminated, and what the free numbers of a fit explain of them.
 
-    `blocks`, shape (n_trials, q, q), are cross products of keys, residual, shapes, systematic errors; `lever`, shape
-    (n_free, n_asked), is I_θθ⁻¹ I_θs; `step`, shape (n_free,), is the Newton step of the free
-    numbers; `moving` are places of those that can give way. `score`, shape (n_asked,), and `information`, squared, are
-    what is left of shapes and systematic errors; `gone` marks those of which that is nothing.
+    `blocks`, shape (n_trials, q, q), are cross products of keys, residual, shapes, and the systematic errors that each
+    trial feels; `lever`, shape (n_free, n_asked), is I_θθ⁻¹ I_θs; `step`, shape (n_free,), is the Newton step of the
+    free numbers; `moving` are places of those that can give way. `score`, shape (n_asked,), and `information`, squared,
+    are what is left of shapes and systematic errors; `gone` marks those of which that is nothing.
     """
 
     blocks: Floats
@@ -134,24 +135,34 @@ def projected(fit: Fit, sums: Products, state: FitState) -> _Projected:
     _Projected
     """
     problem = fit.solution.problem
-    p, size, asked = sums.n_keys, problem.prior_mean.size, sums.n_shapes + sums.n_doubts
-    X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
-    blocks = blocks_of(fit, sums, state)
+    p, size, asked = sums.n_keys, problem.prior_mean.size, sums.n_asked
+    X, r, C = slice(0, p), p, slice(p + 1, None)
+    blocks, places = blocks_of(fit, sums, state), sums.asked
     square = cross_products(blocks[:, X, X], problem) + np.diag(problem.prior_precision)
     slope = cross_products_vector(blocks[:, X, r], problem) - problem.prior_precision * (
         state.theta - problem.prior_mean
     )
-    cross = np.zeros((size + 1, asked))
-    np.add.at(cross, problem.index, blocks[:, X, C])
-    cross = cross[:size]
+    # What a trial does not feel, number or error, is counted in a last row and column, and left out.
+    cross, total, score = np.zeros((size + 1, asked + 1)), np.zeros((asked + 1, asked + 1)), np.zeros(asked + 1)
+    np.add.at(cross, (problem.index[:, :, None], places[:, None, :]), blocks[:, X, C])
+    for part in sums.parts:
+        total += _among(blocks[part, C, C], places[part], asked + 1)
+    np.add.at(score, places, blocks[:, C, r])
+    cross, total, score = cross[:size, :asked], total[:asked, :asked], score[:asked]
     moving = np.flatnonzero(problem.free & (np.diag(square) > 0) & ~_pressed(fit))
     inverse = inverse_among(square, moving)
     lever, step = inverse @ cross, inverse @ slope
-    total = blocks[:, C, C].sum(axis=0)
     information, gone = _emptied(total - cross.T @ lever, total)
-    score = blocks[:, C, r].sum(axis=0) - cross.T @ step
+    score = score - cross.T @ step
     score[gone] = 0.0
     return _Projected(blocks, lever, step, moving, score, information, gone)
+
+
+def _among(blocks: Floats, places: NDArray[np.int_], size: int) -> Floats:
+    """Sum of the trials' blocks, each row and column put in its place, shape (size, size)."""
+    flat = places[:, :, None] * size + places[:, None, :]
+    total = np.bincount(flat.ravel(), weights=blocks.ravel(), minlength=size**2)
+    return np.asarray(total.reshape(size, size), dtype=float)
 
 
 def levers_of(fit: Fit, sums: Products) -> Floats:
@@ -192,24 +203,31 @@ def scores_of(fit: Fit, sums: Products, state: FitState | None = None) -> Scores
     Scores
     """
     projection = projected(fit, sums, state or fit.state)
-    blocks, gone, index = projection.blocks, projection.gone, fit.solution.problem.index
-    asked, p = sums.n_shapes + sums.n_doubts, sums.n_keys
-    X, r, C = slice(0, p), p, slice(p + 1, p + 1 + asked)
-    turn = _systematics_turn(projection.information, sums.n_shapes)
+    blocks, index, asked = projection.blocks, fit.solution.problem.index, sums.asked
+    p, n_shapes = sums.n_keys, sums.n_shapes
+    X, r, C, S = slice(0, p), p, slice(p + 1, None), slice(p + 1, p + 1 + n_shapes)
+    turn = _systematics_turn(projection.information, n_shapes)
     score, information = _beside_systematics(projection.score, projection.information, turn)
-    lever, step = np.vstack([projection.lever, np.zeros((1, asked))]), np.append(projection.step, 0.0)
-    single, informations = np.empty((len(blocks), asked)), np.empty((len(blocks), sums.n_shapes, sums.n_shapes))
+    counted = np.where(projection.gone[:, None], 0.0, turn)
+    # Numbers and errors that a trial does not feel stand in a last row, of zeros.
+    turned, counted_turned, lever, turn, counted = (
+        np.vstack([rows, np.zeros((1, rows.shape[1]))])
+        for rows in (projection.lever @ turn, projection.lever @ counted, projection.lever[:, :n_shapes], turn, counted)
+    )
+    step = np.append(projection.step, 0.0)
+    single, informations = np.empty((len(blocks), n_shapes)), np.empty((len(blocks), n_shapes, n_shapes))
     for part in sums.parts:
-        of_part, levers, steps = blocks[part], lever[index[part]], step[index[part]]
-        left = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], steps)
-        single[part] = left[:, C] - np.einsum("nkj,nk->nj", levers, left[:, X])
-        mixed = np.swapaxes(levers, 1, 2) @ of_part[:, X, C]
-        alone = of_part[:, C, C] - mixed - np.swapaxes(mixed, 1, 2)
-        alone += np.swapaxes(levers, 1, 2) @ of_part[:, X, X] @ levers
-        informations[part] = turn.T @ alone[:, :, : sums.n_shapes]
-    single[:, gone] = 0.0
+        of_part, own, mine = blocks[part], index[part], asked[part]
+        left = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], step[own])
+        single[part] = np.einsum("nc,ncs->ns", left[:, C], counted[mine]) - np.einsum(
+            "nk,nks->ns", left[:, X], counted_turned[own]
+        )
+        of_shapes, of_numbers = np.swapaxes(turn[mine], 1, 2), np.swapaxes(turned[own], 1, 2)
+        informations[part] = of_shapes @ (of_part[:, C, S] - of_part[:, C, X] @ lever[own]) - of_numbers @ (
+            of_part[:, X, S] - of_part[:, X, X] @ lever[own]
+        )
     degrees = max(len(single) - projection.moving.size, 1)
-    return Scores(score, information, single @ turn, informations, float(degrees))
+    return Scores(score, information, single, informations, float(degrees))
 
 
 def informations_at(fit: Fit, sums: Products, spreads: Sequence[tuple[float, float]]) -> Floats:
@@ -230,8 +248,11 @@ def informations_at(fit: Fit, sums: Products, spreads: Sequence[tuple[float, flo
     array, shape (n_spreads, n_shapes)
     """
     state, size, p = fit.state, fit.solution.problem.prior_mean.size, sums.n_keys
-    problem = with_shapes(fit.solution.problem, sums.n_shapes + sums.n_doubts)
+    problem = with_shapes(fit.solution.problem, sums.n_asked)
     total = problem.prior_mean.size
+    own = fit.solution.problem.index
+    index = np.concatenate([np.where(own < 0, total, own), size + sums.asked], axis=1)
+    problem = replace(problem, index=index)
     whole, squares, levers = np.zeros((total, total)), [], []
     for part in sums.parts:
         # The residual tells nothing of the information.
@@ -241,9 +262,8 @@ def informations_at(fit: Fit, sums: Products, spreads: Sequence[tuple[float, flo
         left = white[:, 2:, 2:] - white[:, 2:, :2] @ solve_each(flat, white[:, :2, 2:])
         whole += cross_products(left[:, 2:, 2:], replace(problem, index=problem.index[part]))
         lever = np.zeros((len(left), 2, total + 1))
-        lever[:, :, size:total] = left[:, :2, 2 + p :]
-        for k in range(p):
-            lever[np.arange(len(left)), :, problem.index[part, k]] += left[:, :2, 2 + k]
+        for k in range(index.shape[1]):
+            lever[np.arange(len(left)), :, index[part, k]] += left[:, :2, 2 + k]
         squares.append(left[:, :2, :2])
         levers.append(lever[:, :, :total])
     square, lever = np.concatenate(squares), np.concatenate(levers)
@@ -391,7 +411,7 @@ class Structure:
     loudest: float = 1.0
 
 
-def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Sequence[Floats]) -> Structure:
+def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) -> Structure:
     """Whether anything that a smooth force could explain is left beside a fit.
 
     All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
@@ -400,8 +420,8 @@ def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Sequence[Floa
     ----------
     fit : the fit that is questioned.
     columns : its own, from `fit_columns`.
-    systematics : sequence of arrays, shape (n_points, n_systematics), m
-        From `vinetrack.inference.systematics`.
+    systematics : Systematics
+        What trials err by together.
 
     Returns
     -------

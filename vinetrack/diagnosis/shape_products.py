@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities
@@ -17,6 +18,7 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effects_eliminated
 from vinetrack.inference.sensitivity import OWN
+from vinetrack.inference.systematics import Systematics
 from vinetrack.inference.whitening import all_products
 
 TRIALS_AT_ONCE = 64
@@ -28,19 +30,41 @@ on it."""
 class Products:
     """Columns of a fit and of answers, shape (n_points, n_columns) a trial, and the sums of their products.
 
-    In order: own numbers, keys, residual, shapes, doubts.
+    In order: own numbers, keys, residual, shapes, doubts. Of doubts a trial has those that it feels; `places`, shape
+    (n_trials, n_felt), tells which of the `n_doubts` they are, `n_doubts` for none.
     """
 
     columns: tuple[Floats, ...]
     data: Sequence[FitTrial]
     n_keys: int
     n_shapes: int
+    places: NDArray[np.int_]
     n_doubts: int = 0
+
+    @property
+    def n_asked(self) -> int:
+        """Shapes and doubts of the campaign."""
+        return self.n_shapes + self.n_doubts
+
+    @property
+    def asked(self) -> NDArray[np.int_]:
+        """Place of each trial's shapes and doubts among all of them, shape (n_trials, n_shapes + n_felt).
+
+        `n_asked` where a trial does not feel a doubt.
+        """
+        shapes = np.tile(np.arange(self.n_shapes), (len(self.columns), 1))
+        return np.concatenate([shapes, self.n_shapes + self.places], axis=1)
 
     @cached_property
     def parts(self) -> list[slice]:
         """The trials in parts whose products are held at once."""
         return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
+
+    @property
+    def of_shapes(self) -> tuple[Floats, ...]:
+        """The columns of the shapes alone, shape (n_points, n_shapes) a trial; no copies."""
+        begin = OWN + self.n_keys + 1
+        return tuple(columns[:, begin : begin + self.n_shapes] for columns in self.columns)
 
     def grams(self, part: slice) -> Floats:
         """Sums of products of a part of the trials, shape (n_trials, 3, n_columns, n_columns), see `whitening`.
@@ -68,7 +92,8 @@ class Products:
         -------
         Products
         """
-        return replace(self, columns=tuple(self.columns[k] for k in places), data=[self.data[k] for k in places])
+        columns, data = tuple(self.columns[k] for k in places), [self.data[k] for k in places]
+        return replace(self, columns=columns, data=data, places=self.places[list(places)])
 
     @cached_property
     def _whole(self) -> Floats:
@@ -98,7 +123,7 @@ def fit_columns(fit: Fit) -> list[Floats]:
 
 
 def products_of(
-    fit: Fit, columns: Sequence[Floats], answers: EffectSensitivities, systematics: Sequence[Floats]
+    fit: Fit, columns: Sequence[Floats], answers: EffectSensitivities, systematics: Systematics
 ) -> Products:
     """All that the tests need the products of.
 
@@ -107,8 +132,8 @@ def products_of(
     fit : the fit that is questioned.
     columns : its own, from `fit_columns`.
     answers : how positions answer to the candidates.
-    systematics : sequence of arrays, shape (n_points, n_systematics), m
-        From `vinetrack.inference.systematics`.
+    systematics : Systematics
+        What trials err by together.
 
     Returns
     -------
@@ -116,10 +141,10 @@ def products_of(
     """
     whole = tuple(
         np.column_stack([of_fit, of_shapes, systematic])
-        for of_fit, of_shapes, systematic in zip(columns, answers.columns, systematics, strict=True)
+        for of_fit, of_shapes, systematic in zip(columns, answers.columns, systematics.columns, strict=True)
     )
-    data = fit.predictor.data
-    return Products(whole, data, columns[0].shape[1] - OWN - 1, len(answers.shapes), systematics[0].shape[1])
+    keys, shapes = columns[0].shape[1] - OWN - 1, len(answers.shapes)
+    return Products(whole, fit.predictor.data, keys, shapes, systematics.places, systematics.count)
 
 
 def blocks_of(fit: Fit, sums: Products, state: FitState) -> Floats:
@@ -133,9 +158,9 @@ def blocks_of(fit: Fit, sums: Products, state: FitState) -> Floats:
 
     Returns
     -------
-    array, shape (n_trials, n_keys + 1 + n_asked, n_keys + 1 + n_asked)
+    array, shape (n_trials, n_keys + 1 + n_shapes + n_felt, the same again)
     """
-    size = sums.n_keys + 1 + sums.n_shapes + sums.n_doubts
+    size = sums.columns[0].shape[1] - OWN
     blocks = np.empty((len(sums.columns), size, size))
     for part in sums.parts:
         of_part = _of_trials(fit.solution.problem, state, part)

@@ -19,7 +19,7 @@ from vinetrack.inference.mixed_effects import cross_products, inverse_among, tri
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.pooling import Pooled, trial_information
 from vinetrack.inference.sensitivity import OWN, Predictor
-from vinetrack.inference.systematics import systematics_of
+from vinetrack.inference.systematics import Systematics, systematics_of
 from vinetrack.inference.whitening import products
 
 FEWEST_CLUSTERS = 8
@@ -138,7 +138,7 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     plain, robust : arrays, shape (n_free, n_free)
         Scaled as the fit holds the numbers.
     """
-    nothing = [np.zeros((trial_data.time_s.size, 0)) for trial_data in predictor.data]
+    nothing = Systematics.none([trial_data.time_s.size for trial_data in predictor.data])
     plain, robust, _ = _sandwich(predictor, solution, nothing)
     return plain, robust
 
@@ -211,7 +211,7 @@ def _scores(rows: Floats, index: np.ndarray, size: int) -> Floats:
     return np.asarray(single[:, :size] - single[:, :size].mean(axis=0))
 
 
-def _sandwich(predictor: Predictor, solution: Solution, systematics: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
+def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
     """Covariance by the noise model, by the scatter of trials, and what the doubts add, shape (n_free, n_free) each.
 
     Numbers at a bound stay there.
@@ -219,8 +219,8 @@ def _sandwich(predictor: Predictor, solution: Solution, systematics: Sequence[Fl
     problem, state = solution.problem, solution.state
     p, size = solution.columns[0].shape[1] - OWN - 1, problem.prior_mean.size
     grams = solution.grams
-    if systematics[0].shape[1]:
-        both = zip(solution.columns, systematics, predictor.data, strict=True)
+    if systematics.n_felt:
+        both = zip(solution.columns, systematics.columns, predictor.data, strict=True)
         grams = np.stack(
             [
                 products(np.column_stack([sensitivities, systematic]), trial_data.first, trial_data.relative_sd)
@@ -242,9 +242,10 @@ def _sandwich(predictor: Predictor, solution: Solution, systematics: Sequence[Fl
     if len(set(groups)) < trials:
         by_group = plain @ (group_scatter(single, groups, live.size) + prior) @ plain
         np.fill_diagonal(robust, np.maximum(np.diag(robust), np.diag(by_group)))
-    cross = np.zeros((size + 1, systematics[0].shape[1]))
-    np.add.at(cross, problem.index, blocks[:, :p, p + 1 :])
-    lever = plain @ cross[:size]
+    # What a trial does not feel, number or error, is counted in a last row and column, and left out.
+    cross = np.zeros((size + 1, systematics.count + 1))
+    np.add.at(cross, (problem.index[:, :, None], systematics.places[:, None, :]), blocks[:, :p, p + 1 :])
+    lever = plain @ cross[:size, : systematics.count]
     return plain, robust, lever @ lever.T
 
 

@@ -6,10 +6,11 @@ pass for a small effect as soon as pressures and B scatter little.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
@@ -37,12 +38,46 @@ there, the last fold pulls it out of shape. Chosen after rendered recordings, in
 end of growth were off by several stated errors."""
 
 
+@dataclass(frozen=True)
+class Systematics:
+    """What one standard deviation of each error does to positions.
+
+    An error of one payload or of one set pressure is felt by its own trials alone, and there are as many as conditions:
+    a trial has columns for those that it feels, and not for all.
+
+    Parameters
+    ----------
+    columns : list of arrays, shape (n_points, n_felt), m
+        One a trial.
+    places : array of int, shape (n_trials, n_felt)
+        Which error each column belongs to, `count` where a trial does not feel one of that kind.
+    count : int
+        Number of errors of the campaign.
+    """
+
+    columns: list[Floats]
+    places: NDArray[np.int_]
+    count: int
+
+    @classmethod
+    def none(cls, points: Sequence[int]) -> Systematics:
+        """No systematic errors, of trials with so many points."""
+        return cls([np.zeros((size, 0)) for size in points], np.zeros((len(points), 0), dtype=int), 0)
+
+    @property
+    def n_felt(self) -> int:
+        """Columns of each trial."""
+        return self.places.shape[1]
+
+    def of(self, places: Sequence[int]) -> Systematics:
+        """The same of some of the trials, some of them several times."""
+        return Systematics([self.columns[k] for k in places], self.places[list(places)], self.count)
+
+
 def systematics_of(
     predictor: Predictor, solution: Solution, trials: Sequence[TrialFit], *, positions: bool = True
-) -> list[Floats]:
-    """Columns of shape (n_points, n_doubts) for every trial: what one standard deviation of each does to positions.
-
-    `positions` tells whether smooth errors of position are among them; a fit estimates those along with its numbers.
+) -> Systematics:
+    """What trials err by together: payloads, set pressures, the tracker's slow errors, smooth errors of position.
 
     Parameters
     ----------
@@ -55,49 +90,70 @@ def systematics_of(
 
     Returns
     -------
-    list of arrays, shape (n_points, n_systematics), m
+    Systematics
     """
+    points = [trial.time_s.size for trial in trials]
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
-    ways = (
+    dense = [_tracker(predictor, trials)] + ([position_shapes(predictor, grown)] if positions else [])
+    parts = [
         _payloads(predictor, solution, trials),
         _set_pressures(predictor, solution),
-        _tracker(predictor, trials),
-    )
-    parts = zip(*ways, position_shapes(predictor, grown), strict=True) if positions else zip(*ways, strict=True)
-    return [np.column_stack(part) for part in parts]
+        *(_felt_by_all(columns) for columns in dense),
+    ]
+    columns = [np.empty((size, sum(part.n_felt for part in parts))) for size in points]
+    places = np.empty((len(points), sum(part.n_felt for part in parts)), dtype=int)
+    count, begin, total = 0, 0, sum(part.count for part in parts)
+    for part in parts:
+        beside = slice(begin, begin + part.n_felt)
+        places[:, beside] = np.where(part.places < part.count, count + part.places, total)
+        for column, felt in zip(columns, part.columns, strict=True):
+            column[:, beside] = felt
+        count, begin = count + part.count, begin + part.n_felt
+    return Systematics(columns, places, total)
 
 
-def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> list[Floats]:
+def _felt_by_all(columns: list[Floats]) -> Systematics:
+    """Errors that every trial feels."""
+    count = columns[0].shape[1]
+    return Systematics(columns, np.tile(np.arange(count), (len(columns), 1)), count)
+
+
+def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFit]) -> Systematics:
     """The relative error of each payload of the campaign. Trials with the same payload had the same body."""
+    nothing = Systematics.none([trial.time_s.size for trial in trials])
     loaded = [i for i, trial in enumerate(trials) if trial.trial.payload_kg > 0 and trial.trial.travel_ratio != 1]
-    payloads = dict.fromkeys(round(trials[i].trial.payload_kg, 9) for i in loaded)
-    places = {payload: k for k, payload in enumerate(payloads)}
-    columns = [np.zeros((trial.time_s.size, len(places))) for trial in trials]
     if not loaded:
-        return columns
+        return nothing
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     try:
         plain = predictor.run([jobs[i] for i in loaded])
         heavier = predictor.run([replace(jobs[i], payload_factor=1 + PAYLOAD_STEP) for i in loaded])
     except SimulationError:
-        return [column[:, :0] for column in columns]
+        return nothing
+    columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]
     for i, before, after in zip(loaded, plain, heavier, strict=True):
-        place = places[round(trials[i].trial.payload_kg, 9)]
-        columns[i][:, place] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(before, after)
-    return columns
+        columns[i][:, 0] = PAYLOAD_ERROR / PAYLOAD_STEP * position_change(before, after)
+    names = {i: round(trials[i].trial.payload_kg, 9) for i in loaded}
+    return _one_each(columns, [names.get(i) for i in range(len(trials))])
 
 
-def _set_pressures(predictor: Predictor, solution: Solution) -> list[Floats]:
+def _set_pressures(predictor: Predictor, solution: Solution) -> Systematics:
     """The error of the pressure that was set for a condition; its replicates have it together."""
     data = [trial_data.trial for trial_data in predictor.data]
     feels = predictor.feels_pressure & np.array([trial_data.trace is None for trial_data in predictor.data])
-    conditions = dict.fromkeys(trial.condition for trial, felt in zip(data, feels, strict=True) if felt)
-    places = {condition: k for k, condition in enumerate(conditions)}
-    columns = [np.zeros((len(sensitivities), len(places))) for sensitivities in solution.columns]
+    if not feels.any():
+        return Systematics.none([len(sensitivities) for sensitivities in solution.columns])
+    columns = [np.zeros((len(sensitivities), 1)) for sensitivities in solution.columns]
     for column, trial, sensitivities, felt in zip(columns, data, solution.columns, feels, strict=True):
         if felt:
-            column[:, places[trial.condition]] = PRESSURE_ERROR_PA / trial.pressure_Pa * sensitivities[:, PRESSURE]
-    return columns
+            column[:, 0] = PRESSURE_ERROR_PA / trial.pressure_Pa * sensitivities[:, PRESSURE]
+    return _one_each(columns, [trial.condition if felt else None for trial, felt in zip(data, feels, strict=True)])
+
+
+def _one_each(columns: list[Floats], names: Sequence[Hashable | None]) -> Systematics:
+    """Errors of which a trial feels the one of its name, or none."""
+    places = {name: k for k, name in enumerate(dict.fromkeys(name for name in names if name is not None))}
+    return Systematics(columns, np.array([[places.get(name, len(places))] for name in names]), len(places))
 
 
 def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:

@@ -22,6 +22,7 @@ from vinetrack.inference.mixed_effects import (
     trial_effect_prior,
     trial_effect_step,
 )
+from vinetrack.inference.release_kernels import products_at_releases
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     ORIGIN,
@@ -211,9 +212,11 @@ def search_releases(
     releases = [_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
     answers = _answers(predictor, [plain[i] for i in places], releases)
     trial_effects = state.trial_effects.copy()
+    centre, precision = trial_effect_prior(problem, state)
     claimed = False
     for i, tried_s, answer in zip(places, releases, answers, strict=True):
-        there, gain = _best(predictor.data[i], i, problem, state, tried_s, *answer)
+        noise = state.rho, float(state.variance[i])
+        there, gain = _best(predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, tried_s, *answer)
         if gain > WORTH_MOVING:
             trial_effects[i], claimed = there, True
     kept = _borne_out(predictor, problem, state, replace(state, trial_effects=trial_effects)) if claimed else state
@@ -240,32 +243,36 @@ def _levels(predictor: Predictor, problem: MixedProblem, state: FitState) -> Flo
 
 def _best(
     trial_data: FitTrial,
-    i: int,
-    problem: MixedProblem,
-    state: FitState,
+    trial_effects: Floats,
+    prior: tuple[Floats, Floats],
+    noise: tuple[float, float],
     releases: Floats,
     times: Floats,
     plain: Floats,
     answers: Floats,
 ) -> tuple[Floats, float]:
-    """The own numbers of one trial at its likeliest release, and the fall of −2 ln L from the last of the releases."""
-    trial_effects = state.trial_effects[i]
-    centre, precision = (part[i] for part in trial_effect_prior(problem, state))
-    since = np.clip(trial_data.time_s - releases[:, None], 0.0, times[-1])
-    moved = [np.interp(since, times, values) for values in (*answers, plain)]
-    moved[-1] = trial_data.lead_position_m - trial_effects[ORIGIN] - moved[-1]
-    white = whiten(np.stack(moved, axis=-1), trial_data.first, state.rho, trial_data.relative_sd) / np.sqrt(
-        state.variance[i]
+    """The own numbers of one trial at its likeliest release, and the fall of −2 ln L from the last of the releases.
+
+    `prior` are centre and precision of its own numbers, `noise` the correlation and the variance of the innovations.
+    """
+    centre, precision = prior
+    rho, variance = noise
+    relative = np.ones(trial_data.time_s.size) if trial_data.relative_sd is None else trial_data.relative_sd
+    position_m = trial_data.lead_position_m - trial_effects[ORIGIN]
+    curves = np.vstack([answers, plain])
+    square = (
+        products_at_releases(trial_data.time_s, position_m, trial_data.first, relative, releases, times, curves, rho)
+        / variance
     )
     tried = np.tile(trial_effects, (releases.size, 1))
     tried[:, RELEASE] = releases
-    square = np.swapaxes(white, 1, 2) @ white
     inner = square[:, :-1, :-1] + np.diag(precision)
-    slope = (square[:, :-1, -1] - precision * (tried - centre))[:, ORIGIN:]
+    known, told = square[:, ORIGIN:-1, ORIGIN:-1], square[:, ORIGIN:-1, -1]
+    slope = told - (precision * (tried - centre))[:, ORIGIN:]
     step = np.clip(np.linalg.solve(inner[:, ORIGIN:, ORIGIN:], slope[..., None])[..., 0], *STEPS)
     tried[:, ORIGIN:] += step
-    left = white[..., -1] - np.einsum("rnk,rk->rn", white[..., 1:-1], step)
-    levels = np.sum(left**2, axis=1) + np.sum(precision * (tried - centre) ** 2, axis=1) + np.linalg.slogdet(inner)[1]
+    left = square[:, -1, -1] - np.sum(step * (2 * told - (known @ step[..., None])[..., 0]), axis=1)
+    levels = left + np.sum(precision * (tried - centre) ** 2, axis=1) + np.linalg.slogdet(inner)[1]
     k = int(np.argmin(levels))
     return tried[k], float(levels[-1] - levels[k])
 

@@ -1,0 +1,76 @@
+"""A compiled loop over the releases that a trial may have: the trajectory shifted, its columns whitened and multiplied.
+
+Every look for other releases asks some forty of each trial, and a fit looks a few times; as array operations that was
+three quarters of the time of a fit that is taken up where another ended.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def products_at_releases(
+    time_s: Floats,
+    position_m: Floats,
+    first: NDArray[np.bool_],
+    relative_sd: Floats,
+    releases_s: Floats,
+    grid_s: Floats,
+    curves: Floats,
+    rho: float,
+) -> Floats:
+    """Whitened products of the columns of a trial and of its residual, its trajectory begun at each of these releases.
+
+    As `whitening.whiten` and a product of matrices for each release; curves are joined by straight lines, and stay what
+    they are at either end of the grid beyond it.
+
+    Parameters
+    ----------
+    time_s, position_m : arrays, shape (n_points,)
+        The trial, s and m; the origin taken off the positions.
+    first : array of bool, shape (n_points,)
+        Points that begin a stretch.
+    relative_sd : array, shape (n_points,)
+        Noise of every point relative to that of the trial.
+    releases_s : array, shape (n_releases,), s
+    grid_s : array, shape (n_grid,), s
+        Instants since release, increasing from 0.
+    curves : array, shape (n_columns, n_grid)
+        How positions there answer to each column; the last is the position itself.
+    rho : float
+        Lag-one correlation of the noise.
+
+    Returns
+    -------
+    array, shape (n_releases, n_columns, n_columns)
+        The last column is the residual.
+    """
+    count, size, last = len(curves), len(time_s), len(grid_s) - 1
+    begins = math.sqrt(1 - rho**2)
+    plain, white = np.empty((count, size)), np.empty((count, size))
+    products = np.empty((len(releases_s), count, count))
+    for r in range(len(releases_s)):
+        j = 0
+        for i in range(size):
+            since_s = min(max(time_s[i] - releases_s[r], 0.0), grid_s[last])
+            while j < last - 1 and grid_s[j + 1] <= since_s:
+                j += 1
+            part = (since_s - grid_s[j]) / (grid_s[j + 1] - grid_s[j])
+            for c in range(count):
+                plain[c, i] = curves[c, j] + part * (curves[c, j + 1] - curves[c, j])
+            plain[count - 1, i] = position_m[i] - plain[count - 1, i]
+        for c in range(count):
+            before = 0.0
+            for i in range(size):
+                value = plain[c, i] / relative_sd[i]
+                white[c, i] = begins * value if first[i] else value - rho * before
+                before = value
+        products[r] = np.dot(white, white.T)
+    return products
