@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vinetrack.diagnosis.held_fits import TESTS_HELD, holds_many, let_go, with_curves
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, SUSPECT, MisfitTests, misfit_tests
 from vinetrack.diagnosis.multi_start import SubsetFit, SubsetFitter, best_subset_fit, full_fit, start_of, starts_of
@@ -110,7 +111,7 @@ class CandidateFits:
         return any(hypothesis.fit.chi2_per_dof < SUSPECT for hypothesis in self.fitted.values())
 
     def after(self, fit: Fit) -> MisfitTests:
-        """What one of its fits leaves, asked once.
+        """What one of its fits leaves; asked once, or, of many trials, again where other fits were asked since.
 
         Parameters
         ----------
@@ -123,7 +124,9 @@ class CandidateFits:
         for known, tests in self.tested:
             if known is fit:
                 return tests
-        tests = misfit_tests(fit, self.questions.effects, LATER_LEVEL)
+        tests = misfit_tests(with_curves(fit), self.questions.effects, LATER_LEVEL)
+        if holds_many(fit):
+            del self.tested[: max(len(self.tested) - TESTS_HELD + 1, 0)]
         self.tested.append((fit, tests))
         return tests
 
@@ -298,6 +301,7 @@ class CandidateFits:
             self.silent.add(name)
         elif name not in self.fitted or hypothesis.delta_chi2 > self.fitted[name].delta_chi2:
             self.fitted[name] = hypothesis
+            let_go(self.fitted)
 
     def _from_climb(self, climb: SubsetFit, best: float, *, led: bool, afresh: bool = False) -> LikelihoodRatio | None:
         fit = full_fit(self.questions.fit, climb, best, afresh=afresh, led=led)

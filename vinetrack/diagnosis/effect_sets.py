@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report, simpler_forms
+from vinetrack.diagnosis.held_fits import let_go, with_curves
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import SUSPECT_SIGMAS
 from vinetrack.dynamics.simulate import SimulationError
@@ -243,10 +245,13 @@ class EffectSets:
         if best is None:
             return ()
         steps = [self.of_effects(best, best.effects[: k + 1]) for k in range(len(best.effects))]
-        return tuple(step for step in steps if step is not None)
+        return tuple(replace(step, fit=with_curves(step.fit)) for step in steps if step is not None)
 
     def _keep(self, hypothesis: LikelihoodRatio) -> None:
         names = frozenset(hypothesis.names)
         known = self.known.get(names)
         if known is None or hypothesis.fit.log_likelihood > known.fit.log_likelihood:
             self.known[names] = hypothesis
+            same = {others: known for others, known in self.known.items() if len(others) == len(names)}
+            let_go(same)
+            self.known |= same

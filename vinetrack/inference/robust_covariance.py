@@ -217,8 +217,8 @@ def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics
     Numbers at a bound stay there.
     """
     problem, state = solution.problem, solution.state
-    p, size = solution.columns[0].shape[1] - OWN - 1, problem.prior_mean.size
     grams = solution.grams
+    p, size = grams.shape[-1] - OWN - 1, problem.prior_mean.size
     if systematics.n_felt:
         both = zip(solution.columns, systematics.columns, predictor.data, strict=True)
         grams = np.stack(
