@@ -224,6 +224,15 @@ def test_the_misfit_is_coloured_by_side_and_numbered_where_it_is_beyond_scatter(
     assert after.get_title(loc="left") == "after: with air drag"
 
 
+def test_of_many_conditions_those_with_the_largest_misfit_are_shown() -> None:
+    one = cells().iloc[:4]
+    parts = [one.assign(condition_label=f"{k} kPa", misfit_before_m=1e-4 * k) for k in range(60)]
+    fig = draw_where(pd.concat(parts, ignore_index=True))
+    names = [label.get_text().split(",")[0] for label in fig.axes[0].get_yticklabels()]
+    assert names == [f"{k} kPa" for k in range(12, 60)]
+    assert "the 48 of 60 conditions" in " ".join(text.get_text() for text in fig.legends[0].texts)
+
+
 def test_one_panel_is_enough_where_nothing_was_added() -> None:
     fig = draw_where(cells(after=math.nan))
     assert len(fig.axes) == 1

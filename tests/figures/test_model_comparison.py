@@ -75,9 +75,14 @@ def test_without_a_fit_the_figure_says_so(draw) -> None:  # type: ignore[no-unty
     assert "was not fitted" in fig.texts[0].get_text()
 
 
-def test_a_campaign_of_many_conditions_is_cut_at_what_can_be_read() -> None:
-    fig = draw_model_comparison(*campaign(MAX_PANELS + 5, n_trials=1))
-    assert sum(ax.get_visible() for ax in fig.axes) == MAX_PANELS
+def test_of_many_conditions_those_that_the_model_misses_by_most_are_drawn() -> None:
+    table, trajectories = campaign(MAX_PANELS + 5, n_trials=1)
+    table["rms_position_m"] = np.linspace(1e-3, 2e-3, len(table))
+    fig = draw_model_comparison(table, trajectories)
+    shown = [ax for ax in fig.axes if ax.get_visible()]
+    expected = table["condition_label"].iloc[5:].tolist()
+    assert [ax.get_title(loc="left") for ax in shown] == expected
+    assert f"the {MAX_PANELS} of {MAX_PANELS + 5} conditions" in fig.get_suptitle().replace("\n", " ")
 
 
 @pytest.mark.parametrize("draw", DRAWINGS)

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 _AHEAD, _BEHIND = BLUE, VERMILLION
 _MAX_ROWS = 48
-"""Chosen: conditions of 0.3 in each, 16 in together; a page shows no more at once."""
+"""Chosen: conditions of 0.3 in each, 16 in together; a page shows no more at once. Of more those with the largest
+misfit are drawn, and the legend states it."""
 
 _NUMBERED_ROWS = 26
 """Chosen: with more conditions, the figure is scaled down until numbers of 7.5 pt cannot be read."""
@@ -50,7 +51,7 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
     shown = [c for c in _COLUMNS if len(table) and np.isfinite(table[c].to_numpy(dtype=float)).any()]
     if not shown:
         return blank("There is no prediction to compare with a measurement.")
-    labels = list(dict.fromkeys(table["condition_label"]))[:_MAX_ROWS]
+    labels, n_conditions = _largest_misfits(table, shown), table["condition_label"].nunique()
     known_mm = 1e3 * np.abs(table[shown].to_numpy(dtype=float))
     full_mm = max(float(np.nanpercentile(known_mm, 97)), 1e-6)
     with look():
@@ -63,8 +64,20 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
             ax.set_title(words, fontsize=10)
             ax.set_xlabel("along the growth (%)")
         axes[0].set_yticks(range(len(labels)), _row_names(table, labels), fontsize=9)
-        _misfit_legend(fig, full_mm, 3 if len(shown) > 1 else 2)
+        left_out = f"the {len(labels)} of {n_conditions} conditions with the largest misfit"
+        _misfit_legend(fig, full_mm, 3 if len(shown) > 1 else 2, left_out if n_conditions > len(labels) else "")
     return fig
+
+
+def _largest_misfits(table: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+    """Labels of the conditions with the largest misfit, as many as there is room for, in the order of the table."""
+    labels = list(dict.fromkeys(table["condition_label"]))
+    if len(labels) <= _MAX_ROWS:
+        return labels
+    misfit_m = table.set_index("condition_label")[columns[0]].astype(float)
+    square = (misfit_m**2).groupby(level=0).mean().sort_values(ascending=False, kind="stable")
+    largest = set(square.index[:_MAX_ROWS])
+    return [label for label in labels if label in largest]
 
 
 def _row_names(table: pd.DataFrame, labels: Sequence[str]) -> list[str]:
@@ -95,7 +108,7 @@ def _draw_cells(ax: Axes, table: pd.DataFrame, column: str, labels: Sequence[str
     ax.tick_params(axis="y", length=0)
 
 
-def _misfit_legend(fig: Figure, full_mm: float, n_columns: int) -> None:
+def _misfit_legend(fig: Figure, full_mm: float, n_columns: int, left_out: str = "") -> None:
     from matplotlib.patches import Patch
 
     handles = [
@@ -103,6 +116,8 @@ def _misfit_legend(fig: Figure, full_mm: float, n_columns: int) -> None:
         Patch(facecolor=_BEHIND, alpha=0.85, label="measured is behind"),
         Patch(facecolor=MUTED, alpha=0.2, label=f"full colour: {full_mm:.2g} mm; numbers in mm, where beyond scatter"),
     ]
+    if left_out:
+        handles.append(Patch(alpha=0.0, label=left_out))
     fig.legend(handles=handles, loc="outside upper left", ncols=n_columns, fontsize=9, handlelength=1.3)
 
 

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_PANELS = 60
-"""Chosen: 60 panels in rows of eight are 1.4 in wide, the narrowest that has room for its label."""
+"""Chosen: 60 panels in rows of eight are 1.4 in wide, the narrowest that has room for its label. Of more conditions
+those that the model misses by most are drawn, and the title states it."""
 
 _MAX_POINTS_IN_ALL = 12_000
 """Measured: 12,000 points keep the SVG below a megabyte, with 200 trials too."""
@@ -65,7 +66,10 @@ def _panels(
 ) -> Figure:
     from matplotlib.figure import Figure
 
-    shown = [row for row in rows(comparison) if row.condition in trajectories][:MAX_PANELS]
+    known = [row for row in rows(comparison) if row.condition in trajectories]
+    farthest = sorted(known, key=lambda row: -np.nan_to_num(row.rms_position_m))[:MAX_PANELS]
+    chosen = {row.condition for row in farthest}
+    shown = [row for row in known if row.condition in chosen]
     if not shown:
         return blank(_NOTHING)
     n_columns = page_columns(len(shown), 8)
@@ -86,6 +90,8 @@ def _panels(
         title = f"{str(shown[0].model).replace('+', ' + ')}; {n_trials} trials"
         if draw is _draw_positions and "model_after_m" in trajectories[shown[0].condition]:
             title += "; dashed: this model, full: with the effects that were added"
+        if len(known) > len(shown):
+            title += f"; the {len(shown)} of {len(known)} conditions that the model misses by most"
         wrapped = textwrap.fill(title, int(n_columns * panel_in * 11))
         fig.suptitle(wrapped, fontsize=11, x=0.01, ha="left")
     return fig
