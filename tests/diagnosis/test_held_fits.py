@@ -30,12 +30,14 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again(rubbing: Pairs) -> Non
     steps = fit.predictor.steps.copy()
     again = with_curves(light)
     assert np.array_equal(fit.predictor.steps, steps)
-    assert again.log_likelihood == pytest.approx(fit.log_likelihood, abs=1e-2)
-    for number, before in zip(again.numbers, fit.numbers, strict=True):
-        assert abs(number.value - before.value) < 1e-3 * before.sigma
-        assert number.sigma == pytest.approx(before.sigma, rel=1e-3)
+    assert (again.numbers, again.log_likelihood) == (fit.numbers, fit.log_likelihood)
     for trial, before_trial in zip(again.trials, fit.trials, strict=True):
         assert np.array_equal(trial.residual_m, before_trial.residual_m)
+        assert np.array_equal(trial.predicted_velocity_m_s, before_trial.predicted_velocity_m_s)
+    # Steps of differences differ, and with them the one frame in which growth ends.
+    for columns, before_columns in zip(again.solution.columns, fit.solution.columns, strict=True):
+        apart, whole = (np.linalg.norm(each, axis=0) for each in (columns - before_columns, before_columns))
+        assert np.all(apart <= 0.02 * whole)
 
 
 def test_a_diagnosis_that_lets_go_of_curves_says_the_same(rubbing: Pairs, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,8 @@ from vinetrack.inference.sensitivity import Predictor
 
 MANY_POINTS = 150_000
 """Points of all trials from which anything is let go. Chosen for memory: 300 trials of 500 frames, of which a fit takes
-16 MB; at half smaller campaigns spend time on curves made again, at twice a search over them takes 2 GB. No result
-depends on it but by the rounding of the derivatives of curves made again, a millionth of them."""
+16 MB; at half smaller campaigns spend time on curves made again, at twice a search over them takes 2 GB. It decides no
+number or likelihood of a fit; derivatives made again come of other steps, within the error of the first."""
 
 FITS_HELD, TESTS_HELD = 8, 3
 """Fits, the likeliest of a search, and questioned fits, the last ones asked, that stay whole. Chosen: what steps go on
@@ -96,6 +96,7 @@ def with_curves(fit: Fit) -> Fit:
     predictor = Predictor(former.layout, former.data, former.host)
     predictor.steps, predictor.pressure_step = former.steps.copy(), former.pressure_step.copy()
     columns = predictor.linearise(state.theta, state.trial_effects)
-    solution = replace(fit.solution, columns=tuple(columns), grams=predictor.products(columns))
-    whole = assemble(former, solution, fit.left_out, fit.options, profile=False)
-    return replace(whole, pairs=fit.pairs)
+    # The products are those of the fit, in which columns came of other steps.
+    solution = replace(fit.solution, columns=tuple(columns))
+    trials = assemble(former, solution, fit.left_out, fit.options, profile=False).trials
+    return replace(fit, trials=trials, solution=solution)
