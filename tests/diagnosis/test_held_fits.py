@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from hidden_truth import Pairs, grown
+from hidden_truth import grown
 
 import vinetrack as vt
 from vinetrack.diagnosis import held_fits
-from vinetrack.diagnosis.held_fits import with_curves, without_curves
+from vinetrack.diagnosis.held_fits import let_go, with_curves, without_curves
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, likelihood_ratio
+from vinetrack.effects import find_effect
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.solving import missed_fraction
 
-CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak", "pressure_gain")
-
 
 @pytest.fixture(scope="module")
-def rubbing() -> Pairs:
-    """Trials whose tail rubs beside a chamber that is drained."""
-    return grown({"reservoir_depletion.gamma": 1.3, "tail_friction.mu_w": 1.0}, seed=7270)
+def whole() -> Fit:
+    """The base model fitted to trials whose tail rubs."""
+    pairs = grown({"tail_friction.mu_w": 1.0}, seed=7270)
+    return initial_fit(vt.base_model(), pairs, candidates_of(vt.base_model(), ["tail_friction"]), profile=False)
 
 
-def test_a_fit_is_the_same_once_its_curves_are_made_again(rubbing: Pairs) -> None:
-    fit = initial_fit(vt.base_model(), rubbing, candidates_of(vt.base_model(), CANDIDATES), profile=False)
+def test_a_fit_is_the_same_once_its_curves_are_made_again(whole: Fit) -> None:
+    fit = whole
     light = without_curves(fit)
     assert not light.trials
     assert missed_fraction(light.predictor, light.solution) == missed_fraction(fit.predictor, fit.solution)
@@ -40,21 +43,19 @@ def test_a_fit_is_the_same_once_its_curves_are_made_again(rubbing: Pairs) -> Non
         assert np.all(apart <= 0.02 * whole)
 
 
-def test_a_diagnosis_that_lets_go_of_curves_says_the_same(rubbing: Pairs, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = vt.diagnose(rubbing, candidates=CANDIDATES, ladder=False, advice=False)
-    let_go: list[Fit] = []
-
-    def counted(fit: Fit) -> Fit:
-        let_go.append(fit)
-        return without_curves(fit)
-
-    monkeypatch.setattr(held_fits, "MANY_POINTS", 0)
-    monkeypatch.setattr(held_fits, "FITS_HELD", 1)
-    monkeypatch.setattr("vinetrack.diagnosis.candidate_fits.TESTS_HELD", 1)
-    monkeypatch.setattr(held_fits, "without_curves", counted)
-    light = vt.diagnose(rubbing, candidates=CANDIDATES, ladder=False, advice=False)
-    assert let_go
-    assert len(light.effects) == 2
-    assert (light.verdict, light.answer_set, light.effects) == (whole.verdict, whole.answer_set, whole.effects)
-    for number, before in zip(light.fits[-1].numbers, whole.fits[-1].numbers, strict=True):
-        assert abs(number.value - before.value) < 1e-2 * before.sigma
+@pytest.mark.parametrize("points", [0, 10**9])
+def test_of_many_trials_only_hypotheses_that_may_still_be_kept_hold_their_curves(
+    whole: Fit, points: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(held_fits, "MANY_POINTS", points)
+    monkeypatch.setattr(held_fits, "FITS_HELD", 2)
+    effect = find_effect("tail_friction")
+    behind = {"best": 0.0, "second": 500.0, "third": 600.0, "may be kept": 0.4 * ANSWER_SET * MOST_INFLATION}
+    hypotheses = {
+        name: likelihood_ratio(whole, (effect,), replace(whole, log_likelihood=whole.log_likelihood - fall))
+        for name, fall in behind.items()
+    }
+    let_go(hypotheses)
+    light = {name for name, hypothesis in hypotheses.items() if not hypothesis.fit.trials}
+    assert light == (set() if points else {"second", "third"})
+    assert hypotheses["third"].delta_chi2 == pytest.approx(-1200.0)
