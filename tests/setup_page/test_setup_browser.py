@@ -61,17 +61,36 @@ def person(clips: Path, tmp_path: Path) -> Iterator[Person]:
         assert [text for text in chrome.complaints if "422" not in text] == []
 
 
-def test_a_folder_of_clips_becomes_an_experiment(person: Person, clips: Path) -> None:
-    """The whole way: four shared values, two ruler marks, one length, a track, and a save."""
+def _fill_in(person: Person, length_mm: str) -> None:
+    """Four shared values, two ruler marks and the length between them."""
     for column, value in SHARED.items():
         person.fill(column, "shared", value)
     person.press("input[name=tool][value=scale]")
     for x_px in (15.0, 465.0):
         person.chrome.click(*person.at(x_px, 150))
     person.chrome.wait("document.activeElement.id === 'length'", "the field of the length")
-    for digit in "337.5":
+    for digit in length_mm:
         person.chrome.send("Input.insertText", text=digit)
-    person.chrome.wait("document.querySelector('#headline').textContent.includes('ready to run')", "the check")
+    person.chrome.wait("document.querySelector('#headline').textContent.includes('complete')", "the complete sheet")
+
+
+def test_a_ruler_wrong_by_two_is_said_once_and_not_before_the_recordings_are_looked_at(person: Person) -> None:
+    _fill_in(person, "337.5")
+    person.press("#check")
+    person.chrome.wait("document.querySelector('#headline').textContent.includes('or correct')", "the check", 60)
+    said = person.chrome.run("[...document.querySelectorAll('#trials small.error')].map((words) => words.textContent)")
+    assert "a factor 1.97" in said[0]
+    assert set(said[1:]) <= {"likewise"}
+    person.press("#save")
+    person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
+    assert "or correct" in person.text("#headline")  # saving takes back nothing of what was found
+
+
+def test_a_folder_of_clips_becomes_an_experiment(person: Person, clips: Path) -> None:
+    """The whole way: four shared values, two ruler marks, one length, a check, a track, and a save."""
+    _fill_in(person, "168.75")
+    person.press("#check")
+    person.chrome.wait("document.querySelector('#headline').textContent.includes('ready to run')", "the check", 60)
     person.press("#track")
     person.chrome.wait("document.querySelector('.strip img') !== null", "the strip", 120)
     assert "growth" in person.text("#tracked")
@@ -81,7 +100,7 @@ def test_a_folder_of_clips_becomes_an_experiment(person: Person, clips: Path) ->
     assert settings.calibration is not None
     assert settings.calibration.kind == "two_points"
     assert settings.calibration.from_px == pytest.approx((15, 150), abs=0.6)
-    assert settings.calibration.length_mm == 337.5
+    assert settings.calibration.length_mm == 168.75
     assert settings.capture_fps == 1000
     assert read_table(clips / "trials.csv").columns == ("trial", "video", "diameter_mm", "pressure_kPa")
 

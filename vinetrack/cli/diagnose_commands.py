@@ -151,8 +151,8 @@ def _tracks_only(folder: Path) -> Experiment:
     experiment = read_experiment(folder)
     if experiment.trials and all(trial.track is None for trial in experiment.trials):
         raise ResultsError(
-            f"{folder}: its trials are recordings, which must be tracked first: "
-            f"snakemake --cores 2 --config experiment={folder}, then vinetrack diagnose results/{experiment.name}"
+            f"{folder}: its trials are recordings, which must be tracked first: vinetrack run {folder} does that, and "
+            f"diagnoses them; then vinetrack diagnose {folder.parent / 'results' / experiment.name}"
         )
     return experiment
 

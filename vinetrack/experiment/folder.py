@@ -41,7 +41,10 @@ from vinetrack.tracks.importers import TrackError, load_track, read_pressure_tra
 __all__ = ["Experiment", "ExperimentError", "Problem", "check_experiment", "format_problems", "read_experiment"]
 
 SETTINGS = "experiment.yaml"
-EXPECTED = f"expected a folder with {SHEET} (one row a trial) and, with videos, {SETTINGS}"
+EXPECTED = (
+    f"expected a folder with {SHEET} (one row a trial) and, with videos, {SETTINGS}; vinetrack setup FOLDER makes both "
+    "of a folder of recordings"
+)
 
 
 @dataclass(frozen=True)

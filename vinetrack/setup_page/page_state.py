@@ -209,6 +209,7 @@ def _problem_json(problem: Problem, draft: Draft | None) -> dict[str, Any]:
         "trial": problem.trial,
         "column": column,
         "text": problem.reason,
+        "of_a_measurement": problem.of_a_measurement,
     }
 
 

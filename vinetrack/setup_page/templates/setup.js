@@ -12,6 +12,12 @@ function choose(i) {
   showRecording();
 }
 
+// Without `true` only the sheet was looked at: whether the recordings agree with it is not known yet.
+function headline(n, errors) {
+  if (errors) return `${n} trials, ${errors} ${errors === 1 ? "thing" : "things"} to fill in or correct`;
+  return state.compared ? `${n} trials, ready to run` : `${n} trials, complete; Check compares them with the recordings`;
+}
+
 function showWhole(extra = []) {
   const found = [...extra, ...state.problems.filter((problem) => problem.field === "whole")];
   $("whole").replaceChildren(...found.map((problem) => el("li", {class: problem.severity}, problem.text)));
@@ -21,7 +27,7 @@ function showState(notes = []) {
   const errors = state.problems.filter((problem) => problem.severity === "error").length;
   const warnings = state.problems.length - errors;
   const n = state.sheet.rows.length;
-  $("headline").textContent = errors ? `${n} trials, ${errors} ${errors === 1 ? "thing" : "things"} to fill in or correct` : `${n} trials, ready to run`;
+  $("headline").textContent = headline(n, errors);
   const words = [];
   if (warnings) words.push(`${warnings} ${warnings === 1 ? "warning" : "warnings"}`);
   words.push(state.dirty ? "not saved" : "saved as shown", ...notes);
@@ -39,21 +45,21 @@ async function check(thorough = false) {
     const found = await ask("api/check", content({thorough}));
     if (mine !== turn) return;
     state.problems = found.problems;
+    if (thorough) state.compared = true;
     $("sheet-text").textContent = found.sheet_text;
     $("settings-text").textContent = found.settings_text;
     $("corrections-text").textContent = found.corrections_text;
     $("corrections-shown").hidden = !found.corrections_text;
-    showWhole();
+    showWhole(markProblems());
     $("understood").hidden = !found.understood.length;
     $("understood").textContent = found.understood.join("\n");
     showState(found.notes);
   } catch (error) {
     if (mine !== turn) return;
     state.problems = error.content?.problems ?? [];
-    showWhole(state.problems.length ? [] : [{severity: "error", text: error.message}]);
+    showWhole(state.problems.length ? markProblems() : [{severity: "error", text: error.message}]);
     showState();
   }
-  markProblems();
   drawProblems();
 }
 
@@ -62,7 +68,9 @@ async function save() {
     const made = await ask("api/save", content());
     state.stamp = made.stamp;
     state.dirty = false;
-    await check();
+    // What a comparison with the recordings found still holds: a save changes nothing that was compared.
+    if (state.compared) showState();
+    else await check();
     $("status").textContent = `${made.written.length ? `Written: ${made.written.join(", ")}` : "Nothing had changed"} · ${$("status").textContent}`;
   } catch (error) {
     showWhole([{severity: "error", text: error.message}]);

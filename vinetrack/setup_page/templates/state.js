@@ -1,7 +1,7 @@
 // What the page knows, how it asks the server, and how it makes elements.
 export const state = {
   known: {}, units: {}, offered: [], sheet: {columns: [], rows: []}, kept: [], shared: {}, calibration: null, axis: null, corrections: {},
-  recordings: [], pictures: [], traces: [], stamp: "", chosen: 0, problems: [], dirty: false, clip: null,
+  recordings: [], pictures: [], traces: [], stamp: "", chosen: 0, problems: [], dirty: false, compared: false, clip: null,
 };
 
 export const $ = (id) => document.getElementById(id);
@@ -83,6 +83,7 @@ export const listeners = [];
 let waiting;
 export function changed() {
   state.dirty = true;
+  state.compared = false;
   clearTimeout(waiting);
   waiting = setTimeout(() => listeners.forEach((listener) => listener()), 350);
 }

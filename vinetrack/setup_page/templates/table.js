@@ -129,12 +129,14 @@ function drawAdder(columns) {
   };
 }
 
+// Marks the cells that problems concern; returns those that no cell shows.
 export function markProblems() {
+  const placeless = [], measured = new Set();
   for (const cell of $("trials").querySelectorAll("td")) {
     cell.classList.remove("bad", "odd");
     cell.querySelectorAll("small.said").forEach((words) => words.remove());
   }
-  for (const {severity, field, trial, column, text} of state.problems) {
+  for (const {severity, field, trial, column, text, of_a_measurement} of state.problems) {
     if (!["cell", "row", "shared"].includes(field)) continue;
     const row = field === "shared" ? "shared" : state.sheet.rows.findIndex((one) => one.trial === trial);
     const wanted = field === "row" ? "trial" : column;
@@ -142,13 +144,19 @@ export function markProblems() {
     const inputs = all.filter((one) => one.dataset.row === String(row));
     // A column that neither place has is missing for all; where no cell shows it, it stands with the trial.
     const input = inputs[0] ?? all[0] ?? $("trials").querySelector(`[data-column="trial"][data-row="${row}"]`);
-    if (!input) continue;
+    if (!input) {
+      placeless.push({severity, text});
+      continue;
+    }
     const blank = /^\S+ is (blank|missing)/.test(text);
     if (blank && sharedValue(column)) continue;
     const cell = input.closest("td");
     cell.classList.add(severity === "error" ? "bad" : "odd");
-    const short = blank ? "to be filled in" : text.replace(new RegExp(`^${column} `), "");
+    const again = of_a_measurement && measured.has(`${severity} ${column}`);
+    if (of_a_measurement) measured.add(`${severity} ${column}`);
+    const short = blank ? "to be filled in" : again ? "likewise" : text.replace(new RegExp(`^${column} `), "");
     cell.append(el("small", {class: `said ${severity}`, title: text}, short));
     input.setAttribute("aria-invalid", severity === "error");
   }
+  return placeless;
 }
