@@ -20,7 +20,8 @@ from vinetrack.diagnosis.candidates import CandidateShape
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, answer_set, likelihood_ratio, weights_of
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, LATER_LEVEL, LOUD_PROBE, MisfitTests
-from vinetrack.diagnosis.score_test import Scores, Structure, _beside_systematics, _systematics_turn, structure_in
+from vinetrack.diagnosis.score_test import Scores, _beside_systematics, _systematics_turn
+from vinetrack.diagnosis.structure_test import Structure, structure_in
 from vinetrack.inference.fit_result import Number
 
 QUIET = Structure(0.0, 0, 1.0, 0.0)

@@ -159,7 +159,8 @@ class EffectSets:
             fit = self._refitted(hypothesis.fit, effects)
             if fit is not None:
                 self._keep(likelihood_ratio(self.before, effects, fit))
-        return self.known.get(names)
+        known = self.known.get(names)
+        return None if known is None else replace(known, fit=with_curves(known.fit))
 
     def _refitted(self, fit: Fit, effects: Iterable[Effect]) -> Fit | None:
         model = self.before.model
@@ -245,7 +246,7 @@ class EffectSets:
         if best is None:
             return ()
         steps = [self.of_effects(best, best.effects[: k + 1]) for k in range(len(best.effects))]
-        return tuple(replace(step, fit=with_curves(step.fit)) for step in steps if step is not None)
+        return tuple(step for step in steps if step is not None)
 
     def _keep(self, hypothesis: LikelihoodRatio) -> None:
         names = frozenset(hypothesis.names)

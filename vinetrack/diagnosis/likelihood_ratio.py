@@ -176,7 +176,7 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
 
 def _robust_ratio(after: Fit, names: Sequence[str]) -> float:
     """How much larger the error of an effect's size is by the scatter of trials than by the noise model; at least 1."""
-    if len(after.predictor.data) < FEWEST_CLUSTERS:
+    if len(after.trials) < FEWEST_CLUSTERS:
         return 1.0
     matrices = robust_covariance(after.predictor, after.solution)
     plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in matrices)

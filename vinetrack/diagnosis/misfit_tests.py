@@ -13,8 +13,9 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, plausible_range, shapes_of
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities, effect_sensitivities
 from vinetrack.diagnosis.family_test import FamilyTest, family_test
-from vinetrack.diagnosis.score_test import Scores, Structure, linear_gains, scores_of, structure_of
+from vinetrack.diagnosis.score_test import Scores, linear_gains, scores_of
 from vinetrack.diagnosis.shape_products import Products, fit_columns, products_of
+from vinetrack.diagnosis.structure_test import Structure, structure_of
 from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_motion
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_problem import track_correlation

@@ -20,10 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.candidates import CandidateShape
-from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
-from vinetrack.diagnosis.initial_fit import probe
-from vinetrack.diagnosis.shape_products import Products, blocks_of, products_of
+from vinetrack.diagnosis.shape_products import Products, blocks_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import (
     LEAST_SPREAD,
@@ -37,15 +34,7 @@ from vinetrack.inference.mixed_effects import spreads as spreads_of_trials
 from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.robust_covariance import scatter_of
 from vinetrack.inference.sensitivity import OWN
-from vinetrack.inference.systematics import Systematics
 from vinetrack.inference.whitening import at_correlation
-
-BUMPS_ALONG, BUMPS_SPEED, BUMPS_TIME = 8, 4, 4
-"""Probe bumps along growth, speed and time. Chosen: as fine as positions resolve."""
-
-SHARE_LEFT = 1e-4
-"""Part of its information that a shape must keep once everything else is fitted, to count as a shape of its own.
-Chosen: a hundredth of its amplitude."""
 
 IMITATED = 1e-9
 """Part of its information that rounding leaves of a shape that others imitate exactly. Derived: products of some
@@ -217,14 +206,14 @@ def scores_of(fit: Fit, sums: Products, state: FitState | None = None) -> Scores
     step = np.append(projection.step, 0.0)
     single, informations = np.empty((len(blocks), n_shapes)), np.empty((len(blocks), n_shapes, n_shapes))
     for part in sums.parts:
-        of_part, own, mine = blocks[part], index[part], asked[part]
-        left = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], step[own])
-        single[part] = np.einsum("nc,ncs->ns", left[:, C], counted[mine]) - np.einsum(
-            "nk,nks->ns", left[:, X], counted_turned[own]
+        of_part, keys, felt = blocks[part], index[part], asked[part]
+        left = of_part[:, :, r] - np.einsum("nqk,nk->nq", of_part[:, :, X], step[keys])
+        single[part] = np.einsum("nc,ncs->ns", left[:, C], counted[felt]) - np.einsum(
+            "nk,nks->ns", left[:, X], counted_turned[keys]
         )
-        of_shapes, of_numbers = np.swapaxes(turn[mine], 1, 2), np.swapaxes(turned[own], 1, 2)
-        informations[part] = of_shapes @ (of_part[:, C, S] - of_part[:, C, X] @ lever[own]) - of_numbers @ (
-            of_part[:, X, S] - of_part[:, X, X] @ lever[own]
+        of_shapes, of_numbers = np.swapaxes(turn[felt], 1, 2), np.swapaxes(turned[keys], 1, 2)
+        informations[part] = of_shapes @ (of_part[:, C, S] - of_part[:, C, X] @ lever[keys]) - of_numbers @ (
+            of_part[:, X, S] - of_part[:, X, X] @ lever[keys]
         )
     degrees = max(len(single) - projection.moving.size, 1)
     return Scores(score, information, single, informations, float(degrees))
@@ -250,8 +239,8 @@ def informations_at(fit: Fit, sums: Products, spreads: Sequence[tuple[float, flo
     state, size, p = fit.state, fit.solution.problem.prior_mean.size, sums.n_keys
     problem = with_shapes(fit.solution.problem, sums.n_asked)
     total = problem.prior_mean.size
-    own = fit.solution.problem.index
-    index = np.concatenate([np.where(own < 0, total, own), size + sums.asked], axis=1)
+    keys = fit.solution.problem.index
+    index = np.concatenate([np.where(keys < 0, total, keys), size + sums.asked], axis=1)
     problem = replace(problem, index=index)
     whole, squares, levers = np.zeros((total, total)), [], []
     for part in sums.parts:
@@ -372,98 +361,3 @@ def _rest(fit: Fit, blocks: Floats, p: int, state: FitState) -> float:
     step = np.linalg.lstsq(square, slope, rcond=1e-11)[0]
     whole = blocks[:, p, p].sum() + float(np.sum(problem.prior_precision * away**2))
     return max(float(whole - step @ slope), 1e-9 * float(whole))
-
-
-def _probe_shapes(fit: Fit) -> list[CandidateShape]:
-    """Bumps of force along the growth, over speed and over time, with and without a factor P."""
-    longest_s = max(float(trial.time_s[-1] - trial.release_s) for trial in fit.trials)
-    fastest = max(
-        trial.trial.travel_ratio * float(np.quantile(trial.predicted_velocity_m_s, 0.98)) for trial in fit.trials
-    )
-    lengths = [trial.trial.length_m for trial in fit.trials]
-    reaches = [float(np.max(trial.lead_position_m) - trial.origin_m) for trial in fit.trials]
-    reach = max(
-        grown / length if math.isfinite(length) and length > 0 else grown
-        for grown, length in zip(reaches, lengths, strict=True)
-    )
-    varied = len({round(trial.trial.pressure_Pa, 1) for trial in fit.trials}) > 1
-    shapes = []
-    for kind, count, top in ((0, BUMPS_ALONG, reach), (1, BUMPS_SPEED, fastest), (2, BUMPS_TIME, longest_s)):
-        centres = (np.arange(count) + 0.5) / count * top
-        for centre in centres:
-            for offset in (0, 3) if varied and kind == 0 else (0,):
-                shapes.append(CandidateShape(probe(), (float(kind + offset), float(centre), 0.6 * top / count), 1e-3))
-    return shapes
-
-
-@dataclass(frozen=True)
-class Structure:
-    """What probes find: χ² of their scores for `degrees` of freedom, its upper tail `p`, and that as a `z`.
-
-    `loudest` is the chance at which the loudest of as many probes stands out alone: something narrow shows in one of
-    them, and drowns in the sum over all.
-    """
-
-    chi2: float
-    degrees: int
-    p: float
-    z: float
-    loudest: float = 1.0
-
-
-def structure_of(fit: Fit, columns: Sequence[Floats], systematics: Systematics) -> Structure:
-    """Whether anything that a smooth force could explain is left beside a fit.
-
-    All probes together: their scores against both kinds of error, in the directions that the fit leaves to them.
-
-    Parameters
-    ----------
-    fit : the fit that is questioned.
-    columns : its own, from `fit_columns`.
-    systematics : Systematics
-        What trials err by together.
-
-    Returns
-    -------
-    Structure
-    """
-    answers = effect_sensitivities(fit, _probe_shapes(fit))
-    if not answers.shapes:
-        return Structure(0.0, 0, 1.0, 0.0)
-    return structure_in(scores_of(fit, products_of(fit, columns, answers, systematics)))
-
-
-def structure_in(scores: Scores) -> Structure:
-    """What the scores of probes amount to together, and the loudest of them alone; see `structure_of`.
-
-    Parameters
-    ----------
-    scores : of the probes.
-
-    Returns
-    -------
-    Structure
-    """
-    from scipy.stats import f as fisher
-    from scipy.stats import norm, t
-
-    root = np.sqrt(np.maximum(np.diag(scores.information), 1e-300))
-    live = np.diag(scores.information) > 0
-    information = (scores.information / root[:, None] / root)[np.ix_(live, live)]
-    score = (scores.score / root)[live]
-    values, vectors = np.linalg.eigh(information)
-    keep = values > SHARE_LEFT * values.max(initial=0.0)
-    along = (vectors[:, keep].T @ score) / np.sqrt(values[keep])
-    turn = (vectors / root[live][:, None])[:, keep] / np.sqrt(values[keep])
-    single = scores.scores[:, live] @ turn
-    explained = np.einsum("jk,njl,lk->nk", turn, scores.informations[:, live][:, :, live], turn) * along
-    robust = scatter_of(single - explained, scores.degrees)
-    chi2 = float(np.sum(along**2 / np.maximum(1.0, robust)))
-    degrees = int(np.count_nonzero(keep))
-    p = float(fisher.sf(chi2 / max(degrees, 1), degrees, max(scores.degrees, 1.0))) if degrees else 1.0
-    # A probe that few trials feel has as few degrees of freedom, however many there are in all.
-    each = np.einsum("njj->nj", scores.informations)[:, live]
-    felt = each.sum(axis=0) ** 2 / np.maximum(np.sum(each**2, axis=0), 1e-300)
-    chances = 2 * t.sf(np.abs(scores.z[live]), np.clip(felt - 1, 1.0, max(scores.degrees, 3.0)))
-    loudest = min(degrees * float(np.min(chances, initial=1.0)), 1.0)
-    return Structure(chi2, degrees, p, float(norm.isf(max(p, 1e-300))), loudest)

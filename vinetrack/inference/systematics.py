@@ -61,17 +61,23 @@ class Systematics:
 
     @classmethod
     def none(cls, points: Sequence[int]) -> Systematics:
-        """No systematic errors, of trials with so many points."""
+        """No systematic errors.
+
+        Parameters
+        ----------
+        points : sequence of int
+            Points of each trial.
+
+        Returns
+        -------
+        Systematics
+        """
         return cls([np.zeros((size, 0)) for size in points], np.zeros((len(points), 0), dtype=int), 0)
 
     @property
     def n_felt(self) -> int:
         """Columns of each trial."""
         return self.places.shape[1]
-
-    def of(self, places: Sequence[int]) -> Systematics:
-        """The same of some of the trials, some of them several times."""
-        return Systematics([self.columns[k] for k in places], self.places[list(places)], self.count)
 
 
 def systematics_of(
