@@ -154,7 +154,7 @@ def test_limits_of_what_could_hide_hold_the_truth_19_times_of_20() -> None:
         of = Scores(
             unit.score * 300, unit.information * scale**2, unit.scores * 300, unit.informations * scale**2, 11.0
         )
-        answers = EffectSensitivities((shape,), (), ())
+        answers = EffectSensitivities((shape,), [], ())
         fit: Any = None
         limits, testable = MisfitTests(fit, (friction,), answers, fit, of, QUIET, FIRST_LEVEL).largest(friction)
         assert testable

@@ -41,7 +41,7 @@ class EffectSensitivities:
     """
 
     shapes: tuple[CandidateShape, ...]
-    columns: tuple[Floats, ...]
+    columns: list[Floats]
     silent: tuple[str, ...]
 
     @property
@@ -75,7 +75,7 @@ def effect_sensitivities(fit: Fit, shapes: Sequence[CandidateShape]) -> EffectSe
             answered = [answer for shape in finite if (answer := _answer(fit, shape, plain)) is not None]
         kept += answered
         heard |= {name} if answered else set()
-    columns = tuple(_beside_each_other(kept, i, trajectory.time_s.size) for i, trajectory in enumerate(plain))
+    columns = [_beside_each_other(kept, i, trajectory.time_s.size) for i, trajectory in enumerate(plain)]
     return EffectSensitivities(
         tuple(shape for shape, _ in kept), columns, tuple(name for name in names if name not in heard)
     )

@@ -353,5 +353,5 @@ def _of_trials(asked: MisfitTests, places: Sequence[int]) -> MisfitTests:
     )
     part = replace(fit, predictor=predictor, solution=solution, trials=tuple(fit.trials[k] for k in where), smooth=None)
     sums = asked.sums.of(where)
-    answers = replace(asked.answers, columns=tuple(asked.answers.columns[k] for k in where))
+    answers = replace(asked.answers, columns=[asked.answers.columns[k] for k in where])
     return replace(asked, fit=part, sums=sums, answers=answers, scores=scores_of(part, sums))

@@ -1,8 +1,8 @@
 """Memory of a search over hypotheses about many trials: curves of fits that are out of the race are let go.
 
-A fit of a thousand trials holds some sixty megabytes of curves, what it leaves held against every candidate some four
-hundred; a search fits dozens. Numbers, likelihood and state of a fit always stay, from which its curves are made again
-where a later step asks for them.
+A fit of a thousand trials of 550 frames holds some sixty megabytes of curves, what it leaves held against every
+candidate 700; a search fits dozens. Numbers, likelihood and state of a fit always stay, from which its curves are made
+again where a later step asks for them.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ MANY_POINTS = 150_000
 16 MB; at half smaller campaigns spend time on curves made again, at twice a search over them takes 2 GB. It decides no
 number or likelihood of a fit; derivatives made again come of other steps, within the error of the first."""
 
-FITS_HELD, TESTS_HELD = 8, 3
-"""Fits, the likeliest of a search, and questioned fits, the last ones asked, that stay whole. Chosen: what steps go on
-from is among the best three; at half curves are made again now and then, at twice memory doubles."""
+FITS_HELD, TESTS_HELD = 8, 1
+"""Fits, the likeliest of a search, and questioned fits, the last asked, that stay whole. Chosen for memory: what steps
+go on from is among the best three; of fits at half curves are made again now and then; each questioned fit more holds
+as much as ten fits."""
 
 Key = TypeVar("Key")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -324,6 +324,5 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTes
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials)
     columns = fit_columns(fit)
     sums = products_of(fit, columns, answers, systematics)
-    answers = replace(answers, columns=sums.of_shapes)
     structure = structure_of(fit, columns, systematics)
     return MisfitTests(fit, effects, answers, sums, scores_of(fit, sums), structure, level)

@@ -60,12 +60,6 @@ class Products:
         """The trials in parts whose products are held at once."""
         return [slice(begin, begin + TRIALS_AT_ONCE) for begin in range(0, len(self.columns), TRIALS_AT_ONCE)]
 
-    @property
-    def of_shapes(self) -> tuple[Floats, ...]:
-        """The columns of the shapes alone, shape (n_points, n_shapes) a trial; no copies."""
-        begin = OWN + self.n_keys + 1
-        return tuple(columns[:, begin : begin + self.n_shapes] for columns in self.columns)
-
     def grams(self, part: slice) -> Floats:
         """Sums of products of a part of the trials, shape (n_trials, 3, n_columns, n_columns), see `whitening`.
 
@@ -127,6 +121,8 @@ def products_of(
 ) -> Products:
     """All that the tests need the products of.
 
+    The columns of `answers` are views of those made here from then on, so that no trial's are held twice.
+
     Parameters
     ----------
     fit : the fit that is questioned.
@@ -139,12 +135,13 @@ def products_of(
     -------
     Products
     """
-    whole = tuple(
-        np.column_stack([of_fit, of_shapes, systematic])
-        for of_fit, of_shapes, systematic in zip(columns, answers.columns, systematics.columns, strict=True)
-    )
     keys, shapes = columns[0].shape[1] - OWN - 1, len(answers.shapes)
-    return Products(whole, fit.predictor.data, keys, shapes, systematics.places, systematics.count)
+    of_shapes = slice(OWN + keys + 1, OWN + keys + 1 + shapes)
+    whole: list[Floats] = []
+    for i, (of_fit, systematic) in enumerate(zip(columns, systematics.columns, strict=True)):
+        whole.append(np.column_stack([of_fit, answers.columns[i], systematic]))
+        answers.columns[i] = whole[-1][:, of_shapes]
+    return Products(tuple(whole), fit.predictor.data, keys, shapes, systematics.places, systematics.count)
 
 
 def blocks_of(fit: Fit, sums: Products, state: FitState) -> Floats:
