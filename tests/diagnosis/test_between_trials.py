@@ -11,7 +11,7 @@ from grown import Pairs, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.diagnosis.between_gain import Difference, gains_from_each, linear_gain
+from vinetrack.diagnosis.between_gain import Difference, beside_systematics, gains_from_each, linear_gain
 from vinetrack.diagnosis.between_trials import confounded, differences
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
@@ -19,7 +19,7 @@ from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit import fit, refit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.parameters import DAMPING, BetweenTerm
+from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm
 from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.laboratory.tracks import BASE, Nature, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
@@ -160,6 +160,22 @@ def test_the_linear_estimate_is_what_the_refit_gains(questioned: Fit) -> None:
     slope = after["order_drift.B"]
     assert abs(slope.value - 0.02 / 1.1) < 0.003  # 2 % of the first B is 1.8 % of the mean
     assert drift.p < 1e-6
+
+
+def test_errors_that_replicates_share_take_from_a_difference_what_they_may_explain(
+    questioned: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by_vine = Difference("n_by_vine", shared={EXPONENT: "vine"})
+    gain = linear_gain(questioned, questioned.solution, by_vine)
+    gains = []
+    for error_Pa in (1e-6, 30.0, 3000.0):
+        monkeypatch.setattr("vinetrack.inference.systematics.PRESSURE_ERROR_PA", error_Pa)
+        beside = beside_systematics(questioned, questioned.solution)
+        assert beside.problem.prior_mean.size > questioned.solution.problem.prior_mean.size
+        gains.append(linear_gain(questioned, beside, by_vine))
+    assert gains[0] == pytest.approx(gain, abs=1e-2)
+    assert gains[0] > gains[2]
+    assert gains[2] < 0.5 * gain
 
 
 def test_a_random_effect_without_width_is_no_effect(questioned: Fit) -> None:

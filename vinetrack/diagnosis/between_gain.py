@@ -25,6 +25,7 @@ from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import BetweenTerm, ParameterMap, make_layout
 from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, Predictor
+from vinetrack.inference.systematics import systematics_of
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,40 @@ def linear_gain(fit: Fit, base: Solution, difference: Difference, spread: tuple[
     return plain - deviance(part, problem, state, new, restricted=False)
 
 
+def beside_systematics(fit: Fit, base: Solution) -> Solution:
+    """A solution with the errors that trials share among its numbers: payloads, set pressures, a tracker's.
+
+    All replicates of a condition have them together, so that with enough replicates they stand out from the scatter of
+    trials, and pass for a difference between groups of conditions.
+
+    Parameters
+    ----------
+    fit : the fit that is questioned.
+    base : its solution, smooth errors of position among its numbers where there are any.
+
+    Returns
+    -------
+    Solution
+        Each error has a prior of mean 0 and standard deviation 1; sensitivities stay those of the solution.
+    """
+    errors = systematics_of(fit.predictor, fit.solution, fit.trials, positions=False)
+    if not errors.n_felt:
+        return base
+    columns = [
+        np.column_stack([of_fit[:, :-1], systematic, of_fit[:, -1]])
+        for of_fit, systematic in zip(base.columns, errors.columns, strict=True)
+    ]
+    places = np.where(errors.places < errors.count, base.problem.prior_mean.size + errors.places, -1)
+    problem = with_shapes(base.problem, errors.count)
+    return replace(
+        base,
+        state=replace(base.state, theta=np.append(base.state.theta, np.zeros(errors.count))),
+        problem=replace(problem, index=np.column_stack([base.problem.index, places])),
+        grams=fit.predictor.products(columns),
+        columns=tuple(columns),
+    )
+
+
 def gains_from_each(
     fit: Fit, base: Solution, difference: Difference, members: Sequence[int], begins: Iterable[int]
 ) -> list[float]:
@@ -181,7 +216,10 @@ def _widened(fit: Fit, base: Solution, difference: Difference) -> tuple[Floats, 
         theta[k] = theta[k] if value is None else number.inside(value)
     shapes = base.problem.index.shape[1] - len(old.keys)
     if shapes:
-        problem, theta = with_shapes(problem, shapes), np.append(theta, state.theta[len(old.free) :])
+        further, beyond = state.theta[len(old.free) :], base.problem.index[:, len(old.keys) :]
+        moved = np.where(beyond < 0, -1, beyond - len(old.free) + len(layout.free))
+        problem = replace(with_shapes(problem, further.size), index=np.column_stack([problem.index, moved]))
+        theta = np.append(theta, further)
     turn = _turn(old, layout, shapes)
     grams = np.einsum("nka,nckl,nlb->ncab", turn, base.grams, turn, optimize=True)
     return grams, problem, replace(state, theta=theta)

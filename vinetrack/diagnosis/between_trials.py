@@ -25,7 +25,13 @@ from pathlib import Path
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.diagnosis.between_gain import Difference, chance_of_gain, gains_from_each, linear_gain
+from vinetrack.diagnosis.between_gain import (
+    Difference,
+    beside_systematics,
+    chance_of_gain,
+    gains_from_each,
+    linear_gain,
+)
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
@@ -68,6 +74,10 @@ the answer set's 9 times the usual inflation of 1 to 3; twice as much only costs
 
 LEAST_GAIN = 2.0
 """Fall of −2 ln L below which a difference is not fitted. Chosen: a fifth of what the gate asks for."""
+
+ASKED_AGAIN = 0.01
+"""Chance below which a difference is also asked beside the errors that all replicates of a condition share. Chosen for
+time: three times the level of all tests of a first model; beside more errors no difference gains chance."""
 
 SPREAD_OVER_CONDITIONS = 0.5
 """A difference counts as confounded with the conditions where it varies within them by less than this part of what
@@ -344,7 +354,13 @@ def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
 def _estimated(fit: Fit, base: Solution, difference: Difference) -> Difference | None:
     """The difference with its linear estimate; None where it cannot be laid out."""
     gain = linear_gain(fit, base, difference)
-    return replace(difference, gain=gain, p=chance_of_gain(fit, difference, gain)) if math.isfinite(gain) else None
+    if not math.isfinite(gain):
+        return None
+    p = chance_of_gain(fit, difference, gain)
+    if p < ASKED_AGAIN and difference.stated and difference.confounded:
+        beside = linear_gain(fit, beside_systematics(fit, base), difference)
+        p = max(p, chance_of_gain(fit, difference, beside))
+    return replace(difference, gain=gain, p=p)
 
 
 def _fitted(before: Fit, difference: Difference) -> Fit | None:
