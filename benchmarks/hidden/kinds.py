@@ -278,6 +278,22 @@ def _beyond(draw: Draw, scene: Scene) -> Hidden:
     return Hidden({"beyond": scene.weakest_N * _between(draw, 0.1, 1.0) / speed**2, "beyond_speed": speed})
 
 
+def _slip(draw: Draw, scene: Scene) -> Hidden:
+    F, speed = scene.weakest_N * _between(draw, 0.2, 0.7), scene.slowest_m_s * float(draw.uniform(0.5, 2.0))
+    return Hidden({"slip_F": F, "slip_x": 2 * scene.longest_m, "slip_speed": speed})
+
+
+def _chirp(draw: Draw, scene: Scene) -> Hidden:
+    F, length = scene.weakest_N * _between(draw, 0.1, 0.5), scene.longest_m / float(draw.uniform(1.2, 2.0))
+    return Hidden({"chirp_F": F, "chirp_length": length, "chirp_phase": float(draw.uniform(0, 2 * math.pi))})
+
+
+def _squeeze(draw: Draw, scene: Scene) -> Hidden:
+    F, y = scene.weakest_N * _between(draw, 0.05, 0.2), scene.shortest_m * float(draw.uniform(0.3, 0.6))
+    pressure_Pa = scene.weakest_Pa + scene.highest_yield_Pa
+    return Hidden({"squeeze_F": F, "squeeze_Pa": pressure_Pa, "squeeze_y": y, "squeeze_width": 0.15 * scene.shortest_m})
+
+
 OUTSIDERS: dict[str, tuple[Maker, Wants]] = {
     "rough_patch": (_patch, Wants()),
     "ripple": (_ripple, Wants()),
@@ -285,9 +301,14 @@ OUTSIDERS: dict[str, tuple[Maker, Wants]] = {
     "changed_film": (_changed_film, Wants()),
     "cubic": (_cubic, Wants()),
     "beyond_a_speed": (_beyond, Wants()),
+    "slip": (_slip, Wants()),
+    "chirp": (_chirp, Wants()),
+    "squeeze": (_squeeze, Wants()),
 }
 """Forces that are in no catalogue: a rough patch, a ripple along the film, one that grows with time, a film that
-changes half-way, one with the third power of the speed, one with the square of what is beyond a speed."""
+changes half-way, one with the third power of the speed, one with the square of what is beyond a speed. The last three
+are in no list of simple laws either: a friction that grows with the travel and levels off with the speed, waves along
+the growth that become shorter, and a force with the square of the pressure beyond a place."""
 
 NULLS = (
     "anything",

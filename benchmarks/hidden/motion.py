@@ -87,6 +87,16 @@ class Physics(NamedTuple):
     cubic: float = 0.0
     beyond: float = 0.0
     beyond_speed: float = 0.0
+    slip_F: float = 0.0
+    slip_x: float = 1.0
+    slip_speed: float = 1.0
+    chirp_F: float = 0.0
+    chirp_length: float = 1.0
+    chirp_phase: float = 0.0
+    squeeze_F: float = 0.0
+    squeeze_Pa: float = 1.0
+    squeeze_y: float = 0.0
+    squeeze_width: float = 1.0
 
 
 @njit(cache=True, nogil=True)
@@ -156,6 +166,9 @@ def tail_force(t, y, w, P, film_kg, tube, f, bends):
     force -= f.stribeck_F * math.exp(-((w / f.stribeck_speed) ** f.stribeck_power))
     force -= f.stop_k * max(y - f.stop_y, 0.0) + f.square_q * y * y
     force -= f.cubic * w**3 + f.beyond * max(w - f.beyond_speed, 0.0) ** 2
+    force -= f.slip_F * (2.0 * y / f.slip_x) ** 1.5 * w / (w + f.slip_speed)
+    force -= f.chirp_F * math.sin(2.0 * math.pi * (y / f.chirp_length) ** 1.5 + f.chirp_phase)
+    force -= f.squeeze_F * (P / f.squeeze_Pa) ** 2 * 0.5 * (1.0 + math.tanh((y - f.squeeze_y) / f.squeeze_width))
     return force - f.growing_F * t / f.growing_s
 
 

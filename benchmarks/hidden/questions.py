@@ -41,6 +41,9 @@ def outsider_values(truth: Truth) -> dict[str, float]:
         "beyond_a_speed": {"c": f.beyond, "speed": f.beyond_speed},
         "growing_friction": {"rate": f.growing_F / f.growing_s},
         "changed_film": {"delta": f.step_B, "place": f.step_y},
+        "slip": {"F": f.slip_F, "travel": f.slip_x, "speed": f.slip_speed},
+        "chirp": {"F": f.chirp_F, "length": f.chirp_length, "phase": f.chirp_phase},
+        "squeeze": {"F": f.squeeze_F, "pressure": f.squeeze_Pa, "place": f.squeeze_y, "width": f.squeeze_width},
     }
     return {f"{truth.outsider}.{name}": value for name, value in values.get(truth.outsider, {}).items()}
 

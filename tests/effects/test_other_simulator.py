@@ -65,6 +65,9 @@ OUTSIDE = {
     "beyond_a_speed": {"beyond": 0.02, "beyond_speed": 2.0},
     "growing_friction": {"growing_F": 0.8, "growing_s": 0.2},
     "changed_film": {"step_B": 0.1, "step_y": 0.12},
+    "slip": {"slip_F": 0.8, "slip_x": 0.5, "slip_speed": 1.5},
+    "chirp": {"chirp_F": 0.4, "chirp_length": 0.12, "chirp_phase": 1.0},
+    "squeeze": {"squeeze_F": 0.5, "squeeze_Pa": 2e4, "squeeze_y": 0.1, "squeeze_width": 0.03},
 }
 
 

@@ -425,4 +425,11 @@ def _with_missing_force(result: Diagnosis, report: Report) -> Diagnosis:
     except (FitError, SimulationError, np.linalg.LinAlgError) as error:
         return replace(result, notes=(*result.notes, f"The missing force could not be drawn: {error}"))
     explanation = f"{result.explanation} {force.sentence}"
-    return replace(result, missing_force=force.to_json(), force_table=force.table, explanation=explanation)
+    learned = None if force.learned is None else force.learned.table
+    return replace(
+        result,
+        missing_force=force.to_json(),
+        force_table=force.table,
+        learned_table=learned,
+        explanation=explanation if force.learned is None else f"{explanation} {force.learned.sentence}",
+    )

@@ -162,6 +162,22 @@ class ForceFit:
         levers = np.vstack([lever, np.zeros((1, lever.shape[1]))])[index]
         return np.asarray(left[:, forces] - np.einsum("nkl,nk->nl", levers, left[:, :k]))
 
+    def information(self, answers: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Precision and score of forces that are the same in every trial, all other numbers integrated out.
+
+        Parameters
+        ----------
+        answers : sequence of arrays, shape (n_points, n_columns), m
+
+        Returns
+        -------
+        information : array, shape (n_columns, n_columns), 1/N²
+        score : array, shape (n_columns,), 1/N
+        """
+        square, cross, total = self._spread(self._blocks(answers))
+        left = total - cross.T @ self._inverse(square) @ cross
+        return left[:-1, :-1], left[:-1, -1]
+
     def together(self, answers: Sequence[Floats]) -> Gain:
         """What forces explain all together, the same in every trial.
 

@@ -96,6 +96,11 @@ class Law:
         return self.kind == "patch" and not self.high - max(self.low, 0.0) > LEAST_PATCH_M
 
     @property
+    def precision(self) -> float:
+        """Of its amplitudes beforehand, 1/N²: none, they are free."""
+        return 0.0
+
+    @property
     def shape_names(self) -> tuple[str, ...]:
         """The numbers that shape it."""
         return ("low", "high") if self.kind == "patch" else ("scale",) * self.shapes

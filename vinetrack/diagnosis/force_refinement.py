@@ -24,6 +24,7 @@ from vinetrack.diagnosis.force_sensitivities import (
     pushed,
     with_derivatives,
 )
+from vinetrack.diagnosis.force_surface import Surface
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
@@ -40,6 +41,10 @@ BARE, SHAPED = 5, 2
 """So many first steps are bare ones of Gauss and Newton, the cost rising or not: pressure and B of a trial do nearly
 the same, a first step along their difference overshoots, and the next ones mend it. Place and scale wait for two.
 Chosen; the damped steps that follow make up for a bad choice."""
+
+NEAR = 10
+"""Steps on motions that lie on the tracks, before motions follow the force. Chosen: numbers such as n, in which the
+model bends, settle in three to six."""
 
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
 """Of Levenberg and Marquardt, for steps that may only lower the cost: the first where bare ones lead nowhere. Chosen
@@ -76,18 +81,22 @@ class Refined:
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where the search stands; `motions` are those of these numbers, with the force."""
+class Place:
+    """Where the search stands; `motions` are those of these numbers, with the force.
+
+    Not `driven`, they are others near by: what they lack is then a push of its own.
+    """
 
     theta: Floats
     trial_effects: Floats
-    law: Law
+    law: Law | Surface
     amplitude: Floats
     motions: list[FittedMotion]
+    driven: bool = True
 
 
 @dataclass(frozen=True)
-class _Normal:
+class Normal:
     """Cost at a place, its curvature and slope by numbers, amplitudes, shapes and the own numbers of all trials."""
 
     cost: float
@@ -115,7 +124,7 @@ def refine(
     -------
     Refined or None
     """
-    start = _Place(fit.state.theta, fit.trial_effects, law, 0.0 * gain.amplitude, list(motions))
+    start = Place(fit.state.theta, fit.trial_effects, law, 0.0 * gain.amplitude, list(motions))
     best = _searched(model_fit, fit, start, 0.0)
     if thorough and (best is None or best[1].cost > MENDED * fit.chi2):
         best = _searched(model_fit, fit, start, FIRST_DAMPING)
@@ -127,7 +136,7 @@ def refine(
     sigma = np.sqrt(np.maximum(np.diag(_inverse(normal.square)), 0.0) * inflated)
     relative = gain.sigma / max(float(np.hypot.reduce(gain.amplitude)), 1e-300)
     return Refined(
-        law=place.law,
+        law=place.law if isinstance(place.law, Law) else law,
         amplitude=place.amplitude,
         sigma=max(float(np.sqrt(np.mean(sigma[p : p + q] ** 2))), relative * float(np.hypot.reduce(place.amplitude))),
         shape_sigma=sigma[p + q : p + q + len(place.law.shape_names)],
@@ -136,15 +145,33 @@ def refine(
     )
 
 
-def _searched(model_fit: Fit, fit: ForceFit, start: _Place, damping: float) -> tuple[_Place, _Normal] | None:
+def followed(model_fit: Fit, fit: ForceFit, place: Place) -> Place | None:
+    """Where a force with amplitudes of its own precision leads, all other numbers free beside it.
+
+    Parameters
+    ----------
+    model_fit : the fit that lacks the force.
+    fit : its linear answers to forces.
+    place : where to begin. What is not driven settles on its motions first.
+
+    Returns
+    -------
+    Place, or None where it cannot be followed
+    """
+    begin = place if place.driven else _on_tracks(model_fit, fit, place)
+    best = _searched(model_fit, fit, begin, LEAST_DAMPING)
+    return None if best is None else best[0]
+
+
+def _searched(model_fit: Fit, fit: ForceFit, start: Place, damping: float) -> tuple[Place, Normal] | None:
     """The best place on the way down from `start`; without damping the first steps may lead up."""
-    best: tuple[_Place, _Normal] | None = None
+    best: tuple[Place, Normal] | None = None
     place, bare = start, 0 if damping else BARE
     for turn in range(STEPS):
         try:
             with np.errstate(all="raise", under="ignore"):
                 place = _as_driven(model_fit, place)
-                normal = _normal(model_fit, fit, place)
+                normal = normal_equations(model_fit, fit, place)
         except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
             break
         before = best
@@ -165,15 +192,37 @@ def _searched(model_fit: Fit, fit: ForceFit, start: _Place, damping: float) -> t
     return best
 
 
-def _force(place: _Place, motion: FittedMotion) -> Floats:
-    return place.law.along(motion) @ place.amplitude
+def _on_tracks(model_fit: Fit, fit: ForceFit, place: Place) -> Place:
+    """The numbers settled on motions that lie on the tracks, where the model is linear in all but its own numbers."""
+    damping, best, tried = FIRST_DAMPING, None, place
+    for _ in range(NEAR):
+        try:
+            with np.errstate(all="raise", under="ignore"):
+                tried = _as_driven(model_fit, tried)
+                normal = normal_equations(model_fit, fit, tried)
+        except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
+            normal = None
+        if normal is not None and (best is None or normal.cost < best[1].cost):
+            best, damping = (tried, normal), 0.1 * damping
+        else:
+            damping *= 30
+        if best is None:
+            break
+        tried = replace(_stepped(fit, *best, damping, shaped=True), driven=False)
+    return replace(place if best is None else best[0], driven=True)
 
 
-def _as_driven(fit: Fit, place: _Place) -> _Place:
+def _force(place: Place, motion: FittedMotion) -> Floats:
+    law = place.law
+    # Of many splines the sum costs far less than each.
+    return law.force(motion, place.amplitude) if isinstance(law, Surface) else law.along(motion) @ place.amplitude
+
+
+def _as_driven(fit: Fit, place: Place) -> Place:
     """The motions of these numbers and this force, corrected from those of the place before."""
     jobs = fit.predictor.jobs(place.theta, place.trial_effects)
     motions = [with_derivatives(_with_numbers(fit, *pair)) for pair in zip(place.motions, jobs, strict=True)]
-    return replace(place, motions=pushed(motions, lambda motion: _force(place, motion), ROUNDS))
+    return replace(place, motions=pushed(motions, lambda motion: _force(place, motion), ROUNDS if place.driven else 0))
 
 
 def _with_numbers(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
@@ -183,8 +232,19 @@ def _with_numbers(fit: Fit, motion: FittedMotion, job: Job) -> FittedMotion:
     return replace(motion, model=fit.model.with_values(values), trial=trial)
 
 
-def _normal(model_fit: Fit, fit: ForceFit, place: _Place) -> _Normal:
-    """Normal equations of all unknowns at a place."""
+def normal_equations(model_fit: Fit, fit: ForceFit, place: Place) -> Normal:
+    """Normal equations of all unknowns at a place.
+
+    Parameters
+    ----------
+    model_fit : the fit that lacks the force.
+    fit : its linear answers to forces.
+    place : where they are taken.
+
+    Returns
+    -------
+    Normal
+    """
     theta, trial_effects, q, s = place.theta, place.trial_effects, place.amplitude.size, len(place.law.shape_names)
     p, n = theta.size, trial_effects.shape[0]
     columns = push_sensitivities(model_fit, trial_effects, place.motions, _pushes(model_fit, place))
@@ -193,10 +253,14 @@ def _normal(model_fit: Fit, fit: ForceFit, place: _Place) -> _Normal:
     square, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     cost = float(np.sum(precision * (trial_effects - centre) ** 2))
     cost += float(np.sum(fit.problem.prior_precision * (theta - fit.problem.prior_mean) ** 2))
+    cost += place.law.precision * float(place.amplitude @ place.amplitude)
     for i, trial_data in enumerate(model_fit.predictor.data):
         position, velocity = _seen(place.motions[i], trial_data.time_s - trial_effects[i, RELEASE])
         left = trial_data.lead_position_m - trial_effects[i, ORIGIN] - position
         answers = columns[i]
+        if not place.driven:
+            answers, lacking = answers[:, :-1], answers[:, -1]
+            left = left - lacking
         rows = np.column_stack([answers[:, 2:], -velocity, np.ones(left.size), answers[:, :2], left])
         growing = _growing(trial_data, trial_effects[i])
         relative_sd = None if trial_data.relative_sd is None else trial_data.relative_sd[growing]
@@ -215,9 +279,11 @@ def _normal(model_fit: Fit, fit: ForceFit, place: _Place) -> _Normal:
     square, slope = square[:size, :size], slope[:size]
     square[np.arange(p), np.arange(p)] += fit.problem.prior_precision
     slope[:p] -= fit.problem.prior_precision * (theta - fit.problem.prior_mean)
+    square[np.arange(p, p + q), np.arange(p, p + q)] += place.law.precision
+    slope[p : p + q] -= place.law.precision * place.amplitude
     still = np.flatnonzero(~fit.problem.free)
     square[still, :] = square[:, still] = slope[still] = 0.0
-    return _Normal(cost, square, slope)
+    return Normal(cost, square, slope)
 
 
 def _inverse(square: Floats) -> Floats:
@@ -245,8 +311,11 @@ def _seen(motion: FittedMotion, since_s: Floats) -> tuple[Floats, Floats]:
     return np.asarray(curve(at) + offset), np.where(moving, curve(at, 1) * seen, 0.0)
 
 
-def _pushes(fit: Fit, place: _Place) -> list[Floats]:
-    """Accelerations by a unit of [pressure, B of the trial, every key, amplitudes, shapes], (n_times, n) each."""
+def _pushes(fit: Fit, place: Place) -> list[Floats]:
+    """Accelerations by a unit of [pressure, B of the trial, every key, amplitudes, shapes], (n_times, n) each.
+
+    Where motions are not driven a last column holds what they lack.
+    """
     layout, theta = fit.predictor.layout, place.theta
     jobs = fit.predictor.jobs(theta, place.trial_effects)
     damping = fit.predictor.damping_column
@@ -274,7 +343,8 @@ def _pushes(fit: Fit, place: _Place) -> list[Floats]:
             else 0.0 * motion.free
             for moved, feels in zip(varied, felt, strict=True)
         ]
-        pushes.append(np.column_stack([*changes, _law_pushes(place, motion)]))
+        lacks = [] if place.driven else [motion.free + _force(place, motion) / motion.mass_kg - motion.actual]
+        pushes.append(np.column_stack([*changes, _law_pushes(place, motion), *lacks]))
     return pushes
 
 
@@ -290,7 +360,7 @@ def _acceleration(fit: Fit, motion: FittedMotion, job: Job) -> Floats:
     return evaluate(other.model, other.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
 
 
-def _law_pushes(place: _Place, motion: FittedMotion) -> Floats:
+def _law_pushes(place: Place, motion: FittedMotion) -> Floats:
     """Accelerations by a unit of each amplitude and of each number that shapes the law."""
     shape = place.law.along(motion)
     changes = [
@@ -300,7 +370,7 @@ def _law_pushes(place: _Place, motion: FittedMotion) -> Floats:
     return np.column_stack([shape, *changes]) / motion.mass_kg[:, None]
 
 
-def _stepped(fit: ForceFit, place: _Place, normal: _Normal, damping: float, *, shaped: bool) -> _Place:
+def _stepped(fit: ForceFit, place: Place, normal: Normal, damping: float, *, shaped: bool) -> Place:
     """The next place; a law's place or scale moves by no more than a fifth of its size at once."""
     p, q = place.theta.size, place.amplitude.size
     law = place.law
@@ -320,5 +390,9 @@ def _stepped(fit: ForceFit, place: _Place, normal: _Normal, damping: float, *, s
     )
     theta = np.clip(place.theta + step[:p], fit.problem.lower, fit.problem.upper)
     return replace(
-        place, theta=theta, trial_effects=trial_effects, law=law, amplitude=place.amplitude + step[p : p + q]
+        place,
+        theta=theta,
+        trial_effects=trial_effects,
+        law=law,
+        amplitude=place.amplitude + step[p : p + q],
     )

@@ -47,8 +47,8 @@ class FittedMotion:
 
     `mass_kg` is all that moves; `stiffness` and `friction` are ∂a/∂x and ∂a/∂ẋ; `free` is the tail's acceleration by
     the model's own forces there, `actual` that of this motion. `seen` is by how much the camera sees the leading edge
-    move when it moves, `offset_m` how far from where it is; growth ends at `end_s`. `model` holds the trial's own
-    values, `measured_Pa` the pressure where it does not follow them.
+    move when it moves, `offset_m` how far from where it is; growth ends at `end_s`, positions count until
+    `counts_until_s`. `model` holds the trial's own values, `measured_Pa` the pressure where it does not follow them.
     """
 
     trial: Trial
@@ -66,6 +66,7 @@ class FittedMotion:
     seen: Floats
     offset_m: Floats
     end_s: float
+    counts_until_s: float = math.inf
 
     @property
     def tail_position_m(self) -> Floats:

@@ -24,6 +24,8 @@ from vinetrack.diagnosis.force_inversion import ForceFit, Gain
 from vinetrack.diagnosis.force_laws import Law, coarse_laws, finer_laws
 from vinetrack.diagnosis.force_refinement import refine
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities, motions_of
+from vinetrack.diagnosis.force_surface import curves, splines
+from vinetrack.diagnosis.learned_force import LearnedForce, learned_force
 from vinetrack.diagnosis.per_trial_estimates import lay
 from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
 from vinetrack.dynamics.simulate import SimulationError
@@ -105,6 +107,7 @@ class MissingForce:
     `tail_velocity_m_s`, `time_s` and `pressure_Pa`. `laws`, columns `LAW_COLUMNS`, the best of each kind, best first;
     `explained` is the part of what any smooth force could explain. `depends_on` gives the same for a force that hangs
     on one thing alone. `seen` are the laws whose force is more than errors could make, best first.
+    `learned` is the force as a smooth function of one or two variables; None where none is heard.
     """
 
     table: pd.DataFrame
@@ -112,6 +115,7 @@ class MissingForce:
     depends_on: Mapping[str, float]
     sentence: str
     seen: tuple[SeenLaw, ...] = ()
+    learned: LearnedForce | None = None
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
@@ -119,15 +123,18 @@ class MissingForce:
             "sentence": self.sentence,
             "laws": self.laws.head(6).to_dict("records"),
             "depends_on": dict(self.depends_on),
+            "learned": None if self.learned is None else self.learned.to_json(),
         }
 
 
-def missing_force(model_fit: Fit) -> MissingForce:
+def missing_force(model_fit: Fit, *, learn: bool = True) -> MissingForce:
     """Find the force that a fit lacks.
 
     Parameters
     ----------
     model_fit : the fit that is questioned.
+    learn : bool
+        Whether to learn it as a smooth function as well, which takes most of the time.
 
     Returns
     -------
@@ -167,7 +174,17 @@ def missing_force(model_fit: Fit) -> MissingForce:
         depends_on=depends,
         sentence=_sentence(laws, depends, _mended(fit, whole)),
         seen=tuple(_seen(law) for law in laws if law.seen),
+        learned=_learned(model_fit, fit, motions, scatter.dof) if learn else None,
     )
+
+
+def _learned(model_fit: Fit, fit: ForceFit, motions: Sequence[FittedMotion], replicates: int) -> LearnedForce | None:
+    """The force as a smooth function; None also where it leads to motions that cannot be followed."""
+    try:
+        with np.errstate(all="raise", under="ignore"):
+            return learned_force(model_fit, fit, motions, replicates)
+    except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
+        return None
 
 
 def _seen(judged: _Judged) -> SeenLaw:
@@ -216,33 +233,9 @@ class _Judged:
         return SEEN * self.gain.sigma < size_N < self.largest_N and not self.law.is_a_point
 
 
-def curves(at: Floats, count: int) -> Floats:
-    """Cubic B-splines on 0 to 1, shape (n, count), evenly wide.
-
-    Parameters
-    ----------
-    at : array, shape (n,)
-        Places from 0 to 1.
-    count : int
-        Number of splines.
-
-    Returns
-    -------
-    array, shape (n, count)
-    """
-    return _splines(at, np.linspace(0.0, 1.0, count - 2))
-
-
 def _pieces_of(at: Floats) -> Floats:
     """The smooth pieces of a force along the growth, shape (n, PIECES): narrower at the start, where speed rises."""
-    return _splines(at, np.concatenate([[0.0, *EARLY], np.linspace(0.0, 1.0, PIECES - 2 - len(EARLY))[1:]]))
-
-
-def _splines(at: Floats, knots: Floats) -> Floats:
-    from scipy.interpolate import BSpline
-
-    ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
-    return np.asarray(BSpline.design_matrix(np.clip(at, 0.0, 1.0), ends, 3).toarray())
+    return splines(at, np.concatenate([[0.0, *EARLY], np.linspace(0.0, 1.0, PIECES - 2 - len(EARLY))[1:]]))
 
 
 def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[FittedMotion], everything: Gain) -> list[_Judged]:

@@ -198,7 +198,7 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     if before.chi2_per_dof > FAR_OFF:
         before = from_other_starts(before)
     report("drawing the missing force")
-    seen = missing_force(before).seen
+    seen = missing_force(before, learn=False).seen
     if not seen:
         reason = "No simple law of force is seen in what the model leaves; nothing is proposed."
         return Proposal(before, left_out(before).rms_m, (), (), reason)

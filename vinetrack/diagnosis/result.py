@@ -197,7 +197,8 @@ class Diagnosis:
 
     `effects` are those added, in order; `fits` the model the user came with and every one after it. `drift` holds a row
     a drifting parameter, `ladder` the errors before and after (None where not computed), `next_experiment` what
-    to do now where something is tied; `failure` tells where the first model fails, `force_table` what force it lacks.
+    to do now where something is tied; `failure` tells where the first model fails, `force_table` what force it lacks,
+    `learned_table` the same as learned inside the fit.
     One that was read back has no `fits` but the numbers of the last model in `stored_parameters`; `refused` is the
     reason why no diagnosis could be made, blank where one was: there are no rounds then. `power` is what these trials
     could have seen beside the last model.
@@ -215,6 +216,7 @@ class Diagnosis:
     notes: Sequence[str] = ()
     failure: Failure | None = None
     force_table: pd.DataFrame | None = None
+    learned_table: pd.DataFrame | None = None
     stored_parameters: tuple[Number, ...] = ()
     refused: str = ""
     power: Power | None = None

@@ -121,7 +121,7 @@ def _misfit_legend(fig: Figure, full_mm: float, n_columns: int, left_out: str = 
     fig.legend(handles=handles, loc="outside upper left", ncols=n_columns, fontsize=9, handlelength=1.3)
 
 
-_FORCE_AXES = {
+FORCE_AXES = {
     "tail_position_m": ("tail position x (mm)", 1e3),
     "lead_position_m": ("growth y (mm)", 1e3),
     "tail_velocity_m_s": ("tail speed ẋ (m/s)", 1.0),
@@ -140,8 +140,8 @@ def draw_missing_force(table: pd.DataFrame) -> Figure:
 
     Parameters
     ----------
-    table : one row a point: `against` (a key of `AXES`), `value` (SI), `force_N, sigma_N` (one standard error, NaN
-        where unknown) and `condition`, blank for the mean over all.
+    table : one row a point: `against` (a key of `FORCE_AXES`), `value` (SI), `force_N, sigma_N` (one standard error,
+        NaN where unknown) and `condition`, blank for the mean over all.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def draw_missing_force(table: pd.DataFrame) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    panels = [name for name in _FORCE_AXES if len(table) and (table["against"] == name).any()][:_MAX_FORCE_PANELS]
+    panels = [name for name in FORCE_AXES if len(table) and (table["against"] == name).any()][:_MAX_FORCE_PANELS]
     if not panels:
         return blank("No missing force was found that could be drawn.")
     n_columns = min(len(panels), 2)
@@ -163,7 +163,7 @@ def draw_missing_force(table: pd.DataFrame) -> Figure:
 
 
 def _draw_force(ax: Axes, points: pd.DataFrame, against: str) -> None:
-    words, factor = _FORCE_AXES[against]
+    words, factor = FORCE_AXES[against]
     single = points[points["condition"] != ""]
     for _, curve in single.groupby("condition", sort=False):
         ordered = curve.sort_values("value")

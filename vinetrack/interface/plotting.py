@@ -129,7 +129,8 @@ def _tables_in_memory(shown: Diagnosis) -> DiagnosisTables:
         drifting = drift_groups(shown.failure.drift, after if later else None)
     force = nothing if shown.force_table is None else shown.force_table
     conditions = _described([fitted.trial for fitted in before.trials])
-    return assemble_tables(shown, conditions, pd.concat(parts, ignore_index=True), located, drifting, force)
+    trials = pd.concat(parts, ignore_index=True)
+    return assemble_tables(shown, conditions, trials, located, drifting, force, shown.learned_table)
 
 
 def _of_results(shown: LoadedResults, name: str, trial: str) -> Figure:

@@ -251,6 +251,8 @@ def _tables_of(diagnosis: Diagnosis) -> dict[str, pd.DataFrame]:
         }
     if diagnosis.force_table is not None:
         tables["missing_force.csv"] = diagnosis.force_table
+    if diagnosis.learned_table is not None:
+        tables["learned_force.csv"] = diagnosis.learned_table
     return tables
 
 
@@ -371,7 +373,8 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None = None,
     model = make_model(dict.fromkeys([*experiment.settings.model, *diagnosis.effects]), user_effects)
     pairs, _ = measured(experiment, results)
     proposal = propose(model, pairs, report)
-    lines = proposal.sentences()
+    learned = (diagnosis.missing_force or {}).get("learned") or {}
+    lines = [*([learned["sentence"]] if learned else []), *proposal.sentences()]
     if not proposal.tied:
         return lines
     best = proposal.tied[0]

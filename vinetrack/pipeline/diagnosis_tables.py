@@ -54,6 +54,7 @@ class DiagnosisTables:
     worst: str = ""
     added: str = ""
     labels: Mapping[str, str] = field(default_factory=dict)
+    learned: pd.DataFrame | None = None
 
 
 def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTables | None:
@@ -72,10 +73,10 @@ def read_diagnosed(results: Results, conditions: pd.DataFrame) -> DiagnosisTable
     diagnosis = stored_diagnosis(results)
     if diagnosis is None or not diagnosis.verdict:
         return None
-    located, drifting, force = (
-        _table(results.diagnosed(name)) for name in ("along_position.csv", "drift_groups.csv", "missing_force.csv")
-    )
-    return assemble_tables(diagnosis, conditions, predicted_trials(results, conditions), located, drifting, force)
+    names = ("along_position.csv", "drift_groups.csv", "missing_force.csv", "learned_force.csv")
+    located, drifting, force, learned = (_table(results.diagnosed(name)) for name in names)
+    trials = predicted_trials(results, conditions)
+    return assemble_tables(diagnosis, conditions, trials, located, drifting, force, learned)
 
 
 def assemble_tables(
@@ -85,6 +86,7 @@ def assemble_tables(
     located: pd.DataFrame,
     drifting: pd.DataFrame,
     force: pd.DataFrame,
+    learned: pd.DataFrame | None = None,
 ) -> DiagnosisTables:
     """Put the tables behind the pictures together.
 
@@ -95,8 +97,9 @@ def assemble_tables(
         As of `read_diagnosed`.
     trials : DataFrame
         Columns `CURVE_COLUMNS`.
-    located, drifting, force : DataFrame
-        Misfit along the growth, values of groups of trials, and the missing force; empty where there is none.
+    located, drifting, force, learned : DataFrame
+        Misfit along the growth, values of groups of trials, the missing force, and the same as learned inside the fit;
+        empty where there is none.
 
     Returns
     -------
@@ -120,6 +123,7 @@ def assemble_tables(
         worst=worst,
         added=listed(diagnosis.effects),
         labels=labels,
+        learned=learned,
     )
 
 
@@ -190,6 +194,7 @@ def figure_tables(diagnosed: DiagnosisTables | None) -> dict[str, pd.DataFrame]:
         "before_after": diagnosed.before_after,
         "where": diagnosed.where,
         "missing_force": diagnosed.force,
+        "learned_force": pd.DataFrame() if diagnosed.learned is None else diagnosed.learned,
         "candidates": pd.concat(parts, ignore_index=True) if parts else diagnosed.ladder.iloc[:0],
         "cosines": diagnosed.cells,
         "drift": diagnosed.drift,

@@ -283,6 +283,7 @@ def figure_inputs(tables: DiagnosisTables) -> dict[str, tuple[Any, ...]]:
         "before_after": (tables.labels.get(tables.worst, tables.worst), tables.before_after, tables.added),
         "where": (tables.where, tables.added),
         "missing_force": (tables.force,),
+        "learned_force": (tables.learned,),
         "candidates": (tables.rounds,),
         "cosines": tables.cosines,
         "drift": (tables.drift, tables.added),

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _WHOLLY = "It shows the initial model, which the diagnosis refutes."
 _PARTLY = "The dashed model is the initial one, which the diagnosis refutes."
 OF_INITIAL_MODEL = {
-    **dict.fromkeys(("model_residuals", "payload_speed", "missing_force"), _WHOLLY),
+    **dict.fromkeys(("model_residuals", "payload_speed", "missing_force", "learned_force"), _WHOLLY),
     **dict.fromkeys(("model_comparison", "before_after"), _PARTLY),
 }
 """What the caption of a figure adds where the model in it is refuted."""

@@ -301,7 +301,7 @@ def _simulated(entry: Mapping[str, Any]) -> str:
 
 
 def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return the missing force for the template: a sentence, and simple laws compared with it; None for none.
+    """Return the missing force for the template: sentences, weights and simple laws beside it; None for none.
 
     Parameters
     ----------
@@ -323,7 +323,18 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
     ]
     head = ("Simple law", "explains of the missing force", "size (N)")
     table = ReportTable("Which simple law it looks like", head, rows, frozenset({1, 2})) if rows else None
-    return {"sentence": str(content.get("sentence") or content.get("text") or ""), "laws": table}
+    learned = content.get("learned") or {}
+    weights = [
+        (" and ".join(name.split("+")), f"{100 * float(weight):.1f} %")
+        for name, weight in (learned.get("weights") or {}).items()
+    ]
+    told = ReportTable("What the learned force depends on", ("Variables", "posterior weight"), weights, frozenset({1}))
+    return {
+        "sentence": str(content.get("sentence") or content.get("text") or ""),
+        "laws": table,
+        "learned": str(learned.get("sentence") or ""),
+        "weights": told if weights else None,
+    }
 
 
 def moved_table(moved: pd.DataFrame | None) -> ReportTable | None:

@@ -1,0 +1,157 @@
+"""Whether a force that is in no list is learned: over what, how well, and what its law predicts.
+
+    python benchmarks/learned_laws.py [--first-seed 20520] [--campaigns 10] [--propose] [--rows rows.csv]
+
+Campaigns of `benchmarks/hidden`, which share no code with the package, with one of three forces in turn, by the seed:
+`slip` (a friction that grows with the travel and levels off with the speed; growth and speed), `chirp` (waves along the
+growth that become shorter; growth) and `squeeze` (with the square of the pressure, beyond a place; growth and
+pressure). Seeds 20520–20529 tune, 32000–32009 score: nothing may be tuned on those.
+
+Printed for each: the variables named, with their posterior weight; the part of visited points, each variable within the
+middle 90 % of what was visited, where the learned force is within 10 % of the range of the truth; and the same for the
+sum of the learned force and what B, n and P_y moved along (between those the positions do not decide, but they decide
+the sum). With `--propose` (several times as long) the left-out error of the law that is proposed, in parts of what the
+true model gets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from hidden.campaigns import Hidden, make
+from hidden.motion import Physics, Tube, tail_force
+from hidden.questions import true_fit
+
+import vinetrack as vt
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
+from vinetrack.diagnosis.ladder import left_out
+from vinetrack.diagnosis.learned_force import LearnedForce
+from vinetrack.diagnosis.misfit_tests import FAR_OFF
+from vinetrack.diagnosis.missing_force import missing_force
+from vinetrack.diagnosis.multi_start import from_other_starts
+from vinetrack.diagnosis.propose import propose
+from vinetrack.dynamics.force_terms import evaluate
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.sensitivity import RELEASE
+
+LAWS = {"slip": "growth+speed", "chirp": "growth", "squeeze": "growth+pressure"}
+FIRST_TUNING_SEED = 20520
+MIDDLE, WITHIN = (0.05, 0.95), 0.1
+EVERY = 8
+OUTSIDE = ("slip_F", "slip_x", "slip_speed", "chirp_F", "chirp_length", "chirp_phase")
+OUTSIDE += ("squeeze_F", "squeeze_Pa", "squeeze_y", "squeeze_width")
+
+
+def true_force(campaign: Hidden) -> Callable[[Floats, Floats, Floats, Floats], Floats]:
+    """The hidden force alone, N, of time, growth, tail speed and pressure: the generator's own."""
+    physics = campaign.truth.physics
+    alone = Physics(B=0.0, n=1.0, **{name: getattr(physics, name) for name in OUTSIDE})
+    tube = Tube(1.0, 0.0, 1e-2, 1e-4, 1.0, 0.0, 0.0)
+    bends = np.empty((0, 3))
+    return np.vectorize(lambda t, y, w, P: tail_force(t, y, w, P, 0.0, tube, alone, bends))
+
+
+def errors(campaign: Hidden, fit: Fit, learned: LearnedForce) -> dict[str, float]:
+    """Parts of the visited points where the learned force, alone and with what moved along, is within 10 %."""
+    place, truth = learned.place, campaign.truth
+    effects = place.trial_effects.copy()
+    effects[:, [k for k in range(effects.shape[1]) if k != RELEASE]] = 0.0
+    jobs = fit.predictor.jobs(place.theta, effects)
+    force_of = true_force(campaign)
+    true, alone, moved, values = [], [], [], []
+    for motion, job in zip(place.motions, jobs, strict=True):
+        chosen = np.flatnonzero((motion.lead_position_m > 0) & (motion.time_s <= motion.counts_until_s))[::EVERY]
+        t, y, v, w, P = (
+            course[chosen]
+            for course in (motion.time_s, motion.lead_position_m, motion.lead_velocity_m_s, motion.tail_velocity_m_s,
+                           motion.pressure_Pa)
+        )  # fmt: skip
+        row = dict(zip(fit.model.parameter_names, job.row.tolist(), strict=True))
+        true_row = {"eversion_damping.B": truth.B[motion.trial.vine], "eversion_damping.n": truth.n}
+        yield_Pa = motion.trial.yield_pressure_Pa if math.isnan(job.yield_pressure_Pa) else job.yield_pressure_Pa
+        then, there = (
+            evaluate(fit.model.with_values(row | numbers), replace(motion.trial, yield_pressure_Pa=at_Pa), t, y, v)
+            for numbers, at_Pa in (({}, yield_Pa), (true_row, truth.yield_Pa[motion.trial.vine]))
+        )
+        true.append(force_of(t, y, w, P))
+        alone.append((motion_force(place, motion))[chosen])
+        moved.append((then.acceleration_m_s2 - there.acceleration_m_s2) * then.inertia_kg)
+        values.append(np.column_stack(place.law.domain.of_motion(motion))[chosen])
+    truth_N, alone_N, moved_N = (np.concatenate(parts) for parts in (true, alone, moved))
+    at = np.concatenate(values)
+    low, high = np.quantile(at, MIDDLE, axis=0)
+    middle = np.all((at >= low) & (at <= high), axis=1)
+    span = float(np.ptp(truth_N[middle]))
+    return {
+        "range_N": span,
+        "within": float(np.mean(np.abs(alone_N - truth_N)[middle] < WITHIN * span)),
+        "within_sum": float(np.mean(np.abs(alone_N + moved_N - truth_N)[middle] < WITHIN * span)),
+    }
+
+
+def motion_force(place, motion) -> Floats:
+    """The learned force along a motion, N."""
+    return place.law.along(motion) @ place.amplitude
+
+
+def ask(seed: int, with_law: bool) -> dict[str, object]:
+    """One campaign: what was learned of its hidden force."""
+    law = list(LAWS)[seed % len(LAWS)]
+    campaign = make(f"outsider:{law}", seed)
+    pairs, begun = list(campaign.pairs), time.process_time()
+    fit = initial_fit(vt.base_model(), pairs, candidates_of(vt.base_model(), None, {}), profile=False)
+    if fit.chi2_per_dof > FAR_OFF:
+        fit = from_other_starts(fit)
+    learned = missing_force(fit).learned
+    row: dict[str, object] = {"seed": seed, "law": law, "n_trials": len(pairs), "chi2_per_dof": fit.chi2_per_dof}
+    row["processor_s"] = time.process_time() - begun
+    if learned is not None:
+        row["variables"], row["weight"] = next(iter(learned.weights.items()))
+        row["weight_of_truth"] = learned.weights.get(LAWS[law], 0.0)
+        row |= {"explained": learned.explained, **errors(campaign, fit, learned)}
+    if with_law:
+        begun = time.process_time()
+        proposal = propose(vt.base_model(), pairs, lambda _: None)
+        row["proposed"] = proposal.tied[0].effect.name if proposal.tied else ""
+        row["propose_s"] = time.process_time() - begun
+        true_m = left_out(true_fit(proposal.before, campaign.truth)).rms_m
+        row["before"] = proposal.rms_left_out_m / true_m
+        row["after"] = proposal.tied[0].rms_left_out_m / true_m if proposal.tied else math.nan
+    return row
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--first-seed", type=int, default=FIRST_TUNING_SEED)
+    parser.add_argument("--campaigns", type=int, default=10)
+    parser.add_argument("--propose", action="store_true", help="also fit laws, and hold the best against the truth")
+    parser.add_argument("--rows", type=Path, help="keep every answer as it comes")
+    asked = parser.parse_args()
+    rows = []
+    for seed in range(asked.first_seed, asked.first_seed + asked.campaigns):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            rows.append(ask(seed, asked.propose))
+        if asked.rows:
+            pd.DataFrame(rows).to_csv(asked.rows, index=False)
+        print(pd.DataFrame(rows[-1:]).to_string(index=False), flush=True)
+    table = pd.DataFrame(rows)
+    print(table.to_string(index=False, float_format="%.3g"))
+    right = [variables == LAWS[law] for law, variables in zip(table["law"], table["variables"], strict=True)]
+    print(f"variables right: {np.sum(right)} of {len(table)}; not excluded: {np.sum(table['weight_of_truth'] >= 0.05)}")
+    print(f"within 10 % of the range, median of campaigns: force {table['within'].median():.2f},"
+          f" sum with B, n and P_y {table['within_sum'].median():.2f}")  # fmt: skip
+    print(f"processor time: median {table['processor_s'].median():.0f} s, most {table['processor_s'].max():.0f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,337 @@
+"""A force drawn freely over one variable or over two together: cubic B-splines with a Gaussian process behind them.
+
+The coefficients of the splines are taken as values of a Gaussian process at the splines' places, of covariance
+
+    a² exp(−½ Σ_d ((u_d − u'_d)/ℓ_d)²)
+
+with u the variables as parts of what the trials visited. That is a penalised spline whose penalty has a size a, N, and
+lengths ℓ_d of its own (Wahba, JASA 73, 364, 1978; Wilson & Nickisch, ICML 2015). In the coordinates z in which this
+covariance is a² times the unit matrix most directions are of no size and are left out: `Surface` holds those that stay.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.force_sensitivities import FittedMotion
+
+VARIABLES = {
+    "growth": "lead_position_m",
+    "speed": "tail_velocity_m_s",
+    "time": "time_s",
+    "pressure": "pressure_Pa",
+}
+"""What a force may depend on, and the attribute of a motion that holds it."""
+
+ALONE = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
+TOGETHER = {"growth": 12, "speed": 8, "time": 8, "pressure": 5}
+"""Splines along a variable, alone and beside another. Chosen: as fine as positions tell, which feel a force through two
+integrals; half as many miss waves of a quarter of the growth, twice as many cost four times the time."""
+
+LENGTHS = (0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
+"""Lengths of the process that are tried, as parts of what was visited. Chosen: from the finest that the splines follow
+to one that leaves a curve hardly more than a slope; finer steps move no weight by more than a tenth."""
+
+AMPLITUDES = np.geomspace(0.003, 0.3, 9)
+"""Amplitudes that are tried, as parts of the largest drive. Chosen: from what no trial feels to a gross failure;
+larger forces that B and n balance lead astray where the model is far off."""
+
+KEPT = 1e-4
+"""Variance of a direction, as part of the largest, below which it is left out. Chosen: a force of a hundredth of the
+largest; at a tenth of it a fit takes half as long again."""
+
+OVER_DECADES = ("speed", "time")
+"""Variables that are taken as logarithms beyond their median. Chosen: they differ tenfold between slow and fast trials
+where growth and pressures do not."""
+
+FASTEST = 0.98
+"""Quantile of a trial's speeds that counts as its highest: the model's peak after release is not seen. Chosen."""
+
+DIFFERENT = 0.02
+"""Part of the highest pressure by which pressures must differ to be a variable. Chosen: what single trials err by."""
+
+
+def splines(at: Floats, knots: Floats) -> Floats:
+    """Cubic B-splines on these knots, constant beyond the ends, shape (n, n_knots + 2).
+
+    Parameters
+    ----------
+    at : array, shape (n,)
+    knots : array, shape (n_knots,)
+        From 0 to 1.
+
+    Returns
+    -------
+    array, shape (n, n_knots + 2)
+    """
+    from scipy.interpolate import BSpline
+
+    ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
+    return np.asarray(BSpline.design_matrix(np.clip(at, 0.0, 1.0), ends, 3).toarray())
+
+
+def curves(at: Floats, count: int) -> Floats:
+    """Cubic B-splines on 0 to 1, shape (n, count), evenly wide.
+
+    Parameters
+    ----------
+    at : array, shape (n,)
+        Places from 0 to 1.
+    count : int
+        Number of splines.
+
+    Returns
+    -------
+    array, shape (n, count)
+    """
+    return splines(at, np.linspace(0.0, 1.0, count - 2))
+
+
+def covariance_root(count: int, length: float) -> tuple[Floats, Floats]:
+    """Directions and variances of a process of unit size and this length, at the places of so many splines.
+
+    Parameters
+    ----------
+    count : int
+        Number of splines.
+    length : float
+        As part of the whole.
+
+    Returns
+    -------
+    directions : array, shape (count, count)
+    variances : array, shape (count,)
+    """
+    knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, count - 2), [1.0] * 3])
+    at = np.array([knots[k + 1 : k + 4].mean() for k in range(count)])
+    variances, directions = np.linalg.eigh(np.exp(-0.5 * ((at[:, None] - at) / length) ** 2))
+    return directions, np.maximum(variances, 0.0)
+
+
+@dataclass(frozen=True)
+class Domain:
+    """The variables of a force with what of each the trials visited, SI, and the splines along each."""
+
+    variables: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    counts: tuple[int, ...]
+    usual: tuple[float, ...]
+
+    def parts(self, values: Sequence[Floats]) -> list[Floats]:
+        """The variables as parts of what was visited: beyond what is `usual` above the lowest as its logarithm.
+
+        Speeds and durations of a campaign span decades, and forces change over parts of them.
+
+        Parameters
+        ----------
+        values : sequence of arrays, shape (n,), SI
+            One a variable.
+
+        Returns
+        -------
+        list of arrays
+        """
+        limits = zip(values, self.low, self.high, self.usual, strict=True)
+        return [
+            np.log1p(np.maximum(at - low, 0.0) / usual) / math.log1p((high - low) / usual)
+            if math.isfinite(usual)
+            else (at - low) / (high - low)
+            for at, low, high, usual in limits
+        ]
+
+    @property
+    def name(self) -> str:
+        """The variables in a word: `growth`, `growth+speed`."""
+        return "+".join(self.variables)
+
+    @property
+    def size(self) -> int:
+        """Splines in all."""
+        return math.prod(self.counts)
+
+    def of_motion(self, motion: FittedMotion) -> list[Floats]:
+        """The variables along a motion, SI, each of shape (n_times,).
+
+        Parameters
+        ----------
+        motion : a fitted motion.
+
+        Returns
+        -------
+        list of arrays
+        """
+        return [np.asarray(getattr(motion, VARIABLES[name])) for name in self.variables]
+
+    def basis(self, values: Sequence[Floats]) -> Floats:
+        """All splines, or products of splines, at these values, shape (n, size).
+
+        Parameters
+        ----------
+        values : sequence of arrays, shape (n,), SI
+            One a variable.
+
+        Returns
+        -------
+        array, shape (n, size)
+        """
+        product = np.ones((len(values[0]), 1))
+        for part, count in zip(self.parts(values), self.counts, strict=True):
+            columns = curves(part, count)
+            product = (product[:, :, None] * columns[:, None, :]).reshape(len(part), -1)
+        return product
+
+    def mix(self, lengths: Sequence[float]) -> Floats:
+        """Coefficients of the splines by unit of each direction that stays, shape (size, n_directions).
+
+        Parameters
+        ----------
+        lengths : sequence of float
+            Of the process, as parts of what was visited.
+
+        Returns
+        -------
+        array, shape (size, n_directions)
+        """
+        directions: Floats = np.ones((1, 1))
+        variances: Floats = np.ones(1)
+        for count, length in zip(self.counts, lengths, strict=True):
+            more, strength = covariance_root(count, length)
+            directions, variances = np.asarray(np.kron(directions, more)), np.asarray(np.kron(variances, strength))
+        stays = variances > KEPT * variances.max()
+        return np.asarray(directions[:, stays] * np.sqrt(variances[stays]))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A force over a domain, as `vinetrack.diagnosis.force_refinement` follows it: amplitudes are normal of `sd_N`.
+
+    `mix`, shape (n_splines, n_columns), are the coefficients of the splines by unit of each amplitude. An infinite
+    `sd_N` leaves the amplitudes free.
+    """
+
+    domain: Domain
+    mix: Floats
+    sd_N: float = math.inf
+
+    @property
+    def precision(self) -> float:
+        """Of each amplitude, 1/N²."""
+        return self.sd_N**-2
+
+    @property
+    def shape_names(self) -> tuple[str, ...]:
+        """None: what shapes it are its amplitudes."""
+        return ()
+
+    def size_of(self, name: str) -> float:  # pragma: no cover
+        """No number shapes it; see `shape_names`.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        float
+
+        Raises
+        ------
+        KeyError
+            Always.
+        """
+        raise KeyError(name)
+
+    def shifted(self, name: str, by: float) -> Surface:  # pragma: no cover
+        """No number shapes it; see `shape_names`.
+
+        Parameters
+        ----------
+        name : str
+        by : float
+
+        Returns
+        -------
+        Surface
+
+        Raises
+        ------
+        KeyError
+            Always.
+        """
+        raise KeyError(name, by)
+
+    def kept_inside(self, growth_m: float) -> Surface:  # noqa: ARG002
+        """Itself: beyond what was visited it is constant.
+
+        Parameters
+        ----------
+        growth_m : float
+
+        Returns
+        -------
+        Surface
+        """
+        return self
+
+    def force(self, motion: FittedMotion, amplitude: Floats) -> Floats:
+        """The force of these amplitudes along a motion, N, shape (n_times,).
+
+        Parameters
+        ----------
+        motion : a fitted motion.
+        amplitude : array, shape (n_columns,), N
+
+        Returns
+        -------
+        array, shape (n_times,), N
+        """
+        return np.asarray(self.domain.basis(self.domain.of_motion(motion)) @ (self.mix @ amplitude))
+
+    def along(self, motion: FittedMotion) -> Floats:
+        """The force of amplitude 1 along a motion, N, shape (n_times, n_columns).
+
+        Parameters
+        ----------
+        motion : a fitted motion.
+
+        Returns
+        -------
+        array, shape (n_times, n_columns), N
+        """
+        return np.asarray(self.domain.basis(self.domain.of_motion(motion)) @ self.mix)
+
+
+def domains(motions: Sequence[FittedMotion]) -> list[Domain]:
+    """Every variable alone, then every two together, over what these motions visit.
+
+    Parameters
+    ----------
+    motions : sequence of FittedMotion
+
+    Returns
+    -------
+    list of Domain
+    """
+    reach: dict[str, tuple[float, float, float]] = {}
+    for name, attribute in VARIABLES.items():
+        along = [np.asarray(getattr(motion, attribute))[motion.time_s <= motion.counts_until_s] for motion in motions]
+        high = max(float(np.quantile(course, FASTEST) if name == "speed" else course.max()) for course in along)
+        low = min(float(course.min()) for course in along) if name == "pressure" else 0.0
+        if high - low > DIFFERENT * abs(high):
+            usual = float(np.median([np.median(course) for course in along])) if name in OVER_DECADES else math.inf
+            reach[name] = low, high, usual
+
+    def over(names: tuple[str, ...], counts: dict[str, int]) -> Domain:
+        lows, highs, usual = zip(*(reach[name] for name in names), strict=True)
+        return Domain(names, lows, highs, tuple(counts[name] for name in names), usual)
+
+    return [over((name,), ALONE) for name in reach] + [
+        over(pair, TOGETHER) for pair in itertools.combinations(reach, 2)
+    ]
