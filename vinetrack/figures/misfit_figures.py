@@ -65,7 +65,9 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
             ax.set_xlabel("along the growth (%)")
         axes[0].set_yticks(range(len(labels)), _row_names(table, labels), fontsize=9)
         left_out = f"the {len(labels)} of {n_conditions} conditions with the largest misfit"
-        _misfit_legend(fig, full_mm, 3 if len(shown) > 1 else 2, left_out if n_conditions > len(labels) else "")
+        numbers = "; numbers in mm, where beyond scatter" if len(labels) <= _NUMBERED_ROWS else ""
+        words = f"full colour: {full_mm:.2g} mm{numbers}", left_out if n_conditions > len(labels) else ""
+        _misfit_legend(fig, words, 3 if len(shown) > 1 else 2)
     return fig
 
 
@@ -108,16 +110,18 @@ def _draw_cells(ax: Axes, table: pd.DataFrame, column: str, labels: Sequence[str
     ax.tick_params(axis="y", length=0)
 
 
-def _misfit_legend(fig: Figure, full_mm: float, n_columns: int, left_out: str = "") -> None:
+def _misfit_legend(fig: Figure, words: tuple[str, str], n_columns: int) -> None:
+    """The legend: both colours, then what full colour is and which conditions are shown, blank where all are."""
     from matplotlib.patches import Patch
 
+    full_colour, which = words
     handles = [
         Patch(facecolor=_AHEAD, alpha=0.85, label="measured is ahead of the model"),
         Patch(facecolor=_BEHIND, alpha=0.85, label="measured is behind"),
-        Patch(facecolor=MUTED, alpha=0.2, label=f"full colour: {full_mm:.2g} mm; numbers in mm, where beyond scatter"),
+        Patch(facecolor=MUTED, alpha=0.2, label=full_colour),
     ]
-    if left_out:
-        handles.append(Patch(alpha=0.0, label=left_out))
+    if which:
+        handles.append(Patch(alpha=0.0, label=which))
     fig.legend(handles=handles, loc="outside upper left", ncols=n_columns, fontsize=9, handlelength=1.3)
 
 

@@ -31,7 +31,10 @@ MAX_PANELS = 120
 """Chosen: twelve rows of ten panels; vines beyond are left out, and the title states it."""
 
 _MAX_POINTS_IN_ALL = 12_000
-"""Measured: 12,000 points keep the SVG below a megabyte, with 500 trials too."""
+"""Measured: 12,000 points keep the SVG below a megabyte, with 900 trials too."""
+
+_LEAST_POINTS, _MOST_POINTS = 15, 150
+"""Points of one trial. Chosen: fifteen draw a speed that rises once and stays; a panel shows no more than 150."""
 
 _WIDTH_IN = 11.0
 """Chosen: the width of the page at which letters of 11 pt are as large as its text."""
@@ -67,7 +70,7 @@ def draw_overview(trials: pd.DataFrame, kinematics: Mapping[str, pd.DataFrame]) 
 
     shown = trials[trials["status"] != "left_out"]
     drawn = [name for name in shown["trial"] if _has_points(kinematics.get(name))]
-    n_points = min(max(_MAX_POINTS_IN_ALL // max(len(drawn), 1), 30), 150)
+    n_points = min(max(_MAX_POINTS_IN_ALL // max(len(drawn), 1), _LEAST_POINTS), _MOST_POINTS)
     curves = {name: _curve(kinematics[name], n_points) for name in drawn}
     if not curves:
         return blank("No trial has positions from which a speed could be computed.")
