@@ -66,8 +66,8 @@ def draw_where(table: pd.DataFrame, added: str = "") -> Figure:
         axes[0].set_yticks(range(len(labels)), _row_names(table, labels), fontsize=9)
         left_out = f"the {len(labels)} of {n_conditions} conditions with the largest misfit"
         numbers = "; numbers in mm, where beyond scatter" if len(labels) <= _NUMBERED_ROWS else ""
-        words = f"full colour: {full_mm:.2g} mm{numbers}", left_out if n_conditions > len(labels) else ""
-        _misfit_legend(fig, words, 3 if len(shown) > 1 else 2)
+        legend = f"full colour: {full_mm:.2g} mm{numbers}", left_out if n_conditions > len(labels) else ""
+        _misfit_legend(fig, legend, 3 if len(shown) > 1 else 2)
     return fig
 
 
