@@ -148,31 +148,39 @@ def test_an_effect_within_the_errors_of_positions_counts_half() -> None:
     assert beyond(1.12, -sizes) == pytest.approx(-found)
 
 
-def test_an_effect_is_followed_at_a_second_size_only_where_its_score_bends(
+def test_an_effect_is_followed_at_further_sizes_only_where_its_score_bends(
     six: MisfitTests, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def followed(ratio_at_7: float, ratio_at_4: float) -> tuple[int, EffectPower]:
+    def followed(ratio_at_7: float, ratio_at_4: float, larger: float = math.nan) -> tuple[int, EffectPower]:
         asked: list[float] = []
 
         def ratio(_: MisfitTests, __: int, size: float) -> float:
             asked.append(abs(size))
-            return ratio_at_7 if len(asked) == 1 else ratio_at_4
+            return ratio_at_7 if len(asked) == 1 else ratio_at_4 if len(asked) == 2 else larger
 
         monkeypatch.setattr(expected_scores, "score_ratio", ratio)
         power = effect_power(six, "leak")
         assert power is not None
-        assert asked == pytest.approx([asked[0], asked[0] * 4 / 7][: len(asked)])
+        assert [7 * size / asked[0] for size in asked] == pytest.approx([7.0, 4.0, 14.0, 28.0, 56.0][: len(asked)])
         return len(asked), power
 
     calls, straight = followed(1.01, math.nan)
     assert calls == 1
-    calls, bent = followed(0.7, 0.8)
+    calls, bent = followed(1.2, 1.1)
     assert calls == 2
-    assert 1.01 / 0.8 < bent.size_at(0.5) / straight.size_at(0.5) < 1.01 / 0.7
+    assert 1.01 / 1.2 < bent.size_at(0.5) / straight.size_at(0.5) < 1.01 / 1.1
     calls, wild = followed(5.0, 0.8)
     assert calls == 2
     assert wild.size_at(0.5) == pytest.approx(1.01 * straight.size_at(0.5))
-    assert followed(1.0, 0.8)[0] == 2
+    assert followed(1.0, 1.1)[0] == 2
+    # What other numbers fit away is followed until it is seen, or no longer.
+    calls, hidden = followed(0.3, 0.2, 0.6)
+    assert calls == 3
+    assert 7 / 5 < hidden.size_at(0.9) / straight.size_at(0.9) < 14 / 4
+    assert followed(0.1, 0.2, 0.05)[0] == 5
+    calls, halted = followed(0.3, 0.2, -1.0)
+    assert calls == 3
+    assert halted.size_at(0.9) == pytest.approx(1.01 / 0.3 * straight.size_at(0.9))
 
 
 def test_power_survives_its_file(power: Power) -> None:

@@ -6,8 +6,8 @@ The second is made in the computer without noise, and questioned with the noise 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -76,7 +76,8 @@ class CampaignDesign:
 
     `cameras`, `tracker_sigma_m` and `has_trace` are of each trial: how it is filmed, the error that its tracker states
     (NaN for positions measured elsewhere), and whether its pressure is measured. `candidates` are names of effects,
-    the catalogue where None.
+    the catalogue where None. `other_values` are those of the parameters of an effect behind its first, SI, by its name,
+    as `EffectPower` has them.
     """
 
     model: Model
@@ -86,6 +87,7 @@ class CampaignDesign:
     tracker_sigma_m: tuple[float, ...]
     has_trace: tuple[bool, ...]
     candidates: tuple[str, ...] | None = None
+    other_values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @property
     def to_fit(self) -> Model:
@@ -105,14 +107,14 @@ class CampaignDesign:
         Returns
         -------
         CampaignDesign
-            Its further parameters stand at the middle of what is plausible, as linear theory has them.
+            Its further parameters stand at `other_values`, else at the middle of what is plausible.
         """
         model = self.model + name
         effect = next(effect for effect in model if effect.name == name)
         if not effect.parameters:
             return replace(self, model=model)
         small = [shape for shape in shapes_of(effect) if not shape.whole] or shapes_of(effect)
-        values = (value, *small[len(small) // 2].other_values)
+        values = (value, *self.other_values.get(name, small[len(small) // 2].other_values))
         names = [f"{name}.{parameter.name}" for parameter in effect.parameters]
         return replace(self, model=model.with_values(dict(zip(names, values, strict=True))))
 

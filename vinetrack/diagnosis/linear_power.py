@@ -264,6 +264,7 @@ def _effect_power(
         sizes=tuple((size.zero + steps).tolist()),
         taken_for=taken_for,
         named_alone=alone,
+        other_values=shape.other_values,
     )
 
 
@@ -347,7 +348,7 @@ def _taken_for(
     """How often another candidate has the highest score at a size, and how often the effect is left alone.
 
     Both among draws in which any candidate passes the threshold. A score counts where its size is credible; one of an
-    effect that holds this one as a limit must be better by the answer set's Δχ².
+    effect that holds another as a limit, this one or its rival, must be better by the answer set's Δχ².
     """
     if not math.isfinite(size):
         return {}, math.nan
@@ -366,6 +367,8 @@ def _taken_for(
     if np.count_nonzero(heard) < DRAWS / 100:
         return {}, math.nan
     holding = {effect.name for effect in questions.effects if response.effect.name in effect.replaces}
+    if any(name in response.effect.replaces for name in names):
+        holding.add(response.effect.name)
     squares[:, [k for k, name in enumerate(names) if name in holding]] -= ANSWER_SET
     squares = squares[heard]
     first = np.argmax(squares, axis=1)

@@ -38,7 +38,8 @@ class EffectPower:
     is. `largest` is the end of its plausible range that lies farthest from absence, `least` the other where absence is
     not plausible, else `zero`, the value at which the effect vanishes. `taken_for` maps other candidates to the
     probability that theirs is the highest score, `named_alone` is the probability that no other candidate comes within
-    the answer set, both among campaigns that sound an alarm at the size found with 90 %.
+    the answer set, both among campaigns that sound an alarm at the size found with 90 %. `other_values` are those of
+    the parameters behind the first at which it is followed, SI.
     """
 
     effect: str
@@ -52,6 +53,7 @@ class EffectPower:
     sizes: tuple[float, ...]
     taken_for: Mapping[str, float] = field(default_factory=dict)
     named_alone: float = math.nan
+    other_values: tuple[float, ...] = ()
 
     def size_at(self, probability: float) -> float:
         """The value of the parameter at which the effect is found with this probability.
@@ -111,6 +113,7 @@ class EffectPower:
             "sizes": list(self.sizes),
             "taken_for": dict(self.taken_for),
             "named_alone": self.named_alone,
+            "other_values": list(self.other_values),
         }
 
     @classmethod
@@ -133,6 +136,7 @@ class EffectPower:
             sizes=tuple(math.inf if size is None else float(size) for size in entry.get("sizes") or ()),
             taken_for={str(name): or_nan(value) for name, value in (entry.get("taken_for") or {}).items()},
             named_alone=or_nan(entry.get("named_alone")),
+            other_values=tuple(float(value) for value in entry.get("other_values") or ()),
         )
 
 

@@ -362,7 +362,10 @@ def _simulated(asked: PowerAsked, campaign: _Campaign) -> Iterator[SimulatedRate
     """Rates of complete diagnoses; those kept by an earlier run are not made again."""
     wanted = _sizes_of(asked, campaign)
     how = Simulation(asked.simulate, asked.first_seed, asked.jobs, asked.answers or _answers_file(asked.target))
-    answers = simulated(campaign.design, [(effect, value) for effect, value, _ in wanted], how)
+    design = replace(
+        campaign.design, other_values={entry.effect: entry.other_values for entry in campaign.power.effects}
+    )
+    answers = simulated(design, [(effect, value) for effect, value, _ in wanted], how)
     for effect, value, promised in wanted:
         yield rates_of([answers[effect, key_of(value), seed] for seed in how.seeds], promised)
 

@@ -138,7 +138,13 @@ def fingerprint(design: CampaignDesign) -> str:
     str
     """
     parts = (design.model.names, sorted(design.model.values.items(), key=str), design.trials, design.cameras)
-    around = (design.spreads, design.tracker_sigma_m, design.has_trace, design.candidates)
+    around = (
+        design.spreads,
+        design.tracker_sigma_m,
+        design.has_trace,
+        design.candidates,
+        sorted(design.other_values.items()),
+    )
     return hashlib.sha256(repr((parts, around)).encode()).hexdigest()[:12]
 
 
