@@ -111,12 +111,12 @@ def score_ratio(questions: MisfitTests, place: int, size: float) -> float:
     try:
         after = fitted_without(fit, shape, size)
         answers = effect_sensitivities(after, [shape])
+        if shape.effect.name in answers.silent or not answers.shapes:
+            return 1.0
         systematics = systematics_of(after.predictor, after.solution, after.trials)
+        scores = scores_of(after, products_of(after, fit_columns(after), answers, systematics))
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
-    if shape.effect.name in answers.silent or not answers.shapes:
-        return 1.0
-    scores = scores_of(after, products_of(after, fit_columns(after), answers, systematics))
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
 
 
