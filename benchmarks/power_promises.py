@@ -166,13 +166,13 @@ def diagnosed(folder: Path, effect: str, line: Line) -> Line:
         warnings.simplefilter("ignore")
         said = vt.diagnose(folder, ladder=False, advice=False)
     alarm = said.verdict != "adequate"
-    # A simpler law that it holds as a limit, and that fits as well, is named in its place.
-    named = {effect, *find_effect(effect).replaces} if effect else set()
     held = next((candidate for candidate in said.ranking if candidate.effect == effect), None)
+    # A simpler law that it holds as a limit, and that fits as well, is named in its place.
+    simpler = held is not None and any(f"it holds {name} as a limit" in held.reason for name in said.answer_set)
     return line | {
         "verdict": said.verdict,
         "answer": "|".join(said.answer_set),
-        "found": alarm and not named.isdisjoint((*said.answer_set, *said.effects)),
+        "found": alarm and (simpler or effect in (*said.answer_set, *said.effects)),
         "alarm": alarm,
         "status": f"{held.status} {held.sigma:.1f} sigma {held.reason}" if held else "",
         "seconds": round(time.perf_counter() - begun, 1),
