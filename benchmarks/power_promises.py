@@ -39,7 +39,6 @@ from scipy.stats import binomtest
 
 import vinetrack as vt
 from vinetrack.diagnosis.power import EffectPower
-from vinetrack.effects import find_effect
 
 FIRST_TUNING_SEED, FIRST_SCORING_SEED = 21_000, 31_500
 DESIGNS = {"six": (1, (6, 6)), "twenty_four": (1, (18, 26)), "two_vines": (2, (40, 48))}
