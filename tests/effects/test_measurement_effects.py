@@ -96,18 +96,28 @@ def test_a_lens_bends_about_the_middle_of_the_picture() -> None:
     np.testing.assert_allclose(got, plain - 0.7 * ((plain - 0.1) ** 3 + 0.1**3), rtol=1e-12)
 
 
-@pytest.mark.parametrize("delay", [1.5e-3, -1.5e-3])
+@pytest.mark.parametrize("phase_s", [0.0, 2.1e-4, 4.9e-4])
+@pytest.mark.parametrize("delay", [1.5e-3, -1.5e-3, 1e-6])
 @pytest.mark.parametrize("vine", [LOADED, FAST], ids=["2 m/s", "60 m/s"])
-def test_a_rolling_shutter_sees_the_edge_where_it_is_when_its_row_is_read(vine: Vine, delay: float) -> None:
+def test_a_rolling_shutter_sees_the_edge_where_it_is_when_its_row_is_read(
+    vine: Vine, delay: float, phase_s: float
+) -> None:
     fine = np.linspace(-0.01, 0.3, 400_001)
     y = simulated(vine, {}, fine).lead_position_m
     stamped = fine - delay * y  # the row at y is read delay · y after the stamp of its picture
     ended = simulated(vine, {}, fine)
     assert ended.status == "ended"
-    times = np.arange(-0.005, ended.end_time_s + 0.003, 5e-4)
+    times = np.arange(-0.005, ended.end_time_s + 0.003, 5e-4) + phase_s  # release lies on a frame or between two
     got = simulated(vine, {"rolling_shutter.delay": delay}, times).observed_position_m
     np.testing.assert_allclose(got, np.interp(times, stamped, y), rtol=0, atol=5e-6)
-    assert np.max(np.abs(got - np.interp(times, fine, y))) > 9e-4
+    assert np.max(np.abs(got - np.interp(times, fine, y))) > 0.6 * abs(delay)
+
+
+def test_a_rolling_shutter_of_no_size_does_nothing_where_the_vine_sets_off() -> None:
+    times = np.arange(-0.005, 0.02, 5e-4) + 2.1e-4
+    at_rest = times < 0
+    got = simulated(FAST, {"rolling_shutter.delay": 1e-6}, times).observed_position_m
+    np.testing.assert_array_equal(got[at_rest], simulated(FAST, {}, times).observed_position_m[at_rest])
 
 
 def test_a_supply_that_rises_starts_the_vine_once_it_overcomes_the_yield_pressure() -> None:

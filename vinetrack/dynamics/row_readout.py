@@ -2,7 +2,8 @@
 
 What is stamped t shows the edge at t + s·y, with y the position at which it is seen then and s the delay by the metre.
 Between the times asked for the motion is the Hermite polynomial of degree 5 through position, speed and acceleration at
-either side; up to the end of growth, where the acceleration jumps, that of degree 4 without the one at the end.
+either side; from where the vine sets off and up to the end of growth, where the acceleration jumps, that of degree 4
+without the one at the jump.
 """
 
 from vinetrack.dynamics.equations import Point, compiled, inlined
@@ -74,25 +75,38 @@ def _motion_at(times, out, ratio, end, i, read):
         return max(x, 0.0), before.v + since * before.acceleration, offset
     after = _point(times, out, k + 1)
     if before.v == 0 and after.v > 0:
-        # Somewhere between the two the vine set off.
-        since = read - after.time
-        x = after.x + since * (after.v + 0.5 * since * after.acceleration)
-        return max(x, before.x), max(after.v + since * after.acceleration, 0.0), offset
-    if after.time >= end.time:
-        x, v = _up_to_the_end(before, end, read)
+        x, v = _from_rest(before, after, read)
         return x, v, offset
+    if after.time >= end.time:
+        x, v = _without_far_acceleration(before, end, read)
+        return min(x, end.x), v, offset
     x, v, _a = quintic((read - before.time) / (after.time - before.time), after.time - before.time, before, after)
     return x, v, offset
 
 
 @inlined
-def _up_to_the_end(before, end, read):
-    """Position, m, and speed, m/s, of the tail shortly before the end of growth."""
-    h = end.time - before.time
-    part = (read - before.time) / h
-    d = end.x - before.x - h * before.v - 0.5 * h * h * before.acceleration
-    e = h * (end.v - before.v - h * before.acceleration)
+def _from_rest(before, after, read):
+    """Position, m, and speed, m/s, of a tail that sets off between two instants, not before its release.
+
+    A motion from rest takes at most three times its way over its speed, unless its drive rises faster than in
+    proportion to the time; before that the tail lies where it lay.
+    """
+    set_off = max(before.time, 0.0, after.time - 3.0 * (after.x - before.x) / after.v)
+    if read <= set_off:
+        return before.x, 0.0
+    rest = Point(set_off, before.x, 0.0, 0.0, 0.0)
+    x, v = _without_far_acceleration(after, rest, read)
+    return max(x, before.x), max(v, 0.0)
+
+
+@inlined
+def _without_far_acceleration(near, far, read):
+    """Position, m, and speed, m/s, of the tail between an instant and another, later or earlier, at which it jerks."""
+    h = far.time - near.time
+    part = (read - near.time) / h
+    d = far.x - near.x - h * near.v - 0.5 * h * h * near.acceleration
+    e = h * (far.v - near.v - h * near.acceleration)
     c3, c4 = 4 * d - e, e - 3 * d
-    moved = h * before.v + part * (h * h * before.acceleration + part * (3 * c3 + part * 4 * c4))
-    x = before.x + part * h * (before.v + 0.5 * part * h * before.acceleration) + part**3 * (c3 + part * c4)
-    return min(x, end.x), moved / h
+    moved = h * near.v + part * (h * h * near.acceleration + part * (3 * c3 + part * 4 * c4))
+    x = near.x + part * h * (near.v + 0.5 * part * h * near.acceleration) + part**3 * (c3 + part * c4)
+    return x, moved / h
