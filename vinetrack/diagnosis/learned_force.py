@@ -16,7 +16,9 @@ ch. 5).
 What no force explains is no noise, but is weighed as if it were: χ² is divided by what the best leaves per point. Steps
 end once χ² falls by less than a part of itself (`SETTLED`); differences of ln Z are counted in units of that.
 A force that B, n and P_y could take over as well is not decided by these data. It is drawn as small as it may be, and
-the band holds what they could shift.
+the band holds what they could shift. Growth, speed and time are hardly three variables where speeds are steady: weights
+then spread over several choices, and may lean to a wrong one whose surface is smoother. A learned force is drawn and
+described; `vinetrack.diagnosis.propose` writes laws of its own list only.
 """
 
 from __future__ import annotations
