@@ -252,6 +252,17 @@ def test_a_missing_force_is_drawn_with_what_it_looks_like() -> None:
         assert words in html
 
 
+def test_a_learned_force_is_drawn_with_what_it_depends_on_and_how_sure_that_is() -> None:
+    content = diagnosis("unexplained")
+    weights = {"growth+time": 0.74, "growth+speed": 0.26}
+    content["missing_force"]["learned"] = {"sentence": "It depends on two of them.", "weights": weights}
+    figures = [ReportFigure("learned_force", "The learned force", "c", SVG)]
+    html = page(diagnosis=DiagnosisResult(read(content)), figures=figures)
+    assert html.index("It depends on two of them.") < html.index('id="figure-learned_force"')
+    for words in ("growth and time", "74.0 %", "growth and speed", "26.0 %"):
+        assert words in html
+
+
 def test_a_refusal_is_said_with_its_reason_and_the_law_still_stands() -> None:
     html = shown(refused())
     assert heading(html) == "not diagnosed No diagnosis could be made."
