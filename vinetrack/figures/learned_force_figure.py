@@ -93,7 +93,7 @@ def _draw_map(ax: Axes, grid: pd.DataFrame, along: pd.DataFrame, variables: list
     if high > low:
         steps = np.linspace(low, high, _LABELLED + 2)[1:-1]
         lines = ax.contour(x, y, values, levels=steps, colors=INK, linewidths=0.7)
-        ax.clabel(lines, fmt="%.2g", fontsize=8)
+        ax.clabel(lines, fmt=lambda force: f"{force:.2g}".replace("-", "−"), fontsize=8)
     for _, course in along.groupby("condition", sort=False):
         ax.plot(x_factor * course[variables[0]], y_factor * course[variables[1]], color=MUTED, lw=0.5, alpha=0.7)
     bar = ax.figure.colorbar(filled, ax=ax)
