@@ -27,8 +27,7 @@ class Truth:
     """What is hidden in a campaign.
 
     `effects` are names of the catalogue, `outsider` something that no catalogue has, `values` the true parameters as
-    `effect.parameter`, SI; `B` and `yield_Pa` by vine, `physics` everything that acted, `change` what was wrong with
-    the measurement.
+    `effect.parameter`, SI; `B` by vine, `physics` everything that acted, `change` what was wrong with the measurement.
     """
 
     kind: str
@@ -43,7 +42,6 @@ class Truth:
     nuisances: Nuisances
     dropped_frames: Mapping[str, int]
     release_s: Mapping[str, float]
-    yield_Pa: Mapping[str, float]
 
     @property
     def in_trace(self) -> bool:
@@ -163,7 +161,6 @@ def _attempt(kind: str, seed: int, draw: np.random.Generator, *, filmed: bool, t
         nuisances=how,
         dropped_frames={name: count for name, count in dropped.items() if count},
         release_s=release,
-        yield_Pa={trial.vine: tube.yield_pressure for trial, tube in stated},
     )
     return Hidden(kind, seed, tuple(pairs), truth)
 
