@@ -94,8 +94,8 @@ def _from_rest(before, after, read):
     set_off = max(before.time, 0.0, after.time - 3.0 * (after.x - before.x) / after.v)
     if read <= set_off:
         return before.x, 0.0
-    rest = Point(set_off, before.x, 0.0, 0.0, 0.0)
-    x, v = _without_far_acceleration(after, rest, read)
+    resting = Point(set_off, before.x, 0.0, 0.0, 0.0)
+    x, v = _without_far_acceleration(after, resting, read)
     return max(x, before.x), max(v, 0.0)
 
 

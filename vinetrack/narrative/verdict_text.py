@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.misfit_tests import MisfitTests
     from vinetrack.diagnosis.selection import SelectionStep
 
+MEASUREMENT = "measurement"
+WORTH_A_CHECK_SIGMA = 3.0
+"""From which an error of measurement that falls short of its threshold is named as worth a check. Chosen: about one
+campaign in fifty has one by chance among its ten; at 2.5 one in ten, at 3.5 one in 200. It changes no verdict."""
+
 
 def sizes_in_words(numbers: Sequence[Number]) -> str:
     """Return all sizes of a hypothesis; blank where it has none.
@@ -204,6 +209,9 @@ def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
             f"{names[place]}, has {questions.possible[place]:.1f} σ, and {limits[place]:.1f} σ are asked of it; by "
             f"chance any of them has what is asked of it once in {1 / questions.level:.0f} campaigns."
         )
+        kind = next(effect.kind for effect in questions.effects if effect.name == names[place])
+        if kind == MEASUREMENT and questions.possible[place] >= WORTH_A_CHECK_SIGMA:
+            text += f" It is an error of measurement, and soon checked: see `vinetrack effects {names[place]}`."
     return text
 
 

@@ -201,9 +201,12 @@ def hidden_table(
             rows.append((plain(row.effect), symbol, f"{number(factor * largest)} {shown}".strip()))
     if not rows:
         return None
-    note = "A larger effect would have been detected (one-sided 95 %)."
+    note = (
+        "A larger size contradicts these trials (95 %, one-sided; of either sign where that leaves more room). "
+        "Which sizes would have been noticed is said with the verdict: that takes more."
+    )
     return ReportTable(
-        "Upper limits on undetected effects", ("Candidate", "number", "upper limit"), rows, frozenset({2}), note
+        "Upper limits on undetected effects", ("Candidate", "number", "limit"), rows, frozenset({2}), note
     )
 
 

@@ -1,0 +1,38 @@
+"""An error of measurement that falls short of its threshold is named as worth a check; an effect is not."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vinetrack.diagnosis.result import ADEQUATE
+from vinetrack.narrative.verdict_text import explain
+
+
+def round_of(effect: str, kind: str, sigma: float) -> SimpleNamespace:
+    """A round that finds nothing, in which one candidate comes nearest."""
+    effects = [SimpleNamespace(name=effect, kind=kind), SimpleNamespace(name="leak", kind="physical")]
+    questions = SimpleNamespace(
+        fit=SimpleNamespace(model=SimpleNamespace(names=("gravity",)), trials=[None] * 6),
+        effects=effects,
+        possible=np.array([sigma, 0.5]),
+        answers=SimpleNamespace(effects=(effect, "leak"), silent=()),
+        family=SimpleNamespace(of=lambda _name: 4.5),
+        level=1e-4,
+        largest=lambda _effect: ({}, True),
+        best_z=lambda _name: (0.0, 0),
+    )
+    return SimpleNamespace(questions=questions, verdict=ADEQUATE, note="")
+
+
+@pytest.mark.parametrize(
+    ("effect", "kind", "sigma", "worth"),
+    [("growth_angle", "measurement", 3.3, True), ("growth_angle", "measurement", 2.9, False),
+     ("tail_friction", "physical", 4.2, False)],
+)  # fmt: skip
+def test_only_a_likely_slip_is_named(effect: str, kind: str, sigma: float, worth: bool) -> None:
+    words = explain(round_of(effect, kind, sigma))  # type: ignore[arg-type]
+    assert f"{effect}, has {sigma:.1f} σ" in words
+    assert (f"soon checked: see `vinetrack effects {effect}`" in words) is worth
