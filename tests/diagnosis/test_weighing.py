@@ -11,8 +11,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from vinetrack.diagnosis.candidates import is_plausible
 from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_surprise
-from vinetrack.effects import Parameter
+from vinetrack.effects import Parameter, catalogue
 from vinetrack.inference.fit_result import Number
 
 GAUGE = Parameter("delta", "δ", "Pa", 500.0, plausible=(-2e3, 2e3))
@@ -56,3 +57,12 @@ def test_weights_add_up_and_follow_the_evidence() -> None:
     weights = posterior_weights([-10.0, -10.0 - math.log(3), -800.0])
     assert weights == pytest.approx([0.75, 0.25, 0.0])
     assert posterior_weights([]) == []
+
+
+@pytest.mark.parametrize("phase_rad", [-3.67, 6.9, 3.0])
+def test_any_phase_of_a_swing_is_plausible(phase_rad: float) -> None:
+    """A phase of −3.67 rad is one of 2.61."""
+    phase = next(parameter for parameter in catalogue()["supply_pulsation"].parameters if parameter.name == "phi")
+    assert is_plausible(phase, phase_rad, 0.0)
+    frequency = next(parameter for parameter in catalogue()["supply_pulsation"].parameters if parameter.name == "f")
+    assert not is_plausible(frequency, 480.0, 0.0)

@@ -95,6 +95,21 @@ def test_what_is_missing_comes_with_how_sure_how_large_and_what_it_did() -> None
     assert found["Damping exponent"].answer == "n = 0.3700 ± 0.0040"
 
 
+def test_the_size_on_the_first_screen_has_the_interval_with_others_left_open() -> None:
+    content = diagnosis()
+    (row,) = [row for row in content["rounds"][0]["ranking"] if row["effect"] == "reservoir_depletion"]
+    row["numbers"] = [number("reservoir_depletion.gamma", "γ", 1.17, 0.004)]
+    row["confounded_by"] = [
+        {"parameter": "reservoir_depletion.gamma", "vine": "", "effect": name, "symbol": "k", "unit": "N/m",
+         "limit_95": 1.0, "value_at_limit": 1.1, "low_95": low, "high_95": 1.19}
+        for name, low in (("end_stop", 1.02), ("leak", 1.08))
+    ]  # fmt: skip
+    found = {fact.question: fact for fact in facts(content, None)}
+    assert found["Size of reservoir depletion"].note == (
+        "95 %: 1.162 to 1.178; with end stop and leak left open: 1.020 to 1.190"
+    )
+
+
 @pytest.mark.parametrize(
     ("answers", "words"),
     [

@@ -211,6 +211,8 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
     if parameter.plausible is None or value == parameter.zero:
         return True
     low, high = parameter.plausible
+    if math.isfinite(parameter.period):
+        value = low + (value - low) % parameter.period
     if low > 0 and high / low > NARROW:
         low /= ROOM_BELOW
     low, high = min(low / widened, low * widened), max(high * widened, high / widened)

@@ -7,7 +7,7 @@ five verdicts; while the verdict is `missing` the effect is added and the next r
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -111,21 +111,44 @@ class Candidate:
         -------
         Candidate
         """
+        numbers = tuple(Number.from_json(number) for number in entry.get("numbers") or ())
         return cls(
             effect=str(entry["effect"]),
             kind=str(entry.get("kind") or ""),
             status=str(entry.get("status") or ""),
             delta_chi2=or_nan(entry.get("delta_chi2")),
             sigma=or_nan(entry.get("sigma")),
-            numbers=tuple(Number.from_json(number) for number in entry.get("numbers") or ()),
+            numbers=numbers,
             plausible=bool(entry.get("plausible", True)),
             in_answer_set=bool(entry.get("in_answer_set")),
             reason=str(entry.get("reason") or ""),
             largest={str(name): or_nan(value) for name, value in (entry.get("largest") or {}).items()},
             along=tuple(Number.from_json(number) for number in entry.get("along") or ()),
             posterior_weight=or_nan(entry.get("posterior_weight")),
+            confounded_by=_confounders(entry.get("confounded_by") or (), numbers),
             log_bayes=or_nan(entry.get("log_bayes")),
         )
+
+
+def _confounders(entries: Iterable[Mapping[str, Any]], numbers: Sequence[Number]) -> tuple[Confounder, ...]:
+    """What is written of confounders, each with the size that it is about."""
+    from vinetrack.diagnosis.confounded_sizes import Confounder
+
+    of = {(number.key, number.vine): number for number in numbers}
+    return tuple(
+        Confounder(
+            number=of[entry["parameter"], entry["vine"]],
+            effect=str(entry["effect"]),
+            symbol=str(entry["symbol"]),
+            unit=str(entry["unit"]),
+            limit=or_nan(entry.get("limit_95")),
+            value=or_nan(entry.get("value_at_limit")),
+            low_95=or_nan(entry.get("low_95")),
+            high_95=or_nan(entry.get("high_95")),
+        )
+        for entry in entries
+        if (entry["parameter"], entry["vine"]) in of
+    )
 
 
 @dataclass(frozen=True)

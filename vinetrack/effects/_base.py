@@ -91,7 +91,8 @@ class Parameter:
     `zero` is the value at which the effect vanishes; `shared` says over what one value holds: `all` trials or one
     `vine`. `bounds` are what physics allows, `plausible` what an experimenter would believe. One that is `held` is
     known beforehand: a fit leaves it at its value unless told to find it. `tried` are values at which a diagnosis tries
-    the effect where it is no size but a shape; without them two or three of the plausible range.
+    the effect where it is no size but a shape; without them two or three of the plausible range. Values a
+    `period` apart are the same.
     """
 
     name: str
@@ -105,6 +106,7 @@ class Parameter:
     meaning: str = ""
     held: bool = False
     tried: tuple[float, ...] = ()
+    period: float = math.inf
 
     @property
     def sign(self) -> int:

@@ -31,8 +31,7 @@ PARAMETERS = (
         tried=tuple(float(f) for f in np.geomspace(5.5, 90.0, 13)), meaning="frequency",
     ),
     Parameter(
-        # A swing has no beginning: every phase is plausible, and a fit may pass ±π.
-        "phi", "φ", "rad", 0.0, bounds=(-7.0, 7.0), plausible=(-7.0, 7.0),
+        "phi", "φ", "rad", 0.0, bounds=(-7.0, 7.0), plausible=(-np.pi, np.pi), period=2 * np.pi,
         tried=(-np.pi / 2, 0.0, np.pi / 2, np.pi), meaning="phase at release",
     ),
 )  # fmt: skip

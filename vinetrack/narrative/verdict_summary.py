@@ -17,6 +17,7 @@ from vinetrack.narrative.between_text import difference_headline, trials_differ
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.diagnosis.confounded_sizes import Confounder
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.inference.fit_result import Number
 
@@ -286,9 +287,27 @@ def _sizes(diagnosis: Diagnosis) -> list[Fact]:
     """The size of every effect that was added, at the end; of those in the answer set where none was."""
     if diagnosis.effects:
         of = {name: [n for n in diagnosis.parameters if n.key.split(".")[0] == name] for name in diagnosis.effects}
-        return [Fact(f"Size of {plain(name)}", size(n[0]), size_interval(n[0])) for name, n in of.items() if n]
+        return [
+            Fact(f"Size of {plain(name)}", size(n[0]), size_interval(n[0]) + _beside_others(diagnosis, n[0].key))
+            for name, n in of.items()
+            if n
+        ]
     members = [row for row in diagnosis.ranking if row.in_answer_set and row.numbers]
     return [Fact(f"If {plain(row.effect)}", sizes(row)) for row in members[:3]]
+
+
+def _beside_others(diagnosis: Diagnosis, key: str) -> str:
+    """The wider interval of a size where effects that the data do not exclude are left open; blank without any."""
+    alike: list[Confounder] = []
+    for entry in diagnosis.rounds:
+        rivals = [rival for row in entry.ranking if row.in_answer_set for rival in row.confounded_by]
+        alike = [rival for rival in rivals if rival.number.key == key] or alike
+    if not alike:
+        return ""
+    factor = display_unit(alike[0].number.unit)[1]
+    low, high = min(rival.low_95 for rival in alike) * factor, max(rival.high_95 for rival in alike) * factor
+    names = joined([plain(rival.effect) for rival in alike])
+    return f"; with {names} left open: {number(low, 4)} to {number(high, 4)}"
 
 
 def size_interval(entry: Number) -> str:
