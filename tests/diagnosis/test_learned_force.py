@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 
 import vinetrack as vt
 from vinetrack.diagnosis.force_surface import AMPLITUDES, KEPT, LENGTHS, Domain, Surface, covariance_root, curves
-from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS, _Posterior, _weighed
+from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS, _Posterior, _stand_ins, _weighed
 from vinetrack.diagnosis.missing_force import MissingForce, missing_force
 
 GROWTH = Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
@@ -51,6 +51,23 @@ def test_a_surface_follows_the_function_whose_values_its_coefficients_are() -> N
     motion = SimpleNamespace(lead_position_m=0.25 * u, tail_velocity_m_s=8.0 * v[::-1])
     force = Surface(BOTH, coefficients[:, None]).along(motion)[:, 0]  # type: ignore[arg-type]
     assert force == pytest.approx(2 * u - 3 * v[::-1])
+
+
+def test_a_variable_that_follows_from_those_named_is_told_and_one_that_varies_freely_is_not() -> None:
+    """Trials that grow evenly, each at its own speed: time is growth over speed; speed is no function of growth."""
+    duration_s = np.linspace(0, 1, 80)
+    motions = [
+        SimpleNamespace(
+            time_s=(0.25 / speed) * duration_s,
+            counts_until_s=math.inf,
+            lead_position_m=0.25 * duration_s,
+            tail_velocity_m_s=np.full(80, speed),
+        )
+        for speed in (2.0, 3.0, 4.5, 6.0, 7.5)
+    ]
+    time, speed = (replace(GROWTH, variables=(name,), high=(high,)) for name, high in (("time", 0.125), ("speed", 8.0)))
+    assert _stand_ins(BOTH, [GROWTH, time, speed], motions) == ["time"]  # type: ignore[arg-type]
+    assert _stand_ins(GROWTH, [GROWTH, speed], motions) == []  # type: ignore[arg-type]
 
 
 def test_the_marginal_likelihood_is_that_of_the_normal_distribution() -> None:

@@ -45,11 +45,13 @@ LOUD = 1.0
 
 LEFT = 0.7
 """Part of χ² that a third or further effect may leave of a fit that stays far off, or no more are added. Chosen for
-time: on what no catalogue holds steps go on for ever; at half four equal effects would not be found."""
+time: on what no catalogue holds steps go on for ever; at half of it four equal effects would not be found, at twice no
+step is refused."""
 
 MOSTLY = 0.5
 """Part of the excess of χ² per degree of freedom over 1 that steps must take away for `unexplained` to show them as
-partial. Chosen: what explains less than half says little of where to look."""
+partial. Chosen: what explains less than half says little of where to look; at half of it a quarter is enough,
+at twice nothing is."""
 
 NOT_PHYSICAL = ("measurement", BETWEEN_TRIALS)
 """Kinds of hypotheses that are no physics."""
