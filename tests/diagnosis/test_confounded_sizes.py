@@ -14,7 +14,8 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.diagnosis import candidates as hypotheses
-from vinetrack.diagnosis.confounded_sizes import Confounder, confounders_of, size_not_excluded
+from vinetrack.diagnosis.confounded_sizes import confounders_of, size_not_excluded
+from vinetrack.diagnosis.confounder import Confounder
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for
 from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, MisfitTests, misfit_tests
 from vinetrack.diagnosis.score_test import levers_of

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import plausible_range
+from vinetrack.diagnosis.confounder import Confounder
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.score_test import levers_of
 from vinetrack.effects import Parameter
@@ -32,48 +32,6 @@ MOST_LISTED = 3
 
 TWO_SIDED_95 = 1.959964
 """Derived: quantile of the normal distribution."""
-
-
-@dataclass(frozen=True)
-class Confounder:
-    """Another effect that a fitted size may include.
-
-    Parameters
-    ----------
-    number
-        The fitted size, as the model without the other effect gives it, SI.
-    effect, symbol, unit
-        The other effect and its size.
-    limit
-        Its largest size that neither data nor plausibility exclude, one-sided 95 %, SI.
-    value
-        What the fitted size would be with the other effect at its limit, SI.
-    low_95, high_95
-        Interval of the fitted size with the other effect's size left open, SI; never narrower than `number`'s.
-    """
-
-    number: Number
-    effect: str
-    symbol: str
-    unit: str
-    limit: float
-    value: float
-    low_95: float
-    high_95: float
-
-    def to_json(self) -> dict[str, object]:
-        """Return it as an entry of `confounded_by`."""
-        return {
-            "parameter": self.number.key,
-            "vine": self.number.vine,
-            "effect": self.effect,
-            "symbol": self.symbol,
-            "unit": self.unit,
-            "limit_95": self.limit,
-            "value_at_limit": self.value,
-            "low_95": self.low_95,
-            "high_95": self.high_95,
-        }
 
 
 def confounders_of(after: MisfitTests, added: Sequence[str]) -> tuple[Confounder, ...]:

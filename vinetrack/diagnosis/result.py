@@ -7,12 +7,13 @@ five verdicts; while the verdict is `missing` the effect is added and the next r
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.notebook import html_table, plot
 from vinetrack.core.numbers import or_nan
+from vinetrack.diagnosis.confounder import Confounder, read_confounders
 from vinetrack.diagnosis.power import Power
 from vinetrack.inference.fit_result import Fit, Number
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from vinetrack.diagnosis.confounded_sizes import Confounder
     from vinetrack.diagnosis.locate import Failure
 
 ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
@@ -125,30 +125,9 @@ class Candidate:
             largest={str(name): or_nan(value) for name, value in (entry.get("largest") or {}).items()},
             along=tuple(Number.from_json(number) for number in entry.get("along") or ()),
             posterior_weight=or_nan(entry.get("posterior_weight")),
-            confounded_by=_confounders(entry.get("confounded_by") or (), numbers),
+            confounded_by=read_confounders(entry.get("confounded_by") or (), numbers),
             log_bayes=or_nan(entry.get("log_bayes")),
         )
-
-
-def _confounders(entries: Iterable[Mapping[str, Any]], numbers: Sequence[Number]) -> tuple[Confounder, ...]:
-    """What is written of confounders, each with the size that it is about."""
-    from vinetrack.diagnosis.confounded_sizes import Confounder
-
-    of = {(number.key, number.vine): number for number in numbers}
-    return tuple(
-        Confounder(
-            number=of[entry["parameter"], entry["vine"]],
-            effect=str(entry["effect"]),
-            symbol=str(entry["symbol"]),
-            unit=str(entry["unit"]),
-            limit=or_nan(entry.get("limit_95")),
-            value=or_nan(entry.get("value_at_limit")),
-            low_95=or_nan(entry.get("low_95")),
-            high_95=or_nan(entry.get("high_95")),
-        )
-        for entry in entries
-        if (entry["parameter"], entry["vine"]) in of
-    )
 
 
 @dataclass(frozen=True)

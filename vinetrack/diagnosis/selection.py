@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 from vinetrack.diagnosis.between_trials import between_fits, called, differences
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
-from vinetrack.diagnosis.confounded_sizes import Confounder, confounders_of
+from vinetrack.diagnosis.confounded_sizes import confounders_of
+from vinetrack.diagnosis.confounder import Confounder
 from vinetrack.diagnosis.contradictions import displacement_m, is_within_position_errors
 from vinetrack.diagnosis.effect_sets import MOST_EFFECTS, NO_BETTER, EffectSets
 from vinetrack.diagnosis.initial_fit import with_host

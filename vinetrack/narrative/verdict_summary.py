@@ -17,7 +17,7 @@ from vinetrack.narrative.between_text import difference_headline, trials_differ
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.diagnosis.confounded_sizes import Confounder
+    from vinetrack.diagnosis.confounder import Confounder
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.inference.fit_result import Number
 

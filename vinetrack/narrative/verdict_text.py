@@ -21,7 +21,7 @@ from vinetrack.narrative.between_text import difference_in_words, remedies_in_wo
 from vinetrack.narrative.verdict_summary import joined, size
 
 if TYPE_CHECKING:
-    from vinetrack.diagnosis.confounded_sizes import Confounder
+    from vinetrack.diagnosis.confounder import Confounder
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.misfit_tests import MisfitTests
     from vinetrack.diagnosis.selection import SelectionStep

@@ -1,0 +1,82 @@
+"""What else a fitted size may be: an effect that does nearly the same, as a diagnosis and its file hold it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vinetrack.core.numbers import or_nan
+from vinetrack.inference.fit_result import Number
+
+
+@dataclass(frozen=True)
+class Confounder:
+    """Another effect that a fitted size may include.
+
+    Parameters
+    ----------
+    number
+        The fitted size, as the model without the other effect gives it, SI.
+    effect, symbol, unit
+        The other effect and its size.
+    limit
+        Its largest size that neither data nor plausibility exclude, one-sided 95 %, SI.
+    value
+        What the fitted size would be with the other effect at its limit, SI.
+    low_95, high_95
+        Interval of the fitted size with the other effect's size left open, SI; never narrower than `number`'s.
+    """
+
+    number: Number
+    effect: str
+    symbol: str
+    unit: str
+    limit: float
+    value: float
+    low_95: float
+    high_95: float
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as an entry of `confounded_by`."""
+        return {
+            "parameter": self.number.key,
+            "vine": self.number.vine,
+            "effect": self.effect,
+            "symbol": self.symbol,
+            "unit": self.unit,
+            "limit_95": self.limit,
+            "value_at_limit": self.value,
+            "low_95": self.low_95,
+            "high_95": self.high_95,
+        }
+
+
+def read_confounders(entries: Iterable[Mapping[str, Any]], numbers: Sequence[Number]) -> tuple[Confounder, ...]:
+    """What a file says of confounders, each with the size that it is about.
+
+    Parameters
+    ----------
+    entries : of `confounded_by`.
+    numbers : sizes of the candidate that the entries belong to.
+
+    Returns
+    -------
+    tuple of Confounder
+        Without those whose size is not there.
+    """
+    of = {(number.key, number.vine): number for number in numbers}
+    return tuple(
+        Confounder(
+            number=of[entry["parameter"], entry["vine"]],
+            effect=str(entry["effect"]),
+            symbol=str(entry["symbol"]),
+            unit=str(entry["unit"]),
+            limit=or_nan(entry.get("limit_95")),
+            value=or_nan(entry.get("value_at_limit")),
+            low_95=or_nan(entry.get("low_95")),
+            high_95=or_nan(entry.get("high_95")),
+        )
+        for entry in entries
+        if (entry["parameter"], entry["vine"]) in of
+    )
