@@ -24,8 +24,6 @@ FILMED = "d24_24kPa_1"
 ROW = "48 * 960, 49 * 960"
 """The middle of the bar in the picture."""
 
-REDRAW_MS = 150.0
-
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
@@ -65,14 +63,12 @@ def test_a_condition_is_chosen_by_its_button(visitor: Visitor) -> None:
 
 
 def test_a_drag_moves_the_curves_while_the_hand_moves(visitor: Visitor) -> None:
-    """Of thirty moves, each waited for, the quarter that the rest of the machine disturbs least shows within 150 ms."""
+    """Each of thirty moves shows before the hand lets go; how soon is measured by `benchmarks/explorer_speed.py`."""
     visitor.until("$numbers.text.includes('<table>')", "the fit of the model in use", 300)
     before = errors(visitor)
     visitor.time_redraws(SIZE)
     visitor.drag(SIZE, [*np.linspace(-0.03, -0.6, 20), *np.linspace(-0.57, -0.3, 10)], visitor.one_redraw)
-    redraws = visitor.redraws_ms()
-    assert len(redraws) > 20
-    assert np.quantile(redraws, 0.25) < REDRAW_MS
+    assert len(visitor.redraws_ms()) > 20
     assert visitor.value("tick_reservoir_depletion", "active")
     assert np.abs(errors(visitor) - before).max() > 0.1
     assert "reservoir depletion" in visitor.text("headline")
