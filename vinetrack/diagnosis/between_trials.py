@@ -77,7 +77,8 @@ LEAST_GAIN = 2.0
 
 ASKED_AGAIN = 0.01
 """Chance below which a difference is also asked beside the errors that all replicates of a condition share. Chosen for
-time: three times the level of all tests of a first model; beside more errors no difference gains chance."""
+time: three times the level of all tests of a first model, so that at half of it as at twice nothing that would be
+called goes unasked; beside more errors no difference gains chance."""
 
 SPREAD_OVER_CONDITIONS = 0.5
 """A difference counts as confounded with the conditions where it varies within them by less than this part of what

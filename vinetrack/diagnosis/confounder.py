@@ -52,6 +52,20 @@ class Confounder:
         }
 
 
+def left_open(alike: Sequence[Confounder]) -> tuple[float, float]:
+    """The 95 % interval of a size with every one of these effects left open.
+
+    Parameters
+    ----------
+    alike : all of the same size, at least one.
+
+    Returns
+    -------
+    low, high : SI.
+    """
+    return min(rival.low_95 for rival in alike), max(rival.high_95 for rival in alike)
+
+
 def read_confounders(entries: Iterable[Mapping[str, Any]], numbers: Sequence[Number]) -> tuple[Confounder, ...]:
     """What a file says of confounders, each with the size that it is about.
 

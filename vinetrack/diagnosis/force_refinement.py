@@ -44,7 +44,7 @@ Chosen; the damped steps that follow make up for a bad choice."""
 
 NEAR = 10
 """Steps on motions that lie on the tracks, before motions follow the force. Chosen: numbers such as n, in which the
-model bends, settle in three to six."""
+model bends, settle in three to six; at half of it some have not, at twice only time is spent."""
 
 FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-5
 """Of Levenberg and Marquardt, for steps that may only lower the cost: the first where bare ones lead nowhere. Chosen

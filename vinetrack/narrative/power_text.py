@@ -164,7 +164,7 @@ def could_have_seen(power: Power) -> list[str]:
     """
     if power.wary:
         return [f"What they could have seen is not worked out: {power.wary}."]
-    physical = [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
+    physical = _physical(power)
     seen = [entry for entry in physical if entry.probability_at(entry.largest) >= 0.9]
     at_times = [entry for entry in physical if HARDLY_EVER <= entry.probability_at(entry.largest) < 0.9]
     lines = []
@@ -197,9 +197,13 @@ def unseen(power: Power) -> list[str]:
     list of str
         Names of effects; of all kinds where none is physical.
     """
-    physical = [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
-    never = [entry.effect for entry in physical if entry.probability_at(entry.largest) < HARDLY_EVER]
+    never = [entry.effect for entry in _physical(power) if entry.probability_at(entry.largest) < HARDLY_EVER]
     return [*never, *(name for name in power.not_testable if name not in never)]
+
+
+def _physical(power: Power) -> list[EffectPower]:
+    """The physical effects, all effects where there are none."""
+    return [entry for entry in power.effects if entry.kind == "physical"] or list(power.effects)
 
 
 def width_text(width: NumberWidth) -> str:

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.numbers import number, with_error
 from vinetrack.core.units import display_unit
+from vinetrack.diagnosis.confounder import Confounder, left_open
 from vinetrack.narrative.between_text import difference_headline, trials_differ
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from vinetrack.diagnosis.confounder import Confounder
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.inference.fit_result import Number
 
@@ -305,9 +305,9 @@ def _beside_others(diagnosis: Diagnosis, key: str) -> str:
     if not alike:
         return ""
     factor = display_unit(alike[0].number.unit)[1]
-    low, high = min(rival.low_95 for rival in alike) * factor, max(rival.high_95 for rival in alike) * factor
+    low, high = left_open(alike)
     names = joined([plain(rival.effect) for rival in alike])
-    return f"; with {names} left open: {number(low, 4)} to {number(high, 4)}"
+    return f"; with {names} left open: {number(factor * low, 4)} to {number(factor * high, 4)}"
 
 
 def size_interval(entry: Number) -> str:

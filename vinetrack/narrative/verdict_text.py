@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from vinetrack.core.numbers import decimals
 from vinetrack.core.units import display_unit
+from vinetrack.diagnosis.confounder import Confounder, left_open
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -21,7 +22,6 @@ from vinetrack.narrative.between_text import difference_in_words, remedies_in_wo
 from vinetrack.narrative.verdict_summary import joined, size
 
 if TYPE_CHECKING:
-    from vinetrack.diagnosis.confounder import Confounder
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.misfit_tests import MisfitTests
     from vinetrack.diagnosis.selection import SelectionStep
@@ -144,11 +144,11 @@ def confounders_in_words(confounders: Sequence[Confounder]) -> str:
         larger = [_part_in_words(rival, digits, "beside") for rival in alike if abs(rival.value) >= abs(number.value)]
         parts = [f"includes up to {joined(smaller, 'or')}"] if smaller else []
         parts += [f"would be larger by up to {joined(larger, 'or')}"] if larger else []
-        low, high = min(rival.low_95 for rival in alike) * factor, max(rival.high_95 for rival in alike) * factor
+        low, high = left_open(alike)
         text += (
             f" This {number.title} {', or '.join(parts)}: the data do not exclude that. "
             f"With {joined([rival.effect for rival in alike])} left open, {number.title} lies between "
-            f"{low:.{digits}f} and {high:.{digits}f}{tail} (95 %)."
+            f"{factor * low:.{digits}f} and {factor * high:.{digits}f}{tail} (95 %)."
         )
     return text
 
