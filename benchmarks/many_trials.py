@@ -75,6 +75,7 @@ def costs(kind: str, seed: int, trials: int, folder: Path) -> tuple[dict[str, Co
     for stage, (command, *options) in STAGES.items():
         folders = [str(results)] if stage in WITHOUT_EXPERIMENT else [str(experiment), str(results)]
         found[stage] = cost_of([command, *folders, "--settings", settings, *options])
+        print(f"{trials} trials, {stage}: {found[stage].processor_s:.0f} s", file=sys.stderr, flush=True)
     diagnosis = json.loads((results / "diagnosis.json").read_text())
     return found, f"{diagnosis['verdict']} {','.join(diagnosis['answer_set'])}".strip()
 

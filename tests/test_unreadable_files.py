@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import errno
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from test_pipeline import ROOT, write_track
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
 from vinetrack.core.files import file_size, is_readable
+from vinetrack.effects._first_run import remember
 from vinetrack.experiment.folder import check_experiment
 from vinetrack.experiment.provenance import describe_run
 from vinetrack.pipeline.workflow import make_plan
@@ -116,3 +120,146 @@ def test_a_full_disk_is_said_as_such(vines: Path, tmp_path: Path, monkeypatch: p
     assert done.output.strip() == (
         "The disk is full: make room and run the same command again; what was finished is kept."
     )
+
+
+def _pictures(folder: Path) -> None:
+    """A folder of a few pictures, too few for a recording."""
+    folder.mkdir()
+    for number in range(5):
+        cv2.imwrite(str(folder / f"f{number:04d}.png"), np.full((40, 60), 20 * number, np.uint8))
+
+
+def _no_file(path: Path, kind: str) -> None:
+    """A FIFO, or a link that ends at a device or at itself."""
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero" if kind == "device" else path.name)
+
+
+PLACES = {
+    "track": ("bad.csv", "track,bad.csv", ""),
+    "track of a vine": ("good.csv", "track,good.csv", ""),
+    "recording": ("bad.mp4", "video,bad.mp4", ""),
+    "picture of a recording": ("shots/f0002a.png", "video,shots", ""),
+    "side file of pictures": ("shots/shots.cih", "video,shots", ""),
+    "pressure trace": ("log.csv", "track,good.csv", ""),
+    "calibration picture": ("board.png", "video,shots", "image: board.png"),
+    "one of many calibration pictures": ("boards/f0002a.png", "video,shots", "image: boards"),
+    "effect": ("stick.py", "track,good.csv", "effects: [stick.py]"),
+    "corrections": ("corrections.csv", "track,good.csv", ""),
+    "settings": ("experiment.yaml", "track,good.csv", ""),
+    "sheet": ("trials.csv", "", ""),
+}
+
+
+SOUND = {
+    "log.csv": "time_s,pressure_kPa\n0,20\n5,20\n",
+    "stick.py": (
+        '"""Stick: a force that holds.\n\n    tip force −F\n"""\n\nfrom vinetrack.effects import Parameter\n\n'
+        'PARAMETERS = (Parameter("F", "F", "N", 0.1, bounds=(0.0, 9.0), plausible=(0.0, 1.0)),)\n\n\n'
+        "def tip_force(s, rig, F):\n    return -F\n"
+    ),
+}
+KINDS = ("pipe", "device", "itself")
+LONGEST_S = 200
+"""Chosen: 33 folders are checked in 15 s on a quiet machine; what waits for a pipe waits for ever."""
+
+
+def _experiment(folder: Path, place: str, kind: str) -> None:
+    """An experiment of one trial in which one file is none."""
+    name, recording, setting = PLACES[place]
+    column, _, value = recording.partition(",")
+    write_track(folder / "good.csv", 12, 20.0, 1)
+    _pictures(folder / "shots")
+    _pictures(folder / "boards")
+    rate = "1000" if column == "video" else ""
+    trace = name if place == "pressure trace" else ""
+    scale = "" if setting.startswith("image") else "0.3"
+    header = HEADER.replace("track,", f"{column},pressure_trace,mm_per_px,capture_fps,")
+    (folder / "trials.csv").write_text(f"{header}bad,{value},{trace},{scale},{rate},12,100,300,20,3,0\n")
+    if setting.startswith("image"):
+        setting = f"calibration: {{kind: checkerboard, {setting}, squares: [5, 4], square_mm: 10}}"
+    if setting:
+        (folder / "experiment.yaml").write_text(setting + "\n")
+    if kind:
+        (folder / name).unlink(missing_ok=True)
+        _no_file(folder / name, kind)
+    elif name in SOUND:
+        (folder / name).write_text(SOUND[name])
+
+
+def _check_all(root: Path) -> None:
+    """What `vinetrack check` says of every experiment, beside each."""
+    for place in PLACES:
+        for kind in KINDS:
+            folder = root / kind / place
+            done = CliRunner().invoke(app, ["check", str(folder)])
+            ended = done.exception is None or isinstance(done.exception, SystemExit)
+            said = " ".join(done.output.split()) if ended else repr(done.exception)
+            folder.with_name(f"{place}.txt").write_text(f"{done.exit_code} {said}")
+
+
+@pytest.fixture(scope="module")
+def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every experiment checked, in a process that is ended where it waits for a pipe."""
+    root = tmp_path_factory.mktemp("places")
+    for place in PLACES:
+        for kind in KINDS:
+            _experiment(root / kind / place, place, kind)
+    process = multiprocessing.get_context("spawn").Process(target=_check_all, args=(root,))
+    process.start()
+    process.join(LONGEST_S)
+    process.kill()
+    return root
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("place", PLACES)
+def test_pipes_and_devices_are_refused_wherever_a_file_is_asked_for(checked: Path, place: str, kind: str) -> None:
+    answer = checked / kind / f"{place}.txt"
+    assert answer.exists(), "it waits for the pipe, or for one before it"
+    status, _, said = answer.read_text().partition(" ")
+    assert "Error(" not in said
+    # A link that leads to itself is a file that is missing, and a picture may be.
+    if kind != "itself":
+        assert "it is a pipe or a device, not a file" in said
+    assert int(status) == (0 if (place, kind) == ("picture of a recording", "itself") else 1)
+
+
+@pytest.mark.parametrize("place", ["track of a vine", "picture of a recording", "pressure trace", "effect"])
+def test_what_a_link_out_of_the_folder_leads_to_is_as_good_as_the_file(
+    tmp_path: Path, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Recordings lie on another disk than their sheet: `check` says of links what it says of the files."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    answers = []
+    for name in ("files", "links"):
+        folder = tmp_path / name / "vines"
+        _experiment(folder, place, "")
+        entries = [entry for entry in folder.iterdir() if entry.name not in ("trials.csv", "experiment.yaml")]
+        for entry in entries if name == "links" else []:
+            elsewhere = tmp_path / "disk" / entry.name
+            elsewhere.parent.mkdir(exist_ok=True)
+            entry.rename(elsewhere)
+            entry.symlink_to(elsewhere)
+        assert all(entry.is_symlink() == (name == "links") for entry in entries)
+        if place == "effect":
+            remember(folder / "stick.py")
+        done = CliRunner().invoke(app, ["check", str(folder)])
+        answers.append((done.exit_code, done.output.replace(str(folder), "FOLDER")))
+    assert answers[0] == answers[1]
+    assert "is a link" not in answers[1][1]
+    assert "does not exist" not in answers[1][1]
+
+
+@pytest.mark.parametrize("name", ["trials.csv", "experiment.yaml", "corrections.csv", "good.csv"])
+def test_a_link_whose_disk_is_not_there_is_said_and_not_taken_for_a_file_left_out(tmp_path: Path, name: str) -> None:
+    """Settings on a disk that is not connected would otherwise be the defaults."""
+    _experiment(tmp_path / "vines", "track of a vine", "")
+    path = tmp_path / "vines" / name
+    path.unlink(missing_ok=True)
+    path.symlink_to(tmp_path / "disk" / name)
+    words = [str(problem) for problem in check_experiment(tmp_path / "vines")]
+    assert len(words) == 1
+    assert "is a link whose end is missing: connect the disk" in words[0]

@@ -92,6 +92,11 @@ def test_what_fails_wherever_it_is_asked_is_told_in_a_sentence(tmp_path: Path) -
         ("import numpy as np\n", "import numpy as np\n1/0\n", "ZeroDivisionError"),
         ("import numpy as np\n", "import numpy as np\nKIND = 'guess'\n", "KIND is 'guess'"),
         ('"N/√m", 0.8', '"N/√m", 80.0', "the default of q lies outside its bounds"),
+        ("bounds=(0.0, 10.0)", "bounds=(0.0, 10.0), zero=(0.0, 1.0)", "default and zero of q must be numbers"),
+        ("bounds=(0.0, 10.0)", "bounds=10.0", "its bounds two"),
+        ("bounds=(0.0, 10.0)", "plausible=10.0", "plausible of q must be two numbers"),
+        ("import numpy as np\n", "import numpy as np\nORDER = 'first'\n", "cannot be read (ValueError"),
+        ("import numpy as np\n", "import numpy as np\nNEEDS = 3\n", "cannot be read (TypeError"),
         ('Parameter("q", "q", "N/√m", 0.8, bounds=(0.0, 10.0), meaning="grip of the bristles"),', "3,", "PARAMETERS"),
     ],
 )

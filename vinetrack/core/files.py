@@ -1,4 +1,8 @@
-"""Files as an experiment may hold them: what is no ordinary file is never opened, since a pipe would be waited for."""
+"""Files as an experiment may hold them: what is no ordinary file is never opened, since a pipe would be waited for.
+
+What a sheet names is a path inside the folder by its text. A link there may lead to a file or a folder elsewhere, as to
+recordings on another disk; what it ends at must be an ordinary file, as must every file of the folder itself.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,44 @@ from pathlib import Path
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Errors of a disk, or a share of one, on which nothing more can be written."""
+
+
+NO_FILE = "it is a pipe or a device, not a file; put the file itself there, or a link to it"
+"""What is said of a FIFO, a socket, a terminal or anything like `/dev/zero`."""
+
+
+def absence(path: Path) -> str:
+    """What is said of a file that is not there, and what to do.
+
+    Parameters
+    ----------
+    path : of the file; a link whose end is missing, as one to a disk that is not mounted, is named as such.
+
+    Returns
+    -------
+    message and remedy, parted by a colon.
+    """
+    if path.is_symlink():
+        return "is a link whose end is missing: connect the disk that it leads to, or copy the file itself there"
+    return "does not exist: check the path and its upper and lower case"
+
+
+def is_pipe_or_device(path: Path) -> bool:
+    """Whether a path ends at something that a program would wait for, or read for ever.
+
+    Parameters
+    ----------
+    path : or a link to it.
+
+    Returns
+    -------
+    False for files and folders, and where there is nothing.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 def file_size(path: Path) -> int:
@@ -31,7 +73,7 @@ def file_size(path: Path) -> int:
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, "it is a folder, not a file", str(path))
     if not stat.S_ISREG(status.st_mode):
-        raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(path))
+        raise OSError(errno.EINVAL, NO_FILE, str(path))
     if not os.access(path, os.R_OK):
         raise PermissionError(errno.EACCES, "permission denied; allow it to be read", str(path))
     return status.st_size

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.files import file_size
+from vinetrack.core.files import absence, file_size
 from vinetrack.core.problems import UserError
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def read_text(path: Path) -> str:
             raise TableError("is too large to be a table: is it a recording?")
         return decode_text(path.read_bytes())
     except FileNotFoundError:
-        raise TableError("does not exist: check the path and its upper and lower case") from None
+        raise TableError(absence(path)) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it cannot be opened"
         raise TableError(f"cannot be read: {reason}") from None

@@ -14,11 +14,13 @@ import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
+from numbers import Real
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
 from vinetrack.core.constants import BASE_EFFECTS
+from vinetrack.core.files import file_size
 from vinetrack.core.problems import UserError
 from vinetrack.core.terminal import table
 from vinetrack.effects._base import HOOKS, KINDS, Effect, Parameter, Worked
@@ -38,10 +40,8 @@ def _load_module(path: Path) -> ModuleType:
     Raises
     ------
     EffectError
-        If the file is missing or cannot be run.
+        If the file cannot be run.
     """
-    if not path.is_file():
-        raise EffectError(f"{path}: there is no such effect file; `effects:` lists paths of Python files.")
     whole, package = path.resolve(), Path(__file__).resolve().parents[1]
     place = whole.relative_to(package).as_posix() if whole.is_relative_to(package) else str(whole)
     digest = hashlib.sha256(place.encode() + path.read_bytes()).hexdigest()[:12]
@@ -84,12 +84,31 @@ def load_effect(path: Path | str) -> Effect:
     'air_drag'
     """
     path = Path(path)
+    try:
+        file_size(path)
+    except FileNotFoundError:
+        raise EffectError(f"{path}: there is no such effect file; `effects:` lists paths of Python files.") from None
+    except OSError as error:
+        raise EffectError(f"{path}: this effect cannot be read: {error.strerror}.") from None
     if refusal := first_run(path):
         raise EffectError(f"{path}: {refusal}.")
-    module = _load_module(path)
+    try:
+        effect = _effect_of(_load_module(path), path)
+        faults = list(_faults(effect))
+    except (TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, EffectError):
+            raise
+        raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
+    if faults:
+        raise EffectError(f"{path}: " + "; ".join(faults) + ".")
+    return effect
+
+
+def _effect_of(module: ModuleType, path: Path) -> Effect:
+    """What the file says, as yet unchecked."""
     text = (module.__doc__ or "").strip()  # not `getdoc`: where only the formula follows, it would lose its indent
     functions = {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))}
-    effect = Effect(
+    return Effect(
         name=path.stem,
         kind=getattr(module, "KIND", "physical"),
         summary=text.splitlines()[0].strip() if text else "",
@@ -106,10 +125,6 @@ def load_effect(path: Path | str) -> Effect:
         finite=bool(getattr(module, "FINITE", False)),
         breakpoints=_breakpoints(module),
     )
-    faults = list(_faults(effect))
-    if faults:
-        raise EffectError(f"{path}: " + "; ".join(faults) + ".")
-    return effect
 
 
 def _breakpoints(module: ModuleType) -> Any:
@@ -145,9 +160,19 @@ def _faults(effect: Effect) -> Iterable[str]:
         if given != expected:
             yield f"{hook}({', '.join(given)}) must be {hook}({', '.join(expected)})"
     for parameter in effect.parameters:
+        if not (_is_range(parameter.bounds) and _is_range((parameter.default, parameter.zero))):
+            yield f"default and zero of {parameter.name} must be numbers, its bounds two, such as bounds=(0, 1)"
+            continue
+        if parameter.plausible is not None and not _is_range(parameter.plausible):
+            yield f"plausible of {parameter.name} must be two numbers, such as plausible=(0, 1)"
         low, high = parameter.bounds
         if not (low <= parameter.default <= high or parameter.default == parameter.zero):
             yield f"the default of {parameter.name} lies outside its bounds"
+
+
+def _is_range(pair: Any) -> bool:
+    """Whether it is two numbers."""
+    return isinstance(pair, tuple | list) and len(pair) == 2 and all(isinstance(end, Real) for end in pair)
 
 
 @lru_cache(maxsize=1)

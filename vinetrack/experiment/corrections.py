@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], l
     corrections, problems : both empty where there is no such file.
     """
     path = folder / CORRECTIONS
-    if not path.exists():
+    if not os.path.lexists(path):
         return {}, []
     try:
         table = read_table(path)

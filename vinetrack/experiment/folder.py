@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vinetrack.core.files import file_size
+from vinetrack.core.files import absence, file_size
 from vinetrack.core.problems import COMES_CLOSE, ExperimentError, Problem, format_problems
 from vinetrack.core.records import Correction, Trial
 from vinetrack.core.tables import Table, TableError, read_table, safe_join
@@ -220,7 +220,7 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
         message = "is a file, not a folder" if folder.exists() else "does not exist"
         problems.append(Problem(message=message, file=str(folder), remedy=EXPECTED))
         return None
-    if not (folder / SHEET).exists():
+    if not os.path.lexists(folder / SHEET):
         problems.append(Problem(message="is missing", file=SHEET, remedy=_missing_sheet_remedy(folder)))
         return None
     try:
@@ -351,10 +351,8 @@ def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> l
     problems = list(experiment.problems)
     for key, relative in _settings_paths(experiment.settings):
         if not safe_join(experiment.folder, relative).exists():
-            message = "does not exist"
-            problems.append(
-                Problem(message=message, file=SETTINGS, column=key, value=relative, remedy="check the path")
-            )
+            message, _, remedy = absence(safe_join(experiment.folder, relative)).partition(": ")
+            problems.append(Problem(message=message, file=SETTINGS, column=key, value=relative, remedy=remedy))
     problems += order_problems(experiment.trials, SHEET)
     of_trials: list[Problem] = []
     there: list[Trial] = []
@@ -417,7 +415,9 @@ def _check_video(trial: Trial, used: Set[Path]) -> list[Problem]:
         if file_size(path) == 0:
             return [Problem(message="is an empty file", remedy="copy it anew", **place)]
     except (FileNotFoundError, ValueError):
-        return [Problem(message="does not exist", remedy=_nearest_file(path, used), **place)]
+        message, _, remedy = absence(path).partition(": ")
+        remedy = remedy if path.is_symlink() else _nearest_file(path, used)
+        return [Problem(message=message, remedy=remedy, **place)]
     except OSError as error:
         return [Problem(message=f"cannot be read: {error.strerror}", **place)]
     return []

@@ -6,6 +6,7 @@ in step. An unknown key, a key written twice and a value that is not allowed are
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -342,7 +343,8 @@ def read_experiment_settings(path: Path) -> ExperimentSettings:
     ExperimentError
         With every problem of the file.
     """
-    if not path.exists():
+    # A link whose end is missing is no file left out: the settings behind it were meant.
+    if not os.path.lexists(path):
         return ExperimentSettings()
     return _validate(ExperimentSettings, in_key_units(read_yaml(path), path.name)[0], path.name)
 

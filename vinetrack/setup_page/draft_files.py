@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -157,7 +158,7 @@ def drafted(folder: Path, draft: Draft) -> Iterator[Path]:
         copy.mkdir()
         for path in folder.iterdir():
             if path.name not in FILES:
-                (copy / path.name).symlink_to(path.resolve(), target_is_directory=path.is_dir())
+                (copy / path.name).symlink_to(os.path.realpath(path), target_is_directory=path.is_dir())
         write_text(copy / SHEET, draft.sheet.text())
         write_text(copy / SETTINGS, draft.settings)
         if draft.corrections:

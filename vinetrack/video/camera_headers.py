@@ -281,6 +281,7 @@ def read_side_file(path: Path) -> SideFile:
     """
     name = path.name
     try:
+        file_size(path)  # a pipe would be waited for
         with path.open("rb") as stream:
             data = stream.read(LONGEST_SIDE_FILE)
     except OSError as error:
