@@ -387,6 +387,25 @@ def _with_advice(result: Diagnosis, limits: Limits | None, report: Report) -> Di
     result = _located(result, report) if result.verdict != ADEQUATE else result
     if UNEXPLAINED in (result.verdict, result.final_verdict):
         result = _with_missing_force(result, report)
+    return with_next_experiment(result, limits, report)
+
+
+def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report: Report = _quiet) -> Diagnosis:
+    """A diagnosis with the trials that would tell apart the names that it leaves.
+
+    Parameters
+    ----------
+    result : Diagnosis
+    limits : Limits, optional
+        Within which further trials can be made.
+    report : callable
+        Called with a few words at each step.
+
+    Returns
+    -------
+    Diagnosis
+        As it is where fewer than two names are left.
+    """
     last = result.rounds[-1]
     tied = list(last.fits.values())
     if last.verdict == ARTEFACT and len(tied) == 1 and last.fit is not None:
