@@ -14,12 +14,20 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis import expected_scores
 from vinetrack.diagnosis.campaign_power import CampaignDesign, design_of_fit, planned_questions
-from vinetrack.diagnosis.expected_scores import beyond, displacements, fitted_without, score_ratio
+from vinetrack.diagnosis.expected_scores import (
+    NoiselessStart,
+    beyond,
+    displacements,
+    fitted_without,
+    noiseless_start,
+    score_ratio,
+)
 from vinetrack.diagnosis.linear_power import effect_power, power_of, spread_widening
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, Power, Rate
 from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.diagnosis.score_test import informations_at, scores_of
+from vinetrack.diagnosis.shape_products import fit_columns
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
 from vinetrack.narrative.power_text import effect_sentence, frequency
 from vinetrack.narrative.verdict_summary import facts
@@ -128,14 +136,44 @@ def test_a_sheet_that_states_days_has_one_more_test() -> None:
 
 def test_a_small_size_has_the_score_of_linear_theory(six: MisfitTests, power: Power) -> None:
     k = place_of(six, "leak")
-    assert score_ratio(six, k, 0.3 * power["leak"].size_at(0.5)) == pytest.approx(1.0, abs=0.03)
+    assert score_ratio(six, k, 0.3 * power["leak"].size_at(0.5), noiseless_start(six.fit)) == pytest.approx(
+        1.0, abs=0.03
+    )
 
 
 def test_how_far_an_effect_moves_positions_is_what_a_refit_without_it_leaves(six: MisfitTests, power: Power) -> None:
     k, size = place_of(six, "leak"), 0.5 * power["leak"].size_at(0.5)
     moved_m = size * displacements(six.fit, six.sums)[k]
-    left = [block[:, -1] for block in fitted_without(six.fit, six.answers.shapes[k], size).solution.columns]
+    after = fitted_without(six.fit, six.answers.shapes[k], size, noiseless_start(six.fit))
+    left = [block[:, -1] for block in after.solution.columns]
     assert moved_m == pytest.approx(np.sqrt(np.mean([np.max(np.abs(r)) ** 2 for r in left])), rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["air_drag", "leak", "tail_friction"])
+def test_a_fit_without_an_effect_ends_with_the_columns_that_scores_are_read_from(
+    six: MisfitTests, power: Power, name: str
+) -> None:
+    # No point lies near the end of growth, where `fit_columns` takes derivatives otherwise.
+    start, k = noiseless_start(six.fit), place_of(six, name)
+    after = fitted_without(six.fit, six.answers.shapes[k], power[name].size_at(0.5), start)
+    for mine, other in zip(after.solution.columns, fit_columns(after), strict=True):
+        scale = np.max(np.abs(other[:, :-1]), axis=0)
+        assert mine[:, :-1] / scale == pytest.approx(other[:, :-1] / scale, abs=2e-3)
+        assert mine[:, -1] == pytest.approx(other[:, -1], abs=1e-9)
+
+
+def test_a_fit_without_an_effect_begins_with_the_columns_of_its_own_trajectories(
+    six: MisfitTests, power: Power
+) -> None:
+    start, k = noiseless_start(six.fit), place_of(six, "leak")
+    after = fitted_without(six.fit, six.answers.shapes[k], power["leak"].size_at(0.5), start)
+    begun = after.predictor.linearise(start.state.theta, start.state.trial_effects)
+    kept = [
+        np.isin(old.time_s, new.time_s) for old, new in zip(six.fit.predictor.data, after.predictor.data, strict=True)
+    ]
+    for mine, other, keep in zip(start.columns, begun, kept, strict=True):
+        scale = np.max(np.abs(other[:, :-1]), axis=0)
+        assert mine[keep, :-1] / scale == pytest.approx(other[:, :-1] / scale, abs=2e-3)
 
 
 def test_an_effect_within_the_errors_of_positions_counts_half() -> None:
@@ -154,7 +192,7 @@ def test_an_effect_is_followed_at_further_sizes_only_where_its_score_bends(
     def followed(ratio_at_7: float, ratio_at_4: float, larger: float = math.nan) -> tuple[int, EffectPower]:
         asked: list[float] = []
 
-        def ratio(_: MisfitTests, __: int, size: float) -> float:
+        def ratio(_: MisfitTests, __: int, size: float, ___: NoiselessStart) -> float:
             asked.append(abs(size))
             return ratio_at_7 if len(asked) == 1 else ratio_at_4 if len(asked) == 2 else larger
 

@@ -98,3 +98,8 @@ def test_trials_are_weighted_where_noise_grows_with_speed():
 def test_trials_of_equal_noise_are_not_weighted():
     data, _ = prepare(fast_trials(0.0)[0])
     assert all(item.relative_sd is None and item.mean_noise_m == item.noise_m for item in data)
+
+
+def test_points_count_alike_where_the_noise_is_stated():
+    pairs, _ = fast_trials(6e-5)
+    assert all(trial_data.relative_sd is None for trial_data in prepare(pairs, weighted=False)[0])

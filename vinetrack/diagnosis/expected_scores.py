@@ -10,7 +10,8 @@ Cranmer, Gross & Vitells, European Physical Journal C 71, 1554, 2011).
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +22,13 @@ from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES
 from vinetrack.diagnosis.score_test import projected, scores_of
-from vinetrack.diagnosis.shape_products import Products, fit_columns, products_of
+from vinetrack.diagnosis.shape_products import Products, products_of
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEHIND_END, FitTrial
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import solve_each, trial_effect_prior
+from vinetrack.inference.mixed_effects import FitState, solve_each, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Job, Predictor
 from vinetrack.inference.systematics import systematics_of
 from vinetrack.inference.whitening import at_correlation
 
@@ -56,7 +57,52 @@ LARGEST_MULTIPLE = 56.0
 seen there is fitted away by other numbers, and larger sizes take time only."""
 
 
-def followed_sizes(questions: MisfitTests, place: int, unit: float) -> tuple[Floats, Floats]:
+@dataclass(frozen=True)
+class NoiselessStart:
+    """Trajectories of a fit without deviations of its trials, where every fit without an effect begins.
+
+    `predictor` has the steps of differences that suit them, `columns` are their sensitivities at the fit's points, the
+    last the residual.
+    """
+
+    state: FitState
+    predictor: Predictor
+    jobs: list[Job]
+    columns: list[Floats]
+
+
+def noiseless_start(fit: Fit) -> NoiselessStart:
+    """Take the deviations of trials out of a fit and linearise there: the same for every effect and size.
+
+    Parameters
+    ----------
+    fit : of the model without the effects.
+
+    Returns
+    -------
+    NoiselessStart
+
+    Raises
+    ------
+    SimulationError
+        If the trajectories cannot be followed.
+    """
+    trial_effects = fit.state.trial_effects.copy()
+    trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
+    state = replace(fit.state, trial_effects=trial_effects)
+    predictor = _predictor_of(fit.predictor, fit.predictor.data)
+    columns = predictor.linearise(state.theta, trial_effects)
+    return NoiselessStart(state, predictor, predictor.jobs(state.theta, trial_effects), columns)
+
+
+def _predictor_of(predictor: Predictor, data: Sequence[FitTrial]) -> Predictor:
+    """A predictor of other positions of the same trials, which begins with the same steps of differences."""
+    other = Predictor(predictor.layout, data, predictor.host)
+    other.steps, other.pressure_step = predictor.steps.copy(), predictor.pressure_step.copy()
+    return other
+
+
+def followed_sizes(questions: MisfitTests, place: int, unit: float, start: NoiselessStart) -> tuple[Floats, Floats]:
     """Sizes that an effect is followed at, and by what its expected scores there differ from proportion to the size.
 
     Where the score at seven units, beyond any threshold, is in proportion, no other size is tried; else, and where it
@@ -69,20 +115,22 @@ def followed_sizes(questions: MisfitTests, place: int, unit: float) -> tuple[Flo
     questions : the fit, held against all candidates.
     place : of the shape in which the effect is put in.
     unit : size whose score is one standard error, SI.
+    start : NoiselessStart
+        Of the fit.
 
     Returns
     -------
     sizes : array, shape (n_sizes,), SI
     ratios : array, shape (n_sizes,)
     """
-    large = score_ratio(questions, place, 7 * unit)
+    large = score_ratio(questions, place, 7 * unit, start)
     if 0 < abs(large - 1) < IN_PROPORTION:
         return np.array([7 * unit]), np.array([large])
-    multiples, ratios = [4.0, 7.0], [score_ratio(questions, place, 4 * unit), large]
+    multiples, ratios = [4.0, 7.0], [score_ratio(questions, place, 4 * unit, start), large]
     if not all(0 < ratio < BELIEVABLE for ratio in ratios):
         return unit * np.array(multiples), np.ones(2)
     while ratios[-1] * multiples[-1] < ENOUGH and multiples[-1] < LARGEST_MULTIPLE:
-        ratio = score_ratio(questions, place, 2 * multiples[-1] * unit)
+        ratio = score_ratio(questions, place, 2 * multiples[-1] * unit, start)
         if ratio == 1 or not 0 < ratio < BELIEVABLE:
             break
         multiples.append(2 * multiples[-1])
@@ -90,7 +138,7 @@ def followed_sizes(questions: MisfitTests, place: int, unit: float) -> tuple[Flo
     return unit * np.array(multiples), np.array(ratios)
 
 
-def score_ratio(questions: MisfitTests, place: int, size: float) -> float:
+def score_ratio(questions: MisfitTests, place: int, size: float, start: NoiselessStart) -> float:
     """Expected score of an effect at a size, over what linear theory gives.
 
     Parameters
@@ -98,6 +146,8 @@ def score_ratio(questions: MisfitTests, place: int, size: float) -> float:
     questions : the fit, held against all candidates.
     place : of the shape in which the effect is put in.
     size : deviation from absence, SI.
+    start : NoiselessStart
+        Of the fit.
 
     Returns
     -------
@@ -109,12 +159,13 @@ def score_ratio(questions: MisfitTests, place: int, size: float) -> float:
     if shape.whole or not shape.effect.parameters:
         return 1.0
     try:
-        after = fitted_without(fit, shape, size)
+        after = fitted_without(fit, shape, size, start)
         answers = effect_sensitivities(after, [shape])
         if shape.effect.name in answers.silent or not answers.shapes:
             return 1.0
         systematics = systematics_of(after.predictor, after.solution, after.trials)
-        scores = scores_of(after, products_of(after, fit_columns(after), answers, systematics))
+        # No point lies where growth ends, so the columns of the last step are those that `fit_columns` would make.
+        scores = scores_of(after, products_of(after, after.solution.columns, answers, systematics))
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)
@@ -189,7 +240,7 @@ def beyond(least: float, sizes: Floats) -> Floats:
     return np.asarray(np.sign(sizes) * np.where(away >= least, away, np.minimum(half, least)))
 
 
-def fitted_without(fit: Fit, shape: CandidateShape, size: float) -> Fit:
+def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: NoiselessStart) -> Fit:
     """Fit the model of a fit to noise-free trajectories with an effect; noise and spreads stay as they are.
 
     Parameters
@@ -198,6 +249,8 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float) -> Fit:
     shape : in which the effect is put in.
     size : float
         Deviation from absence, SI.
+    start : NoiselessStart
+        Of the fit.
 
     Returns
     -------
@@ -209,23 +262,22 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float) -> Fit:
     SimulationError
         If a trial does not move with the effect.
     """
-    state = fit.state
-    trial_effects = state.trial_effects.copy()
-    trial_effects[:, [PRESSURE, DAMPING_DEVIATION]] = 0.0
-    state = replace(state, trial_effects=trial_effects)
-    jobs = fit.predictor.jobs(state.theta, trial_effects)
+    state, jobs = start.state, start.jobs
     rows = np.array([[*job.row, shape.size.zero + size, *shape.other_values] for job in jobs])
-    moved = fit.predictor.run_as(fit.model + shape.effect, jobs, rows)
+    moved = start.predictor.run_as(fit.model + shape.effect, jobs, rows)
+    kept = [_kept(trial_data, trajectory) for trial_data, trajectory in zip(fit.predictor.data, moved, strict=True)]
     data = [
-        _recorded(trial_data, trajectory, trial_effects[i])
-        for i, (trial_data, trajectory) in enumerate(zip(fit.predictor.data, moved, strict=True))
+        _recorded(trial_data, trajectory, state.trial_effects[i], keep)
+        for i, (trial_data, trajectory, keep) in enumerate(zip(fit.predictor.data, moved, kept, strict=True))
     ]
     if any(trial_data.time_s.size < FEWEST_POINTS or not np.ptp(trial_data.lead_position_m) > 0 for trial_data in data):
         raise SimulationError(f"With {shape.effect.name} at that size a trial does not move.")
-    predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
-    predictor.steps, predictor.pressure_step = fit.predictor.steps.copy(), fit.predictor.pressure_step.copy()
+    begin = [columns[keep] for columns, keep in zip(start.columns, kept, strict=True)]
+    for columns, trial_data, before, keep in zip(begin, data, fit.predictor.data, kept, strict=True):
+        columns[:, -1] += trial_data.lead_position_m - before.lead_position_m[keep]
+    predictor = _predictor_of(start.predictor, data)
     held = FixedTerms(spread=state.spread, noise=(state.rho, state.variance))
-    solution = solve(predictor, fit.solution.problem, state, held, warm=True, most_iterations=ITERATIONS)
+    solution = solve(predictor, fit.solution.problem, state, held, warm=True, most_iterations=ITERATIONS, columns=begin)
     trials = [
         replace(
             trial,
@@ -248,9 +300,8 @@ def _kept(trial_data: FitTrial, trajectory: Trajectory) -> NDArray[np.bool_]:
     return np.asarray(grown | (ended & (trajectory.time_s > behind_s)) | ~np.isfinite(trial_data.trial.length_m))
 
 
-def _recorded(trial_data: FitTrial, trajectory: Trajectory, trial_effects: Floats) -> FitTrial:
+def _recorded(trial_data: FitTrial, trajectory: Trajectory, trial_effects: Floats, keep: NDArray[np.bool_]) -> FitTrial:
     """A trial with the positions of a trajectory, at the points that a fit would use."""
-    keep = _kept(trial_data, trajectory)
     return replace(
         trial_data,
         time_s=trial_data.time_s[keep],

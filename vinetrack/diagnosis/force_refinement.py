@@ -321,7 +321,7 @@ def _pushes(fit: Fit, place: Place) -> list[Floats]:
     damping = fit.predictor.damping_column
     pushes = []
     for i, (motion, job) in enumerate(zip(place.motions, jobs, strict=True)):
-        varied = [replace(job, pressure_deviation=job.pressure_deviation + SMALL)]
+        varied = [job._replace(pressure_deviation=job.pressure_deviation + SMALL)]
         varied.append(_with(job, damping, job.row[damping] * math.exp(SMALL)) if damping >= 0 else job)
         for column, key in enumerate(layout.keys):
             number = layout.free[layout.index[i, column]] if layout.index[i, column] >= 0 else None
@@ -331,7 +331,7 @@ def _pushes(fit: Fit, place: Place) -> list[Floats]:
             at = theta[layout.index[i, column]]
             change = number.outside(at + SMALL) - number.outside(at)
             if key == YIELD_PRESSURE:
-                varied.append(replace(job, yield_pressure_Pa=job.yield_pressure_Pa + change))
+                varied.append(job._replace(yield_pressure_Pa=job.yield_pressure_Pa + change))
             else:
                 k = layout.model.parameter_names.index(key)
                 factor = number.outside(at + SMALL) / number.outside(at) if number.logarithmic else 0.0
@@ -351,7 +351,7 @@ def _pushes(fit: Fit, place: Place) -> list[Floats]:
 def _with(job: Job, column: int, value: float) -> Job:
     row = job.row.copy()
     row[column] = value
-    return replace(job, row=row)
+    return job._replace(row=row)
 
 
 def _acceleration(fit: Fit, motion: FittedMotion, job: Job) -> Floats:

@@ -32,7 +32,7 @@ from scipy.stats import norm, t
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, plausible_range
-from vinetrack.diagnosis.expected_scores import beyond, followed_sizes, least_sizes
+from vinetrack.diagnosis.expected_scores import beyond, followed_sizes, least_sizes, noiseless_start
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, CREDIBLE
 from vinetrack.diagnosis.misfit_tests import LOUD_PROBE, MisfitTests
 from vinetrack.diagnosis.power import PROBABILITIES, EffectPower, NumberWidth, Power, PowerInput
@@ -185,6 +185,7 @@ def _responses(questions: MisfitTests, *, curved: bool, only: str = "") -> list[
     """Expected scores by size, from the information between shapes; one response an effect, of all or of one."""
     information = questions.scores.information
     root = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    start = noiseless_start(questions.fit) if curved else None
     responses = []
     for effect in questions.effects:
         if only not in ("", effect.name):
@@ -197,9 +198,9 @@ def _responses(questions: MisfitTests, *, curved: bool, only: str = "") -> list[
             [shape.step if shape.whole else _toward(shape) / root[k] for shape, k in zip(shapes, places, strict=True)]
         )
         scores = information[places] * sizes[:, None] / root
-        if curved and not shapes[0].whole:
+        if start is not None and not shapes[0].whole:
             unit = float(sizes[0])
-            sizes, bend = followed_sizes(questions, places[0], unit)
+            sizes, bend = followed_sizes(questions, places[0], unit, start)
             scores = scores[0] * (bend * sizes / unit)[:, None]
         responses.append(
             _Response(effect, shapes[0], places[0], sizes, np.where(np.diag(information) > 0, scores, 0.0))

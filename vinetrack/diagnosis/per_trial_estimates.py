@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -180,7 +180,7 @@ def _improved(
             rows.append(row)
         return rows
 
-    jobs = [replace(job, row=row) for shift in (0.0, step) for job, row in zip(plain, at(shift), strict=True)]
+    jobs = [job._replace(row=row) for shift in (0.0, step) for job, row in zip(plain, at(shift), strict=True)]
     runs = predictor.run(jobs)
     trial_effects, moved, projected = trial_effects.copy(), moved.copy(), []
     held = rest_is_seen(predictor.data)

@@ -75,7 +75,8 @@ def fit(
     spreads : (float, float), optional
         Relative between-trial standard deviations of pressure and of B, in place of their estimates.
     noise : (float, float), optional
-        Standard deviation of a position, m, and its lag-one correlation, in place of their estimates.
+        Standard deviation of a position, m, and its lag-one correlation, in place of their estimates; all points then
+        count alike.
     profile : bool
         Whether intervals near a bound are found by profile, which costs a few refits each.
     host : Model, optional
@@ -99,7 +100,7 @@ def fit(
         If the experiment cannot be read.
     """
     pairs, left_out = pairs_of(experiment, tracks)
-    data, unusable = prepare(pairs)
+    data, unusable = prepare(pairs, weighted=noise is None)
     left_out = {**left_out, **unusable}
     if not data:
         reasons = "; ".join(f"{name}: {why}" for name, why in left_out.items())

@@ -143,12 +143,14 @@ class FitTrial:
 Pairs = Iterable[tuple[Trial, Track]]
 
 
-def prepare(pairs: Pairs) -> tuple[list[FitTrial], dict[str, str]]:
+def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dict[str, str]]:
     """Trials that can be fitted, and for the others the reason why not, by name.
 
     Parameters
     ----------
     pairs : iterable of (Trial, Track)
+    weighted : bool
+        Whether points are weighted where the noise of positions varies from one to the next.
 
     Returns
     -------
@@ -162,7 +164,7 @@ def prepare(pairs: Pairs) -> tuple[list[FitTrial], dict[str, str]]:
             data.append(prepare_trial(trial, track))
         except FitError as error:
             left_out[trial.name] = str(error)
-    return _with_noise_shape(data), left_out
+    return _with_noise_shape(data) if weighted else data, left_out
 
 
 def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:

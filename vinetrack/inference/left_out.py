@@ -274,7 +274,7 @@ def _sums(predictor: Predictor, trial_effects: Floats, rows: NDArray[np.int_], r
     later = [row for row in rows.tolist() if not predictor.plain_release[row]]
     steps = {row: RELEASE_STEP_FRAMES * predictor.data[row].frame_s for row in later}
     moved = predictor.run(
-        [jobs[row] for row in rows] + [replace(jobs[k], release_s=trial_effects[k, RELEASE] + steps[k]) for k in later]
+        [jobs[row] for row in rows] + [jobs[k]._replace(release_s=trial_effects[k, RELEASE] + steps[k]) for k in later]
     )
     shifted = dict(zip(later, moved[rows.size :], strict=True))
     columns = []

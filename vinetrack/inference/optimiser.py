@@ -102,6 +102,7 @@ def solve(
     warm: bool = False,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
+    columns: Sequence[Floats] | None = None,
 ) -> Solution:
     """Iterate to the end. `warm` says that the state is near it already.
 
@@ -121,6 +122,8 @@ def solve(
         Steps at most.
     watch : callable, optional
         Called with each step.
+    columns : sequence of arrays, shape (n_points, 4 + n_keys + 1), optional
+        Sensitivities at the state, as `Predictor.linearise` has them, where they are known.
 
     Returns
     -------
@@ -141,7 +144,7 @@ def solve(
         state = replace(state, rho=held.correlation)
     damping, converged, iteration, promised = (0.0 if warm else 1e-3), False, 0, math.inf
     early = not warm
-    columns, grams = _about(predictor, state)
+    columns, grams = _about(predictor, state) if columns is None else (columns, predictor.products(columns))
     looks, looked, in_vain = MOST_LOOKS, 0, False
     for iteration in range(1, most_iterations + 1):
         near = promised < FAR_OFF or iteration > MOST_EARLY

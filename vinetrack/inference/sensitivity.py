@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,8 +49,7 @@ DAMPING_STEP = 1e-3
 """Relative step of B. Derived as AIMED_RESPONSE is: its answer is of the order of the step."""
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One trajectory to simulate: which trial, its parameters, pressures and release, and how wrong its payload is."""
 
     trial: int
@@ -295,14 +294,14 @@ class Predictor:
         variations: list[tuple[int, float, Job]] = []
         if not self.plain_release[i]:
             step = RELEASE_STEP_FRAMES * self.data[i].frame_s
-            variations.append((RELEASE, step, replace(job, release_s=job.release_s + step)))
+            variations.append((RELEASE, step, job._replace(release_s=job.release_s + step)))
         if self.feels_pressure[i]:
             step = float(self.pressure_step[i])
-            variations.append((PRESSURE, step, replace(job, pressure_deviation=job.pressure_deviation + step)))
+            variations.append((PRESSURE, step, job._replace(pressure_deviation=job.pressure_deviation + step)))
         if self.feels_damping[i] and DAMPING not in self.layout.keys:
             row = job.row.copy()
             row[self.damping_column] *= np.exp(DAMPING_STEP)
-            variations.append((DAMPING_DEVIATION, DAMPING_STEP, replace(job, row=row)))
+            variations.append((DAMPING_DEVIATION, DAMPING_STEP, job._replace(row=row)))
         upper = self.layout.bounds[1]
         for column, key in enumerate(self.layout.keys):
             place = self.layout.index[i, column]
@@ -313,13 +312,13 @@ class Predictor:
                 step = -step
             number = self.layout.free[place]
             if key == YIELD_PRESSURE:
-                varied = replace(job, yield_pressure_Pa=number.outside(theta[place] + step))
+                varied = job._replace(yield_pressure_Pa=number.outside(theta[place] + step))
             else:
                 row, k = job.row.copy(), self.layout.model.parameter_names.index(key)
                 row[k] += number.outside(theta[place] + step) - number.outside(theta[place])
                 if key == DAMPING:
                     row[k] = number.outside(theta[place] + step + trial_effects[i, DAMPING_DEVIATION])
-                varied = replace(job, row=row)
+                varied = job._replace(row=row)
             variations.append((OWN + column, step, varied))
         return variations
 

@@ -7,7 +7,7 @@ pass for a small effect as soon as pressures and B scatter little.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +133,7 @@ def _payloads(predictor: Predictor, solution: Solution, trials: Sequence[TrialFi
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     try:
         plain = predictor.run([jobs[i] for i in loaded])
-        heavier = predictor.run([replace(jobs[i], payload_factor=1 + PAYLOAD_STEP) for i in loaded])
+        heavier = predictor.run([jobs[i]._replace(payload_factor=1 + PAYLOAD_STEP) for i in loaded])
     except SimulationError:
         return nothing
     columns = [np.zeros((trial.time_s.size, 1)) for trial in trials]

@@ -296,15 +296,15 @@ def _answers(
     moves: list[tuple[int, float]] = []
     grids: list[Floats] = []
     for job, tried_s in zip(plain, releases, strict=True):
-        i, released = job.trial, replace(job, release_s=0.0)
+        i, released = job.trial, job._replace(release_s=0.0)
         ways = [((-1, 0.0), released)]
         if predictor.feels_pressure[i]:
             deviation = job.pressure_deviation + PRESSURE_STEP
-            ways.append(((PRESSURE, PRESSURE_STEP), replace(released, pressure_deviation=deviation)))
+            ways.append(((PRESSURE, PRESSURE_STEP), released._replace(pressure_deviation=deviation)))
         if predictor.feels_damping[i]:
             row = job.row.copy()
             row[predictor.damping_column] *= np.exp(DAMPING_STEP)
-            ways.append(((DAMPING_DEVIATION, DAMPING_STEP), replace(released, row=row)))
+            ways.append(((DAMPING_DEVIATION, DAMPING_STEP), released._replace(row=row)))
         longest_s = float(predictor.data[i].time_s[-1] - tried_s.min())
         for move, varied in ways:
             moves.append(move)
