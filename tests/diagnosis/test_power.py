@@ -162,6 +162,25 @@ def test_a_fit_without_an_effect_ends_with_the_columns_that_scores_are_read_from
         assert mine[:, -1] == pytest.approx(other[:, -1], abs=1e-9)
 
 
+def test_what_replicates_without_noise_do_alike_is_simulated_once(
+    six: MisfitTests, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predictor, state = six.fit.predictor, six.fit.solution.state
+    assert predictor.twins.tolist() == [0, 0, 2, 2, 4, 4]
+    counted: list[int] = []
+    run_each = predictor._run_each
+    monkeypatch.setattr(
+        predictor, "_run_each", lambda model, jobs, *of: counted.append(len(jobs)) or run_each(model, jobs, *of)
+    )
+    jobs = predictor.jobs(state.theta, state.trial_effects)
+    once = predictor.run(jobs)
+    predictor.run([job._replace(release_s=job.release_s + 1e-6 * k) for k, job in enumerate(jobs)])
+    assert counted == [3, 6]
+    for job, shared in zip(jobs, once, strict=True):
+        alone = run_each(predictor.layout.model, [job], job.row[None], None)[0]
+        assert np.array_equal(shared.observed_position_m, alone.observed_position_m)
+
+
 def test_a_fit_without_an_effect_begins_with_the_columns_of_its_own_trajectories(
     six: MisfitTests, power: Power
 ) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.model import Model
@@ -90,6 +91,7 @@ class Predictor:
             {"true_time", "observed_position", "row_delay"} & set(effect.functions) for effect in model
         )
         self.plain_release = [trial_data.trace is None and not measured_otherwise for trial_data in data]
+        self.twins = _twins(data, self.rigs, self.bends)
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
 
@@ -114,6 +116,8 @@ class Predictor:
     ) -> list[Trajectory]:
         """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials.
 
+        What replicates of a planned campaign do alike is simulated once.
+
         Parameters
         ----------
         model : simulated in place of the fit's.
@@ -126,6 +130,20 @@ class Predictor:
         -------
         list of Trajectory
         """
+        if times_s is None and np.any(self.twins != np.arange(self.twins.size)):
+            keys = [(self.twins[job.trial], rows[k].tobytes(), *job[2:]) for k, job in enumerate(jobs)]
+            first = {key: k for k, key in reversed(list(enumerate(keys)))}
+            if len(first) < len(jobs):
+                distinct = sorted(first.values())
+                moved = self._run_each(model, [jobs[k] for k in distinct], rows[distinct], None)
+                of = {keys[k]: trajectory for k, trajectory in zip(distinct, moved, strict=True)}
+                return [of[key] for key in keys]
+        return self._run_each(model, jobs, rows, times_s)
+
+    def _run_each(
+        self, model: Model, jobs: Sequence[Job], rows: Floats, times_s: Sequence[Floats] | None
+    ) -> list[Trajectory]:
+        """Simulate every job."""
         places = np.array([job.trial for job in jobs], dtype=int)
         rigs = with_pressures(
             self.rigs[places],
@@ -347,6 +365,19 @@ class Predictor:
             self.steps[column] = _step(float(np.max(answers[:, OWN + column])), float(self.steps[column]))
         for i in np.flatnonzero(self.feels_pressure):
             self.pressure_step[i] = _step(float(answers[i, PRESSURE]), float(self.pressure_step[i]))
+
+
+def _twins(
+    data: Sequence[FitTrial], rigs: Floats, bends: Sequence[Sequence[tuple[float, float, float]]]
+) -> NDArray[np.int_]:
+    """Of every trial the first of the same settings and instants, shape (n_trials,)."""
+    first: dict[tuple[object, ...], int] = {}
+    twins = np.arange(len(data))
+    for i, trial_data in enumerate(data):
+        if trial_data.trace is None:
+            key = (rigs[i].tobytes(), tuple(bends[i]), trial_data.time_s.tobytes(), trial_data.trial.travel_ratio)
+            twins[i] = first.setdefault(key, i)
+    return twins
 
 
 def _clipped_change(plain: Trajectory, moved: Trajectory) -> Floats:
