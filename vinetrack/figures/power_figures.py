@@ -92,7 +92,9 @@ def _mark_rows(ax: Axes, entries: list[EffectPower]) -> None:
     ax.grid(visible=False)
     ax.set_xlabel("size, as part of the largest plausible")
     ax.set_xticks([0.0001, 0.001, 0.01, 0.1, 1.0], labels=["0.0001", "0.001", "0.01", "0.1", "1"])
-    ax.axvline(1.0, color=INK, linewidth=1.0, linestyle=":")
+    # White beneath the dots: ink alone is not seen on the dark of what is found.
+    ax.axvline(1.0, color="white", linewidth=2.2)
+    ax.axvline(1.0, color=INK, linewidth=1.2, linestyle=":")
     ax.set_yticks(range(len(entries)), [f"{plain(entry.effect)}, {entry.symbol}" for entry in entries])
     ax.tick_params(axis="y", length=0)
     for row in range(1, len(entries)):
