@@ -81,6 +81,7 @@ class CandidateFits:
     climbs: dict[str, SubsetFit] = field(default_factory=dict)
     fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
     silent: set[str] = field(default_factory=set)
+    same_end: set[str] = field(default_factory=set)
     simplified: list[Fit] = field(default_factory=list)
     tested: list[tuple[Fit, MisfitTests]] = field(default_factory=list)
     most_fitted: int = MOST_FITTED
@@ -290,18 +291,29 @@ class CandidateFits:
         hypothesis = self._from_climb(climb, best, led=led)
         promised = self.base - climb.deviance if math.isfinite(climb.deviance) else 0.0
         if hypothesis is not None and hypothesis.delta_chi2 < max(WORSE, PART_KEPT * promised):
-            # The smaller model is in this one, and part of the trials gained more: it was led astray by its start.
-            smallest = SubsetFit(climb.effects, math.nan, self._smallest(climb.effects))
-            others = (
-                self._from_climb(climb, best, afresh=True, led=led),
-                self._from_climb(smallest, best, led=led),
-            )
-            hypothesis = max((known for known in (hypothesis, *others) if known is not None), key=_gain)
+            hypothesis = self._begun_again(climb, hypothesis, best, led=led)
         if hypothesis is None or hypothesis.delta_chi2 < WORSE:
             self.silent.add(name)
         elif name not in self.fitted or hypothesis.delta_chi2 > self.fitted[name].delta_chi2:
             self.fitted[name] = hypothesis
             let_go(self.fitted)
+
+    def _begun_again(self, climb: SubsetFit, hypothesis: LikelihoodRatio, best: float, *, led: bool) -> LikelihoodRatio:
+        """The best of other starts of a hypothesis that did worse than the model without it, or than part of the data.
+
+        It may have been led astray by its start. First from where it hardly acts; if that ends in the same place, no
+        start is to blame: a model far off is then as far off with it, and it is not begun again from anywhere else.
+        """
+        name = "+".join(climb.names)
+        if name in self.same_end:
+            return hypothesis
+        smallest = SubsetFit(climb.effects, math.nan, self._smallest(climb.effects))
+        other = self._from_climb(smallest, best, led=led)
+        if other is not None and abs(other.delta_chi2 - hypothesis.delta_chi2) < -WORSE:
+            self.same_end.add(name)
+            return max(hypothesis, other, key=_gain)
+        afresh = self._from_climb(climb, best, afresh=True, led=led)
+        return max((known for known in (hypothesis, other, afresh) if known is not None), key=_gain)
 
     def _from_climb(self, climb: SubsetFit, best: float, *, led: bool, afresh: bool = False) -> LikelihoodRatio | None:
         fit = full_fit(self.questions.fit, climb, best, afresh=afresh, led=led)

@@ -395,16 +395,13 @@ def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report
 
     Parameters
     ----------
-    result : Diagnosis
-    limits : Limits, optional
-        Within which further trials can be made.
-    report : callable
-        Called with a few words at each step.
+    result : with fewer than two names left it stays as it is.
+    limits : within which further trials can be made.
+    report : called with a few words at each step.
 
     Returns
     -------
     Diagnosis
-        As it is where fewer than two names are left.
     """
     last = result.rounds[-1]
     tied = list(last.fits.values())
