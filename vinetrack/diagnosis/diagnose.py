@@ -396,8 +396,7 @@ def with_next_experiment(result: Diagnosis, limits: Limits | None = None, report
     Parameters
     ----------
     result : with fewer than two names left it stays as it is.
-    limits : within which further trials can be made.
-    report : called with a few words at each step.
+    limits, report : within which further trials can be made; called with a few words at each step.
 
     Returns
     -------
