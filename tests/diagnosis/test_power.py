@@ -162,6 +162,16 @@ def test_a_fit_without_an_effect_ends_with_the_columns_that_scores_are_read_from
         assert mine[:, -1] == pytest.approx(other[:, -1], abs=1e-9)
 
 
+def test_a_fit_without_an_effect_that_does_not_settle_is_not_trusted(
+    six: MisfitTests, power: Power, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, k = noiseless_start(six.fit), place_of(six, "leak")
+    size = 2 * power["leak"].size_at(0.5)
+    assert score_ratio(six, k, size, start) != 1.0
+    monkeypatch.setattr(expected_scores, "ITERATIONS", 1)
+    assert score_ratio(six, k, size, start) == 1.0
+
+
 def test_what_replicates_without_noise_do_alike_is_simulated_once(
     six: MisfitTests, monkeypatch: pytest.MonkeyPatch
 ) -> None:

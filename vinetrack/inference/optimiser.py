@@ -103,6 +103,7 @@ def solve(
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
     columns: Sequence[Floats] | None = None,
+    least_decrease: float = SETTLED_DECREASE,
 ) -> Solution:
     """Iterate to the end. `warm` says that the state is near it already.
 
@@ -124,6 +125,8 @@ def solve(
         Called with each step.
     columns : sequence of arrays, shape (n_points, 4 + n_keys + 1), optional
         Sensitivities at the state, as `Predictor.linearise` has them, where they are known.
+    least_decrease : float
+        Decrease of −2 ln L, promised by a step, below which the fit has settled.
 
     Returns
     -------
@@ -155,7 +158,7 @@ def solve(
         step, own_change, promised = newton_step(grams, problem, state, damping)
         if watch is not None:
             watch(_step_report(predictor, state, iteration, promised))
-        settled = promised < SETTLED_DECREASE
+        settled = promised < least_decrease
         if looks and (settled or (promised < NEARLY_SETTLED and not in_vain) or iteration >= looked + PATIENCE):
             looked, in_vain = iteration, True
             jumped = search_releases(predictor, problem, state, residuals_in(columns))
