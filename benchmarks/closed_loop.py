@@ -1,7 +1,7 @@
 """How many trials a campaign takes until one right name is left: next trials as advised, on a grid, or at random.
 
     python benchmarks/closed_loop.py [--campaigns 3] [--first-seed 22000] [--effects inlet_loss,leak] [--answers FILE]
-                                     [--risk 0.03] [--most 30] [--ways advised,grid,random] [--minutes 30]
+                                     [--risk 0.03] [--most 30] [--ways advised,asked,grid,random] [--minutes 30]
 
 A careful laboratory of a simulator that shares no code with the package (`benchmarks/hidden/`) begins with six trials
 of one vine at two pressures, with one effect or with nothing missing. The size of the effect is drawn, evenly in its
@@ -9,7 +9,9 @@ logarithm, between half of and three times what such six trials find every other
 ones are named from the first six trials, however the next are chosen. After each look
 (`vinetrack.diagnosis.stopping`) four trials are added: as `vinetrack campaign` says, those that tell apart what is
 tied, else replicates of the last ones while evidence grows for a name, else wider settings, those of the grid
-(advised); of pressures in equal ratios and all connectors and chambers in turn (grid); or of any of them at random
+(advised); the same, but while nothing is found those that `vinetrack power --reach 0.9` says for the effect that is
+there, at the smallest size it may have here, as one would who is after it (asked; after inlet loss where nothing is
+missing); of pressures in equal ratios and all connectors and chambers in turn (grid); or of any of them at random
 (random). All ways have the same rig: 10 to 40 kPa, connectors of 5.5, 8 and 11 mm, chambers of 3.7 and 8 l, and begin
 with the same six trials, which are looked at once. A campaign ends when one name is left at the stated risk, or with
 `--most` trials. The first table holds the trials until one right name (those that did not get there count with
@@ -41,7 +43,10 @@ from hidden.shots import Camera, Campaign, Laboratory, Recording, Shot, film
 from scipy.stats import binomtest
 
 import vinetrack as vt
+from vinetrack.diagnosis.campaign_power import design_of_fit, fit_power
 from vinetrack.diagnosis.diagnose import with_next_experiment
+from vinetrack.diagnosis.further_trials import further_trials
+from vinetrack.diagnosis.power import sheet_cells
 from vinetrack.diagnosis.stopping import STOP, CampaignLook, look_at, trials_to_go
 from vinetrack.experiment.settings import Limits
 
@@ -134,21 +139,23 @@ def begun(seed: int, effect: str) -> Sequence:
 def four_more(made: Sequence, way: str, said: vt.Diagnosis, look: CampaignLook, draw: np.random.Generator) -> None:
     """Add four trials; those advised are what `vinetrack campaign` says next."""
     wanted: list[tuple[float, float, float]] = []
-    if way == "advised":
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            said = with_next_experiment(said, LIMITS)
-        wanted = [
-            (entry["pressure_kPa"], entry["chamber_l"], entry["inlet_mm"])
-            for entry in (said.next_experiment or {}).get("trials") or ()
-            for _ in range(entry["replicates"])
-        ]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if way in ("advised", "asked"):
+            trials = (with_next_experiment(said, LIMITS).next_experiment or {}).get("trials") or ()
+            wanted = [
+                (entry["pressure_kPa"], entry["chamber_l"], entry["inlet_mm"])
+                for entry in trials
+                for _ in range(entry["replicates"])
+            ]
+        if way == "asked" and said.verdict == "adequate":
+            wanted = asked_for(made, said)
     for k in range(4 - len(wanted)):
         count = len(made.settings) + k
-        if way == "advised" and trials_to_go(look):
+        if way in ("advised", "asked") and trials_to_go(look):
             like = made.settings[-1 - k % len(made.settings)]
             wanted.append((like.pressure_kPa, like.chamber_l, like.inlet_mm))
-        elif way in ("grid", "advised"):
+        elif way != "random":
             pressure = LOW_KPA * (HIGH_KPA / LOW_KPA) ** ((count % 5) / 4)
             wanted.append((pressure, CHAMBERS_L[count % 2], INLETS_MM[count % 3]))
         else:
@@ -156,6 +163,18 @@ def four_more(made: Sequence, way: str, said: vt.Diagnosis, look: CampaignLook, 
             wanted.append((pressure, float(draw.choice(CHAMBERS_L)), float(draw.choice(INLETS_MM))))
     for pressure, chamber, inlet in wanted:
         made.make(pressure, chamber, inlet)
+
+
+def asked_for(made: Sequence, said: vt.Diagnosis) -> list[tuple[float, float, float]]:
+    """Pressure, chamber and inlet of the trials that would show the effect one is after."""
+    name = made.effect or "inlet_loss"
+    fit, value = said.fits[0], EFFECTS[name][1]
+    now = {entry.effect: entry for entry in fit_power(fit, CANDIDATES).effects}.get(name)
+    if now is None:
+        return []
+    plan = further_trials(design_of_fit(fit, CANDIDATES), now, value, 0.9, LIMITS)
+    cells = [sheet_cells(added.trial) for added in plan.trials]
+    return [(cell["pressure_kPa"], cell["chamber_l"], cell["inlet_mm"]) for cell in cells]
 
 
 def sequence(made: Sequence, way: str, said: vt.Diagnosis, risk: float, most: int) -> Line:
@@ -197,8 +216,9 @@ def report(lines: list[Line], most: int) -> None:
                     f"{effect or 'nothing':22s}{way:10s}{len(rows):10d}{sum(is_right(line) for line in rows):7d}"
                     f"{sum(is_wrong(line) for line in rows):7d}{np.mean(trials):14.1f}{np.median(trials):8.0f}"
                 )
-    for other in ("grid", "random"):
-        ratio_row(lines, other, most)
+    for way in ("advised", "asked"):
+        for other in ("grid", "random"):
+            ratio_row(lines, way, other, most)
     for way in (*dict.fromkeys(str(line["way"]) for line in lines), ""):
         rows = [line for line in lines if way in ("", line["way"])]
         wrong = sum(is_wrong(line) for line in rows)
@@ -233,20 +253,20 @@ def trials_of(line: Line, most: int) -> int:
     return int(str(line["trials"])) if is_right(line) else most
 
 
-def ratio_row(lines: list[Line], other: str, most: int) -> None:
-    """Print trials as advised over those of another way, of campaigns with an effect that were made both ways."""
+def ratio_row(lines: list[Line], chosen: str, other: str, most: int) -> None:
+    """Print trials of one way over those of another, of campaigns with an effect that were made both ways."""
     by_way = {
         way: {(str(line["seed"]), line["effect"]): trials_of(line, most) for line in lines
               if line["way"] == way and line["effect"]}
-        for way in ("advised", other)
+        for way in (chosen, other)
     }  # fmt: skip
-    both = [(by_way["advised"][key], by_way[other][key]) for key in by_way["advised"] if key in by_way[other]]
+    both = [(by_way[chosen][key], by_way[other][key]) for key in by_way[chosen] if key in by_way[other]]
     for name, pairs in (("all", both), ("undecided by the first six", [pair for pair in both if max(pair) > 6])):
         if pairs:
             advised, others = np.mean(pairs, axis=0)
             further = (advised - 6) / (others - 6) if others > 6 else math.nan
             print(
-                f"advised over {other}, {name}: {len(pairs)} campaigns, trials {advised:.1f} to {others:.1f}, ratio "
+                f"{chosen} over {other}, {name}: {len(pairs)} campaigns, trials {advised:.1f} to {others:.1f}, ratio "
                 f"{advised / others:.2f}; beyond the first six {further:.2f}"
             )
 
@@ -261,7 +281,7 @@ def main() -> None:
         default=",".join(name for name in EFFECTS if name),
         help="names, comma-separated; blank for nothing",
     )
-    parser.add_argument("--ways", default="advised,grid,random")
+    parser.add_argument("--ways", default="advised,asked,grid,random")
     parser.add_argument("--risk", type=float, default=0.03)
     parser.add_argument("--most", type=int, default=30)
     parser.add_argument("--answers", type=Path, help="CSV that keeps every answer")
