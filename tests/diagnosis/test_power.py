@@ -29,6 +29,7 @@ from vinetrack.diagnosis.result import Diagnosis, Round
 from vinetrack.diagnosis.score_test import informations_at, scores_of
 from vinetrack.diagnosis.shape_products import fit_columns
 from vinetrack.diagnosis.simulated_power import SimulatedAnswer, rates_of, simulated_answer
+from vinetrack.inference import sensitivity
 from vinetrack.narrative.power_text import effect_sentence, frequency
 from vinetrack.narrative.verdict_summary import facts
 from vinetrack.planning.campaign_information import FilmingPlan
@@ -178,16 +179,18 @@ def test_what_replicates_without_noise_do_alike_is_simulated_once(
     predictor, state = six.fit.predictor, six.fit.solution.state
     assert predictor.twins.tolist() == [0, 0, 2, 2, 4, 4]
     counted: list[int] = []
-    run_each = predictor._run_each
+    laid_out = sensitivity.lay_out
     monkeypatch.setattr(
-        predictor, "_run_each", lambda model, jobs, *of: counted.append(len(jobs)) or run_each(model, jobs, *of)
+        sensitivity,
+        "lay_out",
+        lambda model, rigs, *of, **how: counted.append(len(rigs)) or laid_out(model, rigs, *of, **how),
     )
     jobs = predictor.jobs(state.theta, state.trial_effects)
     once = predictor.run(jobs)
     predictor.run([job._replace(release_s=job.release_s + 1e-6 * k) for k, job in enumerate(jobs)])
     assert counted == [3, 6]
     for job, shared in zip(jobs, once, strict=True):
-        alone = run_each(predictor.layout.model, [job], job.row[None], None)[0]
+        alone = predictor.run([job])[0]
         assert np.array_equal(shared.observed_position_m, alone.observed_position_m)
 
 

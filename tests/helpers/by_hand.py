@@ -17,8 +17,9 @@ from scipy.integrate import solve_ivp
 
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.initial_fit import host_for
+from vinetrack.dynamics.batch import Trace
 from vinetrack.dynamics.model import Model, base_model, make_model
-from vinetrack.dynamics.simulate import Trace, Trajectory, simulate
+from vinetrack.dynamics.simulate import Trajectory, simulate
 
 G = 9.81
 ATM = 101_325.0

@@ -13,11 +13,11 @@ from vinetrack.inference.sensitivity import Predictor
 def trajectories(patch: pytest.MonkeyPatch) -> list[int]:
     """How many trajectories each later call simulates; the list grows as fits and predictions are made."""
     counts: list[int] = []
-    simulate = Predictor.run_as
+    simulate = Predictor._simulated
 
     def counted(self: Predictor, model: Any, jobs: Sequence[Any], *more: Any) -> Any:
         counts.append(len(jobs))
         return simulate(self, model, jobs, *more)
 
-    patch.setattr(Predictor, "run_as", counted)
+    patch.setattr(Predictor, "_simulated", counted)
     return counts

@@ -17,7 +17,7 @@ from vinetrack.diagnosis import candidates as hypotheses
 from vinetrack.diagnosis.initial_fit import candidates_of
 from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, misfit_tests
 from vinetrack.dynamics.simulate import Trajectory
-from vinetrack.inference.sensitivity import position_change
+from vinetrack.inference.position_change import position_change
 from vinetrack.laboratory.tracks import BASE, Nature, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
 

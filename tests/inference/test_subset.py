@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from counted import trajectories
 from lsoda_vine import small_campaign
 
 import vinetrack as vt
-from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.dynamics.simulate import Trajectory
+from vinetrack.core.records import Track, Trial
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.left_out import predict_prepared, predict_trials
-from vinetrack.inference.sensitivity import Job, Predictor
 from vinetrack.inference.subset import fit_subset
 
 Pairs = list[tuple[Trial, Track]]
@@ -109,14 +107,7 @@ def test_trials_laid_out_for_the_fit_are_predicted_as_if_read_again(whole: Fit, 
 def test_a_part_is_fitted_with_a_quarter_of_the_trajectories_of_a_fit(
     whole: Fit, pairs: Pairs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    simulated: list[int] = []
-    plain = Predictor.run
-
-    def counted(self: Predictor, jobs: Sequence[Job], times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
-        simulated.append(len(jobs))
-        return plain(self, jobs, times_s)
-
-    monkeypatch.setattr(Predictor, "run", counted)
+    simulated = trajectories(monkeypatch)
     vt.fit(vt.base_model(), pairs, profile=False)
     from_scratch = sum(simulated)
     conditions = dict.fromkeys(trial.trial.condition for trial in whole.trials)

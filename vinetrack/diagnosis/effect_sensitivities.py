@@ -17,7 +17,8 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, whole_shapes
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.sensitivity import position_change
+from vinetrack.inference.position_change import position_change
+from vinetrack.inference.trajectory_jobs import Jobs
 
 AIMED_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
 """A step is good that moves a trajectory by this part of its travel, and done again where it moves it by more than the
@@ -133,5 +134,5 @@ def _change(fit: Fit, shape: CandidateShape, plain: Sequence[Trajectory]) -> lis
     jobs = predictor.jobs(state.theta, state.trial_effects)
     rows = np.array([[*job.row, *shape.values] for job in jobs]).reshape(len(jobs), -1)
     model = fit.predictor.layout.model + shape.effect
-    moved = predictor.run_as(model, jobs, rows)
+    moved = predictor.run_as(model, Jobs.of(jobs, rows))
     return [position_change(before, trajectory) for before, trajectory in zip(plain, moved, strict=True)]

@@ -28,8 +28,9 @@ from vinetrack.inference.fit_data import END_FRACTION, FEWEST_POINTS, FRAMES_BEH
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState, solve_each, trial_effect_prior
 from vinetrack.inference.optimiser import FixedTerms, solve
-from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Job, Predictor
+from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.systematics import systematics_of
+from vinetrack.inference.trajectory_jobs import Job, Jobs
 from vinetrack.inference.whitening import at_correlation
 
 ITERATIONS, SETTLED = 20, 0.2
@@ -268,7 +269,7 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
     """
     state, jobs = start.state, start.jobs
     rows = np.array([[*job.row, shape.size.zero + size, *shape.other_values] for job in jobs])
-    moved = start.predictor.run_as(fit.model + shape.effect, jobs, rows)
+    moved = start.predictor.run_as(fit.model + shape.effect, Jobs.of(jobs, rows))
     kept = [_kept(trial_data, trajectory) for trial_data, trajectory in zip(fit.predictor.data, moved, strict=True)]
     data = [
         _recorded(trial_data, trajectory, state.trial_effects[i], keep)

@@ -31,7 +31,8 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import trial_effect_prior
 from vinetrack.inference.parameters import YIELD_PRESSURE
-from vinetrack.inference.sensitivity import ORIGIN, OWN, RELEASE, Job
+from vinetrack.inference.sensitivity import ORIGIN, OWN, RELEASE
+from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.inference.whitening import whiten
 
 STEPS, ROUNDS = 12, 2

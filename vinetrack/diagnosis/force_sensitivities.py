@@ -22,7 +22,8 @@ from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.sensitivity import RELEASE, Job
+from vinetrack.inference.sensitivity import RELEASE
+from vinetrack.inference.trajectory_jobs import Job
 
 STEPS = 400
 """Of each motion, closer together at its begin: what is slower than a hundredth of it is followed to 0.1 %. Derived:

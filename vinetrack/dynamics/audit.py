@@ -17,9 +17,9 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.records import Floats, Kinematics, Trial
+from vinetrack.dynamics.batch import Trace
 from vinetrack.dynamics.force_terms import Terms, evaluate
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import Trace
 from vinetrack.dynamics.trial_inputs import trial_inputs
 from vinetrack.effects import Effect, EffectError, catalogue
 

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 
 from vinetrack.core.records import Bend, Floats, Trial
+from vinetrack.dynamics.batch import Trace
 from vinetrack.dynamics.model import Model, base_model, make_model
-from vinetrack.dynamics.simulate import Trace, Trajectory, simulate
+from vinetrack.dynamics.simulate import Trajectory, simulate
 from vinetrack.effects import Effect, catalogue
 
 REFERENCE = Trial(

@@ -97,6 +97,18 @@ class Model:
             if other.name in effect.replaces
         ]
 
+    @cached_property
+    def hooks(self) -> dict[str, list[tuple[int, Callable[..., Any], slice]]]:
+        """By hook what `asked` returns."""
+        functions: dict[str, list[tuple[int, int, Callable[..., Any], slice]]] = {}
+        for i, (effect, place) in enumerate(zip(self.effects, self.places, strict=True)):
+            for hook, function in effect.functions.items():
+                functions.setdefault(hook, []).append((effect.order, i, function, place))
+        return {
+            hook: [(i, function, place) for _, i, function, place in sorted(known, key=lambda entry: entry[0])]
+            for hook, known in functions.items()
+        }
+
     def __add__(self, other: Effect | str) -> Model:
         effect = find_effect(other, self.user_effects) if isinstance(other, str) else other
         return replace(self, effects=(*self.effects, effect))
@@ -243,12 +255,7 @@ def asked(model: Model, hook: str) -> list[tuple[int, Callable[..., Any], slice]
     list of (int, callable, slice)
         Index of the effect, its function, and where its parameters stand among those of the model.
     """
-    functions = [
-        (effect.order, i, effect.functions[hook], place)
-        for i, (effect, place) in enumerate(zip(model.effects, model.places, strict=True))
-        if hook in effect.functions
-    ]
-    return [(i, function, place) for _, i, function, place in sorted(functions, key=lambda entry: entry[0])]
+    return model.hooks.get(hook, [])
 
 
 def make_model(names: Iterable[str] = BASE_EFFECTS, user_effects: Mapping[str, Effect] | None = None) -> Model:

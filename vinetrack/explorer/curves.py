@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
+from vinetrack.dynamics.batch import Trace
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import Trace, Trajectory, simulate_many
+from vinetrack.dynamics.simulate import Trajectory, simulate_many
 from vinetrack.explorer.campaign import Campaign, ShownTrial
 from vinetrack.inference.left_out import TOLD_APART, told_apart
 from vinetrack.inference.parameters import YIELD_PRESSURE

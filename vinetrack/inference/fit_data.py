@@ -113,6 +113,11 @@ class FitTrial:
         return float(np.median(np.diff(self.time_s)))
 
     @property
+    def point_sd(self) -> Floats:
+        """`relative_sd`, ones where all points are equally noisy, shape (n_points,)."""
+        return np.ones(self.time_s.size) if self.relative_sd is None else self.relative_sd
+
+    @property
     def mean_noise_m(self) -> float:
         """Root mean square of the noise of the points, m."""
         if self.relative_sd is None:

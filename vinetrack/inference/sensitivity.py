@@ -8,21 +8,27 @@ All trajectories, moved and unmoved, are simulated in one call.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from typing import NamedTuple
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.dynamics.batch import Trace, lay_out, starts_of
 from vinetrack.dynamics.model import Model
-from vinetrack.dynamics.simulate import Trajectory, bends_of, lay_out, trajectories
+from vinetrack.dynamics.simulate import ENDED, Trajectory, bends_of
 from vinetrack.dynamics.trial_inputs import check_needs, trial_inputs, with_pressures
 from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, ParameterMap
+from vinetrack.inference.position_change import position_change
+from vinetrack.inference.trajectory_jobs import Job, Jobs, Motions
 from vinetrack.inference.whitening import all_products
+
+OBSERVED = 3
+"""Column of `Motions.rows` that holds the position of the edge as the camera reports it. Defined by the kernel."""
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 OWN = 4
@@ -41,24 +47,9 @@ curvature."""
 RELEASE_STEP_FRAMES = 0.1
 """Chosen: a tenth of a frame, in which no trajectory bends."""
 
-MOST_CONTINUED = 3.0
-"""Times the delay that a step makes over which a trajectory is continued past its end. Derived: one for motions that
-keep their speed to the end; three allows for one that slows down to a third."""
-
 PAYLOAD_COLUMN = TrialInputs._fields.index("payload_mass")
 DAMPING_STEP = 1e-3
 """Relative step of B. Derived as AIMED_RESPONSE is: its answer is of the order of the step."""
-
-
-class Job(NamedTuple):
-    """One trajectory to simulate: which trial, its parameters, pressures and release, and how wrong its payload is."""
-
-    trial: int
-    row: Floats
-    yield_pressure_Pa: float
-    pressure_deviation: float
-    release_s: float
-    payload_factor: float = 1.0
 
 
 class Predictor:
@@ -90,8 +81,19 @@ class Predictor:
         measured_otherwise = any(
             {"true_time", "observed_position", "row_delay"} & set(effect.functions) for effect in model
         )
-        self.plain_release = [trial_data.trace is None and not measured_otherwise for trial_data in data]
+        self.plain_release = np.array([trial_data.trace is None and not measured_otherwise for trial_data in data])
         self.twins = _twins(data, self.rigs, self.bends)
+        self.has_twins = bool(np.any(self.twins != np.arange(self.twins.size)))
+        self.ratios = [trial_data.trial.travel_ratio for trial_data in data]
+        self.times_s = [np.asarray(trial_data.time_s, dtype=float) for trial_data in data]
+        self.starts = starts_of(self.times_s)
+        self.lead_position_m = np.concatenate([trial_data.lead_position_m for trial_data in data])
+        self.spans_m = np.array([np.ptp(trial_data.lead_position_m) for trial_data in data])
+        self.first = np.concatenate([trial_data.first for trial_data in data])
+        uneven = any(trial_data.relative_sd is not None for trial_data in data)
+        self.relative_sd = np.concatenate([trial_data.point_sd for trial_data in data]) if uneven else None
+        self.frames_s = np.array([trial_data.frame_s for trial_data in data])
+        self.with_trace = np.array([trial_data.trace is not None for trial_data in data], dtype=bool)
         self.pressure_step = np.full(len(data), 1e-3)
         self.steps = np.full(len(layout.keys), 1e-3)
 
@@ -108,21 +110,15 @@ class Predictor:
         -------
         list of Trajectory
         """
-        rows = np.array([job.row for job in jobs]).reshape(len(jobs), -1)
-        return self.run_as(self.layout.model, jobs, rows, times_s)
+        return self.run_as(self.layout.model, Jobs.of(jobs), times_s)
 
-    def run_as(
-        self, model: Model, jobs: Sequence[Job], rows: Floats, times_s: Sequence[Floats] | None = None
-    ) -> list[Trajectory]:
-        """Simulate another model, with parameters `rows`, shape (n_jobs, n_parameters), for the same trials.
-
-        What replicates of a planned campaign do alike is simulated once.
+    def run_as(self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None) -> list[Trajectory]:
+        """Simulate another model for the same trials.
 
         Parameters
         ----------
         model : simulated in place of the fit's.
-        jobs : sequence of Job
-        rows : array, shape (n_jobs, n_parameters), SI
+        jobs : with the parameters of that model.
         times_s : sequence of arrays, optional
             Instants, s, one array a job.
 
@@ -130,50 +126,46 @@ class Predictor:
         -------
         list of Trajectory
         """
-        if times_s is None and np.any(self.twins != np.arange(self.twins.size)):
-            keys = [(self.twins[job.trial], rows[k].tobytes(), *job[2:]) for k, job in enumerate(jobs)]
-            first = {key: k for k, key in reversed(list(enumerate(keys)))}
-            if len(first) < len(jobs):
-                distinct = sorted(first.values())
-                moved = self._run_each(model, [jobs[k] for k in distinct], rows[distinct], None)
-                of = {keys[k]: trajectory for k, trajectory in zip(distinct, moved, strict=True)}
-                return [of[key] for key in keys]
-        return self._run_each(model, jobs, rows, times_s)
+        motions, trials = self._simulated(model, jobs, times_s)
+        return motions.trajectories([self.ratios[i] for i in trials])
 
-    def _run_each(
-        self, model: Model, jobs: Sequence[Job], rows: Floats, times_s: Sequence[Floats] | None
-    ) -> list[Trajectory]:
-        """Simulate every job."""
-        places = np.array([job.trial for job in jobs], dtype=int)
+    def _simulated(
+        self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None
+    ) -> tuple[Motions, NDArray[np.int_]]:
+        """What jobs come to, and the trials of the distinct ones.
+
+        What replicates of a planned campaign do alike is simulated once.
+        """
+        like = np.arange(len(jobs))
+        if times_s is None and self.has_twins:
+            first, like = jobs.distinct(self.twins)
+            jobs = jobs.take(first)
+        trials = jobs.trial
         rigs = with_pressures(
-            self.rigs[places],
-            self.rigs[places, 0] * (1 + np.array([job.pressure_deviation for job in jobs])),
-            np.array([job.yield_pressure_Pa for job in jobs]),
+            self.rigs[trials], self.rigs[trials, 0] * (1 + jobs.pressure_deviation), jobs.yield_pressure_Pa
         )
-        rigs[:, PAYLOAD_COLUMN] *= [job.payload_factor for job in jobs]
-        data = [self.data[job.trial] for job in jobs]
+        rigs[:, PAYLOAD_COLUMN] *= jobs.payload_factor
+        instants = [self.times_s[i] for i in trials] if times_s is None else times_s
+        starts = starts_of(instants)
         batch = lay_out(
             model,
             rigs,
-            [self.bends[job.trial] for job in jobs],
-            [
-                time_s - job.release_s
-                for time_s, job in zip(times_s or [trial_data.time_s for trial_data in data], jobs, strict=True)
-            ],
-            traces=[
-                None
-                if trial_data.trace is None
-                else (trial_data.trace[0] - job.release_s, trial_data.trace[1] * (1 + job.pressure_deviation))
-                for trial_data, job in zip(data, jobs, strict=True)
-            ],
-            parameters=rows,
+            [self.bends[i] for i in trials],
+            np.concatenate(instants) - np.repeat(jobs.release_s, np.diff(starts)),
+            starts,
+            traces=self._traces(jobs) if self.with_trace.any() else None,
+            parameters=jobs.row,
             host=self.host,
         )
-        return trajectories(
-            batch,
-            [trial_data.trial.travel_ratio for trial_data in data],
-            [trial_data.trial.name for trial_data in data],
-        )
+        return Motions.of(batch, like, [self.data[i].trial.name for i in trials]), trials
+
+    def _traces(self, jobs: Jobs) -> list[Trace | None]:
+        """Recorded pressures on the clock of each job."""
+        traces = (self.data[i].trace for i in jobs.trial)
+        return [
+            None if trace is None else (trace[0] - release_s, trace[1] * (1 + deviation))
+            for trace, release_s, deviation in zip(traces, jobs.release_s, jobs.pressure_deviation, strict=True)
+        ]
 
     def jobs(self, theta: Floats, trial_effects: Floats) -> list[Job]:
         """The unmoved trajectories at scaled values `theta` and the trials' `own` numbers, shape (n_trials, 4).
@@ -189,14 +181,17 @@ class Predictor:
         list of Job
             One a trial.
         """
+        return self._unmoved(theta, trial_effects).single()
+
+    def _unmoved(self, theta: Floats, trial_effects: Floats) -> Jobs:
+        """`jobs` together."""
         rows, yields = self.layout.rows(theta)
         trial_effects = self._deviations(theta, trial_effects)
         if self.damping_column >= 0:
             rows[:, self.damping_column] *= np.exp(trial_effects[:, DAMPING_DEVIATION])
-        return [
-            Job(i, rows[i], float(yields[i]), float(trial_effects[i, PRESSURE]), float(trial_effects[i, RELEASE]))
-            for i in range(len(self.data))
-        ]
+        count = len(self.data)
+        pressure, release = trial_effects[:, PRESSURE], trial_effects[:, RELEASE]
+        return Jobs(np.arange(count), rows, yields, pressure, release, np.ones(count))
 
     def _deviations(self, theta: Floats, trial_effects: Floats) -> Floats:
         """The trials' own numbers, their deviations with what trials differ by systematically put in."""
@@ -220,7 +215,7 @@ class Predictor:
         list of Trajectory
             One a trial.
         """
-        return self.run(self.jobs(theta, trial_effects))
+        return self.run_as(self.layout.model, self._unmoved(theta, trial_effects))
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted position of every trial, m.
@@ -235,11 +230,26 @@ class Predictor:
         -------
         list of arrays, shape (n_points,)
         """
-        moved = self.unmoved(theta, trial_effects)
-        return [self._residual(i, moved[i], trial_effects) for i in range(len(self.data))]
+        motions, _ = self._simulated(self.layout.model, self._unmoved(theta, trial_effects))
+        return self.by_trial(self._left(motions.rows(0, len(self.data))[:, OBSERVED], trial_effects))
 
-    def _residual(self, i: int, moved: Trajectory, trial_effects: Floats) -> Floats:
-        return self.data[i].lead_position_m - trial_effects[i, ORIGIN] - moved.observed_position_m
+    def _left(self, observed_m: Floats, trial_effects: Floats) -> Floats:
+        """Measured minus predicted positions of all trials, end to end."""
+        return self.lead_position_m - np.repeat(trial_effects[:, ORIGIN], np.diff(self.starts)) - observed_m
+
+    def by_trial(self, values: Floats) -> list[Floats]:
+        """What all trials have end to end, as an array for each.
+
+        Parameters
+        ----------
+        values : array, shape (n_points_of_all, …)
+
+        Returns
+        -------
+        list of arrays, shape (n_points, …)
+        """
+        edges = self.starts.tolist()
+        return [values[a:b] for a, b in itertools.pairwise(edges)]
 
     def linearise(
         self, theta: Floats, trial_effects: Floats, *, own_only: bool = False, past_end: bool = False
@@ -266,27 +276,52 @@ class Predictor:
             Derivatives of the predicted position, m per unit of the column (trial effects SI, keys scaled); the last
             column is the residual, m.
         """
-        plain, whole = self.jobs(theta, trial_effects), self._deviations(theta, trial_effects)
-        jobs, moves = list(plain), [(-1, 0.0)] * len(plain)
-        for i, job in enumerate(plain):
-            for place, step, varied in self._variations(i, job, theta, whole, own_only):
-                jobs.append(varied)
-                moves.append((place, step))
-        moved = self.run(jobs)
-        columns = [np.zeros((trial_data.time_s.size, OWN + len(self.layout.keys) + 1)) for trial_data in self.data]
-        for i in range(len(plain)):
-            columns[i][:, ORIGIN] = 1.0
-            columns[i][:, RELEASE] = -moved[i].lead_velocity_m_s
-            columns[i][:, -1] = self._residual(i, moved[i], trial_effects)
-        for job, (place, step), other in zip(jobs, moves, moved, strict=True):
-            if place >= 0:
-                change = position_change if past_end else _clipped_change
-                columns[job.trial][:, place] = change(moved[job.trial], other) / step
+        plain, whole = self._unmoved(theta, trial_effects), self._deviations(theta, trial_effects)
+        moves = list(self._variations(plain, theta, whole, own_only))
+        motions, trials = self._simulated(self.layout.model, Jobs.joined([plain, *(varied for _, _, varied in moves)]))
+        count = len(self.data)
+        rows = motions.rows(0, count)
+        table = np.zeros((rows.shape[0], OWN + len(self.layout.keys) + 1))
+        table[:, ORIGIN] = 1.0
+        table[:, RELEASE] = -(rows[:, 1] / np.repeat(self.ratios, np.diff(self.starts)))
+        table[:, -1] = self._left(rows[:, OBSERVED], trial_effects)
+        every = motions.trajectories([self.ratios[i] for i in trials]) if past_end else []
+        first = count
+        for place, steps, varied in moves:
+            jobs, first = slice(first, first + len(varied)), first + len(varied)
+            points = self._points_of(varied.trial)
+            if past_end:
+                pairs = zip(varied.trial, every[jobs], strict=True)
+                change = np.concatenate([position_change(every[i], moved) for i, moved in pairs])
+            else:
+                change = motions.rows(jobs.start, jobs.stop)[:, OBSERVED] - rows[points, OBSERVED]
+                self._clip(change, motions, varied.trial, jobs)
+            table[points, place] = change / np.repeat(steps, np.diff(self.starts)[varied.trial])
+        columns = self.by_trial(table)
         self._share_damping(columns)
         self._share_deviations(columns)
         if not (own_only or past_end):
-            self._adapt(columns)
+            self._adapt(table)
         return columns
+
+    def _points_of(self, trials: NDArray[np.int_]) -> slice | NDArray[np.int_]:
+        """Rows of some trials among those of all, end to end."""
+        if trials.size == len(self.data):
+            return slice(None)
+        return np.concatenate([np.arange(self.starts[i], self.starts[i + 1]) for i in trials])
+
+    def _clip(self, change: Floats, motions: Motions, trials: NDArray[np.int_], jobs: slice) -> None:
+        """End what positions move by where the growth ends, as `clipped_change` does."""
+        ends = motions.ends[motions.like]
+        if not np.any(ends[trials, 0] == ENDED):
+            return
+        starts = starts_of([self.times_s[i] for i in trials])
+        for k, (i, moved) in enumerate(zip(trials, ends[jobs], strict=True)):
+            if ends[i, 0] == ENDED:
+                of_trial = change[starts[k] : starts[k + 1]]
+                stamps = motions.batch.stamps[slice(*motions.batch.starts[[motions.like[i], motions.like[i] + 1]])]
+                over = stamps > ends[i, 1]
+                of_trial[over] = of_trial[-1] if moved[0] == ENDED else 0.0
 
     def products(self, columns: Sequence[Floats]) -> Floats:
         """Sums of products of the trials' columns under their noise, shape (n_trials, 3, k, k), see `whitening`.
@@ -306,39 +341,40 @@ class Predictor:
         )
 
     def _variations(
-        self, i: int, job: Job, theta: Floats, trial_effects: Floats, own_only: bool
-    ) -> list[tuple[int, float, Job]]:
-        """What to simulate for the differences of one trial: place of the column, step, and the moved trajectory."""
-        variations: list[tuple[int, float, Job]] = []
-        if not self.plain_release[i]:
-            step = RELEASE_STEP_FRAMES * self.data[i].frame_s
-            variations.append((RELEASE, step, job._replace(release_s=job.release_s + step)))
-        if self.feels_pressure[i]:
-            step = float(self.pressure_step[i])
-            variations.append((PRESSURE, step, job._replace(pressure_deviation=job.pressure_deviation + step)))
-        if self.feels_damping[i] and DAMPING not in self.layout.keys:
-            row = job.row.copy()
-            row[self.damping_column] *= np.exp(DAMPING_STEP)
-            variations.append((DAMPING_DEVIATION, DAMPING_STEP, job._replace(row=row)))
+        self, plain: Jobs, theta: Floats, trial_effects: Floats, own_only: bool
+    ) -> Iterator[tuple[int, Floats, Jobs]]:
+        """What to simulate for the differences: place of the column, the trials' steps, and the moved trajectories."""
+        if len(measured := np.flatnonzero(~self.plain_release)):
+            steps, varied = RELEASE_STEP_FRAMES * self.frames_s[measured], plain.take(measured)
+            yield RELEASE, steps, replace(varied, release_s=varied.release_s + steps)
+        if len(driven := np.flatnonzero(self.feels_pressure)):
+            steps, varied = self.pressure_step[driven], plain.take(driven)
+            yield PRESSURE, steps, replace(varied, pressure_deviation=varied.pressure_deviation + steps)
+        if DAMPING not in self.layout.keys and len(damped := np.flatnonzero(self.feels_damping)):
+            varied = plain.take(damped)
+            varied.row[:, self.damping_column] *= np.exp(DAMPING_STEP)
+            yield DAMPING_DEVIATION, np.full(damped.size, DAMPING_STEP), varied
         upper = self.layout.bounds[1]
         for column, key in enumerate(self.layout.keys):
-            place = self.layout.index[i, column]
-            if place < 0 or (own_only and key != DAMPING) or self.layout.term(key) is not None:
+            feels = np.flatnonzero(self.layout.index[:, column] >= 0)
+            if not feels.size or (own_only and key != DAMPING) or self.layout.term(key) is not None:
                 continue
+            places = self.layout.index[feels, column]
             step = float(self.steps[column])
-            if theta[place] + step > upper[place]:
-                step = -step
-            number = self.layout.free[place]
+            steps = np.where(theta[places] + step > upper[places], -step, step)
+            varied = plain.take(feels)
+            free = [self.layout.free[place] for place in places]
+            there = theta[places] + steps
             if key == YIELD_PRESSURE:
-                varied = job._replace(yield_pressure_Pa=number.outside(theta[place] + step))
+                varied.yield_pressure_Pa[:] = [number.outside(x) for number, x in zip(free, there, strict=True)]
+            elif key == DAMPING:
+                there = there + trial_effects[feels, DAMPING_DEVIATION]
+                varied.row[:, self.damping_column] = [number.outside(x) for number, x in zip(free, there, strict=True)]
             else:
-                row, k = job.row.copy(), self.layout.model.parameter_names.index(key)
-                row[k] += number.outside(theta[place] + step) - number.outside(theta[place])
-                if key == DAMPING:
-                    row[k] = number.outside(theta[place] + step + trial_effects[i, DAMPING_DEVIATION])
-                varied = job._replace(row=row)
-            variations.append((OWN + column, step, varied))
-        return variations
+                here_and_there = zip(free, theta[places], there, strict=True)
+                k = self.layout.model.parameter_names.index(key)
+                varied.row[:, k] += [number.outside(x) - number.outside(here) for number, here, x in here_and_there]
+            yield OWN + column, steps, varied
 
     def _share_damping(self, columns: list[Floats]) -> None:
         """A trial's deviation of B and ln B itself are one sensitivity."""
@@ -357,10 +393,9 @@ class Predictor:
             for i in np.flatnonzero(self.layout.index[:, column] >= 0):
                 columns[i][:, OWN + column] = term.scale * term.regressor[i] * columns[i][:, source]
 
-    def _adapt(self, columns: list[Floats]) -> None:
+    def _adapt(self, table: Floats) -> None:
         """Steps for the next time, from how far these moved the trajectories."""
-        spans = np.array([np.ptp(trial_data.lead_position_m) for trial_data in self.data])
-        answers = np.array([np.max(np.abs(column), axis=0) for column in columns]) / spans[:, None]
+        answers = np.maximum.reduceat(np.abs(table), self.starts[:-1], axis=0) / self.spans_m[:, None]
         for column in range(len(self.layout.keys)):
             self.steps[column] = _step(float(np.max(answers[:, OWN + column])), float(self.steps[column]))
         for i in np.flatnonzero(self.feels_pressure):
@@ -378,50 +413,6 @@ def _twins(
             key = (rigs[i].tobytes(), tuple(bends[i]), trial_data.time_s.tobytes(), trial_data.trial.travel_ratio)
             twins[i] = first.setdefault(key, i)
     return twins
-
-
-def _clipped_change(plain: Trajectory, moved: Trajectory) -> Floats:
-    """How far positions move, ended where the growth ends; behind that nothing that only delays the end moves them."""
-    change = moved.observed_position_m - plain.observed_position_m
-    if plain.status == "ended":
-        over = plain.time_s > plain.end_time_s
-        change[over] = change[-1] if moved.status == "ended" else 0.0
-    return np.asarray(change)
-
-
-def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
-    """How far the observed positions of a trial answer to a small step, m, shape (n_points,).
-
-    Growth ends at the same place whenever it ends, so a plain difference has a jump between the two ends, of the order
-    of the whole answer, that depends on the sign and size of the step: two effects that do exactly the same would seem
-    to differ by that one frame. So until the unmoved trajectory ends the moved one is continued at its last speed, and
-    from there on only what moves the place of the end counts.
-
-    Parameters
-    ----------
-    plain : Trajectory
-        The unmoved trajectory.
-    moved : Trajectory
-        The same trial, at the same instants, with a step made.
-
-    Returns
-    -------
-    array, shape (n_points,), m
-    """
-    change = _clipped_change(plain, moved)
-    plain_end_s, moved_end_s = (each.end_time_s if each.status == "ended" else math.inf for each in (plain, moved))
-    early = (plain.time_s <= plain_end_s) & (plain.time_s > moved_end_s)
-    last = int(np.argmax(early)) - 1
-    if early.any() and last >= 0:
-        # A step small enough ends growth earlier by what it moves over the speed; where the unmoved motion takes longer
-        # it is another one, such as a stop before the end, and is not continued.
-        speed_m_s = max(float(plain.lead_velocity_m_s[last]), 1e-9)
-        reach_s = plain.time_s[last] + MOST_CONTINUED * abs(float(change[last])) / speed_m_s
-        early &= plain.time_s <= reach_s + 2 * (plain.time_s[1] - plain.time_s[0])
-        if early.any():
-            faster = moved.lead_velocity_m_s[last] - plain.lead_velocity_m_s[last]
-            change[early] = change[last] + faster * (plain.time_s[early] - plain.time_s[last])
-    return change
 
 
 def _step(answer: float, before: float) -> float:

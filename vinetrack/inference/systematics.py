@@ -16,8 +16,9 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.position_change import position_change
 from vinetrack.inference.position_errors import position_shapes
-from vinetrack.inference.sensitivity import PRESSURE, Predictor, position_change
+from vinetrack.inference.sensitivity import PRESSURE, Predictor
 
 PAYLOAD_ERROR = 0.005
 """Standard deviation of a payload's mass beside what the sheet states, as part of it: a gram in two hundred."""

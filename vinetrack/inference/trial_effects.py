@@ -29,9 +29,9 @@ from vinetrack.inference.sensitivity import (
     OWN,
     PRESSURE,
     RELEASE,
-    Job,
     Predictor,
 )
+from vinetrack.inference.trajectory_jobs import Job
 from vinetrack.inference.whitening import at_correlation, whiten
 
 LARGEST_DEVIATION_STEP = 0.3
@@ -126,11 +126,9 @@ def trial_costs(
     """
     if residuals is None:
         residuals = predictor.residuals(state.theta, state.trial_effects)
-    squares = [
-        float(np.sum(whiten(residual, trial_data.first, state.rho, trial_data.relative_sd) ** 2)) / variance
-        for trial_data, residual, variance in zip(predictor.data, residuals, state.variance, strict=True)
-    ]
-    return np.array(squares) + trial_effect_penalty(problem, state)
+    white = whiten(np.concatenate(residuals), predictor.first, state.rho, predictor.relative_sd)
+    squares = [np.sum(of_trial) for of_trial in predictor.by_trial(white**2)]
+    return np.array(squares) / state.variance + trial_effect_penalty(problem, state)
 
 
 def residuals_in(columns: Sequence[Floats]) -> list[Floats]:
@@ -257,7 +255,7 @@ def _best(
     """
     centre, precision = prior
     rho, variance = noise
-    relative = np.ones(trial_data.time_s.size) if trial_data.relative_sd is None else trial_data.relative_sd
+    relative = trial_data.point_sd
     position_m = trial_data.lead_position_m - trial_effects[ORIGIN]
     curves = np.vstack([answers, plain])
     square = (

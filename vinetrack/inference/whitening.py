@@ -40,13 +40,16 @@ def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | No
         columns = columns / relative_sd[:, None]
     if np.count_nonzero(first) == 1:
         now, before = columns[1:], columns[:-1]
+        begin, end = columns[:1], columns[-1:]
     else:
         follows = np.flatnonzero(~first)
         now, before = columns[follows], columns[follows - 1]
-    begin, end = columns[first], columns[np.append(first[1:], True)]
+        begin, end = columns[first], columns[np.append(first[1:], True)]
     whole, cross = columns.T @ columns, now.T @ before
+    sums = np.empty((3, *whole.shape))
     # What has a follower is all but the last point of each stretch.
-    return np.stack([whole, cross + cross.T, whole - end.T @ end - begin.T @ begin])
+    sums[0], sums[1], sums[2] = whole, cross + cross.T, whole - end.T @ end - begin.T @ begin
+    return sums
 
 
 def all_products(

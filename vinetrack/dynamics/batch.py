@@ -1,0 +1,258 @@
+"""Trials laid out end to end for the compiled kernel, and run there."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Callable, Sequence, Sized
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.kernel import kernel
+from vinetrack.dynamics.model import Model, asked, effects_on, hosted
+from vinetrack.effects import State, TrialInputs
+
+RELATIVE_TOLERANCE = 1e-4
+"""Local tolerance on the speed. Hairer's estimate is of order 3, the method of order 5: positions come out good to 10⁻⁶
+of the distance travelled on every trial of the paper's protocol (measured by `benchmarks/integrator.py`)."""
+
+_NOTHING = State(*(math.nan,) * len(State._fields))
+
+CORES = os.cpu_count() or 1
+"""Of this machine; asking for them takes a tenth of the time of a small batch."""
+
+SMALLEST_SHARE = 64
+"""Trials below which another thread costs more than it saves. Chosen: a millisecond of work; no result changes."""
+
+Trace = tuple[Floats, Floats]
+"""Times since release, s, and gauge pressures, Pa, measured there."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Many trials laid out for the compiled kernel: prepared once, run as often as one likes.
+
+    Trial i has rows `starts[i]:starts[i + 1]` of the answer; `stamps`, shape (n_times,), are its instants since release
+    as the camera has them, `times` when they really were. `thetas`, shape (n_trials, n_parameters), may be replaced
+    between runs as long as no effect changes between none and some.
+    """
+
+    integrate_many: Callable[..., None]
+    stamps: Floats
+    starts: NDArray[np.int64]
+    times: Floats
+    on: NDArray[np.bool_]
+    rigs: Floats
+    thetas: Floats
+    trace_starts: NDArray[np.int64]
+    trace_time: Floats
+    trace_pressure: Floats
+    bend_starts: NDArray[np.int64]
+    bends: Floats
+    breakpoints: Floats
+    stops: Floats
+
+    def run(self, relative_tolerance: float = RELATIVE_TOLERANCE, threads: int | None = None) -> tuple[Floats, Floats]:
+        """Integrate every trial.
+
+        Parameters
+        ----------
+        relative_tolerance : of the integrator, relative to the speed that a motion reaches.
+        threads : to share the trials among, by default one for every 64 trials and no more than there are cores: the
+            kernel runs outside the interpreter's lock.
+
+        Returns
+        -------
+        out : array, shape (n_times, 4): x, v, a of the tail, position of the leading edge as the camera reports it
+        ends : array, shape (n_trials, 5): status, end time, end speed, number of steps, first slack
+        """
+        count = self.starts.size - 1
+        out, ends = np.empty((self.times.size, 4)), np.empty((count, 5))
+        threads = threads or max(1, min(CORES, count // SMALLEST_SHARE))
+        edges = np.linspace(0, count, threads + 1).astype(int).tolist()
+        if threads == 1:
+            self._part(0, count, relative_tolerance, out, ends)
+        else:
+            shared = relative_tolerance, out, ends
+            (begin, end), *others = itertools.pairwise(edges)
+            shares = [_pool(os.getpid(), threads).submit(self._part, a, b, *shared) for a, b in others]
+            self._part(begin, end, *shared)
+            for share in shares:
+                share.result()
+        return out, ends
+
+    def _part(self, a: int, b: int, relative_tolerance: float, out: Floats, ends: Floats) -> None:
+        """Trials a to b, each into its own rows of `out` and `ends`."""
+        self.integrate_many(
+            self.starts[a : b + 1],
+            self.times,
+            self.on[a:b],
+            self.rigs[a:b],
+            self.thetas[a:b],
+            self.trace_starts[a : b + 1],
+            self.trace_time,
+            self.trace_pressure,
+            self.bend_starts[a : b + 1],
+            self.bends,
+            self.breakpoints[a:b],
+            self.stops[a:b],
+            relative_tolerance,
+            out,
+            ends[a:b],
+            np.empty((7, 4)),
+        )
+
+
+@lru_cache
+def _pool(process: int, threads: int) -> ThreadPoolExecutor:  # noqa: ARG001
+    """Threads that wait for work; a process that was forked off has its own."""
+    return ThreadPoolExecutor(threads)
+
+
+def lay_out(
+    model: Model,
+    rigs: Floats,
+    bends: Sequence[Sequence[tuple[float, float, float]]],
+    stamps: Floats,
+    starts: NDArray[np.int64],
+    *,
+    traces: Sequence[Trace | None] | None = None,
+    parameters: Floats,
+    host: Model | None = None,
+) -> Batch:
+    """As `prepare`, for trials that are rows of numbers already.
+
+    Parameters
+    ----------
+    model, traces, parameters, host : as those of `simulate_many`
+    rigs : shape (n_trials, n_fields of `TrialInputs`), SI
+    bends : by trial, as `bends_of` returns them
+    stamps : shape (n_times,), instants of all trials end to end, s
+    starts : shape (n_trials + 1,), where each trial's instants begin, as `starts_of` has it
+
+    Returns
+    -------
+    Batch
+        Ready to be run.
+    """
+    count = len(rigs)
+    thetas = np.ascontiguousarray(parameters, dtype=float).reshape(count, len(model.parameter_names))
+    if host is not None and host.names != model.names:
+        resting = np.array([name not in model for name in host.names])
+        model, thetas = host, hosted(host, model, thetas)
+        on = effects_on(model, thetas) & ~resting
+    else:
+        on = effects_on(model, thetas)
+    breakpoints, stops = _limits(model, rigs, thetas, on, bends)
+    times = _true_times(model, rigs, thetas, on, stamps, starts)
+    traces = _true_traces(model, rigs, thetas, on, traces) if traces is not None else [None] * count
+    given = [trace for trace in traces if trace is not None]
+    tail_free = bool(rigs[:, TrialInputs._fields.index("tail_free")].any()) if count else False
+    return Batch(
+        integrate_many=kernel(model.effects, tail_free).integrate_many,
+        stamps=stamps,
+        starts=starts,
+        times=times,
+        on=on,
+        rigs=rigs,
+        thetas=thetas,
+        trace_starts=starts_of([() if trace is None else trace[0] for trace in traces] if given else [()] * count),
+        trace_time=np.concatenate([np.asarray(t, float) for t, _ in given]) if given else np.empty(0),
+        trace_pressure=np.concatenate([np.asarray(p, float) for _, p in given]) if given else np.empty(0),
+        bend_starts=starts_of(bends),
+        bends=np.array([row for rows in bends for row in rows], dtype=float).reshape(-1, 3),
+        breakpoints=breakpoints,
+        stops=stops,
+    )
+
+
+def starts_of(parts: Sequence[Sized]) -> NDArray[np.int64]:
+    """Where each part begins when all are laid end to end, and where the last ends.
+
+    Parameters
+    ----------
+    parts : sequence of sized
+
+    Returns
+    -------
+    array of int, shape (n_parts + 1,)
+    """
+    starts = np.zeros(len(parts) + 1, dtype=np.int64)
+    np.cumsum([len(part) for part in parts], out=starts[1:])
+    return starts
+
+
+def _limits(
+    model: Model,
+    rigs: Floats,
+    thetas: Floats,
+    on: NDArray[np.bool_],
+    bends: Sequence[Sequence[tuple[float, float, float]]],
+) -> tuple[Floats, Floats]:
+    """Tail travel at the breakpoints of the forces, rising, and at which growth ends, m; infinite where there is none.
+
+    Of shape (n_trials, n_breakpoints) and (n_trials,). Breakpoints are where the film's mass reaches its floor, where
+    bends begin and end, and what effects say of theirs.
+    """
+    rig = TrialInputs(*rigs.T)
+    film = np.ones(len(rigs))
+    for effect, function, place in asked(model, "film_gain"):
+        for k in np.flatnonzero(on[:, effect]).tolist():
+            film[k] *= function(_NOTHING, TrialInputs(*rigs[k]), *thetas[k, place])
+    end = np.where(np.asarray(rig.length) > 0, np.asarray(rig.length) * rig.travel_ratio, math.inf)
+    left = np.asarray(rig.linear_density) * rig.length - rig.least_mass / film
+    loss = np.asarray(rig.mass_loss)
+    floor = np.where(loss > 0, np.maximum(left, 0.0) / np.where(loss > 0, loss, 1.0), math.inf)
+    broken = [i for i, effect in enumerate(model.effects) if effect.breakpoints is not None and on[:, i].any()]
+    if not broken and not any(bends):
+        return floor[:, None].copy(), end
+    positions_m = [[edge for start, arc, _ in rows for edge in (start, start + arc)] for rows in bends]
+    for i in broken:
+        of_effect = model.effects[i].breakpoints
+        assert of_effect is not None
+        known: dict[tuple[bytes, bytes], list[float]] = {}
+        for k in np.flatnonzero(on[:, i]).tolist():
+            # A difference moves one number of a trial at a time, and most of them no breakpoint.
+            key = rigs[k].tobytes(), thetas[k, model.places[i]].tobytes()
+            if key not in known:
+                known[key] = list(of_effect(TrialInputs(*rigs[k]), *thetas[k, model.places[i]]))
+            positions_m[k] += known[key]
+    breakpoints = np.full((len(rigs), 1 + max(map(len, positions_m), default=0)), math.inf)
+    breakpoints[:, 0] = floor
+    for k, positions in enumerate(positions_m):
+        breakpoints[k, 1 : 1 + len(positions)] = np.array(positions) * np.asarray(rig.travel_ratio)[k]
+    return np.sort(breakpoints, axis=1), end
+
+
+def _true_times(
+    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], stamps: Floats, starts: NDArray[np.int64]
+) -> Floats:
+    """When what the camera stamps really happened, of all trials end to end, shape (n_times,)."""
+    true_times = stamps
+    for effect, function, place in asked(model, "true_time"):
+        true_times = true_times.copy()
+        for i in np.flatnonzero(on[:, effect]):
+            of_trial = slice(starts[i], starts[i + 1])
+            state = _NOTHING._replace(time=true_times[of_trial])  # type: ignore[arg-type]
+            true_times[of_trial] = function(state, TrialInputs(*rigs[i]), *thetas[i, place])
+    return true_times
+
+
+def _true_traces(
+    model: Model, rigs: Floats, thetas: Floats, on: NDArray[np.bool_], traces: Sequence[Trace | None]
+) -> list[Trace | None]:
+    """Measured pressures at the times at which they were really measured, by trial."""
+    in_time = list(traces)
+    for effect, function, place in asked(model, "trace_time"):
+        for i in np.flatnonzero(on[:, effect]).tolist():
+            if (trace := in_time[i]) is None:
+                continue
+            state = _NOTHING._replace(time=trace[0])  # type: ignore[arg-type]
+            in_time[i] = np.asarray(function(state, TrialInputs(*rigs[i]), *thetas[i, place]), dtype=float), trace[1]
+    return in_time

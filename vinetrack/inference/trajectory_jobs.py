@@ -1,0 +1,197 @@
+"""Trajectories to simulate, as arrays: a fit asks for a hundred at a time, thousands of times over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+from vinetrack.dynamics.batch import Batch
+from vinetrack.dynamics.simulate import Trajectory, check_completed, trajectories
+
+
+class Job(NamedTuple):
+    """One trajectory to simulate: which trial, its parameters, pressures and release, and how wrong its payload is."""
+
+    trial: int
+    row: Floats
+    yield_pressure_Pa: float
+    pressure_deviation: float
+    release_s: float
+    payload_factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """Trajectories to simulate, an entry of every array for each; `row` has shape (n_jobs, n_parameters), SI."""
+
+    trial: NDArray[np.int_]
+    row: Floats
+    yield_pressure_Pa: Floats
+    pressure_deviation: Floats
+    release_s: Floats
+    payload_factor: Floats
+
+    @classmethod
+    def of(cls, jobs: Sequence[Job], rows: Floats | None = None) -> Jobs:
+        """Single jobs together.
+
+        Parameters
+        ----------
+        jobs : sequence of Job
+        rows : array, shape (n_jobs, n_parameters), optional
+            Parameters in place of those of the jobs.
+
+        Returns
+        -------
+        Jobs
+        """
+        trials, own_rows, *columns = zip(*jobs, strict=True) if jobs else [()] * len(Job._fields)
+        rows = np.array(own_rows).reshape(len(jobs), -1) if rows is None else rows
+        return cls(np.array(trials, dtype=int), rows, *(np.array(column, dtype=float) for column in columns))
+
+    def __len__(self) -> int:
+        return self.trial.size
+
+    def take(self, places: NDArray[np.int_]) -> Jobs:
+        """Some of them, copied.
+
+        Parameters
+        ----------
+        places : array of int, shape (n_taken,)
+
+        Returns
+        -------
+        Jobs
+        """
+        trial, *numbers = self._columns
+        return Jobs(trial[places], *(values[places] for values in numbers))
+
+    def single(self) -> list[Job]:
+        """Each of them.
+
+        Returns
+        -------
+        list of Job
+        """
+        rows, *columns = self.row, *(values.tolist() for values in self._columns[2:])
+        return [Job(i, row, *numbers) for i, row, *numbers in zip(self.trial.tolist(), rows, *columns, strict=True)]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Jobs]) -> Jobs:
+        """All of several, one after the other.
+
+        Parameters
+        ----------
+        parts : sequence of Jobs
+
+        Returns
+        -------
+        Jobs
+        """
+        trial, *numbers = (np.concatenate(values) for values in zip(*(part._columns for part in parts), strict=True))
+        return cls(trial, *numbers)
+
+    @property
+    def _columns(self) -> tuple[NDArray[Any], ...]:
+        return (
+            self.trial,
+            self.row,
+            self.yield_pressure_Pa,
+            self.pressure_deviation,
+            self.release_s,
+            self.payload_factor,
+        )
+
+    def distinct(self, twins: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Which of them are the first of their kind, and of each which of those is like it.
+
+        Parameters
+        ----------
+        twins : array of int, shape (n_trials,)
+            Of every trial the first of the same settings and instants.
+
+        Returns
+        -------
+        first : array of int, shape (n_distinct,)
+        like : array of int, shape (n_jobs,)
+        """
+        numbers = np.column_stack([twins[self.trial].astype(float), *self._columns[1:]])
+        first: dict[bytes, int] = {}
+        like = [first.setdefault(numbers[k].tobytes(), k) for k in range(len(numbers))]
+        return np.unique(like, return_inverse=True)
+
+
+@dataclass(frozen=True)
+class Motions:
+    """What was simulated for jobs: rows of `out` and `ends` as `Batch.run` returns them, for distinct trajectories.
+
+    `like`, shape (n_jobs,), tells of each job which trajectory is its own.
+    """
+
+    batch: Batch
+    out: Floats
+    ends: Floats
+    like: NDArray[np.int_]
+
+    @classmethod
+    def of(cls, batch: Batch, like: NDArray[np.int_], names: Sequence[str]) -> Motions:
+        """Integrate a batch.
+
+        Parameters
+        ----------
+        batch : Batch
+            Distinct trajectories.
+        like : array of int, shape (n_jobs,)
+            Of each job its trajectory.
+        names : sequence of str
+            Of the trials, for messages.
+
+        Returns
+        -------
+        Motions
+
+        Raises
+        ------
+        SimulationError
+            If the integration does not get through.
+        """
+        out, ends = batch.run()
+        check_completed(ends, names)
+        return cls(batch, out, ends, like)
+
+    def rows(self, first: int, last: int) -> Floats:
+        """Rows of `out` of jobs `first` up to `last`, end to end.
+
+        Parameters
+        ----------
+        first, last : int
+
+        Returns
+        -------
+        array, shape (n_times, 4)
+            Position, velocity and acceleration of the tail, position of the edge as the camera reports it.
+        """
+        starts, like = self.batch.starts, self.like[first:last]
+        if like.size and like[-1] - like[0] == like.size - 1 and np.all(np.diff(like) == 1):
+            return self.out[starts[like[0]] : starts[like[-1] + 1]]
+        return np.concatenate([self.out[starts[k] : starts[k + 1]] for k in like])
+
+    def trajectories(self, ratios: Sequence[float]) -> list[Trajectory]:
+        """A trajectory for each job.
+
+        Parameters
+        ----------
+        ratios : sequence of float
+            Travel ratios of the distinct trajectories' trials.
+
+        Returns
+        -------
+        list of Trajectory
+        """
+        known = trajectories(self.batch, self.out, self.ends, ratios)
+        return [known[k] for k in self.like]
