@@ -7,10 +7,11 @@ Campaigns of `benchmarks/hidden`, which share no code with the package, with one
 growth that become shorter; growth) and `squeeze` (with the square of the pressure, beyond a place; growth and
 pressure). Seeds 20520–20529 tune, 32000–32009 score: nothing may be tuned on those.
 
-Printed for each: the variables named, with their posterior weight; the part of visited points, each variable within
-the middle 90 % of what was visited, where the learned force is within 10 % of the range of the truth; and the same
-but for a constant, which P_y takes over within its error. With `--propose` (several times as long) the left-out error
-of the law that is proposed, in parts of what the true model gets.
+Printed for each: the variables named, with their posterior weight, and those not excluded beside them; the part of
+visited points, each variable within the middle 90 % of what was visited, where the learned force is within 10 % of the
+range of the truth; and the same but for a constant, which P_y takes over within its error. With `--propose` (several
+times as long) the left-out error of the law that is proposed, in parts of what the true model gets; and with the
+learned force as a table, where one is proposed: that has seen the conditions that are left out.
 """
 
 from __future__ import annotations
@@ -89,7 +90,10 @@ def ask(seed: int, with_law: bool) -> dict[str, object]:
     row: dict[str, object] = {"seed": seed, "law": law, "n_trials": len(pairs), "chi2_per_dof": fit.chi2_per_dof}
     row["processor_s"] = time.process_time() - begun
     if learned is not None:
-        row["variables"], row["weight"] = next(iter(learned.weights.items()))
+        row["variables"] = "+".join(learned.variables)
+        row["weight"] = learned.weights[row["variables"]]
+        row["beside"] = ", ".join(learned.beside)
+        row["in_set"] = LAWS[law] in (row["variables"], *learned.beside)
         row["weight_of_truth"] = learned.weights.get(LAWS[law], 0.0)
         row |= {"explained": learned.explained, **errors(campaign, learned)}
     if with_law:
@@ -100,6 +104,7 @@ def ask(seed: int, with_law: bool) -> dict[str, object]:
         true_m = left_out(true_fit(proposal.before, campaign.truth)).rms_m
         row["before"] = proposal.rms_left_out_m / true_m
         row["after"] = proposal.tied[0].rms_left_out_m / true_m if proposal.tied else math.nan
+        row["with_table"] = math.nan if proposal.table is None else proposal.table.rms_left_out_m / true_m
     return row
 
 
@@ -108,20 +113,27 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=FIRST_TUNING_SEED)
     parser.add_argument("--campaigns", type=int, default=10)
     parser.add_argument("--propose", action="store_true", help="also fit laws, and hold the best against the truth")
-    parser.add_argument("--rows", type=Path, help="keep every answer as it comes")
+    parser.add_argument("--rows", type=Path, help="keep every answer as it comes; what is there is not asked again")
     asked = parser.parse_args()
-    rows = []
+    kept = asked.rows is not None and asked.rows.is_file()
+    rows: list[dict[str, object]] = pd.read_csv(asked.rows).to_dict("records") if kept else []
     for seed in range(asked.first_seed, asked.first_seed + asked.campaigns):
+        if any(row["seed"] == seed for row in rows):
+            continue
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             rows.append(ask(seed, asked.propose))
         if asked.rows:
             pd.DataFrame(rows).to_csv(asked.rows, index=False)
         print(pd.DataFrame(rows[-1:]).to_string(index=False), flush=True)
-    table = pd.DataFrame(rows)
+    absent = {"variables": None, "beside": None, "in_set": False, "within": math.nan, "within_shape": math.nan}
+    table = pd.DataFrame([absent | row for row in rows])
     print(table.to_string(index=False, float_format="%.3g"))
-    right = [variables == LAWS[law] for law, variables in zip(table["law"], table["variables"], strict=True)]
-    print(f"variables right: {np.sum(right)} of {len(table)}; not excluded: {np.sum(table['weight_of_truth'] >= 0.05)}")
+    named = table["variables"].notna()
+    right = table["variables"] == table["law"].map(LAWS)
+    alone = table["beside"].fillna("") == ""
+    print(f"learned {named.sum()} of {len(table)}; variables right {right.sum()}, alone {(right & alone).sum()};")
+    print(f"in the set {table['in_set'].eq(True).sum()}; a wrong name alone {(named & ~right & alone).sum()}")
     print(f"within 10 % of the range, median of campaigns: force {table['within'].median():.2f}, but for a constant"
           f" {table['within_shape'].median():.2f}")  # fmt: skip
     print(f"processor time: median {table['processor_s'].median():.0f} s, most {table['processor_s'].max():.0f} s")

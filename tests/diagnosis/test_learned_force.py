@@ -14,7 +14,8 @@ from scipy.stats import multivariate_normal
 
 import vinetrack as vt
 from vinetrack.diagnosis.force_surface import AMPLITUDES, KEPT, LENGTHS, Domain, Surface, covariance_root, curves
-from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS, _Posterior, _stand_ins, _weighed
+from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS, _Posterior, _weighed
+from vinetrack.diagnosis.learned_variables import following
 from vinetrack.diagnosis.missing_force import MissingForce, missing_force
 
 GROWTH = Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
@@ -66,8 +67,8 @@ def test_a_variable_that_follows_from_those_named_is_told_and_one_that_varies_fr
         for speed in (2.0, 3.0, 4.5, 6.0, 7.5)
     ]
     time, speed = (replace(GROWTH, variables=(name,), high=(high,)) for name, high in (("time", 0.125), ("speed", 8.0)))
-    assert _stand_ins(BOTH, [GROWTH, time, speed], motions) == ["time"]  # type: ignore[arg-type]
-    assert _stand_ins(GROWTH, [GROWTH, speed], motions) == []  # type: ignore[arg-type]
+    assert following(BOTH, [GROWTH, time, speed], motions) == ["time"]  # type: ignore[arg-type]
+    assert following(GROWTH, [GROWTH, speed], motions) == []  # type: ignore[arg-type]
 
 
 def test_the_marginal_likelihood_is_that_of_the_normal_distribution() -> None:

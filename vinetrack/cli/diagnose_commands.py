@@ -113,7 +113,7 @@ def _propose(
     from vinetrack.cli.main import _sentences
 
     with _sentences(log):
-        from vinetrack.pipeline.diagnosis_stage import propose_effect
+        from vinetrack.pipeline.proposed_effects import propose_effect
         from vinetrack.pipeline.source_experiment import experiment_behind
 
         with _told() as report:

@@ -17,9 +17,8 @@ What no force explains is no noise, but is weighed as if it were: χ² is divide
 end once χ² falls by less than a part of itself (`SETTLED`); differences of ln Z are counted in units of that.
 A force that B, n and P_y could take over as well is not decided by these data. It is drawn as small as it may be, and
 the band holds what they could shift. Growth, speed and time are hardly three variables where speeds are steady: weights
-then spread over several choices, and may lean to a wrong one whose surface is smoother: a variable that follows from
-those named is named too (`_stand_ins`). A learned force is drawn and described; `vinetrack.diagnosis.propose` writes
-laws of its own list only.
+then lean to whichever surface is smoother. Choices that the tracks themselves do not exclude are named beside the best
+(`learned_variables`). `vinetrack.diagnosis.propose` seeks a law for the force, or writes it as a table.
 """
 
 from __future__ import annotations
@@ -37,9 +36,10 @@ from vinetrack.diagnosis.force_inversion import ForceFit
 from vinetrack.diagnosis.force_refinement import SETTLED, Normal, Place, followed, normal_equations
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of
 from vinetrack.diagnosis.force_surface import AMPLITUDES, LENGTHS, VARIABLES, Domain, Surface, domains
+from vinetrack.diagnosis.learned_variables import dependence, named, not_excluded
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
 from vinetrack.diagnosis.smoothed_motions import on_tracks
 from vinetrack.inference.fit_result import Fit
-from vinetrack.narrative.verdict_summary import joined
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,20 +68,6 @@ MENDS = 0.95
 """Part of the misfit that a force must take away once it is followed, to be told. Chosen: what leaves more has not
 settled, or something else is missing beside it, and weights of variables say nothing then. At half of the misfit wrong
 variables are named where a force is of the drive's own size."""
-
-TIED = 0.05
-"""Weight from which a choice of variables is named beside the best. Chosen: the usual twentieth."""
-
-SURE = 0.95
-"""Weight from which a choice is sure. Chosen: the usual."""
-
-FOLLOWS = 0.1
-"""Part of a variable's variance that is left beside smooth functions of others, from which down it follows from them.
-Measured on tuning seeds 20500 and 20520 to 20522: of growth, speed and time any two leave at most 8 % of the third, one
-leaves 25 % and more of another. At half of it the speed is not named where it leaves 8 %, at twice most pairs are."""
-
-SAMPLED = 40
-"""Points of a motion by which it is asked whether a variable follows from others. Chosen: more than splines."""
 
 DRAWN, NEAR = (60, 30), 0.06
 """Points of a curve, and along each side of a map; and how near to a point of the map, as a part of each side, a trial
@@ -124,15 +110,15 @@ class _Choice:
 class LearnedForce:
     """The missing force over the variables that it most likely depends on.
 
-    `weights` are posterior, by `growth`, `growth+speed`, …; `lengths` by variable, as parts
-    of what was visited; `amplitude_N` the standard
-    deviation of the process. `table`, columns `LEARNED_COLUMNS`, holds the force on a grid (condition blank; `trials`
-    counts those that came near) and along the first trial of each condition; variables that do not count are NaN.
-    `place` is where the fit ended.
+    `weights` are posterior, by `growth`, `growth+speed`, …; `beside` names the choices that are not excluded either;
+    `lengths` by variable, as parts of what was visited; `amplitude_N` the standard deviation of the process. `table`,
+    columns `LEARNED_COLUMNS`, holds the force on a grid (condition blank; `trials` counts those that came near) and
+    along the first trial of each condition; variables that do not count are NaN. `place` is where the fit ended.
     """
 
     variables: tuple[str, ...]
     weights: Mapping[str, float]
+    beside: tuple[str, ...]
     lengths: Mapping[str, float]
     amplitude_N: float
     log_bayes_factor: float
@@ -146,6 +132,7 @@ class LearnedForce:
         return {
             "variables": list(self.variables),
             "weights": dict(self.weights),
+            "not_excluded": list(self.beside),
             "length_scales": dict(self.lengths),
             "amplitude_N": self.amplitude_N,
             "log_bayes_factor": self.log_bayes_factor,
@@ -220,36 +207,13 @@ def learned_force(
         remarks.append("No condition was repeated: how sure this is rests on the scatter that the fit assumes.")
     if not any("pressure" in choice.domain.variables for choice, _ in linear):
         remarks.append("All trials had one pressure: whether the force depends on it they do not tell.")
-    singles = [choice.domain for choice, _ in linear if len(choice.domain.variables) == 1]
-    instead = _stand_ins(best.domain, singles, motions)
-    if instead:
-        remarks.append(
-            f"Given {_named(best.domain.name)}, these trials leave little open of "
-            f"{joined([_WORDS[name] for name in instead])}: the force may depend on that as well. Trials that pass the "
-            "same growth otherwise, at further pressures or payloads, tell."
-        )
-    return _told(fit, best, place, weights, bayes, remarks, instead)
-
-
-def _stand_ins(best: Domain, others: Sequence[Domain], motions: Sequence[FittedMotion]) -> list[str]:
-    """Variables that are smooth functions of those of a domain wherever trials have been."""
-    counts = [np.count_nonzero(motion.time_s <= motion.counts_until_s) for motion in motions]
-    places = [np.linspace(0, count - 1, SAMPLED).astype(int) for count in counts]
-
-    def visited(domain: Domain) -> list[Floats]:
-        courses = [np.array(domain.of_motion(motion))[:, at] for motion, at in zip(motions, places, strict=True)]
-        return list(np.hstack(courses))
-
-    basis = best.basis(visited(best))
-    named = []
-    for domain in others:
-        if domain.variables[0] in best.variables:
-            continue
-        (value,) = domain.parts(visited(domain))
-        left = value - basis @ np.linalg.lstsq(basis, value, rcond=1e-8)[0]
-        if float(np.var(left)) < FOLLOWS * float(np.var(value)):
-            named.append(domain.variables[0])
-    return named
+    losses = {choice.domain.name: (choice.left - best.left) / inflation for choice in choices}
+    # A fit that has settled within a part of χ² tells no smaller difference.
+    worth = max(ANSWER_SET, SETTLED * left / inflation)
+    beside = not_excluded(best.domain, weights, losses, worth, [choice.domain for choice, _ in linear], motions)
+    if beside:
+        remarks.append("Trials that pass the same growth otherwise, at further pressures or payloads, tell.")
+    return _told(fit, best, place, weights, bayes, remarks, beside)
 
 
 def _followed(
@@ -351,7 +315,7 @@ def _told(
     weights: Mapping[str, float],
     bayes: float,
     remarks: Sequence[str],
-    instead: Sequence[str],
+    beside: Sequence[str],
 ) -> LearnedForce:
     """The force of the best choice with its table and the words for it."""
     domain = best.domain
@@ -362,12 +326,13 @@ def _told(
     return LearnedForce(
         variables=domain.variables,
         weights=weights,
+        beside=tuple(beside),
         lengths=lengths,
         amplitude_N=best.surface.sd_N,
         log_bayes_factor=bayes,
         explained=explained,
         table=table,
-        sentence=" ".join([_sentence(best.domain.name, weights, explained, table, sure=not instead), *remarks]),
+        sentence=" ".join([_sentence(best.domain.name, weights, beside, explained, table), *remarks]),
         place=place,
     )
 
@@ -412,36 +377,16 @@ def _rows(best: _Choice, places: Sequence[Floats], trials: Floats, condition: st
     )
 
 
-_WORDS = {
-    "growth": "the growth",
-    "speed": "the speed of the tail",
-    "time": "the time since release",
-    "pressure": "the pressure",
-}
-
-
-def _named(name: str) -> str:
-    return " and ".join(_WORDS[variable] for variable in name.split("+"))
-
-
-def _sentence(name: str, weights: Mapping[str, float], explained: float, table: pd.DataFrame, *, sure: bool) -> str:
+def _sentence(
+    name: str, weights: Mapping[str, float], beside: Sequence[str], explained: float, table: pd.DataFrame
+) -> str:
     """What it depends on and how sure that is, and how large it is."""
-    weight = weights[name]
-    others = [(other, part) for other, part in weights.items() if other != name and part >= TIED]
-    likely = "depends" if weight >= SURE and sure else "most likely depends"
-    sentence = (
-        f"Learned as a smooth function inside the fit, the missing force {likely} on {_named(name)} (posterior weight"
-        f" {weight:.0%})"
-    )
-    if others:
-        listed = joined([f"{_named(other)} ({part:.0%})" for other, part in others])
-        sentence += f"; these trials cannot rule out that it depends on {listed} instead"
     seen = table[(table["condition"] == "") & (table["trials"] > 0)]
     low, high, sigma = (
         float(value) for value in (seen["force_N"].min(), seen["force_N"].max(), seen["sigma_N"].median())
     )
-    sentence += (
-        f". It lies between {low:.2f} and {high:.2f} N where trials have been, with a standard error of {sigma:.2f} N,"
-        f" and takes away {explained:.0%} of the misfit."
+    drawn = f" Over {named(name)} it" if beside else " It"
+    return (
+        f"{dependence(name, weights, beside)}.{drawn} lies between {low:.2f} and {high:.2f} N where trials have been,"
+        f" with a standard error of {sigma:.2f} N, and takes away {explained:.0%} of the misfit."
     ).replace("-", "−")
-    return sentence

@@ -11,7 +11,7 @@ import math
 import tempfile
 import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,6 +31,7 @@ from vinetrack.diagnosis.likelihood_ratio import (
 from vinetrack.diagnosis.misfit_tests import FAR_OFF
 from vinetrack.diagnosis.missing_force import MENDS, SeenLaw, missing_force
 from vinetrack.diagnosis.multi_start import from_other_starts
+from vinetrack.diagnosis.proposed_table import WORTH, ProposedTable, proposed_table
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, load_effect, remember
 from vinetrack.inference.fit_data import FitError, Pairs
@@ -43,11 +44,6 @@ MOST_PROPOSED = 4
 BEHIND = 0.2
 """Laws that explain less than the best by more than this part are not fitted. Chosen: twice what single trials make of
 it; at half a right law whose linear fit errs is dropped, at twice laws are fitted that no likelihood comes back to."""
-
-WORTH = 6.0
-"""Standard deviations by which a law must mend the model to be proposed: some hundred laws are tried, and none is known
-beforehand. Chosen as SUSPECT_SIGMAS of the misfit tests; at half one is found in noise, at twice in gross misfits
-alone."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +141,7 @@ class Proposal:
     """Laws that mend a model, best first, and what the model without them errs by, m.
 
     `tied` are those that the data do not exclude; none where no law is worth proposing, and `reason` says why.
+    `table` is the learned force where it takes away what no law does.
     """
 
     before: Fit
@@ -152,11 +149,15 @@ class Proposal:
     laws: tuple[ProposedLaw, ...]
     tied: tuple[ProposedLaw, ...]
     reason: str = ""
+    table: ProposedTable | None = None
 
     def sentences(self) -> list[str]:
         """What was tried and what came of it, a line a sentence."""
+        return [*self._of_laws(), *([] if self.table is None else self.table.sentences(self.before))]
+
+    def _of_laws(self) -> list[str]:
         if not self.tied:
-            return [self.reason]
+            return [self.reason if self.table else f"{self.reason} Nothing is proposed."]
         best = self.tied[0]
         lines = [
             f"{law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
@@ -186,6 +187,7 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
     Returns
     -------
     Proposal
+        With the learned force as a table where no law takes away what that does.
 
     Raises
     ------
@@ -199,10 +201,17 @@ def propose(model: Model, pairs: Pairs, report: Callable[[str], None]) -> Propos
         before = from_other_starts(before)
     report("drawing the missing force")
     seen = missing_force(before, learn=False).seen
-    if not seen:
-        reason = "No simple law of force is seen in what the model leaves; nothing is proposed."
-        return Proposal(before, left_out(before).rms_m, (), (), reason)
     near = [law for law in seen if law.explained > seen[0].explained - BEHIND][:MOST_PROPOSED]
+    proposal = _of_laws(model, before, near, report)
+    fits = [law.ratio.fit for law in proposal.tied]
+    return replace(proposal, table=proposed_table(model, proposal.before, fits, report))
+
+
+def _of_laws(model: Model, before: Fit, near: Sequence[SeenLaw], report: Callable[[str], None]) -> Proposal:
+    """The laws fitted in the equation of motion, with those that the data do not exclude."""
+    if not near:
+        reason = "No simple law of force is seen in what the model leaves."
+        return Proposal(before, left_out(before).rms_m, (), (), reason)
     with tempfile.TemporaryDirectory() as folder:
         effects = [_written(law, Path(folder)) for law in near]
         # Compiled without the catalogue, which nothing here asks for.
@@ -242,7 +251,7 @@ def _judged(before: Fit, laws: Sequence[ProposedLaw]) -> Proposal:
         and (misfit < 1 or before.chi2_per_dof - law.ratio.fit.chi2_per_dof > MENDS * misfit)
     ]
     if not worth:
-        reason = "No simple law of force mends the model and predicts left-out conditions better; nothing is proposed."
+        reason = "No simple law of force mends the model and predicts left-out conditions better."
         return Proposal(before, error_m, laws, (), reason)
     kept, _ = answer_set([law.ratio for law in worth])
     tied = tuple(law for ratio in kept for law in worth if law.ratio is ratio)

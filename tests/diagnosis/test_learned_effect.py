@@ -1,0 +1,125 @@
+"""A learned force as a table in an effect file, and which variables it may hang on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from grown import effect_file, grown, pairs_of, sheet
+
+import vinetrack as vt
+from vinetrack.diagnosis.force_surface import Domain, Surface
+from vinetrack.diagnosis.learned_effect import even_coefficients, table_name, table_text
+from vinetrack.diagnosis.learned_force import LearnedForce
+from vinetrack.diagnosis.learned_variables import dependence, not_excluded
+from vinetrack.diagnosis.propose import propose
+from vinetrack.effects import State, own_effects
+
+DOMAINS = [
+    Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
+    Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, 1.3)),
+    Domain(("time", "pressure"), (0.0, 1e4), (0.4, 3e4), (8, 5), (0.1, math.inf)),
+]
+
+
+def learned(domain: Domain, seed: int) -> LearnedForce:
+    """A force of arbitrary coefficients over a domain."""
+    coefficients = np.random.default_rng(seed).standard_normal(domain.size)
+    places = {
+        "lead_position_m": [0.1, 0.2],
+        "tail_velocity_m_s": [2.0, 3.0],
+        "time_s": [0.1, 0.2],
+        "pressure_Pa": [2e4, 2.5e4],
+    }
+    table = pd.DataFrame({**places, "force_N": [-0.1, -0.3], "sigma_N": 0.01, "trials": [2, 3], "condition": ["", ""]})
+    place = SimpleNamespace(law=Surface(domain, np.eye(domain.size)), amplitude=coefficients)
+    return LearnedForce(domain.variables, {domain.name: 1.0}, (), {}, 1.0, 50.0, 0.99, table, "It depends.", place)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)
+def test_the_file_holds_the_force_that_was_learned_wherever_trials_have_been(domain: Domain, tmp_path: Path) -> None:
+    force = learned(domain, 4)
+    path = tmp_path / f"{table_name(force)}.py"
+    path.write_text(table_text(force, "From 24 trials of a bench."), encoding="utf-8")
+    effect = own_effects([path])[path.stem]
+    assert "From 24 trials of a bench." in effect.text
+    assert "no law" in effect.summary
+    draw = np.random.default_rng(5)
+    at = [
+        draw.uniform(low - 0.1 * (high - low), high * 1.2, 40)
+        for low, high in zip(domain.low, domain.high, strict=True)
+    ]
+    names = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
+    state = SimpleNamespace(**{names[name]: value for name, value in zip(domain.variables, at, strict=True)})
+    expected = domain.basis(at) @ force.place.amplitude
+    shown = effect.functions["tail_force"](state, None, 1.0)
+    assert shown == pytest.approx(expected, abs=1e-4 * np.abs(expected).max())
+    assert effect.functions["tail_force"](state, None, 0.0) == pytest.approx(0.0 * expected)
+
+
+def test_even_splines_make_the_same_constant() -> None:
+    assert even_coefficients(DOMAINS[1], np.full(DOMAINS[1].size, 0.7)) == pytest.approx(0.7)
+
+
+def test_choices_are_set_aside_by_what_they_leave_and_not_by_how_smooth_they_are() -> None:
+    """Trials of even speed: a force over growth and time is a force over growth and speed."""
+    growth = replace(DOMAINS[0], counts=(12,))
+    time, speed = (replace(growth, variables=(name,), high=(high,)) for name, high in (("time", 0.125), ("speed", 8.0)))
+    pairs = [
+        replace(growth, variables=pair, low=(0.0, 0.0), high=(0.25, high), counts=(12, 8), usual=(math.inf, math.inf))
+        for pair, high in ((("growth", "speed"), 8.0), (("growth", "time"), 0.125))
+    ]
+    part = np.linspace(0, 1, 80)
+    motions = [
+        SimpleNamespace(
+            time_s=0.25 / v * part,
+            counts_until_s=math.inf,
+            lead_position_m=0.25 * part,
+            tail_velocity_m_s=np.full(80, v),
+        )
+        for v in (2.0, 3.0, 4.5, 6.0, 7.5)
+    ]
+    every = [growth, time, speed, *pairs]
+
+    def kept(weights: dict[str, float], losses: dict[str, float], best: Domain = pairs[1]) -> list[str]:
+        return not_excluded(best, weights, losses, 9.0, every, motions)  # type: ignore[arg-type]
+
+    followed = {"growth+time": 0.999, "growth+speed": 0.001, "growth": 0.0}
+    assert kept(followed, {"growth+time": 0.0, "growth+speed": 4.0, "growth": 400.0}) == ["growth+speed"]
+    assert kept(followed, {"growth+time": 0.0, "growth+speed": 90.0, "growth": 400.0}) == []
+    assert kept({"growth+time": 1.0, "growth": 0.0}, {"growth+time": 0.0, "growth": 400.0}) == ["growth+speed"]
+    assert kept({"growth": 0.99, "growth+time": 0.01}, {"growth": 0.0, "growth+time": -3.0}, growth) == []
+
+
+def test_what_trials_do_not_tell_is_said_of_what_they_do() -> None:
+    weights = {"growth+time": 0.74, "growth+speed": 0.26}
+    both = dependence("growth+time", weights, ["growth+speed"])
+    assert both.endswith(
+        "depends on the growth, and on the time since release (74%) or the speed of the tail (26%):"
+        " these trials do not tell which"
+    )
+    assert dependence("growth", {"growth": 0.97}, []).endswith("depends on the growth (posterior weight 97%)")
+    assert "most likely depends on the time" in dependence("time", {"time": 0.9}, [])
+    unlike = dependence("growth", {"growth": 0.6}, ["speed+time"])
+    assert "on the growth (60%) or on the speed of the tail and the time since release:" in unlike
+
+
+def test_a_force_in_no_list_is_proposed_as_a_table_that_mends_the_model(tmp_path: Path) -> None:
+    """Waves along the growth that become shorter: no formula of the list follows them."""
+    hidden = effect_file(tmp_path, "hidden", ["np.sin(2 * np.pi * (s.lead_position / 0.12) ** 1.5)"])
+    pairs = pairs_of(grown(sheet((4,)), 131, own=[hidden], values={"hidden.a": -0.3, "hidden.kind": 0.0}))
+    proposal = propose(vt.base_model(), pairs, lambda _: None)
+    table = proposal.table
+    assert table is not None
+    assert table.effect.name == "learned_growth"
+    size = next(number for number in table.ratio.fit.numbers if number.key == "learned_growth.a")
+    assert size.value == pytest.approx(1.0, abs=0.1)
+    assert table.ratio.fit.chi2_per_dof < 1.5 < proposal.before.chi2_per_dof
+    assert "No formula tried does what the learned force does." in proposal.sentences()[-1]
+    zero = State(*(0.0,) * len(State._fields))
+    assert math.isfinite(table.effect.functions["tail_force"](zero, None, 1.0))
