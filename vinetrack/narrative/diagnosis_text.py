@@ -15,6 +15,7 @@ from vinetrack.diagnosis.result import (
     DROPPED_FRAMES,
     MISSING,
     NOT_TESTABLE,
+    UNEXPLAINED,
     Candidate,
     Diagnosis,
     Round,
@@ -33,8 +34,12 @@ _HEADLINES = {
     MISSING: "one effect is missing",
     AMBIGUOUS: "one of several effects is missing, and these data cannot tell which",
     ARTEFACT: "a fault of the measurement, not of the physics",
-    "unexplained": "the model fails, and no effect of the catalogue explains it",
+    UNEXPLAINED: "the model fails, and no effect of the catalogue explains it",
 }
+GO_ON = (
+    "To go on: look at the pictures of the missing force in the report; `vinetrack propose` on the results folder seeks a"
+    " law for it, and writes what mends the model as an effect file of your own."
+)
 CLEAR_GAIN = 9.0
 """Δχ² from which an effect helps. Derived: that of the answer set, 3 standard errors for one number."""
 
@@ -68,6 +73,8 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     if diagnosis.next_experiment:
         lines += ["", str(diagnosis.next_experiment.get("text", ""))]
     lines += [f"! {note}" for note in diagnosis.notes]
+    if UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict):
+        lines += ["", GO_ON]
     return "\n".join(lines)
 
 

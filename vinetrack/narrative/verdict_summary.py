@@ -39,7 +39,7 @@ MEANINGS = {
     "adequate": "Every candidate was tested, and none improves the fit significantly. "
     "Upper limits on the size of each are listed below.",
     "unexplained": "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
-    "The missing force is drawn below.",
+    "The missing force is drawn below; vinetrack propose seeks a law for it.",
 }
 """What each verdict means."""
 
