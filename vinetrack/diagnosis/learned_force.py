@@ -61,6 +61,15 @@ SILENT = 1e-8
 """Information below which a direction is not told apart from others, where each number alone has 1. Derived: sums of
 squares are rounded at 1e-14 of the largest, and the score of such a direction at its root."""
 
+ROUNDED = 1e-3
+"""Part of the strongest direction below which splines are not set by a force along the motions. Chosen: places that
+trials hardly came to are left at nothing; only the start of a search depends on it."""
+
+PIECES = 20
+"""Parts of a trial that err by themselves where a model leaves more than noise. Chosen as the pieces of an acceleration
+in `smoothed_motions`: points within a part err together, and count as one (the design effect of Kish 1965, §5.4). At
+half and at twice of it weights are that much nearer to each other, or farther apart."""
+
 ROUNDS = 2
 """Turns of following a force and of choosing its amplitude and lengths anew. Chosen: the third moves no weight."""
 
@@ -191,12 +200,16 @@ def learned_force(
     there = [(choice, *settled) for choice, settled in places if settled is not None]
     if not there:
         return None
+    there = _again(model_fit, fit, there, inflation, largest_N)
     inflation = max(min(settled.cost - settled.gain for _, _, settled in there) / fit.points, 1.0)
     choices = [_weighed(choice.domain, settled, inflation, largest_N) for choice, _, settled in there]
     left = min(choice.left for choice in choices)
     if fit.chi2 - left < MENDS * (fit.chi2 - fit.points):
         return None
-    weights = _weights(choices, max(0.5 * SETTLED * left / inflation, 1.0))
+    # A fit that has settled within a part of χ² tells no smaller difference; nor do points that err together.
+    together = max(fit.points / (PIECES * len(fit.data)), 1.0)
+    error = max(0.5 * SETTLED * left, 1 + (inflation - 1) * together) / inflation
+    weights = _weights(choices, error)
     best, place = max(
         zip(choices, (place for _, place, _ in there), strict=True), key=lambda pair: weights[pair[0].domain.name]
     )
@@ -208,12 +221,43 @@ def learned_force(
     if not any("pressure" in choice.domain.variables for choice, _ in linear):
         remarks.append("All trials had one pressure: whether the force depends on it they do not tell.")
     losses = {choice.domain.name: (choice.left - best.left) / inflation for choice in choices}
-    # A fit that has settled within a part of χ² tells no smaller difference.
-    worth = max(ANSWER_SET, SETTLED * left / inflation)
-    beside = not_excluded(best.domain, weights, losses, worth, [choice.domain for choice, _ in linear], motions)
+    everything = [choice.domain for choice, _ in linear]
+    beside = not_excluded(best.domain, weights, losses, ANSWER_SET * error, everything, motions)
     if beside:
         remarks.append("Trials that pass the same growth otherwise, at further pressures or payloads, tell.")
     return _told(fit, best, place, weights, bayes, remarks, beside)
+
+
+def _again(
+    model_fit: Fit,
+    fit: ForceFit,
+    there: Sequence[tuple[_Choice, Place, _Posterior]],
+    inflation: float,
+    largest_N: float,
+) -> list[tuple[_Choice, Place, _Posterior]]:
+    """Every choice of two variables begun once more from where the best ended, and kept where that leads further down.
+
+    Each is begun from its own linear answer. Where that is far off, one stops short of what it could explain, and is
+    set aside though it could hold the very force of the best.
+    """
+    best, end, settled = min(there, key=lambda ended: ended[2].cost - ended[2].gain)
+    lowest = settled.cost - settled.gain
+    force_N = np.concatenate(
+        [best.domain.basis(best.domain.of_motion(motion)) @ end.amplitude for motion in end.motions]
+    )
+    kept = []
+    for choice, place, posterior in there:
+        kept.append((choice, place, posterior))
+        lacks = posterior.cost - posterior.gain - lowest
+        if choice.domain == best.domain or len(choice.domain.variables) < 2 or lacks < SETTLED * lowest:
+            continue
+        basis = np.concatenate([choice.domain.basis(choice.domain.of_motion(motion)) for motion in end.motions])
+        amplitude = np.asarray(np.linalg.lstsq(basis, force_N, rcond=ROUNDED)[0])
+        begin = replace(end, law=Surface(choice.domain, np.eye(choice.domain.size)), amplitude=amplitude)
+        other = _followed(model_fit, fit, begin, choice, inflation, largest_N)
+        if other is not None and other[1].cost - other[1].gain < posterior.cost - posterior.gain:
+            kept[-1] = (choice, *other)
+    return kept
 
 
 def _followed(

@@ -37,9 +37,11 @@ _HEADLINES = {
     UNEXPLAINED: "the model fails, and no effect of the catalogue explains it",
 }
 GO_ON = (
-    "To go on: look at the pictures of the missing force in the report; `vinetrack propose` on the results folder seeks a"
-    " law for it, and writes what mends the model as an effect file of your own."
+    "To go on: look at the pictures of the missing force in the report; `vinetrack propose` on the results folder seeks"
+    " a law for it, and writes what mends the model as an effect file of your own."
 )
+"""What a user does next where nothing known explains the misfit."""
+
 CLEAR_GAIN = 9.0
 """Δχ² from which an effect helps. Derived: that of the answer set, 3 standard errors for one number."""
 
