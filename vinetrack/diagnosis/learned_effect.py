@@ -2,11 +2,11 @@
 
 Where no formula does what the learned force does, the force itself can stand in the equation of motion. The file holds
 the coefficients of its splines, N, on even steps of each variable as the learning saw it (`force_surface.Domain`), and
-a function that adds them up:
+a function that adds up the four that are not nothing:
 
-    T(u) = Σ c_k β(u − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,
+    T(u) = Σ c_k β(u + 1 − k),   β(d) = (max(0, 2 − |d|)³ − 4 max(0, 1 − |d|)³)/6,
 
-β the cubic B-spline of unit step. Its single parameter is the size of the table, 1 as learned.
+β the cubic B-spline of unit step (de Boor 2001, ch. IX). Its single parameter is the size of the table, 1 as learned.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
         ]
     )
     state, worked = _worked(learned, domain)
-    axes = [_axis(domain, k) for k in range(len(domain.variables))]
+    axes = [line for k in range(len(domain.variables)) for line in _axis(domain, k)]
     counts = " × ".join(str(count) for count in domain.counts)
     parts = [
         f'"""Learned force: a table over {over}, and no law.\n',
@@ -122,23 +122,13 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
     return "\n".join(part for part in parts if part is not None) + "\n"
 
 
-_SUM_OF_ONE = (
-    "    force = 0.0 * u",
-    "    for k in range(len(TABLE)):",
-    "        d = np.abs(u - k)",
-    "        force = force + TABLE[k] * (np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0",
-    "    return a * force",
-)
+_SUM_OF_ONE = ("    return a * (f0 * TABLE[i] + f1 * TABLE[i + 1] + f2 * TABLE[i + 2] + f3 * TABLE[i + 3])",)
 _SUM_OF_TWO = (
-    "    force = 0.0 * u",
-    "    for k in range(len(TABLE)):",
-    "        row = 0.0 * v",
-    "        for j in range(len(TABLE[0])):",
-    "            d = np.abs(v - j)",
-    "            row = row + TABLE[k][j] * (np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0",
-    "        d = np.abs(u - k)",
-    "        force = force + row * (np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0",
-    "    return a * force",
+    "    r0 = g0 * TABLE[i, j] + g1 * TABLE[i, j + 1] + g2 * TABLE[i, j + 2] + g3 * TABLE[i, j + 3]",
+    "    r1 = g0 * TABLE[i + 1, j] + g1 * TABLE[i + 1, j + 1] + g2 * TABLE[i + 1, j + 2] + g3 * TABLE[i + 1, j + 3]",
+    "    r2 = g0 * TABLE[i + 2, j] + g1 * TABLE[i + 2, j + 1] + g2 * TABLE[i + 2, j + 2] + g3 * TABLE[i + 2, j + 3]",
+    "    r3 = g0 * TABLE[i + 3, j] + g1 * TABLE[i + 3, j + 1] + g2 * TABLE[i + 3, j + 2] + g3 * TABLE[i + 3, j + 3]",
+    "    return a * (f0 * r0 + f1 * r1 + f2 * r2 + f3 * r3)",
 )
 
 
@@ -169,16 +159,24 @@ def _even_splines(at: Floats, count: int) -> Floats:
     return np.asarray((np.maximum(2.0 - d, 0.0) ** 3 - 4.0 * np.maximum(1.0 - d, 0.0) ** 3) / 6.0)
 
 
-def _axis(domain: Domain, k: int) -> str:
-    """The line of code that says where along an axis of the table a state is."""
+def _axis(domain: Domain, k: int) -> list[str]:
+    """Lines of code that say between which steps of the table a state is, and the weights of the four splines there."""
     low, high, usual, steps = domain.low[k], domain.high[k], domain.usual[k], domain.counts[k] - 3
-    letter, state = "uv"[k], f"s.{_STATE[domain.variables[k]]}"
+    at, step, weight = "uv"[k], "ij"[k], "fg"[k]
+    state = f"s.{_STATE[domain.variables[k]]}"
     from_low = f"({state} - {_number(low)})" if low else state
     inside = f"np.minimum(np.maximum({from_low} / {_number(high - low)}, 0.0), 1.0)"
     if math.isfinite(usual):
         ratio = (high - low) / usual
         inside = f"np.log1p({_number(ratio)} * {inside}) / {_number(math.log1p(ratio))}"
-    return f"{letter} = 1.0 + {steps}.0 * {inside}"
+    return [
+        f"{at} = {steps}.0 * {inside}",
+        f"{step} = np.maximum(np.minimum(np.int64({at}), {steps - 1}), 0)",
+        f"{at} = {at} - {step}",
+        f"{weight}0, {weight}3 = (1.0 - {at}) ** 3 / 6.0, {at}**3 / 6.0",
+        f"{weight}1 = (3.0 * {at}**3 - 6.0 * {at}**2 + 4.0) / 6.0",
+        f"{weight}2 = 1.0 - {weight}0 - {weight}1 - {weight}3",
+    ]
 
 
 def _number(value: float) -> str:
@@ -189,9 +187,13 @@ def _table_lines(table: Floats) -> list[str]:
     """The table as a tuple, or as a tuple of rows, in lines that are not too long."""
     if table.ndim == 1:
         numbers = ", ".join(f"{value:.{DIGITS}g}" for value in table.tolist())
-        return ["TABLE = (  # N", *textwrap.wrap(numbers, 110, initial_indent="    ", subsequent_indent="    "), ")"]
+        return [
+            "TABLE = np.array((  # N",
+            *textwrap.wrap(numbers, 110, initial_indent="    ", subsequent_indent="    "),
+            "))",
+        ]
     rows = [f"    ({', '.join(f'{value:.{DIGITS}g}' for value in row)})," for row in table.tolist()]
-    return ["TABLE = (  # N", *rows, ")"]
+    return ["TABLE = np.array((  # N", *rows, "))"]
 
 
 def _worked(learned: LearnedForce, domain: Domain) -> tuple[dict[str, float], float]:
