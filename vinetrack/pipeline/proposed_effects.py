@@ -71,10 +71,13 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
         table = proposal.table
         remark = f"{misses} table, which was learned from them all, by {1e3 * table.rms_left_out_m:.2f} mm."
         files.append((table.effect.path.name, table_text(table.learned, remark)))
-    for k, (name, text) in enumerate(files):
-        path = experiment.folder / name if to is None else to if k == 0 else to.with_name(name)
+    paths = [experiment.folder / name if to is None else to.with_name(name) for name, _ in files]
+    if to is not None and paths:
+        paths[0] = to
+    for path in paths:
         if path.exists():
             raise ResultsError(f"{path} is there already: move it away, or name another file with --to.")
+    for path, (_, text) in zip(paths, files, strict=True):
         write_text(path, text)
         remember(path)
         lines.append(f"Written to {path}. Read it; `vinetrack add {path} {folder}` fits it.")
