@@ -157,7 +157,7 @@ class Proposal:
 
     def _of_laws(self) -> list[str]:
         if not self.tied:
-            return [self.reason if self.table else f"{self.reason} Nothing is proposed."]
+            return [self.reason if self.table else f"{self.reason.removesuffix('.')}; nothing is proposed."]
         best = self.tied[0]
         lines = [
             f"{law.words}: Δχ² = {law.ratio.delta_chi2:.0f} ({law.ratio.sigma:.1f} σ)"
