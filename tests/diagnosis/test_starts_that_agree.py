@@ -40,6 +40,14 @@ def test_two_starts_that_end_in_the_same_place_are_enough(monkeypatch: pytest.Mo
     assert begun == [1e-3]
 
 
+def test_a_start_where_it_hardly_acts_is_not_made_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, begun = search(monkeypatch, [12.0])
+    small = SubsetFit(LEAK.effects, math.nan, {"leak.rate": 1e-3})
+    first: Any = SimpleNamespace(delta_chi2=-6.5)
+    assert tried._begun_again(small, first, 0.0, led=True).delta_chi2 == 12.0
+    assert begun == [math.inf]
+
+
 def test_starts_that_end_apart_are_followed_by_one_with_nothing_taken_over(monkeypatch: pytest.MonkeyPatch) -> None:
     tried, begun = search(monkeypatch, [3.0, 40.0])
     first: Any = SimpleNamespace(delta_chi2=-6.5)

@@ -301,19 +301,24 @@ class CandidateFits:
     def _begun_again(self, climb: SubsetFit, hypothesis: LikelihoodRatio, best: float, *, led: bool) -> LikelihoodRatio:
         """The best of other starts of a hypothesis that did worse than the model without it, or than part of the data.
 
-        It may have been led astray by its start. First from where it hardly acts; if that ends in the same place, no
-        start is to blame: a model far off is then as far off with it, and it is not begun again from anywhere else.
+        It may have been led astray by its start. First from where it hardly acts (where it began there, with nothing
+        taken over); if that ends in the same place, no start is to blame: a model far off is then as far off with it,
+        and it is not begun again from anywhere else.
         """
         name = "+".join(climb.names)
         if name in self.same_end:
             return hypothesis
         smallest = SubsetFit(climb.effects, math.nan, self._smallest(climb.effects))
-        other = self._from_climb(smallest, best, led=led)
-        if other is not None and abs(other.delta_chi2 - hypothesis.delta_chi2) < -WORSE:
-            self.same_end.add(name)
-            return max(hypothesis, other, key=_gain)
-        afresh = self._from_climb(climb, best, afresh=True, led=led)
-        return max((known for known in (hypothesis, other, afresh) if known is not None), key=_gain)
+        starts = [(smallest, False), (climb, True)] if smallest.values != climb.values else [(climb, True)]
+        ends = [hypothesis]
+        for start, afresh in starts:
+            other = self._from_climb(start, best, afresh=afresh, led=led)
+            if other is not None:
+                ends.append(other)
+                if abs(other.delta_chi2 - hypothesis.delta_chi2) < -WORSE:
+                    self.same_end.add(name)
+                    break
+        return max(ends, key=_gain)
 
     def _from_climb(self, climb: SubsetFit, best: float, *, led: bool, afresh: bool = False) -> LikelihoodRatio | None:
         fit = full_fit(self.questions.fit, climb, best, afresh=afresh, led=led)
