@@ -220,7 +220,9 @@ def learned_force(
         remarks.append("No condition was repeated: how sure this is rests on the scatter that the fit assumes.")
     if not any("pressure" in choice.domain.variables for choice, _ in linear):
         remarks.append("All trials had one pressure: whether the force depends on it they do not tell.")
-    losses = {choice.domain.name: (choice.left - best.left) / inflation for choice in choices}
+    # What the splines of a choice leave at best, whatever the prior says of how smooth they are.
+    lowest = {choice.domain.name: end.cost - end.gain for choice, (_, _, end) in zip(choices, there, strict=True)}
+    losses = {name: (value - lowest[best.domain.name]) / inflation for name, value in lowest.items()}
     everything = [choice.domain for choice, _ in linear]
     beside = not_excluded(best.domain, weights, losses, ANSWER_SET * error, everything, motions)
     if beside:
@@ -274,7 +276,11 @@ def _followed(
         if after is None:
             break
         place = replace(after, law=free, amplitude=surface.mix @ after.amplitude)
-        settled = place, _posterior(place, normal_equations(model_fit, fit, place))
+        posterior = _posterior(place, normal_equations(model_fit, fit, place))
+        # Another amplitude may lead away: what has been reached is kept.
+        if settled is not None and posterior.cost - posterior.gain > settled[1].cost - settled[1].gain:
+            break
+        settled = place, posterior
         inflation = max((settled[1].cost - settled[1].gain) / fit.points, 1.0)
         choice = _weighed(choice.domain, settled[1], inflation, largest_N)
     return settled
