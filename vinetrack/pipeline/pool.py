@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from typing import TypeVar
@@ -81,4 +83,21 @@ def as_they_come(function: Callable[[Item], Answer], items: Sequence[Item], n_wo
 def _pool(n_workers: int) -> ProcessPoolExecutor:
     """Processes that start as copies are ready at once; where the system cannot copy, they import what they need."""
     method = "fork" if "fork" in multiprocessing.get_all_start_methods() and sys.platform == "linux" else "spawn"
-    return ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context(method))
+    context = multiprocessing.get_context(method)
+    return ProcessPoolExecutor(n_workers, mp_context=context, initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it ends, however it ends.
+
+    A worker waits for its next argument on a pipe that the workers beside it hold open too: where a run is killed they
+    would wait for ever, each with the memory of what it did last.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, name="end with the parent", daemon=True).start()
