@@ -5,8 +5,9 @@
 
 Needs a finished demonstration (`make demo`, which `make guide` runs first), and a Chromium for the pictures of the
 report and of the explorer, whose caption follows what the page says. Everything runs in a scratch folder, on copies of
-the demonstration and its results. With the effect of docs/own_effect.md trials of two vines are
-grown in the virtual laboratory; its walk-through on `film_friction` stays as it stands. Pages are rewritten in place; folders are shown relative, long lines wrapped.
+the demonstration and its results. With the effect of docs/own_effect.md trials of two vines are grown in the virtual
+laboratory; the walk-through on `film_friction` stays as it stands. Pages are rewritten in place; folders are shown
+relative, long lines wrapped.
 """
 
 from __future__ import annotations
