@@ -100,13 +100,13 @@ def test_what_trials_do_not_tell_is_said_of_what_they_do() -> None:
     weights = {"growth+time": 0.74, "growth+speed": 0.26}
     both = dependence("growth+time", weights, ["growth+speed"])
     assert both.endswith(
-        "depends on the growth, and on the time since release (74%) or the speed of the tail (26%):"
+        "is described by the growth, and by the time since release (74%) or the speed of the tail (26%):"
         " these trials do not tell which"
     )
-    assert dependence("growth", {"growth": 0.97}, []).endswith("depends on the growth (posterior weight 97%)")
-    assert "most likely depends on the time" in dependence("time", {"time": 0.9}, [])
+    assert dependence("growth", {"growth": 0.97}, []).endswith("is described by the growth (posterior weight 97%)")
+    assert "is most likely described by the time" in dependence("time", {"time": 0.9}, [])
     unlike = dependence("growth", {"growth": 0.6}, ["speed+time"])
-    assert "on the growth (60%) or on the speed of the tail and the time since release:" in unlike
+    assert "by the growth (60%) or by the speed of the tail and the time since release:" in unlike
 
 
 def test_a_force_in_no_list_is_proposed_as_a_table_that_mends_the_model(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_waves_along_the_growth_are_learned_with_their_variable_and_their_size(w
 def test_it_says_what_it_depends_on_and_goes_into_a_file(waves: MissingForce) -> None:
     content = json.loads(json.dumps(waves.to_json()))["learned"]
     assert content["variables"] == ["growth"]
-    assert "depends on the growth" in content["sentence"]
+    assert "is described by the growth" in content["sentence"]
     assert set(content["length_scales"]) == {"growth"}
     without = replace(waves, learned=None).to_json()
     assert without["learned"] is None

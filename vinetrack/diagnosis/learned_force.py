@@ -430,7 +430,7 @@ def _rows(best: _Choice, places: Sequence[Floats], trials: Floats, condition: st
 def _sentence(
     name: str, weights: Mapping[str, float], beside: Sequence[str], explained: float, table: pd.DataFrame
 ) -> str:
-    """What it depends on and how sure that is, and how large it is."""
+    """What describes it and how sure that is, and how large it is."""
     seen = table[(table["condition"] == "") & (table["trials"] > 0)]
     low, high, sigma = (
         float(value) for value in (seen["force_N"].min(), seen["force_N"].max(), seen["sigma_N"].median())
@@ -438,5 +438,6 @@ def _sentence(
     drawn = f" Over {named(name)} it" if beside else " It"
     return (
         f"{dependence(name, weights, beside)}.{drawn} lies between {low:.2f} and {high:.2f} N where trials have been,"
-        f" with a standard error of {sigma:.2f} N, and takes away {explained:.0%} of the misfit."
+        f" with a standard error of {sigma:.2f} N beside the B, n and P_y fitted with it, and takes away"
+        f" {explained:.0%} of the misfit. B, n and P_y may hold a part of it, and a law over other variables may leave the same tracks."
     ).replace("-", "−")

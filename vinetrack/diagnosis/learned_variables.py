@@ -135,7 +135,7 @@ def not_excluded(
 
 
 def dependence(name: str, weights: Mapping[str, float], beside: Sequence[str]) -> str:
-    """What a force depends on, and how sure that is: a sentence without its full stop.
+    """What describes a force, and how sure that is: a sentence without its full stop.
 
     Parameters
     ----------
@@ -152,14 +152,14 @@ def dependence(name: str, weights: Mapping[str, float], beside: Sequence[str]) -
     """
     begin = "Learned as a smooth function inside the fit, the missing force"
     if not beside:
-        likely = "depends" if weights[name] >= SURE else "most likely depends"
-        return f"{begin} {likely} on {named(name)} (posterior weight {weights[name]:.0%})"
+        likely = "is described" if weights[name] >= SURE else "is most likely described"
+        return f"{begin} {likely} by {named(name)} (posterior weight {weights[name]:.0%})"
     choices = [tuple(choice.split("+")) for choice in (name, *beside)]
     common = [variable for variable in choices[0] if all(variable in choice for choice in choices)]
     shares = [f" ({weights[choice]:.0%})" if choice in weights else "" for choice in (name, *beside)]
     remaining = ["+".join(variable for variable in choice if variable not in common) for choice in choices]
     if common and all(remaining):
         listed = joined([f"{named(left)}{share}" for left, share in zip(remaining, shares, strict=True)], "or")
-        return f"{begin} depends on {named('+'.join(common))}, and on {listed}: these trials do not tell which"
-    listed = joined([f"{named(choice)}{share}" for choice, share in zip((name, *beside), shares, strict=True)], "or on")
-    return f"{begin} depends on {listed}: these trials do not tell which"
+        return f"{begin} is described by {named('+'.join(common))}, and by {listed}: these trials do not tell which"
+    listed = joined([f"{named(choice)}{share}" for choice, share in zip((name, *beside), shares, strict=True)], "or by")
+    return f"{begin} is described by {listed}: these trials do not tell which"

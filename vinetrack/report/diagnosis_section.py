@@ -331,7 +331,7 @@ def missing_force(content: Mapping[str, Any] | None) -> dict[str, Any] | None:
         (" and ".join(name.split("+")), f"{100 * float(weight):.1f} %")
         for name, weight in (learned.get("weights") or {}).items()
     ]
-    told = ReportTable("What the learned force depends on", ("Variables", "posterior weight"), weights, frozenset({1}))
+    told = ReportTable("What describes the learned force", ("Variables", "posterior weight"), weights, frozenset({1}))
     return {
         "sentence": str(content.get("sentence") or content.get("text") or ""),
         "laws": table,
