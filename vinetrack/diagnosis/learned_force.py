@@ -439,5 +439,6 @@ def _sentence(
     return (
         f"{dependence(name, weights, beside)}.{drawn} lies between {low:.2f} and {high:.2f} N where trials have been,"
         f" with a standard error of {sigma:.2f} N beside the B, n and P_y fitted with it, and takes away"
-        f" {explained:.0%} of the misfit. B, n and P_y may hold a part of it, and a law over other variables may leave the same tracks."
+        f" {explained:.0%} of the misfit. B, n and P_y may hold a part of it, and a law over other variables may leave"
+        " the same tracks."
     ).replace("-", "−")
