@@ -19,7 +19,7 @@ NO_FILE = "it is a pipe or a device, not a file; put the file itself there, or a
 """What is said of a FIFO, a socket, a terminal or anything like `/dev/zero`."""
 
 
-def absence(path: Path) -> str:
+def absence(path: Path) -> tuple[str, str]:
     """What is said of a file that is not there, and what to do.
 
     Parameters
@@ -28,11 +28,11 @@ def absence(path: Path) -> str:
 
     Returns
     -------
-    message and remedy, parted by a colon.
+    message, remedy
     """
     if path.is_symlink():
-        return "is a link whose end is missing: connect the disk that it leads to, or copy the file itself there"
-    return "does not exist: check the path and its upper and lower case"
+        return "is a link whose end is missing", "connect the disk that it leads to, or copy the file itself there"
+    return "does not exist", "check the path and its upper and lower case"
 
 
 def is_pipe_or_device(path: Path) -> bool:

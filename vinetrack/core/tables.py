@@ -188,7 +188,7 @@ def read_text(path: Path) -> str:
             raise TableError("is too large to be a table: is it a recording?")
         return decode_text(path.read_bytes())
     except FileNotFoundError:
-        raise TableError(absence(path)) from None
+        raise TableError(": ".join(absence(path))) from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "it cannot be opened"
         raise TableError(f"cannot be read: {reason}") from None

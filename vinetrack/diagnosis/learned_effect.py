@@ -19,6 +19,7 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_surface import VARIABLES, Domain, Surface, curves
 from vinetrack.diagnosis.learned_force import LearnedForce
+from vinetrack.diagnosis.learned_variables import named
 from vinetrack.narrative.verdict_summary import joined
 
 STEP = 4
@@ -31,12 +32,6 @@ DIGITS = 6
 
 _STATE = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
 _SYMBOL = {"growth": "y", "speed": "ẋ", "time": "t", "pressure": "P"}
-_WORDS = {
-    "growth": "the growth",
-    "speed": "the speed of the tail",
-    "time": "the time since release",
-    "pressure": "the pressure",
-}
 _RANGE = {"growth": ("mm", 1e3), "speed": ("m/s", 1.0), "time": ("ms", 1e3), "pressure": ("kPa", 1e-3)}
 
 
@@ -70,11 +65,11 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
     assert isinstance(place.law, Surface)
     domain = place.law.domain
     table = even_coefficients(domain, place.law.mix @ place.amplitude)
-    over = joined([_WORDS[name] for name in domain.variables])
+    over = named(domain.name)
     symbols = ", ".join(_SYMBOL[name] for name in domain.variables)
     ranges = joined(
         [
-            f"{_WORDS[name]} from {low * _RANGE[name][1]:.3g} to {high * _RANGE[name][1]:.3g} {_RANGE[name][0]}"
+            f"{named(name)} from {low * _RANGE[name][1]:.3g} to {high * _RANGE[name][1]:.3g} {_RANGE[name][0]}"
             for name, low, high in zip(domain.variables, domain.low, domain.high, strict=True)
         ]
     )

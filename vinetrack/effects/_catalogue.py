@@ -95,9 +95,9 @@ def load_effect(path: Path | str) -> Effect:
     try:
         effect = _effect_of(_load_module(path), path)
         faults = list(_faults(effect))
+    except EffectError:
+        raise
     except (TypeError, ValueError, AttributeError) as error:
-        if isinstance(error, EffectError):
-            raise
         raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
     if faults:
         raise EffectError(f"{path}: " + "; ".join(faults) + ".")

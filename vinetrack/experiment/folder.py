@@ -351,7 +351,7 @@ def check_experiment(folder: Path | str, open_videos: Survey | None = None) -> l
     problems = list(experiment.problems)
     for key, relative in _settings_paths(experiment.settings):
         if not safe_join(experiment.folder, relative).exists():
-            message, _, remedy = absence(safe_join(experiment.folder, relative)).partition(": ")
+            message, remedy = absence(safe_join(experiment.folder, relative))
             problems.append(Problem(message=message, file=SETTINGS, column=key, value=relative, remedy=remedy))
     problems += order_problems(experiment.trials, SHEET)
     of_trials: list[Problem] = []
@@ -415,7 +415,7 @@ def _check_video(trial: Trial, used: Set[Path]) -> list[Problem]:
         if file_size(path) == 0:
             return [Problem(message="is an empty file", remedy="copy it anew", **place)]
     except (FileNotFoundError, ValueError):
-        message, _, remedy = absence(path).partition(": ")
+        message, remedy = absence(path)
         remedy = remedy if path.is_symlink() else _nearest_file(path, used)
         return [Problem(message=message, remedy=remedy, **place)]
     except OSError as error:

@@ -317,6 +317,6 @@ def _correlation(trial_data: FitTrial, rho: float) -> Floats:
     points = np.arange(trial_data.time_s.size)
     stretch = np.cumsum(trial_data.first)
     together = stretch[:, None] == stretch
-    sd = np.ones(points.size) if trial_data.relative_sd is None else trial_data.relative_sd
+    sd = trial_data.point_sd
     apart = np.power(rho, np.arange(points.size))[np.abs(points[:, None] - points)]
     return np.asarray(np.where(together, apart, 0.0) * sd[:, None] * sd)

@@ -98,14 +98,7 @@ class Jobs:
 
     @property
     def _columns(self) -> tuple[NDArray[Any], ...]:
-        return (
-            self.trial,
-            self.row,
-            self.yield_pressure_Pa,
-            self.pressure_deviation,
-            self.release_s,
-            self.payload_factor,
-        )
+        return tuple(vars(self).values())
 
     def distinct(self, twins: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Which of them are the first of their kind, and of each which of those is like it.
