@@ -18,7 +18,6 @@ from vinetrack.diagnosis.candidates import CandidateShape, whole_shapes
 from vinetrack.dynamics.simulate import SimulationError, Trajectory
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.position_change import position_change
-from vinetrack.inference.trajectory_jobs import Jobs
 
 AIMED_RESPONSE, LARGEST_RESPONSE, LEAST_RESPONSE = 2e-3, 2e-2, 2e-4
 """A step is good that moves a trajectory by this part of its travel, and done again where it moves it by more than the
@@ -131,8 +130,6 @@ def _response(fit: Fit, change: Sequence[Floats]) -> float:
 def _change(fit: Fit, shape: CandidateShape, plain: Sequence[Trajectory]) -> list[Floats]:
     """By how much the positions of every trial change with the step put in, m."""
     predictor, state = fit.predictor, fit.solution.state
-    jobs = predictor.jobs(state.theta, state.trial_effects)
-    rows = np.array([[*job.row, *shape.values] for job in jobs]).reshape(len(jobs), -1)
-    model = fit.predictor.layout.model + shape.effect
-    moved = predictor.run_as(model, Jobs.of(jobs, rows))
+    jobs = predictor.together(state.theta, state.trial_effects).with_effect(shape.values)
+    moved = predictor.run_as(predictor.layout.model + shape.effect, jobs)
     return [position_change(before, trajectory) for before, trajectory in zip(plain, moved, strict=True)]

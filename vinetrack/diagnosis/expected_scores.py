@@ -30,7 +30,7 @@ from vinetrack.inference.mixed_effects import FitState, solve_each, trial_effect
 from vinetrack.inference.optimiser import FixedTerms, solve
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
 from vinetrack.inference.systematics import systematics_of
-from vinetrack.inference.trajectory_jobs import Job, Jobs
+from vinetrack.inference.trajectory_jobs import Jobs
 from vinetrack.inference.whitening import at_correlation
 
 ITERATIONS, SETTLED = 20, 0.2
@@ -70,7 +70,7 @@ class NoiselessStart:
 
     state: FitState
     predictor: Predictor
-    jobs: list[Job]
+    jobs: Jobs
     columns: list[Floats]
 
 
@@ -95,7 +95,7 @@ def noiseless_start(fit: Fit) -> NoiselessStart:
     state = replace(fit.state, trial_effects=trial_effects)
     predictor = _predictor_of(fit.predictor, fit.predictor.data)
     columns = predictor.linearise(state.theta, trial_effects)
-    return NoiselessStart(state, predictor, predictor.jobs(state.theta, trial_effects), columns)
+    return NoiselessStart(state, predictor, predictor.together(state.theta, trial_effects), columns)
 
 
 def _predictor_of(predictor: Predictor, data: Sequence[FitTrial]) -> Predictor:
@@ -267,9 +267,8 @@ def fitted_without(fit: Fit, shape: CandidateShape, size: float, start: Noiseles
     SimulationError
         If a trial does not move with the effect.
     """
-    state, jobs = start.state, start.jobs
-    rows = np.array([[*job.row, shape.size.zero + size, *shape.other_values] for job in jobs])
-    moved = start.predictor.run_as(fit.model + shape.effect, Jobs.of(jobs, rows))
+    state, jobs = start.state, start.jobs.with_effect([shape.size.zero + size, *shape.other_values])
+    moved = start.predictor.run_as(fit.model + shape.effect, jobs)
     kept = [_kept(trial_data, trajectory) for trial_data, trajectory in zip(fit.predictor.data, moved, strict=True)]
     data = [
         _recorded(trial_data, trajectory, state.trial_effects[i], keep)

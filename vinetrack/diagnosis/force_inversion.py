@@ -65,6 +65,7 @@ class ForceFit:
         data, problem = fit.predictor.data, fit.solution.problem
         rho = track_correlation(data)
         noise = np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2)
+        self.scatter = scatter
         spread = (max(scatter.pressure, LEAST_SPREAD[0]), max(scatter.damping, LEAST_SPREAD[1]))
         before = fit.solution.state
         state = FitState(before.theta, trial_effects, spread, rho, np.maximum(noise, floor(data)))

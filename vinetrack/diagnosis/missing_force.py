@@ -23,13 +23,11 @@ from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_inversion import ForceFit, Gain
 from vinetrack.diagnosis.force_laws import Law, coarse_laws, finer_laws
 from vinetrack.diagnosis.force_refinement import refine
-from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities, motions_of
-from vinetrack.diagnosis.force_surface import curves, splines
+from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities
+from vinetrack.diagnosis.force_surface import curves
 from vinetrack.diagnosis.learned_force import LearnedForce, learned_force
-from vinetrack.diagnosis.per_trial_estimates import lay
-from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
+from vinetrack.diagnosis.linear_misfit import LinearMisfit, linear_misfit, pieces_along
 from vinetrack.dynamics.simulate import SimulationError
-from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
 
 if TYPE_CHECKING:
@@ -37,10 +35,6 @@ if TYPE_CHECKING:
 
 FORCE_COLUMNS = ("against", "value", "force_N", "sigma_N", "condition")
 LAW_COLUMNS = ("law", "words", "explained", "amplitude_N", "sigma_N", "delta_chi2", "bic")
-
-PIECES, EARLY = 15, (0.01, 0.03, 0.06)
-"""Smooth pieces of a force along the growth of one condition; and further knots in the first tenth of it. Chosen:
-finer than any force that leaves a trace of its own in positions."""
 
 FAMILIES = {"growth": 24, "speed": 10, "time": 10}
 """Smooth pieces of a force that hangs on one thing alone, the same in all trials."""
@@ -145,15 +139,8 @@ def missing_force(model_fit: Fit, *, learn: bool = True) -> MissingForce:
     FitError
         If the model cannot be followed.
     """
-    try:
-        scatter = replicate_scatter(model_fit, courses_of(model_fit)[0])
-        begins = [model_fit.solution.state.trial_effects, lay(model_fit).trial_effects]
-        looks = [_look(model_fit, ForceFit(model_fit, trial_effects, scatter)) for trial_effects in begins]
-    except SimulationError as error:
-        raise FitError(f"The model cannot be followed: {error}") from error
-    # All is linear about where the trials' own numbers are: the better place leaves less that no force explains.
-    look = min(looks, key=lambda tried: tried.fit.chi2 - tried.everything.chi2)
-    fit, motions, everything = look.fit, look.motions, look.everything
+    linear = linear_misfit(model_fit)
+    fit, motions, everything = linear.fit, linear.motions, linear.everything
 
     def answers(laws: Sequence[Law]) -> list[Floats]:
         return force_sensitivities(
@@ -167,22 +154,41 @@ def missing_force(model_fit: Fit, *, learn: bool = True) -> MissingForce:
     depends = {name: beyond / whole for name, beyond in families.items()}
     best = laws[0]
     gauge = best.gain.numbers if best.explained >= LIKE and best.seen else np.zeros_like(best.gain.numbers)
-    drawn = fit.smooth(look.pieces, gauge)
+    drawn = fit.smooth(linear.pieces, gauge)
     return MissingForce(
-        table=_table(motions, look.longest, drawn),
+        table=_table(motions, linear.longest, drawn),
         laws=_law_table(laws),
         depends_on=depends,
         sentence=_sentence(laws, depends, _mended(fit, whole)),
         seen=tuple(_seen(law) for law in laws if law.seen),
-        learned=_learned(model_fit, fit, motions, scatter.dof) if learn else None,
+        learned=_learned(model_fit, linear) if learn else None,
     )
 
 
-def _learned(model_fit: Fit, fit: ForceFit, motions: Sequence[FittedMotion], replicates: int) -> LearnedForce | None:
+def learned_alone(model_fit: Fit) -> LearnedForce | None:
+    """The force that a fit lacks as a smooth function, without the laws that it may look like.
+
+    Parameters
+    ----------
+    model_fit : the fit that is questioned.
+
+    Returns
+    -------
+    LearnedForce or None
+
+    Raises
+    ------
+    FitError
+        If the model cannot be followed.
+    """
+    return _learned(model_fit, linear_misfit(model_fit))
+
+
+def _learned(model_fit: Fit, linear: LinearMisfit) -> LearnedForce | None:
     """The force as a smooth function; None also where it leads to motions that cannot be followed."""
     try:
         with np.errstate(all="raise", under="ignore"):
-            return learned_force(model_fit, fit, motions, replicates)
+            return learned_force(model_fit, linear.fit, linear.motions, linear.fit.scatter.dof)
     except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
         return None
 
@@ -191,29 +197,6 @@ def _seen(judged: _Judged) -> SeenLaw:
     amplitude = judged.gain.amplitude
     words = judged.law.words(amplitude.tolist(), judged.gain.sigma)
     return SeenLaw(judged.law, tuple(amplitude.tolist()), judged.explained, words)
-
-
-@dataclass(frozen=True)
-class _Look:
-    """The trials laid out about one place: motions, what smooth pieces of force do, and what all of them explain."""
-
-    fit: ForceFit
-    motions: list[FittedMotion]
-    longest: dict[str, float]
-    pieces: list[Floats]
-    everything: Gain
-
-
-def _look(model_fit: Fit, fit: ForceFit) -> _Look:
-    motions = motions_of(model_fit, fit.trial_effects)
-    # A vine that stands still by its model is at the start of its growth throughout.
-    longest = {motion.trial.condition: float(np.finfo(float).tiny) for motion in motions}
-    for motion in motions:
-        longest[motion.trial.condition] = max(longest[motion.trial.condition], float(motion.lead_position_m.max()))
-    pieces = force_sensitivities(
-        model_fit, fit.trial_effects, motions, lambda m: _pieces_of(m.lead_position_m / longest[m.trial.condition])
-    )
-    return _Look(fit, motions, longest, pieces, fit.by_condition(pieces))
 
 
 @dataclass(frozen=True)
@@ -231,11 +214,6 @@ class _Judged:
         """Whether its force is more than the errors of single trials could make, and one that these motions allow."""
         size_N = math.hypot(*self.gain.amplitude)
         return SEEN * self.gain.sigma < size_N < self.largest_N and not self.law.is_a_point
-
-
-def _pieces_of(at: Floats) -> Floats:
-    """The smooth pieces of a force along the growth, shape (n, PIECES): narrower at the start, where speed rises."""
-    return splines(at, np.concatenate([[0.0, *EARLY], np.linspace(0.0, 1.0, PIECES - 2 - len(EARLY))[1:]]))
 
 
 def _ranked(fit: ForceFit, answers: Answers, motions: Sequence[FittedMotion], everything: Gain) -> list[_Judged]:
@@ -335,7 +313,7 @@ def _table(
     for condition, (coefficients, covariance) in drawn.items():
         motion = next(m for m in motions if m.trial.condition == condition)
         at = np.linspace(0.04, 0.96, DRAWN) * motion.lead_position_m.max()
-        shape = _pieces_of(at / longest[condition])
+        shape = pieces_along(at / longest[condition])
         sigma = np.sqrt(np.einsum("nk,kl,nl->n", shape, covariance, shape))
         told = sigma < UNTOLD * np.median(sigma)
         at, force, sigma = at[told], (shape @ coefficients)[told], sigma[told]

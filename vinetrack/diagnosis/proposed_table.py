@@ -13,7 +13,7 @@ from vinetrack.diagnosis.ladder import left_out
 from vinetrack.diagnosis.learned_effect import table_name, table_text
 from vinetrack.diagnosis.learned_force import MISSES, LearnedForce
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, LikelihoodRatio, likelihood_ratio
-from vinetrack.diagnosis.missing_force import MENDS, missing_force
+from vinetrack.diagnosis.missing_force import MENDS, learned_alone
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Effect, load_effect, remember
 from vinetrack.inference.fit_data import FitError
@@ -80,7 +80,7 @@ def proposed_table(
     if misfit < MISSES - 1 or left < (1 - REPRODUCES) * misfit:
         return None
     report("learning the missing force as a table")
-    learned = missing_force(before).learned
+    learned = learned_alone(before)
     if learned is None:
         return None
     with tempfile.TemporaryDirectory() as folder:

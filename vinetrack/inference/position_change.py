@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import Trajectory
@@ -14,23 +15,19 @@ MOST_CONTINUED = 3.0
 keep their speed to the end; three allows for one that slows down to a third."""
 
 
-def clipped_change(plain: Trajectory, moved: Trajectory) -> Floats:
-    """How far positions move, ended where the growth ends; behind that nothing that only delays the end moves them.
+def clip_at_end(change: Floats, over: NDArray[np.bool_], *, moved_ends: bool) -> None:
+    """End what positions move by where the growth ends; behind that nothing that only delays the end moves them.
 
     Parameters
     ----------
-    plain, moved : Trajectory
-        As those of `position_change`.
-
-    Returns
-    -------
-    array, shape (n_points,), m
+    change : array, shape (n_points,), m
+        Changed in place.
+    over : array of bool, shape (n_points,)
+        Points behind the end of the unmoved trajectory.
+    moved_ends : bool
+        Whether the moved one comes to its end too.
     """
-    change = moved.observed_position_m - plain.observed_position_m
-    if plain.status == "ended":
-        over = plain.time_s > plain.end_time_s
-        change[over] = change[-1] if moved.status == "ended" else 0.0
-    return np.asarray(change)
+    change[over] = change[-1] if moved_ends else 0.0
 
 
 def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
@@ -52,7 +49,9 @@ def position_change(plain: Trajectory, moved: Trajectory) -> Floats:
     -------
     array, shape (n_points,), m
     """
-    change = clipped_change(plain, moved)
+    change = np.asarray(moved.observed_position_m - plain.observed_position_m)
+    if plain.status == "ended":
+        clip_at_end(change, plain.time_s > plain.end_time_s, moved_ends=moved.status == "ended")
     plain_end_s, moved_end_s = (each.end_time_s if each.status == "ended" else math.inf for each in (plain, moved))
     early = (plain.time_s <= plain_end_s) & (plain.time_s > moved_end_s)
     last = int(np.argmax(early)) - 1

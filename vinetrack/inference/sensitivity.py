@@ -23,7 +23,7 @@ from vinetrack.dynamics.trial_inputs import check_needs, trial_inputs, with_pres
 from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, ParameterMap
-from vinetrack.inference.position_change import position_change
+from vinetrack.inference.position_change import clip_at_end, position_change
 from vinetrack.inference.trajectory_jobs import Job, Jobs, Motions
 from vinetrack.inference.whitening import all_products
 
@@ -126,16 +126,10 @@ class Predictor:
         -------
         list of Trajectory
         """
-        motions, trials = self._simulated(model, jobs, times_s)
-        return motions.trajectories([self.ratios[i] for i in trials])
+        return self._simulated(model, jobs, times_s).trajectories()
 
-    def _simulated(
-        self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None
-    ) -> tuple[Motions, NDArray[np.int_]]:
-        """What jobs come to, and the trials of the distinct ones.
-
-        What replicates of a planned campaign do alike is simulated once.
-        """
+    def _simulated(self, model: Model, jobs: Jobs, times_s: Sequence[Floats] | None = None) -> Motions:
+        """What jobs come to; what replicates of a planned campaign do alike is simulated once."""
         like = np.arange(len(jobs))
         if times_s is None and self.has_twins:
             first, like = jobs.distinct(self.twins)
@@ -157,7 +151,7 @@ class Predictor:
             parameters=jobs.row,
             host=self.host,
         )
-        return Motions.of(batch, like, [self.data[i].trial.name for i in trials]), trials
+        return Motions.of(batch, [self.data[i].trial for i in trials], like)
 
     def _traces(self, jobs: Jobs) -> list[Trace | None]:
         """Recorded pressures on the clock of each job."""
@@ -181,10 +175,21 @@ class Predictor:
         list of Job
             One a trial.
         """
-        return self._unmoved(theta, trial_effects).single()
+        return self.together(theta, trial_effects).single()
 
-    def _unmoved(self, theta: Floats, trial_effects: Floats) -> Jobs:
-        """`jobs` together."""
+    def together(self, theta: Floats, trial_effects: Floats) -> Jobs:
+        """`jobs` as arrays.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        trial_effects : array, shape (n_trials, 4)
+
+        Returns
+        -------
+        Jobs
+        """
         rows, yields = self.layout.rows(theta)
         trial_effects = self._deviations(theta, trial_effects)
         if self.damping_column >= 0:
@@ -215,7 +220,7 @@ class Predictor:
         list of Trajectory
             One a trial.
         """
-        return self.run_as(self.layout.model, self._unmoved(theta, trial_effects))
+        return self.run_as(self.layout.model, self.together(theta, trial_effects))
 
     def residuals(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted position of every trial, m.
@@ -230,7 +235,7 @@ class Predictor:
         -------
         list of arrays, shape (n_points,)
         """
-        motions, _ = self._simulated(self.layout.model, self._unmoved(theta, trial_effects))
+        motions = self._simulated(self.layout.model, self.together(theta, trial_effects))
         return self.by_trial(self._left(motions.rows(0, len(self.data))[:, OBSERVED], trial_effects))
 
     def _left(self, observed_m: Floats, trial_effects: Floats) -> Floats:
@@ -276,16 +281,16 @@ class Predictor:
             Derivatives of the predicted position, m per unit of the column (trial effects SI, keys scaled); the last
             column is the residual, m.
         """
-        plain, whole = self._unmoved(theta, trial_effects), self._deviations(theta, trial_effects)
+        plain, whole = self.together(theta, trial_effects), self._deviations(theta, trial_effects)
         moves = list(self._variations(plain, theta, whole, own_only))
-        motions, trials = self._simulated(self.layout.model, Jobs.joined([plain, *(varied for _, _, varied in moves)]))
+        motions = self._simulated(self.layout.model, Jobs.joined([plain, *(varied for _, _, varied in moves)]))
         count = len(self.data)
         rows = motions.rows(0, count)
         table = np.zeros((rows.shape[0], OWN + len(self.layout.keys) + 1))
         table[:, ORIGIN] = 1.0
         table[:, RELEASE] = -(rows[:, 1] / np.repeat(self.ratios, np.diff(self.starts)))
         table[:, -1] = self._left(rows[:, OBSERVED], trial_effects)
-        every = motions.trajectories([self.ratios[i] for i in trials]) if past_end else []
+        every = motions.trajectories() if past_end else []
         first = count
         for place, steps, varied in moves:
             jobs, first = slice(first, first + len(varied)), first + len(varied)
@@ -311,17 +316,15 @@ class Predictor:
         return np.concatenate([np.arange(self.starts[i], self.starts[i + 1]) for i in trials])
 
     def _clip(self, change: Floats, motions: Motions, trials: NDArray[np.int_], jobs: slice) -> None:
-        """End what positions move by where the growth ends, as `clipped_change` does."""
+        """End what positions move by where the growth ends."""
         ends = motions.ends[motions.like]
         if not np.any(ends[trials, 0] == ENDED):
             return
         starts = starts_of([self.times_s[i] for i in trials])
         for k, (i, moved) in enumerate(zip(trials, ends[jobs], strict=True)):
             if ends[i, 0] == ENDED:
-                of_trial = change[starts[k] : starts[k + 1]]
-                stamps = motions.batch.stamps[slice(*motions.batch.starts[[motions.like[i], motions.like[i] + 1]])]
-                over = stamps > ends[i, 1]
-                of_trial[over] = of_trial[-1] if moved[0] == ENDED else 0.0
+                over = motions.stamps(i) > ends[i, 1]
+                clip_at_end(change[starts[k] : starts[k + 1]], over, moved_ends=moved[0] == ENDED)
 
     def products(self, columns: Sequence[Floats]) -> Floats:
         """Sums of products of the trials' columns under their noise, shape (n_trials, 3, k, k), see `whitening`.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.batch import Batch
 from vinetrack.dynamics.simulate import Trajectory, check_completed, trajectories
 
@@ -37,22 +37,34 @@ class Jobs:
     payload_factor: Floats
 
     @classmethod
-    def of(cls, jobs: Sequence[Job], rows: Floats | None = None) -> Jobs:
+    def of(cls, jobs: Sequence[Job]) -> Jobs:
         """Single jobs together.
 
         Parameters
         ----------
         jobs : sequence of Job
-        rows : array, shape (n_jobs, n_parameters), optional
-            Parameters in place of those of the jobs.
 
         Returns
         -------
         Jobs
         """
-        trials, own_rows, *columns = zip(*jobs, strict=True) if jobs else [()] * len(Job._fields)
-        rows = np.array(own_rows).reshape(len(jobs), -1) if rows is None else rows
-        return cls(np.array(trials, dtype=int), rows, *(np.array(column, dtype=float) for column in columns))
+        trials, rows, *values = zip(*jobs, strict=True) if jobs else [()] * len(Job._fields)
+        others = [np.array(column, dtype=float) for column in values]
+        return cls(np.array(trials, dtype=int), np.array(rows).reshape(len(jobs), -1), *others)
+
+    def with_effect(self, values: Sequence[float]) -> Jobs:
+        """The same trajectories of a model with one effect more.
+
+        Parameters
+        ----------
+        values : sequence of float
+            Its parameters, SI, alike for all.
+
+        Returns
+        -------
+        Jobs
+        """
+        return replace(self, row=np.hstack([self.row, np.tile(np.asarray(values, dtype=float), (len(self), 1))]))
 
     def __len__(self) -> int:
         return self.trial.size
@@ -123,26 +135,27 @@ class Jobs:
 class Motions:
     """What was simulated for jobs: rows of `out` and `ends` as `Batch.run` returns them, for distinct trajectories.
 
-    `like`, shape (n_jobs,), tells of each job which trajectory is its own.
+    `ratios` are the travel ratios of their trials; `like`, shape (n_jobs,), tells of each job which is its own.
     """
 
     batch: Batch
     out: Floats
     ends: Floats
+    ratios: list[float]
     like: NDArray[np.int_]
 
     @classmethod
-    def of(cls, batch: Batch, like: NDArray[np.int_], names: Sequence[str]) -> Motions:
+    def of(cls, batch: Batch, trials: Sequence[Trial], like: NDArray[np.int_]) -> Motions:
         """Integrate a batch.
 
         Parameters
         ----------
         batch : Batch
             Distinct trajectories.
+        trials : sequence of Trial
+            One a trajectory.
         like : array of int, shape (n_jobs,)
             Of each job its trajectory.
-        names : sequence of str
-            Of the trials, for messages.
 
         Returns
         -------
@@ -154,8 +167,8 @@ class Motions:
             If the integration does not get through.
         """
         out, ends = batch.run()
-        check_completed(ends, names)
-        return cls(batch, out, ends, like)
+        check_completed(ends, [trial.name for trial in trials])
+        return cls(batch, out, ends, [trial.travel_ratio for trial in trials], like)
 
     def rows(self, first: int, last: int) -> Floats:
         """Rows of `out` of jobs `first` up to `last`, end to end.
@@ -174,17 +187,25 @@ class Motions:
             return self.out[starts[like[0]] : starts[like[-1] + 1]]
         return np.concatenate([self.out[starts[k] : starts[k + 1]] for k in like])
 
-    def trajectories(self, ratios: Sequence[float]) -> list[Trajectory]:
-        """A trajectory for each job.
+    def stamps(self, job: int) -> Floats:
+        """Instants of a job since its release, s, as the camera has them.
 
         Parameters
         ----------
-        ratios : sequence of float
-            Travel ratios of the distinct trajectories' trials.
+        job : int
+
+        Returns
+        -------
+        array, shape (n_times,)
+        """
+        return self.batch.stamps[self.batch.starts[self.like[job]] : self.batch.starts[self.like[job] + 1]]
+
+    def trajectories(self) -> list[Trajectory]:
+        """A trajectory for each job.
 
         Returns
         -------
         list of Trajectory
         """
-        known = trajectories(self.batch, self.out, self.ends, ratios)
+        known = trajectories(self.batch, self.out, self.ends, self.ratios)
         return [known[k] for k in self.like]
