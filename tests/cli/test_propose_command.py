@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
 from vinetrack.effects import own_effects
+from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.laboratory.tracks import write_experiment
 
 
@@ -38,7 +39,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return experiment, results
 
 
-def test_a_law_is_written_beside_the_experiment_and_added(bench: tuple[Path, Path]) -> None:
+def test_a_law_is_written_beside_the_experiment_and_added(bench: tuple[Path, Path], tmp_path: Path) -> None:
     experiment, results = bench
     assert json.loads((results / "diagnosis.json").read_text())["verdict"] == "unexplained"
     code, output = run("propose", results)
@@ -47,15 +48,18 @@ def test_a_law_is_written_beside_the_experiment_and_added(bench: tuple[Path, Pat
     path = experiment / "proposed_time.py"
     effect = own_effects([path])["proposed_time"]
     assert "12 trials of bench" in effect.text
-    code, output = run("add", path, results)
-    assert code == 0, output
-    assert "proposed_time added to" in output
     code, output = run("propose", results)
     assert code == 1
     assert "is there already" in output
-    code, output = run("add", path, results, "--save")
+    elsewhere = shutil.copy(path, tmp_path)
+    code, output = run("add", elsewhere, results, "--save")
     assert code == 1
-    assert "under `effects:`" in output
+    assert f"put the file into {experiment}" in output
+    code, output = run("add", path, results, "--save")
+    assert code == 0, output
+    assert "proposed_time added to" in output
+    settings = read_experiment_settings(experiment / "experiment.yaml")
+    assert (settings.model[-1], settings.effects) == ("proposed_time", ("proposed_time.py",))
 
 
 def test_nothing_is_proposed_where_the_verdict_is_another(bench: tuple[Path, Path], tmp_path: Path) -> None:

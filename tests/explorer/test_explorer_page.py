@@ -5,20 +5,17 @@ from __future__ import annotations
 import base64
 import re
 import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from bokeh.document import Document
 from explorer_campaign import SETTINGS, write_diagnosis
+from page_browser import Browser
 
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.command import open_campaign
 from vinetrack.explorer.fitting import BackgroundFit
-from vinetrack.explorer.page import Page
 
 GAMMA = "size_reservoir_depletion.gamma"
 
@@ -29,43 +26,6 @@ def ground(campaign: Campaign) -> BackgroundFit:
     grown.wait(240)
     assert grown.trouble == ""
     return grown
-
-
-class Browser:
-    """Stands for the browser: a document whose callbacks are run by hand."""
-
-    def __init__(self, ground: BackgroundFit) -> None:
-        self.document = Document()
-        self.page = Page(ground, self.document)
-        self.turn()
-
-    def model(self, name: str) -> Any:
-        found = self.document.get_model_by_name(name)
-        assert found is not None, name
-        return found
-
-    def text(self, name: str) -> str:
-        return str(self.model(name).text)
-
-    def turn(self) -> None:
-        """Run everything that is due once."""
-        for callback in list(self.document.session_callbacks):
-            if type(callback).__name__ != "PeriodicCallback":
-                self.document.callbacks.remove_session_callback(callback)
-                callback.callback()
-
-    def until(self, asked: Callable[[], bool], seconds: float = 60) -> None:
-        end = time.monotonic() + seconds
-        while not asked():
-            assert time.monotonic() < end
-            self.turn()
-            time.sleep(0.01)
-
-    def click(self, name: str) -> None:
-        from bokeh.events import ButtonClick
-
-        button = self.model(name)
-        button._trigger_event(ButtonClick(button))
 
 
 @pytest.fixture

@@ -87,17 +87,18 @@ def _add(
         from vinetrack.pipeline.source_experiment import experiment_behind
 
         read = experiment_behind(results, experiment)
-        if save and effect.endswith(".py"):
+        own_file = Path(effect) if effect.endswith(".py") else None
+        if save and own_file is not None and own_file.resolve().parent != read.folder.resolve():
             raise UserError(
-                f"{effect}: to save it, name the file under `effects:` of {read.folder / 'experiment.yaml'}, then add"
-                f" it by its name: vinetrack add {Path(effect).stem} {results} --save"
+                f"{effect}: to save it, put the file into {read.folder} first: an experiment is one folder."
             )
         with _told() as report:
             lines = add_effect(read, results, effect, report)
         if save:
             from vinetrack.pipeline.source_experiment import save_model
 
-            path = save_model(read.folder, [*read.settings.model, effect])
+            name = effect if own_file is None else own_file.stem
+            path = save_model(read.folder, [*read.settings.model, name], [] if own_file is None else [own_file.name])
             lines.append(f"Saved to {path}; run vinetrack run, or snakemake, again to have everything with it.")
         tell(lines, {"effect": effect, "saved": save, "lines": lines}, json_file)
 
@@ -117,8 +118,9 @@ def _propose(
         from vinetrack.pipeline.source_experiment import experiment_behind
 
         with _told() as report:
-            lines = propose_effect(experiment_behind(results, experiment), results, to, report)
-        tell(lines, {"lines": lines}, json_file)
+            proposal = propose_effect(experiment_behind(results, experiment), results, to, report)
+        lines, files = list(proposal.lines), [path.as_posix() for path in proposal.files]
+        tell(lines, {"lines": lines, "files": files}, json_file)
 
 
 def _diagnosis(

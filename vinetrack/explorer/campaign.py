@@ -6,7 +6,7 @@ It is read once and never changed; the choice of the user is in `choice`, its cu
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -140,6 +140,21 @@ class Campaign:
     def host(self) -> Model:
         """One model with all effects, as in a diagnosis: its compiled form serves every model that can be chosen."""
         return host_for(Model(()), self.effects.values())
+
+    def own_files(self, names: Sequence[str]) -> list[str]:
+        """Files of the user's own effects beside the settings, of those named.
+
+        Parameters
+        ----------
+        names : effects of a model.
+
+        Returns
+        -------
+        list of str
+        """
+        folder = self.experiment.folder.resolve()
+        paths = [self.effects[name].path for name in names]
+        return [path.name for path in paths if path.resolve().parent == folder]
 
     def of_condition(self, condition: str) -> list[int]:
         """Places of the trials of a condition among `trials`.

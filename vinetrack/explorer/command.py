@@ -121,7 +121,8 @@ def _without_a_page(
         write_export(campaign, choice, curves, path)
         say(f"Written: {path}")
     if wanted.save:
-        say(f"Saved: {save_model(campaign.experiment.folder, choice.effects)}")
+        files = campaign.own_files(choice.effects)
+        say(f"Saved: {save_model(campaign.experiment.folder, choice.effects, files)}")
 
 
 def error_lines(campaign: Campaign, choice: ModelChoice, now: dict[str, float], before: dict[str, float]) -> list[str]:

@@ -364,7 +364,7 @@ class KeepPanel:
         page = self._page
         folder = page.campaign.experiment.folder
         try:
-            path = save_model(folder, page.choice.effects)
+            path = save_model(folder, page.choice.effects, page.campaign.own_files(page.choice.effects))
         except (ExperimentError, TableError, OSError) as error:
             lines = format_problems(error.problems) if isinstance(error, ExperimentError) else [str(error)]
             self.said.text = f'<p class="bad">{escaped("; ".join(lines))}</p>'

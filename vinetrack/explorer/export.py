@@ -159,13 +159,20 @@ def commands(
         return [f"vinetrack compare {folder}"]
     if fitted and not dropped:
         end = " --save" if save else ""
-        return [f"vinetrack add {name} {folder}{end}" for name in added]
+        return [f"vinetrack add {_typed(campaign, name)} {folder}{end}" for name in added]
     words = [f"--add {name}" for name in added] + [f"--drop {name}" for name in dropped]
     if fitted or save:
         words += ["--refit"] if fitted else []
         return [" ".join(["vinetrack explore", folder, *words, *(["--save"] if save else [])])]
     words += [f"--set {shlex.quote(f'{name}={value:.6g}')}" for name, value in _moved(campaign, start, choice).items()]
     return [" ".join(["vinetrack explore", folder, *words])]
+
+
+def _typed(campaign: Campaign, effect: str) -> str:
+    """An effect as it is named on the command line: by its file where the settings do not name that yet."""
+    path = campaign.effects[effect].path
+    unnamed = campaign.own_files([effect]) and path.name not in campaign.experiment.settings.effects
+    return shlex.quote(path.as_posix()) if unnamed else effect
 
 
 def _moved(campaign: Campaign, start: ModelChoice, choice: ModelChoice) -> dict[str, float]:

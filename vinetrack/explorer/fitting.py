@@ -9,8 +9,10 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Generic, TypeVar
 
 from vinetrack.core.local_page import THREAD_PREFIX
+from vinetrack.core.problems import UserError
 from vinetrack.diagnosis.compare import compare
 from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
@@ -194,15 +196,19 @@ def tied_words(result: Fit) -> list[str]:
     return [words for _, words in sorted(pairs, reverse=True)]
 
 
-class FitJob:
-    """One fit in a thread; `told`, `done` and `failed` are called from that thread."""
+Told = TypeVar("Told")
+Outcome = TypeVar("Outcome")
+
+
+class FitJob(Generic[Told, Outcome]):
+    """One fit, or a search made of fits, in a thread; `told`, `done` and `failed` are called from that thread."""
 
     def __init__(
         self,
-        work: Callable[[Watch], Fitted],
+        work: Callable[[Callable[[Told], None]], Outcome],
         *,
-        told: Callable[[Step], None],
-        done: Callable[[Fitted], None],
+        told: Callable[[Told], None],
+        done: Callable[[Outcome], None],
         failed: Callable[[str], None],
     ) -> None:
         self._work, self._told, self._done, self._failed = work, told, done, failed
@@ -234,7 +240,7 @@ class FitJob:
             result = self._work(self._watch)
         except GivenUp:
             return
-        except (FitError, EffectError, SimulationError) as error:
+        except UserError as error:
             self._say(self._failed, str(error))
         except Exception:
             log.exception("a fit of the explorer")
@@ -247,7 +253,7 @@ class FitJob:
         if not self._unwanted.is_set():
             whom(words)
 
-    def _watch(self, step: Step) -> None:
+    def _watch(self, step: Told) -> None:
         if self._unwanted.is_set():
             raise GivenUp
         self._told(step)

@@ -18,6 +18,7 @@ from vinetrack.explorer.film_panel import FilmPanel
 from vinetrack.explorer.fitting import BackgroundFit, FitJob, FitProgress, Fitted, at_numbers, fit_choice
 from vinetrack.explorer.look import escaped, page_style, page_template, progress_bar, screen_script, sheet, theme, words
 from vinetrack.explorer.plots import Plots
+from vinetrack.explorer.proposal import ProposalPanel, Reopen
 from vinetrack.explorer.series import vine_colours
 from vinetrack.explorer.sides import (
     DIAGNOSIS,
@@ -58,7 +59,7 @@ for (const plot of plots) {
 class Page:
     """The controller of one document. Everything here runs in the document's own turn, but `_heard_…`."""
 
-    def __init__(self, ground: BackgroundFit, document: Document) -> None:
+    def __init__(self, ground: BackgroundFit, document: Document, reopen: Reopen | None = None) -> None:
         self.ground, self.campaign, self.document = ground, ground.campaign, document
         self.choice: ModelChoice = ground.opening
         self.curves: Curves | None = None
@@ -70,11 +71,11 @@ class Page:
         self._story_time = self._diagnosed_at()
         self._touched = False
         self._redraw_pending = self._words_pending = False
-        self._job: FitJob | None = None
+        self._job: FitJob[Step, Fitted] | None = None
         self._wanted = False
         self._step: Step | None = None
         self._waiting = FitProgress()
-        self._build()
+        self._build(reopen)
         ground.listen(self._heard_ground)
         document.on_session_destroyed(lambda _context: self.close())
         document.add_periodic_callback(self._look_again, LOOK_AGAIN_MS)
@@ -83,7 +84,7 @@ class Page:
 
     # ---- what is on the page -------------------------------------------------------------------------------------
 
-    def _build(self) -> None:
+    def _build(self, reopen: Reopen | None) -> None:
         campaign = self.campaign
         self.headline, self.status = words(name="headline"), words(name="status")
         self.numbers, self.tied, self.next = words(name="numbers"), words(name="tied"), words(name="next")
@@ -93,6 +94,7 @@ class Page:
         self.panel = EffectPanel(campaign, self.choice, suspects, self._ticked, self._moved)
         self.film = FilmPanel(campaign, self.document, self._instant)
         self.keep = KeepPanel(self)
+        self.proposal = ProposalPanel(self, reopen)
         self.refit = Button(label="Refit", button_type="primary", width=110, name="refit", stylesheets=[sheet()])
         self.back = Button(label="As fitted", width=96, name="as_fitted", stylesheets=[sheet()])
         self.hold = Button(label="Hold to compare", width=132, name="hold", stylesheets=[sheet()])
@@ -109,7 +111,7 @@ class Page:
         actions = Column(children=[buttons, hint, self.said], sizing_mode="stretch_width", name="actions", margin=0)
         roots = [self.headline, self.status, self.chooser.root, self.plots.motion, self.plots.residual]
         roots += [self.plots.errors, self.panel.root, actions, self.numbers, self.tied, self.next]
-        for root in (*roots, self.film.root, self.keep.root):
+        for root in (*roots, self.film.root, self.keep.root, self.proposal.root):
             self.document.add_root(root)
         figures = [self.plots.motion, self.plots.residual, self.plots.errors, self.film.figure]
         self.document.js_on_event("document_ready", CustomJS(args={"plots": figures}, code=LET_SCROLL))
@@ -354,6 +356,7 @@ class Page:
 
     def _clock(self) -> None:
         """The line of what is going on; it is alive while anything is."""
+        self.proposal.show()
         if self._job is not None or self._wanted:
             about = "refitting" if self._job is not None else "first the model in use is fitted"
             share, text = self._waiting.state(time.monotonic(), about, self.ground.step if self._wanted else None)
@@ -391,6 +394,7 @@ class Page:
         """Nobody looks any more."""
         self.ground.forget(self._heard_ground)
         self.film.close()
+        self.proposal.close()
         if self._job is not None:
             self._job.give_up()
 

@@ -40,8 +40,10 @@ def application(ground: BackgroundFit) -> Application:
     """
     from vinetrack.explorer.page import Page
 
+    shown = [ground]
+
     def open_page(document: Document) -> None:
-        Page(ground, document)
+        Page(shown[-1], document, shown.append)
 
     return Application(FunctionHandler(open_page, trap_exceptions=False))
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from vinetrack.core.numbers import decimals
 from vinetrack.core.units import SLIDER_UNITS, display_unit
+from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.experiment.schema import COLUMNS, LIMITED
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.choice import ModelChoice
@@ -336,6 +337,7 @@ class DiagnosisSummary:
     """The first round of a diagnosis, and what to do next. `cosines` is a matrix in the order of `cosine_names`."""
 
     verdict: str
+    unexplained: bool
     explanation: str
     answer_set: tuple[str, ...]
     suspects: tuple[RankedCandidate, ...]
@@ -389,6 +391,7 @@ def read_summary(folder: Path) -> DiagnosisSummary | None:
     first = diagnosis.rounds[0] if diagnosis.rounds else None
     return DiagnosisSummary(
         verdict=diagnosis.verdict or "not diagnosed",
+        unexplained=UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict),
         explanation=diagnosis.explanation,
         answer_set=diagnosis.answer_set,
         suspects=tuple(RankedCandidate(c.effect, c.delta_chi2, c.in_answer_set, c.reason) for c in diagnosis.ranking),

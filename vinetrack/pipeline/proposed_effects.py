@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from vinetrack.experiment.folder import Experiment
@@ -13,7 +14,15 @@ from vinetrack.results.stored_diagnosis import read_diagnosis
 Report = Callable[[str], None]
 
 
-def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report: Report) -> list[str]:
+@dataclass(frozen=True)
+class WrittenProposal:
+    """Lines for the terminal, and the effect files that were written, the law first."""
+
+    lines: tuple[str, ...]
+    files: tuple[Path, ...]
+
+
+def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report: Report) -> WrittenProposal:
     """Write the law that mends what no effect of the catalogue does, and the learned force where no law does.
 
     Parameters
@@ -26,8 +35,7 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
 
     Returns
     -------
-    list of str
-        Lines for the terminal.
+    WrittenProposal
 
     Raises
     ------
@@ -84,4 +92,4 @@ def propose_effect(experiment: Experiment, folder: Path, to: Path | None, report
     if files:
         settings = experiment.folder / "experiment.yaml"
         lines.append(f"To have the diagnosis question it, name it under `effects:` of {settings}.")
-    return lines
+    return WrittenProposal(tuple(lines), tuple(paths))

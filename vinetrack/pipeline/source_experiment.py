@@ -49,7 +49,7 @@ SETTINGS = "experiment.yaml"
 BOM = b"\xef\xbb\xbf"
 
 
-def save_model(folder: Path, names: Sequence[str]) -> Path:
+def save_model(folder: Path, names: Sequence[str], files: Sequence[str] = ()) -> Path:
     """Set `model:` of an experiment, in a whole file or not at all; return the path of the settings.
 
     A mark at the beginning of the file and its line ends stay; a file in another encoding becomes UTF-8.
@@ -59,6 +59,8 @@ def save_model(folder: Path, names: Sequence[str]) -> Path:
     folder : experiment folder.
     names : sequence of str
         Effects of the model.
+    files : sequence of str
+        Files of own effects in that folder that `effects:` has to name as well, where it does not yet.
 
     Returns
     -------
@@ -73,13 +75,16 @@ def save_model(folder: Path, names: Sequence[str]) -> Path:
     """
     from vinetrack.core.tables import read_text, write_bytes
     from vinetrack.core.yaml_document import with_list
+    from vinetrack.experiment.settings import read_experiment_settings
 
     path = folder / SETTINGS
-    if not path.exists():
-        write_bytes(path, with_list("", "model", names).encode())
-        return path
-    text = with_list(read_text(path), "model", names, path.name)
-    before = path.read_bytes()
+    before = path.read_bytes() if path.exists() else b""
+    text = read_text(path) if before else ""
+    named = list(read_experiment_settings(path).effects) if before and files else []
+    new = [name for name in files if name not in named]
+    if new:
+        text = with_list(text, "effects", [*named, *new], path.name)
+    text = with_list(text, "model", names, path.name)
     if b"\r\n" in before:
         text = text.replace("\n", "\r\n")
     write_bytes(path, (BOM if before.startswith(BOM) else b"") + text.encode("utf-8"))

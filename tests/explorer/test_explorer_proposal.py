@@ -1,0 +1,159 @@
+"""The button that has an effect proposed where no known one explains the trials; the search is tried elsewhere."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from explorer_campaign import SETTINGS, write_diagnosis
+from page_browser import Browser
+
+from vinetrack.effects import EffectError, remember
+from vinetrack.experiment.settings import read_experiment_settings
+from vinetrack.explorer import proposal
+from vinetrack.explorer.campaign import Campaign
+from vinetrack.explorer.command import open_campaign
+from vinetrack.explorer.fitting import BackgroundFit
+from vinetrack.pipeline.proposed_effects import WrittenProposal
+from vinetrack.results.folder_layout import ResultsError
+
+SPRING = (
+    '"""Spring line: pulls the tail back.\n\n    tail force −k x\n\nShorten it.\n"""\n\n'
+    "from vinetrack.effects import Parameter\n\n"
+    'PARAMETERS = (Parameter("k", "k", "N/m", 0.5, bounds=(0.0, 20.0)),)\n\n\n'
+    "def tail_force(s, rig, k):\n    return -k * s.tail_position\n"
+)
+
+
+@pytest.fixture
+def unexplained(campaign: Campaign, tmp_path: Path) -> Campaign:
+    """A copy of the experiment and its results, diagnosed as `unexplained`."""
+    experiment, folder = tmp_path / "vines", tmp_path / "results"
+    shutil.copytree(campaign.experiment.folder, experiment)
+    shutil.copytree(campaign.folder, folder)
+    path = write_diagnosis(folder)
+    rounds = [{"model": [], "verdict": "unexplained", "ranking": []}]
+    known = {**json.loads(path.read_text()), "verdict": "unexplained", "answer_set": [], "rounds": rounds}
+    path.write_text(json.dumps(known), encoding="utf-8")
+    return open_campaign(folder, experiment)
+
+
+@pytest.fixture
+def opened(unexplained: Campaign) -> Iterator[tuple[Browser, list[BackgroundFit]]]:
+    """A page of it, and what it has opened instead."""
+    reopened: list[BackgroundFit] = []
+    ground = BackgroundFit(unexplained).begin()
+    ground.wait(240)
+    browser = Browser(ground, reopened.append)
+    yield browser, reopened
+    browser.page.close()
+
+
+def searching(monkeypatch: pytest.MonkeyPatch, search: Callable[..., WrittenProposal]) -> None:
+    monkeypatch.setattr(proposal, "propose_effect", search)
+
+
+def test_the_effect_proposed_is_opened_fitted_and_saved_with_its_file(
+    opened: tuple[Browser, list[BackgroundFit]], unexplained: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    browser, reopened = opened
+    folder, going_on = unexplained.experiment.folder, threading.Event()
+
+    def search(experiment: Any, results: Path, to: Path | None, told: Callable[[str], None]) -> WrittenProposal:
+        assert (experiment.folder, results, to) == (folder, unexplained.folder, None)
+        told("learning the missing force as a table")
+        assert going_on.wait(60)
+        path = folder / "spring_line.py"
+        path.write_text(SPRING, encoding="utf-8")
+        remember(path)
+        return WrittenProposal(("A law of the travel does.", f"Written to {path}."), (path,))
+
+    searching(monkeypatch, search)
+    assert browser.model("propose_panel").visible
+    assert f"vinetrack propose {unexplained.folder.as_posix()}" in browser.text("proposal")
+    browser.click("propose")
+    browser.until(lambda: (browser.page._clock(), "learning the missing force" in browser.text("proposal"))[1])
+    assert browser.model("propose").label == "Stop"
+    going_on.set()
+    browser.until(lambda: "Written to" in browser.text("proposal"))
+    assert not browser.model("propose").visible
+
+    browser.click("open_proposed")
+    assert browser.page.proposal._reload.data == {"times": [1]}
+    (ground,) = reopened
+    ground.wait(240)
+    page = Browser(ground)
+    page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))
+    assert page.model("tick_spring_line").active
+    assert f"vinetrack add {(folder / 'spring_line.py').as_posix()}" in _fitted_commands(page)
+    page.click("save")
+    assert "Saved." in page.text("saved")
+    page.page.close()
+    settings = read_experiment_settings(folder / "experiment.yaml")
+    assert (settings.model[-1], settings.effects) == ("spring_line", ("spring_line.py",))
+    assert SETTINGS.splitlines()[0] in (folder / "experiment.yaml").read_text(encoding="utf-8")
+    assert "spring_line" in open_campaign(unexplained.folder, folder).in_use
+
+
+def _fitted_commands(page: Browser) -> str:
+    """Commands of the page once the effect that is ticked was fitted."""
+    page.click("refit")
+    page.until(lambda: page.model("refit").label == "Refit" and page.page.is_fitted(), 240)
+    page.page._say()
+    return page.text("commands")
+
+
+def test_a_search_that_is_stopped_or_fails_says_so_and_may_begin_again(
+    opened: tuple[Browser, list[BackgroundFit]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    browser, _ = opened
+    begun, ended = threading.Event(), threading.Event()
+
+    def endless(*given: Any) -> WrittenProposal:
+        begun.set()
+        try:
+            while not ended.wait(0.01):
+                given[-1]("still searching")
+        finally:
+            ended.set()
+        raise AssertionError
+
+    searching(monkeypatch, endless)
+    browser.click("propose")
+    assert begun.wait(60)
+    browser.click("propose")
+    assert "was stopped" in browser.text("proposal")
+    assert ended.wait(60)
+
+    def refused(*_: Any) -> WrittenProposal:
+        raise ResultsError("proposed_time.py is there already: move it away, or name another file with --to.")
+
+    searching(monkeypatch, refused)
+    browser.click("propose")
+    browser.until(lambda: "is there already" in browser.text("proposal"))
+    assert browser.model("propose").label == proposal.PROPOSE
+    assert not browser.model("open_proposed").visible
+
+    searching(monkeypatch, lambda *_: WrittenProposal(("No law does better than chance.",), ()))
+    browser.click("propose")
+    browser.until(lambda: "better than chance" in browser.text("proposal"))
+    assert not browser.model("open_proposed").visible
+
+
+def test_it_is_not_offered_where_a_known_effect_may_explain_the_trials(campaign: Campaign) -> None:
+    browser = Browser(BackgroundFit(campaign))
+    assert not browser.model("propose_panel").visible
+    browser.page.close()
+
+
+def test_a_file_that_is_no_effect_is_said(unexplained: Campaign, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = unexplained.experiment.folder / "torn.py"
+    path.write_text("def tail_force(", encoding="utf-8")
+    searching(monkeypatch, lambda *_: WrittenProposal((), (path,)))
+    with pytest.raises(EffectError, match="cannot be read"):
+        proposal.proposed(unexplained, lambda _: None)

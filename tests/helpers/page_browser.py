@@ -1,0 +1,49 @@
+"""Stands for the browser in tests of the explorer's page that need none."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from bokeh.document import Document
+
+from vinetrack.explorer.fitting import BackgroundFit
+from vinetrack.explorer.page import Page
+
+
+class Browser:
+    """Stands for the browser: a document whose callbacks are run by hand."""
+
+    def __init__(self, ground: BackgroundFit, reopen: Callable[[BackgroundFit], None] | None = None) -> None:
+        self.document = Document()
+        self.page = Page(ground, self.document, reopen)
+        self.turn()
+
+    def model(self, name: str) -> Any:
+        found = self.document.get_model_by_name(name)
+        assert found is not None, name
+        return found
+
+    def text(self, name: str) -> str:
+        return str(self.model(name).text)
+
+    def turn(self) -> None:
+        """Run everything that is due once."""
+        for callback in list(self.document.session_callbacks):
+            if type(callback).__name__ != "PeriodicCallback":
+                self.document.callbacks.remove_session_callback(callback)
+                callback.callback()
+
+    def until(self, asked: Callable[[], bool], seconds: float = 60) -> None:
+        end = time.monotonic() + seconds
+        while not asked():
+            assert time.monotonic() < end
+            self.turn()
+            time.sleep(0.01)
+
+    def click(self, name: str) -> None:
+        from bokeh.events import ButtonClick
+
+        button = self.model(name)
+        button._trigger_event(ButtonClick(button))
