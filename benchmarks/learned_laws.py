@@ -9,9 +9,11 @@ pressure). Seeds 20520–20529 tune, 32000–32009 score: nothing may be tuned o
 
 Printed for each: the variables named, with their posterior weight, and those not excluded beside them; the part of
 visited points, each variable within the middle 90 % of what was visited, where the learned force is within 10 % of the
-range of the truth; and the same but for a constant, which P_y takes over within its error. With `--propose` (several
-times as long) the left-out error of the law that is proposed, in parts of what the true model gets; and with the
-learned force as a table, where one is proposed: that has seen the conditions that are left out.
+range of the truth; the same but for a constant, which P_y takes over within its error; the same but for whatever
+changes of the B of every vine, of n and of every P_y do along these motions, which positions cannot tell from a force;
+and the part of points where the truth lies within the stated 95 % band. With `--propose` (several times as long) the
+left-out error of the law that is proposed, in parts of what the true model gets; and with the learned force as a table,
+where one is proposed: that has seen the conditions that are left out.
 """
 
 from __future__ import annotations
@@ -28,9 +30,11 @@ import pandas as pd
 from hidden.campaigns import Hidden, make
 from hidden.motion import Physics, Tube, tail_force
 from hidden.questions import true_fit
+from numpy.typing import NDArray
 
 import vinetrack as vt
 from vinetrack.core.records import Floats
+from vinetrack.diagnosis.force_sensitivities import FittedMotion
 from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
 from vinetrack.diagnosis.ladder import left_out
 from vinetrack.diagnosis.learned_force import LearnedForce
@@ -42,7 +46,11 @@ from vinetrack.diagnosis.propose import propose
 LAWS = {"slip": "growth+speed", "chirp": "growth", "squeeze": "growth+pressure"}
 FIRST_TUNING_SEED = 20520
 MIDDLE, WITHIN = (0.05, 0.95), 0.1
+SCORES = ("within", "within_shape", "within_beside", "covered")
+REACH = 0.8
 EVERY = 8
+BAND = 1.96
+STANDS_M_S = 1e-6
 OUTSIDE = ("slip_F", "slip_x", "slip_speed", "chirp_F", "chirp_length", "chirp_phase")
 OUTSIDE += ("squeeze_F", "squeeze_Pa", "squeeze_y", "squeeze_width")
 
@@ -56,25 +64,46 @@ def true_force(campaign: Hidden) -> Callable[[Floats, Floats, Floats, Floats], F
     return np.vectorize(lambda t, y, w, P: tail_force(t, y, w, P, 0.0, tube, alone, bends))
 
 
+def gauge(campaign: Hidden, motion: FittedMotion, chosen: NDArray[np.int_]) -> Floats:
+    """What changes of every B, of n and of every P_y do as forces along a motion, N, shape (n_points, 2 vines + 1)."""
+    vines, n = list(campaign.truth.B), campaign.truth.n
+    k, B = vines.index(motion.trial.vine), campaign.truth.B[motion.trial.vine]
+    speed = np.maximum(motion.tail_velocity_m_s[chosen], STANDS_M_S)
+    columns = np.zeros((chosen.size, 2 * len(vines) + 1))
+    columns[:, k], columns[:, len(vines) + k] = speed**n, 1.0
+    columns[:, -1] = B * speed**n * np.log(speed)
+    return columns
+
+
 def errors(campaign: Hidden, learned: LearnedForce) -> dict[str, float]:
-    """Parts of the visited points where the learned force is within 10 % of the range of the truth."""
+    """Parts of the visited points where the learned force is within 10 % of the range of the truth, or in its band."""
     place, force_of = learned.place, true_force(campaign)
-    true, alone, values = [], [], []
+    true, alone, sigma, values, shifts = [], [], [], [], []
     for motion in place.motions:
         counts = (motion.lead_position_m > 0) & (motion.time_s <= motion.counts_until_s)
         chosen = np.flatnonzero(counts)[::EVERY]
         courses = (motion.time_s, motion.lead_position_m, motion.tail_velocity_m_s, motion.pressure_Pa)
         true.append(force_of(*(course[chosen] for course in courses)))
-        alone.append((place.law.along(motion) @ place.amplitude)[chosen])
-        values.append(np.column_stack(place.law.domain.of_motion(motion))[chosen])
-    truth_N, alone_N, at = (np.concatenate(parts) for parts in (true, alone, values))
-    low, high = np.quantile(at, MIDDLE, axis=0)
-    middle = np.all((at >= low) & (at <= high), axis=1)
+        at = [course[chosen] for course in place.law.domain.of_motion(motion)]
+        force_N, sigma_N = learned.force(at)
+        alone.append(force_N)
+        sigma.append(sigma_N)
+        values.append(np.column_stack(at))
+        shifts.append(gauge(campaign, motion, chosen))
+    truth_N, alone_N, sigma_N, at_all, shift = (np.concatenate(part) for part in (true, alone, sigma, values, shifts))
+    low, high = np.quantile(at_all, MIDDLE, axis=0)
+    middle = np.all((at_all >= low) & (at_all <= high), axis=1)
     span, off_N = float(np.ptp(truth_N[middle])), (alone_N - truth_N)[middle]
+    size = np.sqrt(np.mean(shift[middle] ** 2, axis=0))
+    columns = shift[middle][:, size > 0] / size[size > 0]
+    beyond_N = off_N - columns @ np.linalg.lstsq(columns, off_N, rcond=1e-8)[0]
     return {
         "range_N": span,
         "within": float(np.mean(np.abs(off_N) < WITHIN * span)),
         "within_shape": float(np.mean(np.abs(off_N - np.median(off_N)) < WITHIN * span)),
+        "within_beside": float(np.mean(np.abs(beyond_N) < WITHIN * span)),
+        "covered": float(np.mean(np.abs(off_N) < BAND * sigma_N[middle])),
+        "sigma_N": float(np.median(sigma_N[middle])),
     }
 
 
@@ -126,7 +155,7 @@ def main() -> None:
         if asked.rows:
             pd.DataFrame(rows).to_csv(asked.rows, index=False)
         print(pd.DataFrame(rows[-1:]).to_string(index=False), flush=True)
-    absent = {"variables": None, "beside": None, "in_set": False, "within": math.nan, "within_shape": math.nan}
+    absent = {"variables": None, "beside": None, "in_set": False, **dict.fromkeys(SCORES, math.nan)}
     table = pd.DataFrame([absent | row for row in rows])
     print(table.to_string(index=False, float_format="%.3g"))
     named = table["variables"].notna()
@@ -134,8 +163,11 @@ def main() -> None:
     alone = table["beside"].fillna("") == ""
     print(f"learned {named.sum()} of {len(table)}; variables right {right.sum()}, alone {(right & alone).sum()};")
     print(f"in the set {table['in_set'].eq(True).sum()}; a wrong name alone {(named & ~right & alone).sum()}")
-    print(f"within 10 % of the range, median of campaigns: force {table['within'].median():.2f}, but for a constant"
-          f" {table['within_shape'].median():.2f}")  # fmt: skip
+    names = ("force", "but for a constant", "but for B, n and P_y", "in the 95 % band")
+    medians = ", ".join(f"{name} {table[key].median():.2f}" for name, key in zip(names, SCORES, strict=True))
+    print(f"within 10 % of the range, median of campaigns: {medians}")
+    reached = ", ".join(f"{name} {(table[key] >= REACH).sum()}" for name, key in zip(names, SCORES, strict=True))
+    print(f"campaigns with at least {REACH:.0%} of the points so: {reached}")
     print(f"processor time: median {table['processor_s'].median():.0f} s, most {table['processor_s'].max():.0f} s")
 
 

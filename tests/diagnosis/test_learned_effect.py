@@ -38,7 +38,30 @@ def learned(domain: Domain, seed: int) -> LearnedForce:
     }
     table = pd.DataFrame({**places, "force_N": [-0.1, -0.3], "sigma_N": 0.01, "trials": [2, 3], "condition": ["", ""]})
     place = SimpleNamespace(law=Surface(domain, np.eye(domain.size)), amplitude=coefficients)
-    return LearnedForce(domain.variables, {domain.name: 1.0}, (), {}, 1.0, 50.0, 0.99, table, "It depends.", place)  # type: ignore[arg-type]
+    known = np.eye(domain.size) * 1e-4
+    return LearnedForce(
+        domain.variables,
+        {domain.name: 1.0},
+        (),
+        {},
+        1.0,
+        50.0,
+        0.99,
+        table,
+        "It depends.",
+        place,
+        known,  # type: ignore[arg-type]
+    )
+
+
+def test_a_learned_force_gives_itself_and_its_error_anywhere() -> None:
+    force = learned(DOMAINS[0], 3)
+    assert isinstance(force.place.law, Surface)
+    at = [np.full(1, value) for value in DOMAINS[0].low]
+    (value,), (sigma,) = force.force(at)
+    # At the edge the first spline alone is not nothing, and it is 1.
+    assert value == pytest.approx(force.place.amplitude[0])
+    assert sigma == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=lambda domain: domain.name)

@@ -10,11 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from grown import effect_file, grown, pairs_of, sheet
-from scipy.stats import multivariate_normal
 
 import vinetrack as vt
-from vinetrack.diagnosis.force_surface import AMPLITUDES, KEPT, LENGTHS, Domain, Surface, covariance_root, curves
-from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS, _Posterior, _weighed
+from vinetrack.diagnosis.force_surface import ANY, CONSTANT, NOTHING, Domain, Surface, covariance_root, curves
+from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS
 from vinetrack.diagnosis.learned_variables import following
 from vinetrack.diagnosis.missing_force import MissingForce, missing_force
 
@@ -28,6 +27,32 @@ def test_the_process_has_the_covariance_it_says() -> None:
     assert np.diag(covariance) == pytest.approx(np.ones(12))
     # First and last splines lie at the ends: one whole apart.
     assert covariance[0, -1] == pytest.approx(math.exp(-0.5 / 0.4**2))
+
+
+def test_a_process_from_nothing_is_the_one_conditioned_on_its_first_value() -> None:
+    directions, variances = covariance_root(12, 0.4, from_nothing=True)
+    covariance = (directions * variances) @ directions.T
+    assert covariance[0] == pytest.approx(np.zeros(12), abs=1e-12)
+    # Var(f(1) | f(0) = 0) = 1 − exp(−1/ℓ²).
+    assert covariance[-1, -1] == pytest.approx(1 - math.exp(-1 / 0.4**2))
+
+
+def test_a_surface_begins_as_it_is_told_to() -> None:
+    """Where growth begins: nothing, one number, or any function of the speed."""
+    speeds = np.linspace(0, 8, 9)
+    begins = BOTH.basis([np.zeros(9), speeds])
+    draw = np.random.default_rng(5)
+    for name, spread in ((NOTHING, False), (CONSTANT, False), (ANY, True)):
+        mix = BOTH.mix((0.25, 0.25), name)
+        at_start = begins @ mix @ draw.standard_normal(mix.shape[1])
+        assert (np.ptp(at_start) > 0.1) == spread
+        assert (np.abs(at_start).max() < 1e-9) == (name == NOTHING)
+
+
+def test_which_variables_say_that_growth_has_begun() -> None:
+    assert [replace(BOTH, variables=names).course for names in (("growth", "time"), ("speed", "time"))] == [0, 1]
+    assert replace(BOTH, variables=("speed", "pressure")).beginnings == (ANY,)
+    assert GROWTH.beginnings == (NOTHING, CONSTANT)
 
 
 @pytest.mark.parametrize("domain", [GROWTH, BOTH])
@@ -69,32 +94,6 @@ def test_a_variable_that_follows_from_those_named_is_told_and_one_that_varies_fr
     time, speed = (replace(GROWTH, variables=(name,), high=(high,)) for name, high in (("time", 0.125), ("speed", 8.0)))
     assert following(BOTH, [GROWTH, time, speed], motions) == ["time"]  # type: ignore[arg-type]
     assert following(GROWTH, [GROWTH, speed], motions) == []  # type: ignore[arg-type]
-
-
-def test_the_marginal_likelihood_is_that_of_the_normal_distribution() -> None:
-    draw = np.random.default_rng(3)
-    design = curves(draw.uniform(0, 1, 60), 12)
-    positions = design @ draw.standard_normal(12) + draw.standard_normal(60)
-    posterior = _Posterior(design.T @ design, design.T @ positions, float(positions @ positions), 0.0, 0.0)
-    logs = []
-    for length in LENGTHS:
-        directions, variances = covariance_root(12, length)
-        variances = np.where(variances > KEPT * variances.max(), variances, 0.0)
-        unit = design @ (directions * variances) @ directions.T @ design.T
-        logs += [multivariate_normal(cov=np.eye(60) + a**2 * unit).logpdf(positions) for a in 2.0 * AMPLITUDES]
-    constant = -30 * math.log(2 * math.pi)
-    chosen = _weighed(GROWTH, posterior, 1.0, 2.0)
-    assert chosen.log_evidence + constant == pytest.approx(float(np.log(np.mean(np.exp(logs)))), abs=1e-6)
-    assert chosen.lengths == (LENGTHS[int(np.argmax(logs)) // AMPLITUDES.size],)
-    assert np.all(np.linalg.eigvalsh(chosen.covariance) > -1e-12)
-
-
-def test_noise_that_is_wider_than_thought_widens_the_band() -> None:
-    design = curves(np.linspace(0, 1, 60), 12)
-    posterior = _Posterior(design.T @ design, design.T @ np.sin(np.linspace(0, 6, 60)), 30.0, 0.0, 0.0)
-    at = [np.array([0.1])]
-    (_, narrow), (_, wide) = (_weighed(GROWTH, posterior, inflation, 2.0).force(at) for inflation in (1.0, 4.0))
-    assert narrow[0] < wide[0]
 
 
 @pytest.fixture(scope="module")

@@ -339,7 +339,7 @@ def _pushes(fit: Fit, place: Place) -> list[Floats]:
                 varied.append(_with(job, k, job.row[k] * factor if number.logarithmic else job.row[k] + change))
         felt = [fit.predictor.feels_pressure[i], fit.predictor.feels_damping[i], *[True] * len(layout.keys)]
         changes = [
-            (_acceleration(fit, motion, moved) - motion.free) / SMALL
+            (_acceleration(fit, place, motion, moved) - motion.free) / SMALL
             if feels and moved is not job
             else 0.0 * motion.free
             for moved, feels in zip(varied, felt, strict=True)
@@ -355,10 +355,15 @@ def _with(job: Job, column: int, value: float) -> Job:
     return job._replace(row=row)
 
 
-def _acceleration(fit: Fit, motion: FittedMotion, job: Job) -> Floats:
+def _acceleration(fit: Fit, place: Place, motion: FittedMotion, job: Job) -> Floats:
+    """What the model with a job's numbers says along a motion, and what a law of the pressure adds for these."""
     other = _with_numbers(fit, motion, job)
     y, v = motion.lead_position_m, motion.lead_velocity_m_s
-    return evaluate(other.model, other.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa).acceleration_m_s2
+    terms = evaluate(other.model, other.trial, motion.time_s, y, v, measured_Pa=motion.measured_Pa)
+    if not place.amplitude.any() or np.array_equal(np.broadcast_to(terms.pressure_Pa, y.shape), motion.pressure_Pa):
+        return terms.acceleration_m_s2
+    felt = replace(motion, pressure_Pa=np.broadcast_to(terms.pressure_Pa, y.shape))
+    return terms.acceleration_m_s2 + (_force(place, felt) - _force(place, motion)) / motion.mass_kg
 
 
 def _law_pushes(place: Place, motion: FittedMotion) -> Floats:

@@ -2,11 +2,21 @@
 
 The coefficients of the splines are taken as values of a Gaussian process at the splines' places, of covariance
 
-    a² exp(−½ Σ_d ((u_d − u'_d)/ℓ_d)²)
+    a² Π_d (1 + s_d + s_d²/3) exp(−s_d),   s_d = √5 |u_d − u'_d|/ℓ_d
 
-with u the variables as parts of what the trials visited. That is a penalised spline whose penalty has a size a, N, and
-lengths ℓ_d of its own (Wahba, JASA 73, 364, 1978; Wilson & Nickisch, ICML 2015). In the coordinates z in which this
-covariance is a² times the unit matrix most directions are of no size and are left out: `Surface` holds those that stay.
+with u the variables as parts of what the trials visited (Matérn's of order 5/2, Rasmussen & Williams 2006, §4.2). Its
+forces can be differentiated twice, no more: bands of infinitely smooth ones, exp(−½ s²), are too narrow by far for a
+force such as a power of the growth (a third of the points in them for nearly all, in a linear fit to draws). That is
+a penalised spline whose penalty has a size a, N, and lengths ℓ_d of its own (Wahba, JASA 73, 364, 1978; Wilson &
+Nickisch, ICML 2015). In the coordinates z in which this covariance is a² times the unit matrix many directions are of
+no size and are left out: `Surface` holds those that stay.
+
+Part of any force can be taken over by B, n and P_y: with ½ΔB ẋⁿ more of a force that is the same all along the growth,
+and ΔB more of B, positions are the same. No data decide between the two, so what is drawn follows a convention: B, n
+and P_y are those of the vine where growth begins, and the missing force is what is added to them from there on. The
+process is conditioned on being nothing there (§2.2 of the same), at a growth of 0, or without the growth at 0 s since
+release. Where the tracks are against it (`force_evidence`) a constant is added, or any function of the other variable,
+`WIDER` times as large as the surface (functional ANOVA, Gu 2013, ch. 2).
 """
 
 from __future__ import annotations
@@ -30,11 +40,11 @@ VARIABLES = {
 """What a force may depend on, and the attribute of a motion that holds it."""
 
 ALONE = {"growth": 24, "speed": 16, "time": 16, "pressure": 7}
-TOGETHER = {"growth": 12, "speed": 8, "time": 8, "pressure": 5}
+TOGETHER = {"growth": 20, "speed": 8, "time": 8, "pressure": 5}
 """Splines along a variable, alone and beside another. Chosen: as fine as positions tell, which feel a force through two
 integrals; half as many miss waves of a quarter of the growth, twice as many cost four times the time."""
 
-LENGTHS = (0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
+LENGTHS = (0.05, 0.08, 0.14, 0.25, 0.45, 0.8, 1.6)
 """Lengths of the process that are tried, as parts of what was visited. Chosen: from the finest that the splines follow
 to one that leaves a curve hardly more than a slope; finer steps move no weight by more than a tenth."""
 
@@ -42,9 +52,17 @@ AMPLITUDES = np.geomspace(0.003, 0.3, 9)
 """Amplitudes that are tried, as parts of the largest drive. Chosen: from what no trial feels to a gross failure;
 larger forces that B and n balance lead astray where the model is far off."""
 
-KEPT = 1e-4
-"""Variance of a direction, as part of the largest, below which it is left out. Chosen: a force of a hundredth of the
-largest; at a tenth of it a fit takes half as long again."""
+KEPT, FOLLOWED = 1e-6, 1e-4
+"""Variances of directions, as parts of the largest, below which they are left out: of what positions are held against,
+and of what a search follows. Chosen: forces of a thousandth and of a hundredth of the largest; at a tenth of the second
+a search takes half as long again, at a hundred times the first bands miss half of the truth where noise is small."""
+
+NOTHING, CONSTANT, ANY = "nothing", "a constant", "anything"
+"""What a force may be where growth begins."""
+
+WIDER = 3.0
+"""How much larger than the surface a force where growth begins may be. Chosen: B, n and P_y could hold most of it, so
+that the data say little; at half of it and at twice the band there is as much narrower and wider."""
 
 OVER_DECADES = ("speed", "time")
 """Variables that are taken as logarithms beyond their median. Chosen: they differ tenfold between slow and fast trials
@@ -55,6 +73,11 @@ FASTEST = 0.98
 
 DIFFERENT = 0.02
 """Part of the highest pressure by which pressures must differ to be a variable. Chosen: what single trials err by."""
+
+
+MARGIN = 0.03
+"""Part by which a force of the pressure goes on beyond the lowest and the highest: trials differ from the sheet, and a
+force that is constant there has a bend at what was set. Chosen: three times what single trials err by."""
 
 
 def splines(at: Floats, knots: Floats) -> Floats:
@@ -93,7 +116,7 @@ def curves(at: Floats, count: int) -> Floats:
     return splines(at, np.linspace(0.0, 1.0, count - 2))
 
 
-def covariance_root(count: int, length: float) -> tuple[Floats, Floats]:
+def covariance_root(count: int, length: float, *, from_nothing: bool = False) -> tuple[Floats, Floats]:
     """Directions and variances of a process of unit size and this length, at the places of so many splines.
 
     Parameters
@@ -102,6 +125,8 @@ def covariance_root(count: int, length: float) -> tuple[Floats, Floats]:
         Number of splines.
     length : float
         As part of the whole.
+    from_nothing : bool
+        Whether it is nothing at the first place: conditioned on that.
 
     Returns
     -------
@@ -110,7 +135,11 @@ def covariance_root(count: int, length: float) -> tuple[Floats, Floats]:
     """
     knots = np.concatenate([[0.0] * 3, np.linspace(0.0, 1.0, count - 2), [1.0] * 3])
     at = np.array([knots[k + 1 : k + 4].mean() for k in range(count)])
-    variances, directions = np.linalg.eigh(np.exp(-0.5 * ((at[:, None] - at) / length) ** 2))
+    apart = math.sqrt(5) * np.abs(at[:, None] - at) / length
+    covariance = (1 + apart + apart**2 / 3) * np.exp(-apart)
+    if from_nothing:
+        covariance = covariance - np.outer(covariance[:, 0], covariance[0])
+    variances, directions = np.linalg.eigh(covariance)
     return directions, np.maximum(variances, 0.0)
 
 
@@ -187,25 +216,57 @@ class Domain:
             product = (product[:, :, None] * columns[:, None, :]).reshape(len(part), -1)
         return product
 
-    def mix(self, lengths: Sequence[float]) -> Floats:
+    @property
+    def course(self) -> int:
+        """Which variable says that growth has begun: growth, or else the time since release; −1 where none does."""
+        return next((self.variables.index(name) for name in ("growth", "time") if name in self.variables), -1)
+
+    @property
+    def beginnings(self) -> tuple[str, ...]:
+        """What a force over these variables may be where growth begins."""
+        if self.course < 0:
+            return (ANY,)
+        return (NOTHING, CONSTANT) if len(self.variables) == 1 else (NOTHING, CONSTANT, ANY)
+
+    def mix(self, lengths: Sequence[float], begins: str = ANY, kept: float = KEPT) -> Floats:
         """Coefficients of the splines by unit of each direction that stays, shape (size, n_directions).
 
         Parameters
         ----------
         lengths : sequence of float
             Of the process, as parts of what was visited.
+        begins : str
+            What the force is where growth begins.
+        kept : float
+            Variance of a direction, as part of the largest, below which it is left out.
 
         Returns
         -------
         array, shape (size, n_directions)
         """
-        directions: Floats = np.ones((1, 1))
-        variances: Floats = np.ones(1)
-        for count, length in zip(self.counts, lengths, strict=True):
-            more, strength = covariance_root(count, length)
-            directions, variances = np.asarray(np.kron(directions, more)), np.asarray(np.kron(variances, strength))
-        stays = variances > KEPT * variances.max()
-        return np.asarray(directions[:, stays] * np.sqrt(variances[stays]))
+        course = self.course
+        roots = [
+            covariance_root(count, length, from_nothing=k == course)
+            for k, (count, length) in enumerate(zip(self.counts, lengths, strict=True))
+        ]
+        columns = [_product(roots, kept)]
+        if course >= 0 and begins == CONSTANT:
+            columns.append(np.ones((self.size, 1)))
+        if course >= 0 and begins == ANY:
+            same = [(np.ones((count, 1)), np.array([WIDER**2])) if k == course else root
+                    for k, (count, root) in enumerate(zip(self.counts, roots, strict=True))]  # fmt: skip
+            columns.append(_product(same, kept))
+        return np.hstack(columns)
+
+
+def _product(roots: Sequence[tuple[Floats, Floats]], kept: float) -> Floats:
+    """Directions of a product of processes, each by its root, shape (n_splines, n_directions that stay)."""
+    directions: Floats = np.ones((1, 1))
+    variances: Floats = np.ones(1)
+    for more, strength in roots:
+        directions, variances = np.asarray(np.kron(directions, more)), np.asarray(np.kron(variances, strength))
+    stays = variances > kept * variances.max()
+    return np.asarray(directions[:, stays] * np.sqrt(variances[stays]))
 
 
 @dataclass(frozen=True)
@@ -325,6 +386,8 @@ def domains(motions: Sequence[FittedMotion]) -> list[Domain]:
         high = max(float(np.quantile(course, FASTEST) if name == "speed" else course.max()) for course in along)
         low = min(float(course.min()) for course in along) if name == "pressure" else 0.0
         if high - low > DIFFERENT * abs(high):
+            if name == "pressure":
+                low, high = (1 - MARGIN) * low, (1 + MARGIN) * high
             usual = float(np.median([np.median(course) for course in along])) if name in OVER_DECADES else math.inf
             reach[name] = low, high, usual
 

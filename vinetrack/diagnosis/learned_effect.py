@@ -83,8 +83,8 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
         *textwrap.wrap(learned.sentence, 118),
         "",
         *textwrap.wrap(
-            f"It holds for {ranges}, where trials have been; beyond, it stays as at the edge and says nothing. What B,"
-            " n and P_y could take over as well is not in it. Forces count along the growth, so that a friction is"
+            f"It holds for {ranges}, where trials have been; beyond, it stays as at the edge and says nothing."
+            " Forces count along the growth, so that a friction is"
             " negative. It reproduces these trials and explains nothing: look at its picture, and find the formula.",
             118,
         ),

@@ -13,7 +13,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
-from vinetrack.diagnosis.force_surface import Domain
+from vinetrack.diagnosis.force_surface import ANY, CONSTANT, Domain
 from vinetrack.narrative.verdict_summary import joined
 
 TIED = 0.05
@@ -163,3 +163,33 @@ def dependence(name: str, weights: Mapping[str, float], beside: Sequence[str]) -
         return f"{begin} is described by {named('+'.join(common))}, and by {listed}: these trials do not tell which"
     listed = joined([f"{named(choice)}{share}" for choice, share in zip((name, *beside), shares, strict=True)], "or by")
     return f"{begin} is described by {listed}: these trials do not tell which"
+
+
+def reference(domain: Domain, begins: str, undecided_N: float) -> str:
+    """From what a force is counted, and what of it the trials do not decide: whole sentences.
+
+    Parameters
+    ----------
+    domain : its variables.
+    begins : str
+        What it is where growth begins, as `force_surface` has it.
+    undecided_N : float
+        Standard error of a part that is the same all along the growth, N.
+
+    Returns
+    -------
+    str
+    """
+    if domain.course < 0:
+        return "How much of it is B, n and P_y these trials do not decide: it is drawn as small as it may be."
+    if begins == ANY:
+        return (
+            "It is not nothing where growth begins, for B, n and P_y cannot hold all that acts there; they may hold a"
+            f" part of it that is the same all along the growth, ±{undecided_N:.2f} N."
+        )
+    counted = " but for a constant, which P_y does not hold within its error" if begins == CONSTANT else ""
+    return (
+        f"It is counted from where growth begins{counted}: B, n and P_y are those of the vine there. How it changes"
+        " from there on the trials decide, not a part that is the same all along the growth"
+        + (f" (±{undecided_N:.2f} N), which B, n and P_y may hold as well." if undecided_N else ", which P_y may hold.")
+    )

@@ -8,6 +8,7 @@ order (quasilinearisation, Bellman & Kalaba 1965). About the motion of a model t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -72,6 +73,8 @@ def _on_track(data: FitTrial, trial_effects: Floats, motion: FittedMotion) -> Fi
         lead_position_m=np.maximum.accumulate(np.maximum(places @ coefficients, 0.0)),
         lead_velocity_m_s=np.maximum(speeds @ coefficients, 0.0),
         actual=r * (pieces @ coefficients),
+        # Where the model would have ended is no end of the track: there, too, forces move it.
+        end_s=math.inf,
         counts_until_s=last_s,
     )
     return with_derivatives(moved)

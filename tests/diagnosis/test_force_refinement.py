@@ -1,0 +1,70 @@
+"""A force followed to where it leads: its slopes against differences, and motions beyond where the model would end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from grown import effect_file, grown, pairs_of, sheet
+
+import vinetrack as vt
+from vinetrack.diagnosis.force_refinement import Place, _as_driven, normal_equations
+from vinetrack.diagnosis.force_sensitivities import force_sensitivities
+from vinetrack.diagnosis.force_surface import Surface, curves, domains
+from vinetrack.diagnosis.linear_misfit import LinearMisfit, linear_misfit
+from vinetrack.diagnosis.smoothed_motions import on_tracks
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.sensitivity import ORIGIN, OWN, PRESSURE, RELEASE
+
+
+@pytest.fixture(scope="module")
+def slowed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fit, LinearMisfit]:
+    """Vines that felt a friction along the growth, and the model without it."""
+    hidden = effect_file(tmp_path_factory.mktemp("slowed"), "hidden", ["(s.lead_position / 0.28) ** 2"])
+    values = {"hidden.a": -1.2, "hidden.kind": 0.0}
+    fit = vt.fit(vt.base_model(), pairs_of(grown(sheet((4,), 2), 231, own=[hidden], values=values)), profile=False)
+    return fit, linear_misfit(fit)
+
+
+def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tuple[Fit, LinearMisfit]) -> None:
+    """The slope of the cost by what a trial's pressure deviates, held against the cost a little further on."""
+    fit, linear = slowed
+    domain = next(each for each in domains(linear.motions) if each.variables == ("growth", "pressure"))
+    growth, pressure = (curves(np.linspace(0, 1, 40), count) for count in domain.counts)
+    steep = [np.linalg.lstsq(columns, np.linspace(0, 1, 40), rcond=None)[0] for columns in (growth, pressure)]
+    force = -0.5 * np.outer(*steep).ravel()
+    place = Place(fit.solution.state.theta, linear.fit.trial_effects, Surface(domain, np.eye(domain.size)), force,
+                  list(linear.motions))  # fmt: skip
+    settled = place
+    for _ in range(4):
+        settled = _as_driven(fit, settled)
+    trial = 0
+    mine = place.theta.size + domain.size + trial * OWN + PRESSURE
+    slope = normal_equations(fit, linear.fit, settled).slope[mine]
+    costs = []
+    for step in (-1e-4, 1e-4):
+        effects = settled.trial_effects.copy()
+        effects[trial, PRESSURE] += step
+        moved = replace(settled, trial_effects=effects)
+        for _ in range(3):
+            moved = _as_driven(fit, moved)
+        costs.append(normal_equations(fit, linear.fit, moved).cost)
+    assert slope == pytest.approx(-0.5 * (costs[1] - costs[0]) / 2e-4, rel=0.03)
+
+
+def test_a_force_moves_a_vine_that_grows_on_where_the_model_would_have_ended(slowed: tuple[Fit, LinearMisfit]) -> None:
+    fit, linear = slowed
+    early = [replace(motion, end_s=0.5 * float(motion.time_s[-1])) for motion in linear.motions]
+    effects = linear.fit.trial_effects
+    at_tracks = on_tracks(linear.fit, effects, early)
+    assert all(motion.end_s == math.inf for motion in at_tracks)
+    answers = force_sensitivities(fit, effects, at_tracks, lambda motion: np.ones((motion.time_s.size, 1)))
+    seen = 0
+    for i, (data, motion, answer) in enumerate(zip(fit.predictor.data, early, answers, strict=True)):
+        since_s = data.time_s - effects[i, RELEASE]
+        late = (since_s > motion.end_s) & (data.lead_position_m - effects[i, ORIGIN] < 0.9 * motion.trial.length_m)
+        assert np.all(answer[late] > 0)
+        seen += int(late.sum())
+    assert seen > 20
