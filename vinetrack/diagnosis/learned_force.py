@@ -197,12 +197,14 @@ def learned_force(
         return None
     # A fit that has settled within a part of χ² tells no smaller difference; nor do points that err together.
     together = max(fit.points / (PIECES * len(fit.data)), 1.0)
-    error = max(0.5 * SETTLED * left, 1 + (inflation - 1) * together) / inflation
+    shared = (1 + (inflation - 1) * together) / inflation
+    error = max(0.5 * SETTLED * left / inflation, shared)
     weights = posterior_weights(choices, error)
     choice, place = max(
         zip(choices, (place for _, place, _ in there), strict=True), key=lambda pair: weights[pair[0].domain.name]
     )
-    best = choice.best(error)
+    # Forces that begin in different ways are weighed at one place: how far the fit has settled they share.
+    best = choice.best(shared)
     place = replace(place, amplitude=best.mean)
     bayes = next(choice.log_evidence for choice, _ in linear if choice.domain == best.surface.domain) - silent
     remarks = []
