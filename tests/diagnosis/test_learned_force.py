@@ -21,20 +21,24 @@ GROWTH = Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
 BOTH = Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, math.inf))
 
 
+FAR = math.sqrt(5) / 0.4
+ALIKE = (1 + FAR + FAR**2 / 3) * math.exp(-FAR)
+"""Covariance of the ends of a variable at a length of 0.4: Rasmussen & Williams 2006, eq. 4.17."""
+
+
 def test_the_process_has_the_covariance_it_says() -> None:
     directions, variances = covariance_root(12, 0.4)
     covariance = (directions * variances) @ directions.T
     assert np.diag(covariance) == pytest.approx(np.ones(12))
     # First and last splines lie at the ends: one whole apart.
-    assert covariance[0, -1] == pytest.approx(math.exp(-0.5 / 0.4**2))
+    assert covariance[0, -1] == pytest.approx(ALIKE)
 
 
 def test_a_process_from_nothing_is_the_one_conditioned_on_its_first_value() -> None:
     directions, variances = covariance_root(12, 0.4, from_nothing=True)
     covariance = (directions * variances) @ directions.T
     assert covariance[0] == pytest.approx(np.zeros(12), abs=1e-12)
-    # Var(f(1) | f(0) = 0) = 1 − exp(−1/ℓ²).
-    assert covariance[-1, -1] == pytest.approx(1 - math.exp(-1 / 0.4**2))
+    assert covariance[-1, -1] == pytest.approx(1 - ALIKE**2)
 
 
 def test_a_surface_begins_as_it_is_told_to() -> None:
