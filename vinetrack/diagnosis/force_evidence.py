@@ -81,7 +81,7 @@ class Beginning:
 
 
 @dataclass(frozen=True)
-class Choice:
+class VariableChoice:
     """A domain with its marginal likelihood, averaged over all ways to begin, and each of these."""
 
     domain: Domain
@@ -184,7 +184,7 @@ def posterior(place: Place, normal: Normal) -> Posterior:
     )
 
 
-def weighed(domain: Domain, told: Posterior, inflation: float, largest_N: float) -> Choice:
+def weighed(domain: Domain, told: Posterior, inflation: float, largest_N: float) -> VariableChoice:
     """The marginal likelihood of a domain, averaged over ways to begin, lengths and amplitudes.
 
     Parameters
@@ -198,11 +198,11 @@ def weighed(domain: Domain, told: Posterior, inflation: float, largest_N: float)
 
     Returns
     -------
-    Choice
+    VariableChoice
     """
     beginnings = tuple(_begun(domain, begins, told, inflation, largest_N) for begins in domain.beginnings)
     logs = np.array([each.log_evidence for each in beginnings])
-    return Choice(domain, float(logs.max() + np.log(np.mean(np.exp(logs - logs.max())))), beginnings)
+    return VariableChoice(domain, float(logs.max() + np.log(np.mean(np.exp(logs - logs.max())))), beginnings)
 
 
 def _begun(domain: Domain, begins: str, told: Posterior, inflation: float, largest_N: float) -> Beginning:
@@ -247,12 +247,12 @@ def _given(mix: Floats, sd_N: float, told: Posterior, inflation: float) -> tuple
     return covariance @ told.score / inflation, covariance
 
 
-def posterior_weights(choices: Sequence[Choice], error: float) -> dict[str, float]:
+def posterior_weights(choices: Sequence[VariableChoice], error: float) -> dict[str, float]:
     """Posterior weights of choices by name, one variable and two with the same odds beforehand.
 
     Parameters
     ----------
-    choices : sequence of Choice
+    choices : sequence of VariableChoice
     error : float
         What ln Z is known to.
 

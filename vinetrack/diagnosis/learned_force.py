@@ -32,7 +32,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_evidence import Beginning, Choice, Posterior, posterior, posterior_weights, weighed
+from vinetrack.diagnosis.force_evidence import (
+    Beginning,
+    Posterior,
+    VariableChoice,
+    posterior,
+    posterior_weights,
+    weighed,
+)
 from vinetrack.diagnosis.force_inversion import ForceFit
 from vinetrack.diagnosis.force_refinement import SETTLED, Place, followed, normal_equations
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of
@@ -225,10 +232,10 @@ def learned_force(
 def _again(
     model_fit: Fit,
     fit: ForceFit,
-    there: Sequence[tuple[Choice, Place, Posterior]],
+    there: Sequence[tuple[VariableChoice, Place, Posterior]],
     inflation: float,
     largest_N: float,
-) -> list[tuple[Choice, Place, Posterior]]:
+) -> list[tuple[VariableChoice, Place, Posterior]]:
     """Every choice of two variables begun once more from where the best ended, and kept where that leads further down.
 
     Each is begun from its own linear answer. Where that is far off, one stops short of what it could explain, and is
@@ -255,7 +262,7 @@ def _again(
 
 
 def _followed(
-    model_fit: Fit, fit: ForceFit, place: Place, choice: Choice, inflation: float, largest_N: float
+    model_fit: Fit, fit: ForceFit, place: Place, choice: VariableChoice, inflation: float, largest_N: float
 ) -> tuple[Place, Posterior] | None:
     """Where a force over these variables leads, and what positions say of it there."""
     settled: tuple[Place, Posterior] | None = None
