@@ -228,3 +228,15 @@ def test_a_page_opened_with_a_choice_shows_it(campaign: Campaign) -> None:
     assert page.model("size_leak.rate").value == pytest.approx(0.2)
     assert "leak" in page.text("headline")
     page.page.close()
+
+
+def test_a_page_opened_as_the_command_does_shows_the_fit_and_no_size_that_was_moved(campaign: Campaign) -> None:
+    from vinetrack.explorer.choice import first_choice
+
+    grown = BackgroundFit(campaign, first_choice(campaign)).begin()
+    grown.wait(240)
+    page = Browser(grown)
+    page.until(lambda: "N·(s/m)ⁿ" in page.text("numbers"))
+    assert page.page.is_fitted()
+    assert "Sizes were moved" not in page.text("numbers")
+    page.page.close()

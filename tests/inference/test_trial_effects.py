@@ -9,11 +9,14 @@ import pytest
 from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
+from vinetrack.inference import trial_effects
 from vinetrack.inference.assemble import log_likelihood
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.optimiser import FixedTerms, solve
+from vinetrack.inference.mixed_effects import FitState
+from vinetrack.inference.optimiser import FixedTerms, _creeps, solve
 from vinetrack.inference.release_kernels import products_at_releases
+from vinetrack.inference.trial_effects import residuals_in
 from vinetrack.inference.whitening import whiten
 
 
@@ -60,3 +63,50 @@ def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho
         columns[:, -1] = position_m - columns[:, -1]
         white = whiten(columns, first, rho, relative)
         assert np.allclose(product, white.T @ white, rtol=1e-12, atol=1e-12)
+
+
+def test_a_release_that_steps_led_back_from_is_taken_again_only_where_less_is_missed(
+    only_in_motion: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else steps, which lower what is missed, and searches, which go by likelihood, go round in a circle."""
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    columns = predictor.linearise(solution.state.theta, solution.state.trial_effects)
+    there = solution.state.trial_effects.copy()
+    there[:, 0] -= 0.004
+    elsewhere, missed = replace(solution.state, trial_effects=there), [0.0]
+
+    def level(_predictor: object, _problem: object, state: FitState, *_: object) -> np.ndarray:
+        return np.full(len(there), -9.0 if state is elsewhere else 0.0)
+
+    def cost(_predictor: object, _problem: object, state: FitState, *_: object) -> np.ndarray:
+        return np.full(len(there), missed[0] if state is elsewhere else 0.0)
+
+    monkeypatch.setattr(trial_effects, "_levels", level)
+    monkeypatch.setattr(trial_effects, "trial_costs", cost)
+    monkeypatch.setattr(trial_effects, "follow_trial_effects", lambda *given: (given[-1], None))
+    monkeypatch.setattr(trial_effects.ReleaseSearch, "_likelier", lambda *_: elsewhere)
+    search = trial_effects.ReleaseSearch(predictor, solution.problem)
+
+    def looked(missed_there: float) -> object:
+        missed[0] = missed_there
+        return search.look(solution.state, residuals_in(columns))
+
+    assert looked(+4.0) is not None
+    # The next search finds the trials where they had been.
+    assert looked(+4.0) is None
+    assert search.led_back.all()
+    assert looked(-4.0) is not None
+
+
+@pytest.mark.parametrize(
+    ("levels", "ends"),
+    [
+        ([100.0, 50.0, 49.0, 48.5, 48.2, 48.1], False),
+        ([100.0, 50.0, 49.9, 49.8, 49.7, 49.6], True),
+        ([50.0, 49.9, 49.8, 49.7, 60.0], False),
+        ([50.0, 49.9, 49.8, 49.7], False),
+    ],
+    ids=["it still falls", "it creeps", "a jump has just raised it", "too few steps"],
+)
+def test_a_fit_that_only_creeps_may_end(levels: list[float], *, ends: bool) -> None:
+    assert _creeps(levels, 1.0) == ends

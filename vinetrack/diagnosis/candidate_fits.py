@@ -36,6 +36,11 @@ WORSE = -1.0
 """An effect added can do no harm: Δχ² below this is a fit that has lost its way. Derived: nested models cannot be
 worse; 1 is rounding and unsettled iterations."""
 
+SAME_MISFIT = 0.01
+"""Δχ² per point below which two fits far off the tracks end in the same place. Derived: −2 ln L of n points with noise
+s is n ln s², so they then miss by the same to half a per cent; such fits end before they have settled. At half more
+starts are tried (time), at twice fewer."""
+
 WITHIN_REACH = 16.0
 """Fall of −2 ln L behind the best within which an effect is worth a fit; cosine from which two effects count as alike;
 part of the best promise worth a subset fit. Chosen: √16 is four standard deviations for what the linear prediction may
@@ -289,8 +294,8 @@ class CandidateFits:
         best = max((fitted_one.fit.log_likelihood for fitted_one in self.fitted.values()), default=-math.inf)
         led = math.isfinite(climb.deviance) or not self.explained
         hypothesis = self._from_climb(climb, best, led=led)
-        promised = self.base - climb.deviance if math.isfinite(climb.deviance) else 0.0
-        if hypothesis is not None and hypothesis.delta_chi2 < max(WORSE, PART_KEPT * promised):
+        promised = max(self.base - climb.deviance, 0.0) if math.isfinite(climb.deviance) else 0.0
+        if hypothesis is not None and hypothesis.delta_chi2 < (PART_KEPT * promised or -_same_place(hypothesis.fit)):
             hypothesis = self._begun_again(climb, hypothesis, best, led=led)
         if hypothesis is None or hypothesis.delta_chi2 < WORSE:
             self.silent.add(name)
@@ -315,7 +320,7 @@ class CandidateFits:
             other = self._from_climb(start, best, afresh=afresh, led=led)
             if other is not None:
                 ends.append(other)
-                if abs(other.delta_chi2 - hypothesis.delta_chi2) < -WORSE:
+                if abs(other.delta_chi2 - hypothesis.delta_chi2) < _same_place(other.fit, hypothesis.fit):
                     self.same_end.add(name)
                     break
         return max(ends, key=_gain)
@@ -327,6 +332,13 @@ class CandidateFits:
 
 def _gain(hypothesis: LikelihoodRatio) -> float:
     return hypothesis.delta_chi2
+
+
+def _same_place(*fits: Fit) -> float:
+    """By how much less in −2 ln L two fits of one hypothesis end in the same place."""
+    if not all(is_poor_fit(fit.predictor, fit.solution) for fit in fits):
+        return -WORSE
+    return max(-WORSE, SAME_MISFIT * sum(trial.time_s.size for trial in fits[0].predictor.data))
 
 
 def simpler_forms(

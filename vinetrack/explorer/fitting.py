@@ -271,7 +271,7 @@ class BackgroundFit:
     def __init__(self, campaign: Campaign, choice: ModelChoice | None = None) -> None:
         self.campaign = campaign
         self.start = first_choice(campaign)
-        self.opening = choice or self.start
+        self.opening = self.start if choice in (None, self.start) else choice
         self.curves: Curves | None = None
         self.errors_m: dict[str, float] = {}
         self.fitted: Fitted | None = None

@@ -15,10 +15,10 @@ from vinetrack.inference.marginal_likelihood import estimate_noise, estimate_spr
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_step, shared_penalty
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.trial_effects import (
+    ReleaseSearch,
     follow_trial_effects,
     limited,
     residuals_in,
-    search_releases,
     trial_costs,
 )
 from vinetrack.inference.whitening import at_correlation
@@ -44,6 +44,12 @@ EARLY_ITERATIONS, MOST_EARLY, FAR_OFF = 3, 9, 1e3
 promises more than this of −2 ln L: what is only not yet fitted must not pass for noise or scatter. Chosen: a start
 misses by less than that after three steps, or needs more; at half the spreads soak up what the first steps have not
 fitted yet."""
+
+PROGRESS_STEPS = 4
+"""Steps in which a fit that may end early has to come forward. Chosen: as many as lie between two searches of
+releases, after which −2 ln L may rise for a step or two; at half such a rise would end it, at twice a third of the
+steps is saved instead of more than half. The likelihood of a vine that sticks has corners where more steps stand still,
+so a fit that is asked for by itself is not ended."""
 
 SHORTER, MOST_DAMPED = (1.0, 0.4, 0.15), 11
 """Parts of a step that are tried, and how often it is damped further if none of them helps. Chosen: a line search in
@@ -104,6 +110,7 @@ def solve(
     watch: Watch | None = None,
     columns: Sequence[Floats] | None = None,
     least_decrease: float = SETTLED_DECREASE,
+    least_progress: float = 0.0,
 ) -> Solution:
     """Iterate to the end. `warm` says that the state is near it already.
 
@@ -127,6 +134,8 @@ def solve(
         Sensitivities at the state, as `Predictor.linearise` has them, where they are known.
     least_decrease : float
         Decrease of −2 ln L, promised by a step, below which the fit has settled.
+    least_progress : float
+        Fall of −2 ln L per point in PROGRESS_STEPS steps below which the fit ends, unsettled; 0: it goes on.
 
     Returns
     -------
@@ -149,6 +158,8 @@ def solve(
     early = not warm
     columns, grams = _about(predictor, state) if columns is None else (columns, predictor.products(columns))
     looks, looked, in_vain = MOST_LOOKS, 0, False
+    levels: list[float] = []
+    releases = ReleaseSearch(predictor, problem)
     for iteration in range(1, most_iterations + 1):
         near = promised < FAR_OFF or iteration > MOST_EARLY
         early = early and not (iteration > EARLY_ITERATIONS and near)
@@ -161,7 +172,7 @@ def solve(
         settled = promised < least_decrease
         if looks and (settled or (promised < NEARLY_SETTLED and not in_vain) or iteration >= looked + PATIENCE):
             looked, in_vain = iteration, True
-            jumped = search_releases(predictor, problem, state, residuals_in(columns))
+            jumped = releases.look(state, residuals_in(columns))
             if jumped is not None:
                 state, (columns, grams) = jumped, _about(predictor, jumped)
                 looks, in_vain = looks - 1, False
@@ -171,6 +182,9 @@ def solve(
             converged = True
             break
         now = cost(predictor, problem, state, residuals_in(columns))
+        levels.append(now + float(np.sum(problem.points * np.log(state.variance))))
+        if least_progress and _creeps(levels, least_progress * float(np.sum(problem.points))):
+            break
         taken, damping = _take_step(predictor, problem, grams, state, step, own_change, damping, now)
         if taken is None:
             # No step helps: a corner of the cost, where a frame meets the end of growth. It is as low as it gets.
@@ -185,6 +199,12 @@ def solve(
             break
         state = taken
     return Solution(state, problem, grams, tuple(columns), can, converged, iteration)
+
+
+def _creeps(levels: Sequence[float], least: float) -> bool:
+    """Whether the last steps lowered −2 ln L by less than `least`; never just after a jump that raised it."""
+    before, last = levels[:-PROGRESS_STEPS], levels[-PROGRESS_STEPS:]
+    return bool(before) and last[-1] == min(last) > min(before) - least
 
 
 def _about(predictor: Predictor, state: FitState) -> tuple[list[Floats], Floats]:

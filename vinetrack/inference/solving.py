@@ -40,6 +40,12 @@ ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 40
 """Steps of a solution that is taken up again, and of one that is guided. Chosen for time: most settle in half of them;
 at half some stay unsettled and say so, at twice hopeless starts cost twice the time."""
 
+CREEPING = 2e-3
+"""Fall of −2 ln L per point in a few steps below which a guided fit of a search ends. Derived: −2 ln L of n points with
+noise s is n ln s², so what the model misses then changes by less than a thousandth: such a candidate is far off, and
+which of those far off is a little less so decides nothing. At half and at twice it ends a step or two later or
+earlier."""
+
 BAD_START = 1.5
 """χ² per point from which a start misses by more than the noise of the fit it came from. Chosen: below it the
 likelihood is nearly quadratic and one descent suffices; it decides time, not results."""
@@ -201,7 +207,16 @@ def _guided(
     guide = FixedTerms(spread=held.spread or GUIDING_SPREADS, correlation=track_correlation(predictor.data))
     state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
     try:
-        first = solve(predictor, problem, state, guide, warm=True, most_iterations=GUIDED_ITERATIONS, watch=watch)
+        first = solve(
+            predictor,
+            problem,
+            state,
+            guide,
+            warm=True,
+            most_iterations=GUIDED_ITERATIONS,
+            watch=watch,
+            least_progress=0.0 if freed else CREEPING,
+        )
         if not freed:
             return first
         trial_effects, _ = align(predictor.data, predictor, first.state.theta, initial_trial_effects(predictor.data))

@@ -178,55 +178,78 @@ DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
 error and bends it by 1e-4."""
 
 
-def search_releases(
-    predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats]
-) -> FitState | None:
-    """The state with likelier releases; None if none is.
+class ReleaseSearch:
+    """Releases looked for elsewhere during a fit, and what its steps made of those that were taken.
 
-    Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than noise:
-    another release would make up for something else.
-
-    Parameters
-    ----------
-    predictor : of the trials to fit.
-    problem : what does not change during the fit.
-    state : where the fit stands.
-    residuals : sequence of arrays, shape (n_points,), m
-        What is left of each trial there.
-
-    Returns
-    -------
-    FitState or None
+    A release is taken where a trial is likelier with its own numbers integrated out. The steps of a fit lower what is
+    missed at the best numbers, and lead back where the volume of the likelihood alone spoke for a release; from then on
+    such a trial jumps only to where less is missed as well. Else steps and searches go round in a circle.
     """
-    missed = trial_costs(predictor, problem, state, residuals) * state.variance / (1 - state.rho**2) / problem.points
-    places = [
-        i
-        for i, trial_data in enumerate(predictor.data)
-        if trial_data.trace is None and (not trial_data.shows_rest or missed[i] < HARDLY_MISSED * trial_data.noise_m**2)
-    ]
-    if not places:
-        return None
-    plain = predictor.jobs(state.theta, state.trial_effects)
-    releases = [_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
-    answers = _answers(predictor, [plain[i] for i in places], releases)
-    trial_effects = state.trial_effects.copy()
-    centre, precision = trial_effect_prior(problem, state)
-    claimed = False
-    for i, tried_s, answer in zip(places, releases, answers, strict=True):
-        noise = state.rho, float(state.variance[i])
-        there, gain = _best(predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, tried_s, *answer)
-        if gain > WORTH_MOVING:
-            trial_effects[i], claimed = there, True
-    kept = _borne_out(predictor, problem, state, replace(state, trial_effects=trial_effects)) if claimed else state
-    return None if np.array_equal(kept.trial_effects, state.trial_effects) else kept
 
+    def __init__(self, predictor: Predictor, problem: MixedProblem) -> None:
+        self.predictor, self.problem = predictor, problem
+        self.led_back = np.zeros(len(predictor.data), dtype=bool)
+        self.jumped_from = self.jumped_to = np.zeros(len(predictor.data))
 
-def _borne_out(predictor: Predictor, problem: MixedProblem, state: FitState, tried: FitState) -> FitState:
-    """Of both states the own numbers that fit a trial better, once those tried have settled: lines are not straight."""
-    for _ in range(IMPROVED):
-        tried = follow_trial_effects(predictor, problem, tried)[0]
-    better = _levels(predictor, problem, tried) < _levels(predictor, problem, state) - WORTH_MOVING
-    return replace(state, trial_effects=np.where(better[:, None], tried.trial_effects, state.trial_effects))
+    def look(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
+        """The state with likelier releases; None if none is.
+
+        Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than
+        noise: another release would make up for something else.
+
+        Parameters
+        ----------
+        state : where the fit stands.
+        residuals : sequence of arrays, shape (n_points,), m
+            What is left of each trial there.
+
+        Returns
+        -------
+        FitState or None
+        """
+        release_s = state.trial_effects[:, RELEASE]
+        self.led_back |= np.abs(release_s - self.jumped_from) < np.abs(release_s - self.jumped_to)
+        tried = self._likelier(state, residuals)
+        kept = state if tried is None else self._borne_out(state, tried)
+        self.jumped_from, self.jumped_to = release_s, kept.trial_effects[:, RELEASE]
+        return None if np.array_equal(kept.trial_effects, state.trial_effects) else kept
+
+    def _likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
+        """The state with each trial at its likeliest release in a linear answer; None where no trial would move."""
+        predictor, problem = self.predictor, self.problem
+        missed = trial_costs(predictor, problem, state, residuals) * state.variance
+        missed /= (1 - state.rho**2) * problem.points
+        places = [
+            i
+            for i, trial_data in enumerate(predictor.data)
+            if trial_data.trace is None
+            and (not trial_data.shows_rest or missed[i] < HARDLY_MISSED * trial_data.noise_m**2)
+        ]
+        if not places:
+            return None
+        plain = predictor.jobs(state.theta, state.trial_effects)
+        releases = [_releases(predictor.data[i], float(state.trial_effects[i, RELEASE])) for i in places]
+        answers = _answers(predictor, [plain[i] for i in places], releases)
+        trial_effects = state.trial_effects.copy()
+        centre, precision = trial_effect_prior(problem, state)
+        claimed = False
+        for i, tried_s, answer in zip(places, releases, answers, strict=True):
+            noise = state.rho, float(state.variance[i])
+            there, gain = _best(predictor.data[i], trial_effects[i], (centre[i], precision[i]), noise, tried_s, *answer)
+            if gain > WORTH_MOVING:
+                trial_effects[i], claimed = there, True
+        return replace(state, trial_effects=trial_effects) if claimed else None
+
+    def _borne_out(self, state: FitState, tried: FitState) -> FitState:
+        """Of both the own numbers that fit a trial better, once those tried have settled: lines are not straight."""
+        predictor, problem = self.predictor, self.problem
+        for _ in range(IMPROVED):
+            tried = follow_trial_effects(predictor, problem, tried)[0]
+        better = _levels(predictor, problem, tried) < _levels(predictor, problem, state) - WORTH_MOVING
+        if self.led_back.any():
+            lower = trial_costs(predictor, problem, tried) < trial_costs(predictor, problem, state)
+            better &= lower | ~self.led_back
+        return replace(state, trial_effects=np.where(better[:, None], tried.trial_effects, state.trial_effects))
 
 
 def _levels(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:
