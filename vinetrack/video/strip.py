@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
+from vinetrack.video.resample import warp_all
 
 GAP_PX = 5
 """Rows left out between tube and band, for sway and blur. Chosen; at half a swaying tube enters the bands, at twice
@@ -126,13 +127,19 @@ def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: 
     start = axis.points(np.array(0.0), float(rows_px[0]))
     if shift_px is None and max(abs(along)) > 1 - 1e-9:
         return _slice(luma, start, along, across, len(rows_px), n_along)
+    if shift_px is None:
+        return warp_all(luma, _matrix(along, across, start), len(rows_px), n_along)
     out = np.empty((len(luma), len(rows_px), n_along), luma.dtype)
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     for i, frame in enumerate(luma):
-        origin = start if shift_px is None else start + shift_px[i, 0] * along + shift_px[i, 1] * across
-        matrix = np.array([[along[0], across[0], origin[0]], [along[1], across[1], origin[1]]])
+        matrix = _matrix(along, across, start + shift_px[i, 0] * along + shift_px[i, 1] * across)
         cv2.warpAffine(frame, matrix, (n_along, len(rows_px)), dst=out[i], flags=flags, borderMode=cv2.BORDER_REPLICATE)
     return out
+
+
+def _matrix(along: Floats, across: Floats, origin: Floats) -> Floats:
+    """Matrix of places in the picture: matrix @ (along, row, 1), shape (2, 3)."""
+    return np.array([[along[0], across[0], origin[0]], [along[1], across[1], origin[1]]])
 
 
 def _slice(luma: NDArray[Any], start: Floats, along: Floats, across: Floats, n_rows: int, n_along: int) -> NDArray[Any]:
