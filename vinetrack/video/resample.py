@@ -101,8 +101,6 @@ def _interpolate(luma: np.ndarray, parts: np.ndarray, runs: np.ndarray, most: np
     Whole vectors are computed; what is too much of the last one is overwritten by the next run.
     """
     n, height, width = luma.shape
-    n_along = parts.shape[2] - VECTOR
-    nothing = np.float32(0.0)
     top = max(0, runs[:, 3].min())
     bottom = max(top + 1, min(height, runs[:, 3].max() + 4))
     rows = np.zeros((bottom - top, width + VECTOR), np.float32)
@@ -112,34 +110,47 @@ def _interpolate(luma: np.ndarray, parts: np.ndarray, runs: np.ndarray, most: np
             source, target = picture[top + y], rows[y]
             for s in range(width):
                 target[s] = np.float32(source[s])
-        for i in range(len(runs)):
-            u, first, last, y, lead = runs[i]
-            begin, end, place = first, first, u * n_along
-            if y >= top and y + 4 <= bottom:
-                begin = min(max(first, -lead), last)
-                end = max(min(last, width - 3 - lead), begin)
-                full = end - begin + (begin - end) % VECTOR
-                full = full if place + begin + full <= made.size else end - begin
-                at, j = begin + lead, y - top
-                a, b, c, d = rows[j, at:], rows[j + 1, at:], rows[j + 2, at:], rows[j + 3, at:]
-                p, q, line = parts[0, u, begin:], parts[1, u, begin:], made[place + begin :]
-                for s in range(full):
-                    x0, x1, x2, x3 = _weights(p[s])
-                    y0, y1, y2, y3 = _weights(q[s])
-                    value = y0 * (x0 * a[s] + x1 * a[s + 1] + x2 * a[s + 2] + x3 * a[s + 3])
-                    value += y1 * (x0 * b[s] + x1 * b[s + 1] + x2 * b[s + 2] + x3 * b[s + 3])
-                    value += y2 * (x0 * c[s] + x1 * c[s + 1] + x2 * c[s + 2] + x3 * c[s + 3])
-                    value += y3 * (x0 * d[s] + x1 * d[s + 1] + x2 * d[s + 2] + x3 * d[s + 3])
-                    line[s] = np.int32((min(max(value, nothing), most) + WHOLE) - WHOLE)
-            for s in range(first, last):
-                if begin <= s < end:
-                    continue
-                across, value = _weights(parts[1, u, s]), nothing
-                along = _weights(parts[0, u, s])
-                for k in range(4):
-                    neighbours = picture[min(max(y + k, 0), height - 1)]
-                    total = nothing
-                    for j in range(4):
-                        total += along[j] * neighbours[min(max(s + lead + j, 0), width - 1)]
-                    value += across[k] * total
-                made[place + s] = np.int32((min(max(value, nothing), most) + WHOLE) - WHOLE)
+        _interpolate_one(picture, rows, top, parts, runs, most, made)
+
+
+@njit(cache=True, nogil=True, fastmath=EXACT, error_model="numpy", _nrt=False)
+def _interpolate_one(
+    picture: np.ndarray, rows: np.ndarray, top: int, parts: np.ndarray, runs: np.ndarray, most: np.float32,
+    made: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill `made`, shape (n_rows * n_along,), from one picture; `rows` are those from `top` on in single precision."""
+    height, width = picture.shape
+    bottom = top + len(rows)
+    n_along = parts.shape[2] - VECTOR
+    nothing = np.float32(0.0)
+    for i in range(len(runs)):
+        u, first, last, y, lead = runs[i]
+        begin, end, place = first, first, u * n_along
+        if y >= top and y + 4 <= bottom:
+            begin = min(max(first, -lead), last)
+            end = max(min(last, width - 3 - lead), begin)
+            full = end - begin + (begin - end) % VECTOR
+            full = full if place + begin + full <= made.size else end - begin
+            at, j = begin + lead, y - top
+            a, b, c, d = rows[j, at:], rows[j + 1, at:], rows[j + 2, at:], rows[j + 3, at:]
+            p, q, line = parts[0, u, begin:], parts[1, u, begin:], made[place + begin :]
+            for s in range(full):
+                x0, x1, x2, x3 = _weights(p[s])
+                y0, y1, y2, y3 = _weights(q[s])
+                value = y0 * (x0 * a[s] + x1 * a[s + 1] + x2 * a[s + 2] + x3 * a[s + 3])
+                value += y1 * (x0 * b[s] + x1 * b[s + 1] + x2 * b[s + 2] + x3 * b[s + 3])
+                value += y2 * (x0 * c[s] + x1 * c[s + 1] + x2 * c[s + 2] + x3 * c[s + 3])
+                value += y3 * (x0 * d[s] + x1 * d[s + 1] + x2 * d[s + 2] + x3 * d[s + 3])
+                line[s] = np.int32((min(max(value, nothing), most) + WHOLE) - WHOLE)
+        for s in range(first, last):
+            if begin <= s < end:
+                continue
+            across, value = _weights(parts[1, u, s]), nothing
+            along = _weights(parts[0, u, s])
+            for k in range(4):
+                neighbours = picture[min(max(y + k, 0), height - 1)]
+                total = nothing
+                for j in range(4):
+                    total += along[j] * neighbours[min(max(s + lead + j, 0), width - 1)]
+                value += across[k] * total
+            made[place + s] = np.int32((min(max(value, nothing), most) + WHOLE) - WHOLE)
