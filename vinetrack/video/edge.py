@@ -25,6 +25,8 @@ from vinetrack.video.edge_state import (
     find_exposure,
     find_shape,
     fit_edges,
+    frames_that_tell,
+    held_at_rest,
     moving_frames,
     repicture,
     residuals,
@@ -137,22 +139,30 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     for _ in range(3):
         path = _second_path(strip, state, passed, change)
         state = repicture(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
-    fit = fit_edges(strip, state)
+    fit = _fit_some(strip, state, frames_that_tell(state.edge))
     for turn in range(3 * rounds):
         before = fit[:, 0]
         state = _restate(strip, state, fit, exposure)
+        seen = frames_that_tell(state.edge)
         if turn == 1 and not np.isfinite(exposure_frames):
             exposure = find_exposure(strip, state, fit)
         if turn < 3:
             state = find_shape(strip, state, fit, turn == 0)
-        fit = mend_jumps(strip, state, fit_edges(strip, state))
+        fit = mend_jumps(strip, state, _fit_some(strip, state, seen), seen)
         if turn >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < SETTLED_PX:
             break
+    alone = _fit_some(strip, state, ~seen)
+    fit = mend_jumps(strip, state, np.where(seen[:, None], fit, alone), np.ones(len(fit), dtype=bool))
     finished = _finish(strip, state, fit, exposure, passed)
     if not np.isfinite(exposure_frames):
         return finished
     seen, speed = seen_exposure(strip, state, fit, exposure)
     return replace(finished, seen_exposure_frames=seen, fast_px_per_frame=speed)
+
+
+def _fit_some(strip: Strip, state: EdgeState, chosen: Bools) -> Floats:
+    """Most likely edge of the chosen frames, shape (n_frames, 6), NaN in the others."""
+    return fit_edges(strip, replace(state, edge=np.where(chosen, state.edge, np.nan)))
 
 
 @dataclass(frozen=True)
@@ -374,7 +384,7 @@ def _novelty(change: Floats, edge: Floats) -> NDArray[np.float32]:
 
 def _restate(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> EdgeState:
     """Take over the fitted edges and renew blur lengths, pictures and how far noise adds up about the edge."""
-    edge = np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge)
+    edge = held_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), frames_that_tell(state.edge))
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
     state = repicture(strip, state, 4 * strip.noise + 4)
     by_distance, _, _ = residuals(strip, state, fit, core_frames(state, fit))

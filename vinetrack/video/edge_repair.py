@@ -33,7 +33,7 @@ LONG_REST = 8
 at rest a search from one start is enough."""
 
 
-def mend_jumps(strip: Strip, state: EdgeState, fit: Floats) -> Floats:
+def mend_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.bool_]) -> Floats:
     """Fits that break the motion, or hardly fit, sought again where the motion leads, shape (n_frames, 6).
 
     From the middle of the motion backwards and forwards: the edge never retreats, and a step is at most 1.3 times (or
@@ -46,6 +46,7 @@ def mend_jumps(strip: Strip, state: EdgeState, fit: Floats) -> Floats:
     strip : along the axis.
     state : what lies before and after the edge.
     fit : from `edge_state.fit_edges`, shape (n_frames, 6).
+    chosen : frames that were fitted, one stretch of them, shape (n_frames,).
 
     Returns
     -------
@@ -58,9 +59,10 @@ def mend_jumps(strip: Strip, state: EdgeState, fit: Floats) -> Floats:
     bad = 1.5 * float(np.nanmedian(fit[core_frames(state, fit), 2]))
     central = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
     anchor = int(moving[np.argmin(central + _rough(fit[moving, 0]) + (fit[moving, 2] > bad))])
+    first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
     for sense in (-1, 1):
         resting = 0
-        for t in range(anchor + sense, -1 if sense < 0 else len(fit), sense):
+        for t in range(anchor + sense, first - 1 if sense < 0 else last + 1, sense):
             near = out[t - sense, 0]
             past = out[np.clip([t - sense, t - 2 * sense, t - 3 * sense], 0, len(fit) - 1), 0]
             step = float(np.nan_to_num(np.abs(np.diff(past))).max())  # of two: a frame may repeat the one before it

@@ -6,6 +6,7 @@ unexplained.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,6 +94,38 @@ def moving_frames(edge: Floats) -> NDArray[np.bool_]:
     speed = np.abs(np.gradient(edge)) if len(edge) > 1 else np.zeros(len(edge))
     moving = speed > max(0.2, 0.1 * float(np.quantile(speed, 0.95)))
     return moving if moving.sum() >= 5 else np.ones(len(edge), dtype=bool)
+
+
+def frames_that_tell(edge: Floats) -> NDArray[np.bool_]:
+    """Frames from which pictures and shape are known: those in motion, and as many about them as are remembered.
+
+    Parameters
+    ----------
+    edge : shape (n_frames,), px.
+
+    Returns
+    -------
+    mask, shape (n_frames,).
+    """
+    moving, reach = np.flatnonzero(moving_frames(edge)), math.ceil(MEMORY_FRAMES * picture_kernels.FORGOTTEN)
+    frames = np.arange(len(edge))
+    return np.asarray((frames >= moving[0] - reach) & (frames <= moving[-1] + reach))
+
+
+def held_at_rest(edge: Floats, tell: NDArray[np.bool_]) -> Floats:
+    """The edge with what rests long before and after the motion where it is at the borders of `tell`.
+
+    Parameters
+    ----------
+    edge : shape (n_frames,), px.
+    tell : from `frames_that_tell`, shape (n_frames,).
+
+    Returns
+    -------
+    shape (n_frames,), px.
+    """
+    frames = np.flatnonzero(tell)
+    return np.asarray(edge[np.clip(np.arange(len(edge)), frames[0], frames[-1])])
 
 
 def repicture(strip: Strip, state: EdgeState, clip: float) -> EdgeState:

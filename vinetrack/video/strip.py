@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
+from vinetrack.video.order_kernels import BINS_A_LEVEL, median
 from vinetrack.video.resample import warp_all
 
 GAP_PX = 5
@@ -29,12 +30,6 @@ REFERENCE_FRAMES = 15
 PIXELS = 9000
 """Pixels of the bands that are used, evenly spread: enough for a shift of 0.01 px. Derived for slopes of 5 grey levels
 a pixel and noise of 5: 1/√9000 = 0.01 px."""
-BINS_A_LEVEL = 16
-"""Bins of a histogram of residuals by grey level of 255, in one of which their median is looked for. Chosen: a bin then
-holds some hundred of 9000 values; only time depends on it."""
-FEW_TO_SORT = 300
-"""Values that are put in order at once. Chosen for time alone: a bin holds some hundred, thousands where a coder has
-frozen the picture."""
 SHAKE_FLOOR_PX = 0.04
 """Shake below this is left alone: moving a picture by it costs more than it mends. Chosen as FLOOR_PX of
 `point_quality`."""
@@ -360,11 +355,11 @@ def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: f
                 r1 += value * basis[1, k]
                 r2 += value * basis[2, k]
                 r3 += value * basis[3, k]
-            inverse = np.linalg.inv(whole if turn == 0 else (basis * keep) @ basis.T + ridge)
+            inverse = np.linalg.inv(whole if turn == 0 else _products(basis, keep) + ridge)
             a, b, c, d = inverse @ np.array([r0, r1, r2, r3])
             for k in range(count):
                 strays[k] = abs(values[k] - a * basis[0, k] - b * basis[1, k] - c * basis[2, k] - d * basis[3, k])
-            size = 1.4826 * _median(strays, keep, unit * BINS_A_LEVEL) + 0.3
+            size = 1.4826 * median(strays, keep, unit * BINS_A_LEVEL) + 0.3
             out[t, 0], out[t, 1], out[t, 2], out[t, 3] = a, b, c, d
             error[t] = size * np.sqrt(max(inverse[2, 2], 0.0))
             inside = 0.0
@@ -376,31 +371,17 @@ def _robust_fits(data: np.ndarray, basis: np.ndarray, ridge: np.ndarray, unit: f
     return out, error
 
 
-@njit(cache=True, nogil=True)
-def _median(values: np.ndarray, keep: np.ndarray, fine: float) -> float:
-    """Median of the values that are kept: of the values in the bin of a histogram (`fine` a unit) that holds it."""
-    kept = values[keep > 0]
-    if len(kept) == 0:
-        return 0.0
-    return 0.5 * (_ranked(kept, (len(kept) - 1) // 2, fine) + _ranked(kept, len(kept) // 2, fine))
-
-
-@njit(cache=True, nogil=True)
-def _ranked(values: np.ndarray, rank: int, fine: float) -> float:
-    """The value of a rank, counted from 0; a bin that holds many is divided into finer bins, as long as it divides."""
-    low, last = 0.0, 256 * BINS_A_LEVEL - 1
-    while len(values) > FEW_TO_SORT and values.min() < values.max():
-        place = np.minimum((values - low) * fine, last).astype(np.int64)
-        bins = np.bincount(place, minlength=last + 1)
-        below, chosen = 0, 0
-        while below + bins[chosen] <= rank:
-            below += bins[chosen]
-            chosen += 1
-        if chosen == last or bins[chosen] == len(values):
-            break
-        values, rank = values[place == chosen], rank - below
-        low, fine = low + chosen / fine, fine * last
-    return float(np.sort(values)[rank])
+@njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+def _products(basis: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """Sums of products of the rows of `basis`, (4, 4), over the pixels that are kept."""
+    out = np.empty((4, 4))
+    for i in range(4):
+        for j in range(i, 4):
+            total, first, second = 0.0, basis[i], basis[j]
+            for k in range(len(keep)):
+                total += keep[k] * first[k] * second[k]
+            out[i, j] = out[j, i] = total
+    return out
 
 
 def _noise(values: NDArray[Any], scale: Floats) -> float:
