@@ -1,0 +1,206 @@
+"""Compiled medians: exact ones of many values whose range is known, by a histogram instead of by sorting."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+LEVELS = 256
+"""Range of the values whose histogram is taken. Derived: brightness and its differences are in grey levels of 255."""
+BINS_A_LEVEL = 16
+"""Bins of a histogram by grey level, in one or two of which the median is looked for. Chosen: a bin then holds some
+hundred of 9000 values; only time depends on it."""
+FEW_TO_SORT = 300
+"""Values that are put in order at once. Chosen for time alone: a bin holds some hundred, thousands where a coder has
+frozen the picture."""
+
+
+@njit(cache=True, nogil=True)
+def median(values: np.ndarray, keep: np.ndarray, fine: float) -> float:
+    """Median of the values that are kept; the mean of the two middle ones of an even number.
+
+    Parameters
+    ----------
+    values : from 0 on, shape (n,).
+    keep : 1 for those that count, else 0, shape (n,).
+    fine : bins a unit.
+
+    Returns
+    -------
+    the median; 0 of no values.
+    """
+    last = LEVELS * BINS_A_LEVEL - 1
+    place = np.empty(len(values), np.int32)
+    bins = np.zeros(last + 1, np.int32)
+    count = 0
+    for k in range(len(values)):
+        place[k] = min(int(values[k] * fine), last) if keep[k] > 0 else -1
+    for k in range(len(values)):
+        if place[k] >= 0:
+            bins[place[k]] += 1
+            count += 1
+    if count == 0:
+        return 0.0
+    lower, upper = (count - 1) // 2, count // 2
+    below, first = 0, 0
+    while below + bins[first] <= lower:
+        below += bins[first]
+        first += 1
+    second, within = first, bins[first]
+    while below + within <= upper:
+        second += 1
+        within += bins[second]
+    middle = np.empty(within, values.dtype)
+    j = 0
+    for k in range(len(values)):
+        if first <= place[k] <= second:
+            middle[j] = values[k]
+            j += 1
+    return 0.5 * (_ranked(middle, lower - below) + _ranked(middle, upper - below))
+
+
+@njit(cache=True, nogil=True)
+def _ranked(values: np.ndarray, rank: int) -> float:
+    """The value of a rank, counted from 0; what lies in one bin of a histogram is divided again, until few are left."""
+    while len(values) > FEW_TO_SORT:
+        low, high = values.min(), values.max()
+        if low == high:
+            return float(low)
+        last = LEVELS * BINS_A_LEVEL - 1
+        place = np.minimum((values - low) * (last / (high - low)), last).astype(np.int64)
+        bins = np.bincount(place, minlength=last + 1)
+        below, chosen = 0, 0
+        while below + bins[chosen] <= rank:
+            below += bins[chosen]
+            chosen += 1
+        if bins[chosen] == len(values):
+            break
+        values, rank = values[place == chosen], rank - below
+    return float(np.sort(values)[rank])
+
+
+@njit(cache=True, nogil=True)
+def ratio_medians(pictures: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Median ratio of each picture, one level brighter, to a reference.
+
+    Parameters
+    ----------
+    pictures : shape (n, height, width).
+    reference : shape (height, width), above 0.
+
+    Returns
+    -------
+    shape (n,).
+    """
+    n, height, width = pictures.shape
+    out, ratio, keep = np.empty(n, np.float32), np.empty(height * width, np.float32), np.ones(height * width, np.int8)
+    for t in range(n):
+        for y in range(height):
+            for x in range(width):
+                ratio[y * width + x] = (pictures[t, y, x] + np.float32(1.0)) / reference[y, x]
+        # A flicker is by tenths: bins of 1/1024.
+        out[t] = median(ratio, keep, 64.0 * BINS_A_LEVEL)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
+    """Mean of the largest changes from each picture to the next, to a quarter of a grey level.
+
+    Parameters
+    ----------
+    pictures : grey levels of 255, shape (n, n_pixels).
+    count : how many of the largest.
+
+    Returns
+    -------
+    shape (n - 1,).
+    """
+    n, pixels = pictures.shape
+    out = np.empty(n - 1)
+    last = 4 * LEVELS - 1
+    place = np.empty(pixels, np.int32)
+    for t in range(n - 1):
+        bins = np.zeros(last + 1, np.int64)
+        before, after = pictures[t], pictures[t + 1]
+        for k in range(pixels):
+            place[k] = min(int(np.float32(4.0) * abs(after[k] - before[k])), last)
+        for k in range(pixels):
+            bins[place[k]] += 1
+        left, total, level = min(count, pixels), 0.0, last
+        while left > 0:
+            taken = min(left, bins[level])
+            total += taken * 0.25 * (level + 0.5)
+            left -= taken
+            level -= 1
+        out[t] = total / min(count, pixels)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
+    """When the means of the pictures before and after differ most at each pixel, and the power of that difference.
+
+    Parameters
+    ----------
+    pictures : shape (n, n_pixels).
+    window : pictures before and after of which means are taken.
+
+    Returns
+    -------
+    number of the first picture after the step and the power, each of shape (n_pixels,).
+    """
+    n, pixels = pictures.shape
+    best, when = np.zeros(pixels, np.float32), np.zeros(pixels, np.int_)
+    at_once = 512
+    sums = np.zeros((n + 1, at_once), np.float32)
+    for start in range(0, pixels, at_once):
+        stop = min(start + at_once, pixels)
+        for t in range(n):
+            for k in range(stop - start):
+                sums[t + 1, k] = sums[t, k] + pictures[t, start + k]
+        for t in range(1, n):
+            a, b = min(n, t + window), max(0, t - window)
+            after, before = np.float32(a - t), np.float32(t - b)
+            factor = np.float32((a - t) * (t - b) / (a - b))
+            above, here, under = sums[a], sums[t], sums[b]
+            top, place = best[start:stop], when[start:stop]
+            for k in range(stop - start):
+                step = (above[k] - here[k]) / after - (here[k] - under[k]) / before
+                score = factor * step * step
+                place[k] = t if score > top[k] else place[k]
+                top[k] = max(score, top[k])
+    return when, best
+
+
+@njit(cache=True, nogil=True)
+def block_means(luma: np.ndarray, side: int) -> np.ndarray:
+    """Pictures shrunk by a whole factor: means of square blocks, rounded to whole grey levels as OpenCV does.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n, height, width), height and width multiples of `side`.
+    side : of a block, px.
+
+    Returns
+    -------
+    grey levels, shape (n, height / side, width / side).
+    """
+    n, height, width = luma.shape
+    out = np.empty((n, height // side, width // side), np.float32)
+    total = np.empty(width, np.int32)
+    weight = np.float32(1.0 / (side * side))
+    for t in range(n):
+        for y in range(height // side):
+            total[:] = 0
+            for j in range(side):
+                row = luma[t, y * side + j]
+                for x in range(width):
+                    total[x] += row[x]
+            line = out[t, y]
+            for x in range(width // side):
+                block = np.int32(0)
+                for j in range(side):
+                    block += total[x * side + j]
+                line[x] = np.rint(block * weight)
+    return out
