@@ -8,6 +8,7 @@ from a step blurred by optics and by its own motion. Tip shape, optical blur and
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +114,9 @@ class EdgeFit:
     fast_px_per_frame: float = np.nan
 
 
-def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -> EdgeFit:
+def track_edge(
+    strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, sides: Outline | None = None
+) -> EdgeFit:
     """Track the leading edge through a strip, growing towards higher columns.
 
     Parameters
@@ -121,6 +124,7 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     strip : along the axis, growth towards higher columns.
     exposure_frames : exposure over frame period; NaN to estimate it from the blur.
     rounds : at least so many, at most three times as many until the edges settle.
+    sides : `outline` of this very strip where it is known, which spares a first path.
 
     Returns
     -------
@@ -131,7 +135,7 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4) -
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, passed = _grown_path(strip)
+    path, passed = _grown_path(strip) if sides is None else (sides.path_px, sides.passed)
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = _first_state(strip, path, exposure)
@@ -171,6 +175,7 @@ class Outline:
 
     `shift_px` and `slope` (px a px) are of the centreline across the strip; `half_px` is half of what holds all of the
     width, with room for its blur; `width_px` the width between the sides and `width_sigma_px` its standard error.
+    `path_px`, shape (n_frames,), is a first path of the front and `passed` the first and last column passed.
     """
 
     shift_px: float
@@ -178,6 +183,8 @@ class Outline:
     half_px: float
     width_px: float
     width_sigma_px: float
+    path_px: Floats
+    passed: tuple[int, int]
 
 
 def outline(strip: Strip, parts: int = 12) -> Outline:
@@ -219,7 +226,8 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     middle = float(np.median(width))
     scatter = 1.4826 * float(np.median(np.abs(width - middle))) / np.sqrt(len(width))
     faint = FAINT_PART * middle if float(np.median(contrasts)) < FAINT else 0.0
-    return Outline(begin, slope, middle / 2 + 1.5, middle, float(np.linalg.norm([scatter, SIDES_PX, faint])))
+    sigma = float(np.linalg.norm([scatter, SIDES_PX, faint]))
+    return Outline(begin, slope, middle / 2 + 1.5, middle, sigma, path, passed)
 
 
 def rough_growth(strip: Strip) -> tuple[float, float]:
@@ -364,10 +372,11 @@ def _second_path(strip: Strip, state: EdgeState, passed: tuple[int, int], change
 
 def _frame_changes(strip: Strip) -> Floats:
     """How much each frame of a strip differs from the one before it, shape (n_frames,)."""
+    import cv2
+
     change = np.zeros(len(strip.values))
-    for t in range(1, len(change)):
-        pair = strip.values[t - 1 : t + 1, ::2, ::2].astype(np.float32)
-        change[t] = float(np.mean(np.abs(pair[1] - pair[0])))
+    pairs = pairwise(np.ascontiguousarray(strip.values[:, ::2, ::2]))
+    change[1:] = [cv2.absdiff(before, after).mean() for before, after in pairs]
     change[0] = change[1] if len(change) > 1 else 1.0
     return change
 

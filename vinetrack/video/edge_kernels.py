@@ -251,11 +251,38 @@ def residual_sums(
         # By k, the place in the table, from 1 on: a whole number of pixels behind or ahead of the edge.
         column = np.zeros((2, table.shape[2] + 1))
         odds = np.empty(table.shape[2])
-        pixels, misfit_of = _residuals_of(
-            strip[t], scale[t], offset[t], pictures, fit[t], lag, half, first, last, middle, table, column, odds, by_row
-        )
-        count += pixels
-        misfit += misfit_of
+        for u in range(rows):
+            at = y - lag[u]
+            whole, j, f, even = phase(at)
+            a, b = max(first, math.ceil(at - half)), min(last, math.floor(at + half) + 1)
+            if b <= a:
+                continue
+            k = a - whole + middle
+            m = b - a
+            count += m
+            low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
+            low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
+            values, after, before = strip[t, u, a:b], pictures[0, u, a:b], pictures[1, u, a:b]
+            after_variance, before_variance = pictures[2, u, a:b], pictures[3, u, a:b]
+            tops, squares = column[0, k + even : k + even + m], column[1, k + even : k + even + m]
+            top, square = 0.0, 0.0
+            for i in range(m):
+                p = low[i] + f * (high[i] - low[i])
+                slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
+                contrast = after[i] - before[i]
+                r = values[i] * scale[t] + offset[t] - before[i] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
+                v = p * p * after_variance[i] + (1 - p) * (1 - p) * before_variance[i]
+                w = 1 / (v + r * r / 9)
+                tops[i] += w * contrast * r
+                squares[i] += w * contrast * contrast
+                g = -contrast * slope
+                top += w * g * r
+                square += w * g * g
+                # A variance that knows nothing of the blur: else the widest blur would be its own excuse.
+                odds[i] = 1 + r * r / (4.5 * (after_variance[i] + before_variance[i]))
+            by_row[u, 0] += top
+            by_row[u, 1] += square
+            misfit += _log_of_product(odds[:m])
         for k in range(column.shape[1]):
             if column[1, k] > 0:
                 i = min(max(centre - middle + k - 1, 0), bins - 1)
@@ -264,50 +291,7 @@ def residual_sums(
     return by_distance, by_row, misfit / max(count, 1)
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", _nrt=False)
-def _residuals_of(
-    picture: np.ndarray, gain: float, shift: float, pictures: np.ndarray, fit: np.ndarray, lag: np.ndarray,
-    half: float, first: int, last: int, middle: int, table: np.ndarray,
-    column: np.ndarray, odds: np.ndarray, by_row: np.ndarray,
-) -> tuple[int, float]:  # fmt: skip
-    """Add what one frame leaves to `column` and `by_row`; pixels that take part, and the sum of log(1 + r²/9v̄)."""
-    y, count, misfit = fit[0], 0, 0.0
-    for u in range(picture.shape[0]):
-        at = y - lag[u]
-        whole, j, f, even = phase(at)
-        a, b = max(first, math.ceil(at - half)), min(last, math.floor(at + half) + 1)
-        if b <= a:
-            continue
-        k = a - whole + middle
-        m = b - a
-        count += m
-        low, high = table[0, j, k : k + m], table[0, j + 1, k : k + m]
-        low_slope, high_slope = table[1, j, k : k + m], table[1, j + 1, k : k + m]
-        values, after, before = picture[u, a:b], pictures[0, u, a:b], pictures[1, u, a:b]
-        after_variance, before_variance = pictures[2, u, a:b], pictures[3, u, a:b]
-        tops, squares = column[0, k + even : k + even + m], column[1, k + even : k + even + m]
-        top, square = 0.0, 0.0
-        for i in range(m):
-            p = low[i] + f * (high[i] - low[i])
-            slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
-            contrast = after[i] - before[i]
-            r = values[i] * gain + shift - before[i] - contrast * ((1 + fit[3]) * p + fit[4])
-            v = p * p * after_variance[i] + (1 - p) * (1 - p) * before_variance[i]
-            w = 1 / (v + r * r / 9)
-            tops[i] += w * contrast * r
-            squares[i] += w * contrast * contrast
-            g = -contrast * slope
-            top += w * g * r
-            square += w * g * g
-            # A variance that knows nothing of the blur: else the widest blur would be its own excuse.
-            odds[i] = 1 + r * r / (4.5 * (after_variance[i] + before_variance[i]))
-        by_row[u, 0] += top
-        by_row[u, 1] += square
-        misfit += _log_of_product(odds[:m])
-    return count, misfit
-
-
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", _nrt=False)
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
 def _log_of_product(factors: np.ndarray) -> float:
     """Sum of the logarithms of factors from 1 to 1e18: of sixteen at a time, whose product is a finite number."""
     total = 0.0

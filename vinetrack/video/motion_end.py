@@ -86,8 +86,8 @@ def end_of_growth(
         return []
     import cv2
 
-    pairs = itertools.pairwise(luma)
-    change = np.array([cv2.absdiff(a[::3, ::3].copy(), b[::3, ::3].copy()).mean() for a, b in pairs])
+    pairs = itertools.pairwise(np.ascontiguousarray(luma[:, ::3, ::3]))
+    change = np.array([cv2.absdiff(a, b).mean() for a, b in pairs])
     before = float(np.median(change[verdict.first_moving : last])) if last > verdict.first_moving else 0.0
     least = float(np.min(change)) if len(change) else 0.0
     later = float(np.median(change[last + 1 :]))

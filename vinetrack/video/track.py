@@ -294,7 +294,7 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
             strip = centred(luma, strip, sides)
             if strip is before:
                 break
-        front = track_edge(strip, exposure_frames)
+        front = track_edge(strip, exposure_frames, sides=sides if strip is before else None)
     except ValueError as error:
         raise RecordingError(str(error)) from error
     reach = 3 * front.blur_px + 1
