@@ -11,7 +11,8 @@ from vinetrack.video import edge_cover, picture_kernels
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.axis import Axis
 from vinetrack.video.kymograph import fan_gains
-from vinetrack.video.strip import _median, _pixels, _reference, sample
+from vinetrack.video.order_kernels import median
+from vinetrack.video.strip import _pixels, _reference, sample
 
 
 @pytest.mark.parametrize(("length", "blur"), [(0.0, 0.4), (0.02, 3.0), (4.3, 0.8), (17.0, 1.6)])
@@ -149,12 +150,12 @@ def test_a_median_by_histogram_is_the_median(count: int, step: float) -> None:
     values[0] = 1e4 if count > 2 else values[0]  # beyond the last bin
     for kept in ((values > 0.3) | (count < 3), values >= 0, values < 0.04):
         expected = np.median(values[kept]) if kept.any() else 0.0
-        assert _median(values, kept.astype(float), 16.0) == expected
+        assert median(values, kept.astype(float), 16.0) == expected
 
 
 def test_a_median_beyond_the_last_bin_is_the_median() -> None:
     values = np.linspace(400, 5000, 1001)
-    assert _median(values, np.ones(1001), 16.0) == np.median(values)
+    assert median(values, np.ones(1001), 16.0) == np.median(values)
 
 
 @pytest.mark.parametrize("shake", [None, np.array([[0.6, -0.3], [0.0, 0.2], [-1.2, 0.4]])])
