@@ -140,8 +140,10 @@ def track_edge(
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
     state = _first_state(strip, path, exposure)
     change = _frame_changes(strip)
-    for _ in range(3):
-        path = _second_path(strip, state, passed, change)
+    for turn in range(3):
+        before, path = path, _second_path(strip, state, passed, change)
+        if turn > 0 and np.array_equal(before, path):
+            break
         state = repicture(strip, replace(state, edge=path, lengths=blur_lengths(path, exposure)), 0.0)
     fit = _fit_some(strip, state, frames_that_tell(state.edge))
     for turn in range(3 * rounds):

@@ -8,6 +8,7 @@ Where growth ends, when something flies on: a payload in free flight leaves back
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -60,28 +61,31 @@ def mend_jumps(strip: Strip, state: EdgeState, fit: Floats, chosen: NDArray[np.b
     central = np.abs(moving - 0.5 * (moving[0] + moving[-1])) / len(moving)
     anchor = int(moving[np.argmin(central + _rough(fit[moving, 0]) + (fit[moving, 2] > bad))])
     first, last = (int(frame) for frame in np.flatnonzero(chosen)[[0, -1]])
+    edge = out[:, 0].tolist()
     for sense in (-1, 1):
         resting = 0
         for t in range(anchor + sense, first - 1 if sense < 0 else last + 1, sense):
-            near = out[t - sense, 0]
-            past = out[np.clip([t - sense, t - 2 * sense, t - 3 * sense], 0, len(fit) - 1), 0]
-            step = float(np.nan_to_num(np.abs(np.diff(past))).max())  # of two: a frame may repeat the one before it
+            near, before, earlier = (edge[min(max(t - k * sense, 0), len(edge) - 1)] for k in (1, 2, 3))
+            # Of two steps, for a frame may repeat the one before it.
+            step = max(0.0 if math.isnan(gap) else abs(gap) for gap in (before - near, earlier - before))
             resting = resting + 1 if step < 0.3 else 0
             far = max(1.3 * step, step + 1.5)
             low, high = (near - far, near + 0.8) if sense < 0 else (near - 0.8, near + far)
-            inside, faint = low <= out[t, 0] <= high, out[t, 3] < FAINTEST - 1
-            if not np.isfinite(near) or (inside and (out[t, 2] <= bad or resting > LONG_REST) and not faint):
+            inside, faint = low <= edge[t] <= high, out[t, 3] < FAINTEST - 1
+            if not math.isfinite(near) or (inside and (out[t, 2] <= bad or resting > LONG_REST) and not faint):
                 continue
             better = _best_between(strip, state, t, low, high, 1 if resting > LONG_REST else 9)
             if inside:
                 if better is not None and (faint or better[2] < out[t, 2]):
                     out[t] = better
-            elif _may_be_gap(out[t, 0] - near, step) and not faint and _is_better(out[t], better, bad):
+            elif _may_be_gap(edge[t] - near, step) and not faint and _is_better(out[t], better, bad):
                 continue
             elif better is None:
-                out[t] = (float(np.clip(np.nan_to_num(out[t, 0], nan=near), low, high)), ASTRAY_PX, 4 * bad, 0, 0, 0)
+                place = near if math.isnan(edge[t]) else edge[t]
+                out[t] = (min(max(place, low), high), ASTRAY_PX, 4 * bad, 0, 0, 0)
             else:
                 out[t] = better
+            edge[t] = float(out[t, 0])
     return _smoothed_out(strip, state, out, moving, bad)
 
 

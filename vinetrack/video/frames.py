@@ -214,7 +214,7 @@ def read_frames(
         expected, between_s = last - first + 1, (float(index.times_s[first]), float(index.times_s[last]))
     try:
         decoded = decode_container(
-            recording.path, shape, lambda frame: luma_plane(frame, region), threads, expected, between_s
+            recording.path, shape, lambda frame: luma_plane(frame, region, copy=False), threads, expected, between_s
         )
     except MemoryError:
         raise too_large(recording) from None
@@ -270,17 +270,18 @@ def iterate_frames(recording: Recording, region: Region | None = None) -> Iterat
             return
 
 
-def luma_plane(frame: av.VideoFrame, region: Region) -> NDArray[Any]:
+def luma_plane(frame: av.VideoFrame, region: Region, copy: bool = True) -> NDArray[Any]:
     """Brightness of one decoded frame.
 
     Parameters
     ----------
     frame : as the decoder gives it.
     region : part of the picture.
+    copy : False where the picture is copied at once, before the decoder goes on.
 
     Returns
     -------
-    grey levels, a copy, shape region.shape, uint8 or uint16.
+    grey levels, shape region.shape, uint8 or uint16.
     """
     name = frame.format.name
     depth = frame.format.components[0].bits
@@ -292,8 +293,8 @@ def luma_plane(frame: av.VideoFrame, region: Region) -> NDArray[Any]:
     plane = frame.planes[0]
     dtype = np.dtype(np.uint8) if depth <= 8 else np.dtype(">u2" if name.endswith("be") else "<u2")
     rows = np.frombuffer(memoryview(plane), dtype=dtype).reshape(-1, plane.line_size // dtype.itemsize)
-    copied = rows[region.slices].copy()
-    return copied if dtype.itemsize == 1 else copied.astype(np.uint16, copy=False)
+    picture = rows[region.slices]
+    return np.array(picture, np.uint8 if dtype.itemsize == 1 else np.uint16) if copy else picture
 
 
 def _inspect_container(path: Path) -> Recording:
