@@ -114,9 +114,7 @@ class EdgeFit:
     fast_px_per_frame: float = np.nan
 
 
-def track_edge(
-    strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, sides: Outline | None = None
-) -> EdgeFit:
+def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, sides: Outline | None = None) -> EdgeFit:
     """Track the leading edge through a strip, growing towards higher columns.
 
     Parameters
@@ -162,8 +160,8 @@ def track_edge(
     finished = _finish(strip, state, fit, exposure, passed)
     if not np.isfinite(exposure_frames):
         return finished
-    seen, speed = seen_exposure(strip, state, fit, exposure)
-    return replace(finished, seen_exposure_frames=seen, fast_px_per_frame=speed)
+    shown, speed = seen_exposure(strip, state, fit, exposure)
+    return replace(finished, seen_exposure_frames=shown, fast_px_per_frame=speed)
 
 
 def _fit_some(strip: Strip, state: EdgeState, chosen: Bools) -> Floats:

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numba import njit
 
-from vinetrack.video.edge_cover import MATHS, VECTOR, cover_reach, cover_table, phase
+from vinetrack.video.edge_cover import BORROWED, MATHS, VECTOR, cover_reach, cover_table, phase
 
 BEHIND = 25
 """Columns behind the first passed one whose film is looked at: neighbours that stand in where it is never seen.
@@ -165,7 +165,7 @@ def fit_edges(
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", _nrt=False)
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
 def _line_up(
     picture: np.ndarray, gain: float, level: float, pictures: np.ndarray, y: float, lag: np.ndarray, half: float,
     first: int, last: int, middle: int, table: np.ndarray, wider: np.ndarray,

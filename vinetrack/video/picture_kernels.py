@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from vinetrack.video.edge_cover import MATHS, PHASES, VECTOR, cover_reach, cover_table, phase
+from vinetrack.video.edge_cover import BORROWED, MATHS, PHASES, VECTOR, cover_reach, cover_table, phase
 
 FORGOTTEN = 4.0
 """Frames further off than this many memories, e⁻⁴ = 2 %, are not read. Chosen for time; at half 14 % of the weight is
@@ -68,7 +68,7 @@ def gather(
     """
     n, rows, columns = strip.shape
     sums = np.zeros((11, rows, columns), np.float32)
-    unity, tight = np.float32(1.0), np.float32(1 / (clip * clip) if clip > 0 else 0.0)
+    tight = np.float32(1 / (clip * clip) if clip > 0 else 0.0)
     # What is the same for all rows: weights of columns, first and behind the last that counts, covers by distance.
     seen, film = np.zeros((n, columns), np.float32), np.zeros((n, columns), np.float32)
     limits = np.zeros((n, 2), np.int64)
@@ -106,7 +106,7 @@ def gather(
     return sums
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", _nrt=False)
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
 def _gather_rows(
     picture: np.ndarray, low: int, high: int, gain: np.float32, level: np.float32, edge: float, lag: np.ndarray,
     table: np.ndarray, middle: int, first: int, last: int, bare_weight: np.ndarray, film_weight: np.ndarray,
@@ -153,7 +153,7 @@ def _gather_rows(
                 sums[4, u, s] += w * p * value
 
 
-@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", _nrt=False)
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
 def _count(
     values: np.ndarray, gain: np.float32, level: np.float32, weight: np.ndarray, picture: np.ndarray, tight: np.float32,
     count: np.ndarray, total: np.ndarray, squares: np.ndarray,

@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vinetrack.video.edge_cover import BORROWED
+
 SHARPNESS = np.float32(-0.75)
 """Slope of the cubic at its first zero. Defined by OpenCV's INTER_CUBIC, whose values these are but for rounding."""
 SHORTEST_RUN_PX = 16
@@ -113,7 +115,7 @@ def _interpolate(luma: np.ndarray, parts: np.ndarray, runs: np.ndarray, most: np
         _interpolate_one(picture, rows, top, parts, runs, most, made)
 
 
-@njit(cache=True, nogil=True, fastmath=EXACT, error_model="numpy", _nrt=False)
+@njit(cache=True, nogil=True, fastmath=EXACT, error_model="numpy", **BORROWED)
 def _interpolate_one(
     picture: np.ndarray, rows: np.ndarray, top: int, parts: np.ndarray, runs: np.ndarray, most: np.float32,
     made: np.ndarray,
