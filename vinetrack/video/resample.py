@@ -87,20 +87,20 @@ def _grid(matrix: np.ndarray, n_rows: int, n_along: int) -> tuple[np.ndarray, np
 @njit(cache=True, nogil=True, inline="always")
 def _weights(x: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Weights of four neighbours, of which the second lies `x` before the place asked for."""
-    one, a = np.float32(1.0), SHARPNESS
+    unity, a = np.float32(1.0), SHARPNESS
     two, three, five, eight = np.float32(2.0), np.float32(3.0), np.float32(5.0), np.float32(8.0)
-    far, y = x + one, one - x
+    far, y = x + unity, unity - x
     before = ((a * far - five * a) * far + eight * a) * far - np.float32(4.0) * a
-    left = ((a + two) * x - (a + three)) * x * x + one
-    right = ((a + two) * y - (a + three)) * y * y + one
-    return before, left, right, one - before - left - right
+    left = ((a + two) * x - (a + three)) * x * x + unity
+    right = ((a + two) * y - (a + three)) * y * y + unity
+    return before, left, right, unity - before - left - right
 
 
 @njit(cache=True, nogil=True, fastmath=EXACT, error_model="numpy")
 def _interpolate(luma: np.ndarray, parts: np.ndarray, runs: np.ndarray, most: np.float32, out: np.ndarray) -> None:
     """Fill `out`, shape (n_frames, n_rows * n_along), run by run; see `_grid`.
 
-    Whole vectors are computed; what is too much of the last one is overwritten by the next run.
+    Whole vectors are computed; what is too much of the last unity is overwritten by the next run.
     """
     n, height, width = luma.shape
     top = max(0, runs[:, 3].min())
