@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vinetrack.video.order_kernels import block_means, largest_changes, largest_steps, ratio_medians
+from vinetrack.video.order_kernels import block_means, largest_steps, ratio_medians
 
 
 @pytest.mark.parametrize("side", [1, 3, 4])
@@ -20,12 +20,6 @@ def test_ratios_have_the_median_of_numpy():
     reference = rng.uniform(1, 255, (30, 41)).astype(np.float32)
     expected = np.median((pictures + np.float32(1)) / reference, axis=(1, 2))
     np.testing.assert_allclose(ratio_medians(pictures, reference), expected, rtol=1e-6)
-
-
-def test_the_largest_changes_have_the_mean_of_those_sorted():
-    pictures = np.random.default_rng(3).uniform(0, 255, (5, 900)).astype(np.float32)
-    changes = np.sort(np.abs(np.diff(pictures, axis=0)), axis=1)[:, -200:].mean(axis=1)
-    np.testing.assert_allclose(largest_changes(pictures, 200), changes, rtol=1e-5)
 
 
 def test_the_largest_step_is_where_means_differ_most():

@@ -20,7 +20,6 @@ from vinetrack.video.kymograph import fan_gains, passing_times
 from vinetrack.video.order_kernels import (
     BINS_A_LEVEL,
     block_means,
-    largest_changes,
     largest_steps,
     median,
     ratio_medians,
@@ -39,9 +38,6 @@ PREFIXES = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Parts of a recording, from its beginning, that may be orderly. Chosen: steps of a quarter; more cost time alone."""
 MAX_FRAMES = 150
 """Frames, spread evenly over the changes, in which it is sought. Chosen for time; they resolve 1 % of the growth."""
-BUSY_PIXELS = 200
-"""Pixels of a small picture whose change tells how much goes on. Chosen: one in a hundred, as a tip's border has. At
-half noise decides, at twice slow tips count little."""
 
 
 @dataclass(frozen=True)
@@ -347,7 +343,8 @@ def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
     n = len(small)
     if n <= MAX_FRAMES:
         return np.arange(n)
-    activity = largest_changes(small.reshape(n, -1), BUSY_PIXELS)
+    change = np.abs(np.diff(small, axis=0))
+    activity = np.partition(change.reshape(n - 1, -1), -20, axis=1)[:, -200:].mean(axis=1)
     floor = float(np.quantile(activity, 0.2))
     busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
     total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])

@@ -104,54 +104,6 @@ def ratio_medians(pictures: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def largest_changes(pictures: np.ndarray, count: int) -> np.ndarray:
-    """Mean of the largest changes from each picture to the next.
-
-    Parameters
-    ----------
-    pictures : grey levels of 255, shape (n, n_pixels).
-    count : how many of the largest; of those that differ by less than 1/4096 of a level the mean counts for each.
-
-    Returns
-    -------
-    shape (n - 1,).
-    """
-    n, pixels = pictures.shape
-    count = min(count, pixels)
-    out = np.empty(n - 1)
-    last, fine = LEVELS * BINS_A_LEVEL - 1, np.float32(BINS_A_LEVEL)
-    place, change = np.empty(pixels, np.int32), np.empty(pixels, np.float32)
-    for t in range(n - 1):
-        bins, parts, sums = np.zeros(last + 1, np.int64), np.zeros(256, np.int64), np.zeros(256)
-        before, after = pictures[t], pictures[t + 1]
-        for k in range(pixels):
-            change[k] = abs(after[k] - before[k])
-            place[k] = min(int(fine * change[k]), last)
-        for k in range(pixels):
-            bins[place[k]] += 1
-        left, level, total = count, last, 0.0
-        while bins[level] < left:
-            left -= bins[level]
-            level -= 1
-        for k in range(pixels):
-            if place[k] > level:
-                total += change[k]
-            elif place[k] == level:
-                part = min(int((change[k] * fine - level) * 256), 255)
-                parts[part] += 1
-                sums[part] += change[k]
-        part = 255
-        while left > 0:
-            taken = min(left, parts[part])
-            if taken > 0:
-                total += sums[part] * taken / parts[part]
-            left -= taken
-            part -= 1
-        out[t] = total / count
-    return out
-
-
-@njit(cache=True, nogil=True)
 def largest_steps(pictures: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
     """When the means of the pictures before and after differ most at each pixel, and the power of that difference.
 
