@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_evidence import Posterior, posterior, posterior_weights, weighed
+from vinetrack.diagnosis.force_evidence import UNLIKELY, Posterior, posterior, posterior_weights, weighed
 from vinetrack.diagnosis.force_refinement import Normal, Place
 from vinetrack.diagnosis.force_surface import (
     AMPLITUDES,
@@ -125,3 +125,36 @@ def test_one_variable_and_two_have_the_same_odds_beforehand() -> None:
     weights = posterior_weights([single, *pairs], 1.0)
     assert weights["growth"] == pytest.approx(0.5)
     assert weights["growth+speed"] == pytest.approx(0.25)
+
+
+def test_the_mean_and_the_band_are_those_of_the_mixture_over_lengths_and_amplitudes() -> None:
+    """Each length and amplitude by the closed form of a normal prior, with the weight of its likelihood."""
+    draw = np.random.default_rng(11)
+    design = curves(draw.uniform(0, 1, 40), 12)
+    told = seen(design, design @ draw.standard_normal(12) + draw.standard_normal(40))
+    parts = []
+    for length in LENGTHS:
+        mix = GROWTH.mix((length,), CONSTANT)
+        for sd_N in 2 * AMPLITUDES:
+            prior = np.eye(mix.shape[1]) / sd_N**2
+            covariance = mix @ np.linalg.inv(mix.T @ told.information @ mix + prior) @ mix.T
+            shrunk = np.linalg.slogdet(np.eye(mix.shape[1]) + sd_N**2 * mix.T @ told.information @ mix)[1]
+            parts.append((0.5 * float(told.score @ covariance @ told.score - shrunk), covariance))
+    logs = np.array([log for log, _ in parts])
+    weights = np.where(logs > logs.max() - UNLIKELY, np.exp(logs - logs.max()), 0.0)
+    weights /= weights.sum()
+    means = np.array([covariance @ told.score for _, covariance in parts])
+    mean = weights @ means
+    spread = np.tensordot(weights, np.array([covariance for _, covariance in parts]), 1)
+    spread += ((means - mean).T * weights) @ (means - mean)
+    beginning = next(each for each in weighed(GROWTH, told, 1.0, 2.0).beginnings if each.begins == CONSTANT)
+    assert beginning.mean == pytest.approx(mean, abs=1e-9)
+    assert beginning.covariance == pytest.approx(spread, abs=1e-9)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_overflows_says_nothing(value: float) -> None:
+    told = seen(np.eye(3), np.ones(3))
+    assert told.finite
+    assert not replace(told, cost=value).finite
+    assert not replace(told, score=np.array([0.0, value, 0.0])).finite

@@ -6,12 +6,16 @@ Seeds 81 to 86 were looked at while laws and errors were built; those here, from
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from grown import effect_file, grown, pairs_of, sheet
+from threadpoolctl import threadpool_info
 
 import vinetrack as vt
+import vinetrack.diagnosis.missing_force as missing_force_module
 from vinetrack.diagnosis.force_sensitivities import force_sensitivities, motions_of
 from vinetrack.diagnosis.missing_force import FORCE_COLUMNS, LAW_COLUMNS, MissingForce, missing_force
 from vinetrack.diagnosis.per_trial_estimates import lay
@@ -140,3 +144,16 @@ def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(path: Path) 
         for i, answer in enumerate(answers):
             exact = (moved[0][i].observed_position_m - moved[1][i].observed_position_m) / 2e-3
             assert np.max(np.abs(answer[:, k] - exact)) < 2e-3 * np.max(np.abs(exact))
+
+
+def test_the_force_is_learned_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On cores that are busy, threads of such small matrices wait for each other a hundred times as long."""
+    threads: list[int] = []
+
+    def learned(*_: object) -> None:
+        threads.extend(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+
+    monkeypatch.setattr(missing_force_module, "learned_force", learned)
+    linear: Any = SimpleNamespace(fit=SimpleNamespace(scatter=SimpleNamespace(dof=1)), motions=[])
+    assert missing_force_module._learned(linear, linear) is None
+    assert set(threads) == {1}

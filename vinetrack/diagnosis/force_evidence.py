@@ -48,6 +48,12 @@ class Posterior:
         """χ² of the best coefficients, whatever the prior says of how smooth they are."""
         return self.cost - self.gain
 
+    @property
+    def finite(self) -> bool:
+        """Whether positions say anything: far beyond what trials have been through numbers overflow."""
+        parts = (self.information, self.score, self.cost, self.gain, self.log_determinant)
+        return all(bool(np.isfinite(part).all()) for part in parts)
+
 
 @dataclass(frozen=True)
 class Beginning:
@@ -206,45 +212,40 @@ def weighed(domain: Domain, told: Posterior, inflation: float, largest_N: float)
 
 
 def _begun(domain: Domain, begins: str, told: Posterior, inflation: float, largest_N: float) -> Beginning:
-    """One way to begin: averaged over lengths and amplitudes, each as likely as positions make it."""
-    tried = []
+    """One way to begin: averaged over lengths and amplitudes, each as likely as positions make it.
+
+    In the directions of one choice of lengths, each known by itself, only the shrinkage depends on the amplitude.
+    """
+    sizes_N = largest_N * AMPLITUDES[:, None]
+    logs, tried = [], []
     for lengths in itertools.product(LENGTHS, repeat=len(domain.variables)):
         mix = domain.mix(lengths, begins)
         values, directions = np.linalg.eigh(mix.T @ told.information @ mix / inflation)
         heard = directions.T @ (mix.T @ told.score) / inflation
-        values = np.maximum(values, 0.0)
-        for sd_N in largest_N * AMPLITUDES:
-            shrunk = sd_N**2 / (1 + sd_N**2 * values)
-            log = 0.5 * float(np.sum(shrunk * heard**2) - np.sum(np.log1p(sd_N**2 * values)))
-            tried.append((log, lengths, float(sd_N)))
-    logs = np.array([log for log, _, _ in tried])
-    most, lengths, sd_N = tried[int(np.argmax(logs))]
-    evidence = most + math.log(float(np.mean(np.exp(logs - most))))
-    likely = [other for other in tried if other[0] > most - UNLIKELY]
-    means, covariances = zip(
-        *(_given(domain.mix(at, begins), size_N, told, inflation) for _, at, size_N in likely), strict=True
-    )
-    weights = np.exp([log - most for log, _, _ in likely])
+        spread = 1 + sizes_N**2 * np.maximum(values, 0.0)
+        shrunk = sizes_N**2 / spread
+        logs.append(0.5 * np.sum(shrunk * heard**2 - np.log(spread), axis=1))
+        tried.append((lengths, mix @ directions, shrunk, shrunk * heard))
+    best, size = np.unravel_index(np.argmax(logs), (len(tried), len(sizes_N)))
+    most = logs[best][size]
+    evidence = most + math.log(float(np.mean(np.exp(np.array(logs) - most))))
+    weights = np.where(np.array(logs) > most - UNLIKELY, np.exp(np.array(logs) - most), 0.0)
     weights /= weights.sum()
-    mean = np.tensordot(weights, np.array(means), 1)
-    off = np.array(means) - mean
-    covariance = np.tensordot(weights, np.array(covariances), 1) + (off.T * weights) @ off
+    mean, square = np.zeros(domain.size), np.zeros((domain.size, domain.size))
+    for weight, (_, ways, shrunk, means) in zip(weights, tried, strict=True):
+        if weight.any():
+            mean += ways @ (weight @ means)
+            square += ways @ (np.diag(weight @ shrunk) + (means.T * weight) @ means) @ ways.T
+    lengths = tried[best][0]
     return Beginning(
         begins,
-        evidence - 0.5 * told.cost / inflation - 0.5 * told.log_determinant,
-        Surface(domain, domain.mix(lengths, begins, FOLLOWED), sd_N),
+        float(evidence) - 0.5 * told.cost / inflation - 0.5 * told.log_determinant,
+        Surface(domain, domain.mix(lengths, begins, FOLLOWED), float(sizes_N[size, 0])),
         lengths,
         mean,
-        covariance,
+        square - np.outer(mean, mean),
         told.cost - 2 * float(told.score @ mean) + float(mean @ told.information @ mean),
     )
-
-
-def _given(mix: Floats, sd_N: float, told: Posterior, inflation: float) -> tuple[Floats, Floats]:
-    """Mean and covariance of the coefficients for these lengths and this amplitude."""
-    inner = np.linalg.inv(mix.T @ told.information @ mix / inflation + np.eye(mix.shape[1]) / sd_N**2)
-    covariance = mix @ inner @ mix.T
-    return covariance @ told.score / inflation, covariance
 
 
 def posterior_weights(choices: Sequence[VariableChoice], error: float) -> dict[str, float]:

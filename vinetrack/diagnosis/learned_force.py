@@ -175,6 +175,8 @@ def learned_force(
         for surface in (Surface(domain, np.eye(domain.size)) for domain in domains(motions))
     ]
     about = [posterior(place, normal_equations(model_fit, fit, place)) for place in begins]
+    if not all(told.finite for told in about):
+        return None
     inflation = max(min(told.lowest for told in about) / fit.points, 1.0)
     silent = -0.5 * about[0].cost / inflation - 0.5 * about[0].log_determinant
     linear = [
@@ -281,7 +283,7 @@ def _followed(
         place = replace(after, law=free, amplitude=surface.mix @ after.amplitude)
         told = posterior(place, normal_equations(model_fit, fit, place))
         # Another amplitude may lead away: what has been reached is kept.
-        if settled is not None and told.lowest > settled[1].lowest:
+        if not told.finite or (settled is not None and told.lowest > settled[1].lowest):
             break
         settled = place, told
         inflation = max(told.lowest / fit.points, 1.0)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from vinetrack.core.constants import GRAVITY_M_S2
 from vinetrack.core.records import Floats
@@ -185,9 +186,13 @@ def learned_alone(model_fit: Fit) -> LearnedForce | None:
 
 
 def _learned(model_fit: Fit, linear: LinearMisfit) -> LearnedForce | None:
-    """The force as a smooth function; None also where it leads to motions that cannot be followed."""
+    """The force as a smooth function; None also where it leads to motions that cannot be followed.
+
+    In one thread: matrices of 160 rows are too small for more, and on cores that are busy threads wait for each other,
+    a hundred times as long as the work takes.
+    """
     try:
-        with np.errstate(all="raise", under="ignore"):
+        with threadpool_limits(1), np.errstate(all="raise", under="ignore"):
             return learned_force(model_fit, linear.fit, linear.motions, linear.fit.scatter.dof)
     except (SimulationError, FloatingPointError, np.linalg.LinAlgError):
         return None
