@@ -5,6 +5,8 @@ The truth is the motion that the virtual laboratory filmed, and the same recordi
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -256,3 +258,44 @@ def test_motion_without_any_edge_is_refused() -> None:
     state = EdgeState(edge, np.zeros(60), np.zeros(3), 1.0, blank, np.ones(3))
     with pytest.raises(ValueError, match="nothing like an edge is seen"):
         core_frames(state, np.full((60, 6), np.nan))
+
+
+GIVEN_UP = """
+import sys
+from pathlib import Path
+import numpy as np
+from vinetrack.video.decoding import decode_container
+
+class GivenUp(Exception):
+    pass
+
+for _ in range(60):
+    seen = []
+    def picture(frame):
+        seen.append(frame.pts)
+        if len(seen) > 2:
+            raise GivenUp
+        return np.zeros((320, 960), np.uint8)
+    try:
+        decode_container(Path(sys.argv[1]), (320, 960), picture, 2)
+    except GivenUp:
+        pass
+"""
+"""A decoder left after three frames, sixty times over."""
+
+
+def test_a_damaged_recording_that_is_given_up_lets_go_of_its_decoder(tmp_path: Path) -> None:
+    """Threads of the decoder that complain, and Python that frees the decoder, waited for each other for ever."""
+    path, draw = tmp_path / "noise.mp4", np.random.default_rng(0)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=60)
+        stream.width, stream.height, stream.pix_fmt, stream.options = 960, 320, "yuv420p", {"g": "30", "bf": "0"}
+        for _ in range(60):
+            picture = draw.integers(0, 255, (320, 960, 3), dtype=np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
+    content = bytearray(path.read_bytes())
+    for place in draw.integers(3000, len(content) - 20_000, 3000):
+        content[place] ^= int(draw.integers(1, 255))
+    path.write_bytes(content)
+    subprocess.run([sys.executable, "-c", GIVEN_UP, str(path)], check=True, timeout=120)

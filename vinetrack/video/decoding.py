@@ -98,7 +98,7 @@ def decode_container(
     held: NDArray[Any] | None = None
     with quiet_log() as complaints:
         try:
-            with av.open(str(path)) as container:
+            with opened(path) as container:
                 stream = container.streams.video[0]
                 stream.thread_type = "AUTO"
                 stream.codec_context.thread_count = threads
@@ -231,15 +231,39 @@ def decode_packets(path: Path, chosen: Container[int] | None, threads: int) -> I
     ------
     frames, those that cannot be decoded left out.
     """
-    import av
-
-    with quiet_log() as complaints, av.open(str(path)) as container:
+    with quiet_log() as complaints, opened(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = threads
         packets = container.demux(stream)
         wanted = (packet for packet in packets if chosen is None or not packet.size or packet.pts in chosen)
         yield from _frames_of(wanted, complaints)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[av.container.InputContainer]:
+    """Open a film to decode it; its decoder comes to rest before it is closed.
+
+    A decoder that is freed waits for its threads, and Python with it. A thread that has just met a fault waits for
+    Python to take its complaint, and both wait for ever; a flush waits as well, but lets Python go on.
+
+    Parameters
+    ----------
+    path : of a film.
+
+    Yields
+    ------
+    container
+    """
+    import av
+
+    with av.open(str(path)) as container:
+        try:
+            yield container
+        finally:
+            for stream in container.streams.video:
+                if stream.codec_context is not None:
+                    stream.codec_context.flush_buffers()
 
 
 def _keep(decoded: Decoded, frame: av.VideoFrame, base_s: float) -> None:
@@ -271,7 +295,7 @@ def _times_complained_of(path: Path) -> set[float]:
     import av.logging
 
     marked: set[float] = set()
-    with quiet_log(), av.open(str(path)) as container, contextlib.suppress(av.error.FFmpegError):
+    with quiet_log(), opened(path) as container, contextlib.suppress(av.error.FFmpegError):
         stream = container.streams.video[0]
         stream.codec_context.thread_count = 1
         base = float(stream.time_base) if stream.time_base else 1.0

@@ -24,6 +24,7 @@ from vinetrack.video.decoding import (
     PacketIndex,
     damaged_frames,
     decode_container,
+    opened,
     quiet_log,
 )
 from vinetrack.video.frame_faults import torn_frames
@@ -262,7 +263,7 @@ def iterate_frames(recording: Recording, region: Region | None = None) -> Iterat
         return
     import av
 
-    with av.open(str(recording.path)) as container:
+    with opened(recording.path) as container:
         try:
             for frame in container.decode(video=0):
                 yield luma_plane(frame, region)
@@ -301,7 +302,7 @@ def _inspect_container(path: Path) -> Recording:
     import av
 
     try:
-        with quiet_log() as complaints, av.open(str(path)) as container:
+        with quiet_log() as complaints, opened(path) as container:
             if container.format.name in TEXT_FORMATS:
                 raise RecordingError(f"{path.name}: a text, not a recording; name a film, or a folder of pictures")
             if not container.streams.video:
