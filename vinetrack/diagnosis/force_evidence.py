@@ -177,9 +177,10 @@ def posterior(place: Place, normal: Normal) -> Posterior:
     strength, ways = np.linalg.eigh(square[np.ix_(force, force)] - cross.T @ cross)
     # What other numbers do as well is known no better than numbers are rounded.
     ways, strength = ways[:, strength > SILENT], strength[strength > SILENT]
-    back = np.where(unit[force] > 0, 1 / np.where(unit[force] > 0, unit[force], 1.0), 0.0)[:, None] * ways
+    scale = np.where(unit[force] > 0, 1 / np.where(unit[force] > 0, unit[force], 1.0), 0.0)
+    back = scale[:, None] * ways
     heard = ways.T @ (slope[force] - cross.T @ along)
-    inner = np.where(unit[force] > 0, 1 / np.where(unit[force] > 0, unit[force], 1.0), 0.0) * place.amplitude @ ways
+    inner = scale * place.amplitude @ ways
     cost = normal.cost - float(along @ along)
     return Posterior(
         information=(back * strength) @ back.T,
@@ -217,19 +218,21 @@ def _begun(domain: Domain, begins: str, told: Posterior, inflation: float, large
     In the directions of one choice of lengths, each known by itself, only the shrinkage depends on the amplitude.
     """
     sizes_N = largest_N * AMPLITUDES[:, None]
-    logs, tried = [], []
+    by_length, tried = [], []
     for lengths in itertools.product(LENGTHS, repeat=len(domain.variables)):
         mix = domain.mix(lengths, begins)
         values, directions = np.linalg.eigh(mix.T @ told.information @ mix / inflation)
         heard = directions.T @ (mix.T @ told.score) / inflation
         spread = 1 + sizes_N**2 * np.maximum(values, 0.0)
         shrunk = sizes_N**2 / spread
-        logs.append(0.5 * np.sum(shrunk * heard**2 - np.log(spread), axis=1))
+        by_length.append(0.5 * np.sum(shrunk * heard**2 - np.log(spread), axis=1))
         tried.append((lengths, mix @ directions, shrunk, shrunk * heard))
-    best, size = np.unravel_index(np.argmax(logs), (len(tried), len(sizes_N)))
-    most = logs[best][size]
-    evidence = most + math.log(float(np.mean(np.exp(np.array(logs) - most))))
-    weights = np.where(np.array(logs) > most - UNLIKELY, np.exp(np.array(logs) - most), 0.0)
+    logs = np.array(by_length)
+    best, size = np.unravel_index(np.argmax(logs), logs.shape)
+    most = logs[best, size]
+    likelihoods = np.exp(logs - most)
+    evidence = most + math.log(float(np.mean(likelihoods)))
+    weights = np.where(logs > most - UNLIKELY, likelihoods, 0.0)
     weights /= weights.sum()
     mean, square = np.zeros(domain.size), np.zeros((domain.size, domain.size))
     for weight, (_, ways, shrunk, means) in zip(weights, tried, strict=True):
