@@ -15,7 +15,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.force_refinement import Normal, Place
-from vinetrack.diagnosis.force_surface import AMPLITUDES, ANY, FOLLOWED, LENGTHS, Domain, Surface
+from vinetrack.diagnosis.force_surface import AMPLITUDES, ANY, FOLLOWED, LENGTHS, Domain, Surface, standard_error
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
 
 SILENT = 1e-8
@@ -83,7 +83,7 @@ class Beginning:
         force, sigma : arrays, shape (n,), N
         """
         basis = self.surface.domain.basis(values)
-        return basis @ self.mean, np.sqrt(np.einsum("nk,kl,nl->n", basis, self.covariance, basis))
+        return basis @ self.mean, standard_error(basis, self.covariance)
 
 
 @dataclass(frozen=True)

@@ -116,6 +116,22 @@ def curves(at: Floats, count: int) -> Floats:
     return splines(at, np.linspace(0.0, 1.0, count - 2))
 
 
+def standard_error(basis: Floats, covariance: Floats) -> Floats:
+    """Standard error of what coefficients of this covariance make of a basis, shape (n,).
+
+    Parameters
+    ----------
+    basis : array, shape (n, n_splines)
+    covariance : array, shape (n_splines, n_splines)
+        Of the coefficients, N².
+
+    Returns
+    -------
+    array, shape (n,), N
+    """
+    return np.asarray(np.sqrt(np.einsum("nk,kl,nl->n", basis, covariance, basis)))
+
+
 def covariance_root(count: int, length: float, *, from_nothing: bool = False) -> tuple[Floats, Floats]:
     """Directions and variances of a process of unit size and this length, at the places of so many splines.
 

@@ -43,7 +43,7 @@ from vinetrack.diagnosis.force_evidence import (
 from vinetrack.diagnosis.force_inversion import ForceFit
 from vinetrack.diagnosis.force_refinement import SETTLED, Place, followed, normal_equations
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of
-from vinetrack.diagnosis.force_surface import ANY, CONSTANT, NOTHING, VARIABLES, Surface, domains
+from vinetrack.diagnosis.force_surface import ANY, CONSTANT, NOTHING, VARIABLES, Surface, domains, standard_error
 from vinetrack.diagnosis.learned_variables import dependence, named, not_excluded, reference
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
 from vinetrack.diagnosis.smoothed_motions import on_tracks
@@ -128,7 +128,7 @@ class LearnedForce:
         """
         assert isinstance(self.place.law, Surface)
         basis = self.place.law.domain.basis(values) @ self.place.law.mix
-        return basis @ self.place.amplitude, np.sqrt(np.einsum("nk,kl,nl->n", basis, self.covariance, basis))
+        return basis @ self.place.amplitude, standard_error(basis, self.covariance)
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""

@@ -25,7 +25,7 @@ from vinetrack.diagnosis.force_inversion import ForceFit, Gain
 from vinetrack.diagnosis.force_laws import Law, coarse_laws, finer_laws
 from vinetrack.diagnosis.force_refinement import refine
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities
-from vinetrack.diagnosis.force_surface import curves
+from vinetrack.diagnosis.force_surface import curves, standard_error
 from vinetrack.diagnosis.learned_force import LearnedForce, learned_force
 from vinetrack.diagnosis.linear_misfit import LinearMisfit, linear_misfit, pieces_along
 from vinetrack.dynamics.simulate import SimulationError
@@ -319,7 +319,7 @@ def _table(
         motion = next(m for m in motions if m.trial.condition == condition)
         at = np.linspace(0.04, 0.96, DRAWN) * motion.lead_position_m.max()
         shape = pieces_along(at / longest[condition])
-        sigma = np.sqrt(np.einsum("nk,kl,nl->n", shape, covariance, shape))
+        sigma = standard_error(shape, covariance)
         told = sigma < UNTOLD * np.median(sigma)
         at, force, sigma = at[told], (shape @ coefficients)[told], sigma[told]
         when = np.interp(at, motion.lead_position_m, motion.time_s)
