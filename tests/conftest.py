@@ -1,13 +1,26 @@
-"""What every test has in common: nothing is remembered beyond the tests."""
+"""What every test has in common: nothing is remembered beyond a test, so that their order does not matter."""
 
 from __future__ import annotations
 
+from itertools import count
+from pathlib import Path
+
 import pytest
+
+FOLDERS = count()
+"""Numbers the folders of one process."""
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_memory_of_the_user(tmp_path_factory: pytest.TempPathFactory):
-    """Own effects that tests run are remembered in a folder of theirs, here and in processes that they start."""
+def _folder_of_memories(tmp_path_factory: pytest.TempPathFactory):
+    """A folder for what programs remember of their user, for fixtures that live longer than a test too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
-        yield
+        folder = tmp_path_factory.mktemp("state")
+        patch.setenv("XDG_STATE_HOME", str(folder / "fixtures"))
+        yield folder
+
+
+@pytest.fixture(autouse=True)
+def _no_memory_of_the_user(_folder_of_memories: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each test, and the processes that it starts, meet own effects for the first time."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(_folder_of_memories / str(next(FOLDERS))))

@@ -70,7 +70,7 @@ def test_what_the_page_shows_of_the_effect_is_what_is_printed(experiment: Path) 
     shown = next(piece for piece in pieces(PAGE.read_text(encoding="utf-8")) if isinstance(piece, Shown))
     assert shown.arguments == ("effects", "spring_line", "--experiment", "my_experiment")
     done = CliRunner().invoke(app, ["effects", "spring_line", "--experiment", str(experiment)])
-    assert done.output.strip().replace(str(experiment), "my_experiment") == shown.output
+    assert done.stdout.strip().replace(str(experiment), "my_experiment") == shown.output
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def test_the_list_is_aligned_and_has_the_users_own(tmp_path: Path) -> None:
     written(tmp_path)
     done = run("--experiment", experiment(tmp_path, "[brush.py]"))
     assert done.exit_code == 0
-    lines = done.output.splitlines()
+    lines = done.stdout.splitlines()
     column = lines[0].index("kind")
     named = [line for line in lines[1:] if not line.startswith("    ")]
     assert len(named) == len(catalogue()) + 1
@@ -183,8 +183,9 @@ def test_a_broken_effect_of_an_experiment_is_one_sentence(tmp_path: Path) -> Non
     written(tmp_path, BRUSH.replace("-0.4,", "-0.3,"))
     done = run("--experiment", experiment(tmp_path, "[brush.py]"))
     assert done.exit_code == 1
-    assert len(done.output.strip().splitlines()) == 1
-    assert "worked out by hand" in done.output
+    named, refused = done.stderr.strip().splitlines()
+    assert "runs for the first time" in named
+    assert "worked out by hand" in refused
 
 
 def test_an_effect_outside_the_experiment_is_refused(tmp_path: Path) -> None:
