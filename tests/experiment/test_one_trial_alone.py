@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from vinetrack.core.problems import ExperimentError
+from vinetrack.core.records import PictureAxis
 from vinetrack.experiment.cells import CellError, read_cell
 from vinetrack.experiment.folder import read_experiment
 from vinetrack.experiment.schema import COLUMNS
@@ -37,12 +38,21 @@ def test_a_sheet_gives_one_trial_its_own(tmp_path: Path) -> None:
     assert track.flag[-1] == "after_end"
 
 
+def test_an_axis_may_go_through_more_points() -> None:
+    axis = read_cell(COLUMNS["axis"], "161,40:170,300:151.5,799:20")
+    assert isinstance(axis, PictureAxis)
+    assert (axis.from_px, axis.via_px, axis.to_px) == ((161.0, 40.0), ((170.0, 300.0),), (151.5, 799.0))
+    assert axis.width_m == pytest.approx(0.02)
+
+
 @pytest.mark.parametrize(
     ("column", "text", "said"),
     [
         ("axis", "161,40", "is no axis"),
         ("axis", "161,40:165,40", "is shorter than 10 pixels"),
         ("axis", "161,40:151,799:0", "has a width that is not positive"),
+        ("axis", "161,40:162,41:151,799", "has neighbouring points less than 2 pixels apart"),
+        ("axis", "161,40:162:151,799", "is no axis"),
         ("frames_used", "20:5", "ends before it starts"),
         ("frames_used", "a:5", "is no range of frames"),
     ],

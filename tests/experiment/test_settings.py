@@ -172,6 +172,7 @@ def test_what_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
         ("model: gravity", "should be a list"),
         ("axis: 3", "should be a group of keys"),
         ("axis: {from_px: [1, 1], to_px: [1, 1]}", "same point"),
+        ("axis: {from_px: [1, 1], via_px: [[2, 2]], to_px: [9, 9]}", "less than 2 pixels apart"),
         ("calibration: {kind: mm_per_px, mm_per_px: 0}", "greater than 0"),
         ("limits: {pressure_kPa: 7}", "write low:high"),
         ("limits: {pressure_kPa: 40:7}", "write the lower value first"),

@@ -13,6 +13,7 @@ from explorer_campaign import write_bars
 from vinetrack.explorer.campaign import Campaign
 from vinetrack.explorer.recording import DecodedRecording, RecordingView, view_of
 from vinetrack.results.folder_layout import Results
+from vinetrack.video.axis import Axis
 
 
 def write_clip(path: Path, count: int = 30, width: int = 320, height: int = 96) -> Path:
@@ -59,8 +60,7 @@ def view(angle: float = 0.0) -> RecordingView:
     return RecordingView(
         trial="a",
         path=Path("a.mp4"),
-        from_px=(100.0, 50.0),
-        direction=(float(np.cos(angle)), float(np.sin(angle))),
+        axis=Axis((100.0, 50.0), (100.0 + 300 * float(np.cos(angle)), 50.0 + 300 * float(np.sin(angle)))),
         half_width_px=10.0,
         time_s=frames / 1000,
         edge_px=edge_px,
@@ -117,4 +117,12 @@ def test_a_recording_is_shown_with_the_axis_it_was_tracked_along(campaign: Campa
     found = view_of(results, trial)
     assert isinstance(found, RecordingView)
     assert found.half_width_px == pytest.approx(15.0)
-    assert found.direction == (1.0, 0.0)
+    assert (found.axis.from_px, found.axis.to_px) == ((0.0, 10.0), (300.0, 10.0))
+    bent = {"from_px": [0, 10], "via_px": [[100, 40]], "to_px": [300, 10], "width_px": 20}
+    results.analysed(trial.name).write_text(json.dumps({"axis": bent}))
+    found = view_of(results, trial)
+    assert isinstance(found, RecordingView)
+    (x0, x1), (y0, y1) = found.across(0.5 * found.axis.length_px)
+    middle, direction = found.axis.points(0.5 * found.axis.length_px), np.array([y0 - y1, x1 - x0]) / 30
+    assert np.allclose([(x0 + x1) / 2, (y0 + y1) / 2], middle)
+    assert np.allclose(direction, found.axis.direction_at(0.5 * found.axis.length_px), atol=1e-9)

@@ -163,6 +163,42 @@ def test_an_axis_outside_the_picture_is_refused(folder: Path) -> None:
     assert "leaves the picture of a.mp4, 96 × 64 pixels" in problem.message
 
 
+@pytest.mark.parametrize(
+    ("given", "said", "remedy"),
+    [
+        (
+            "from_px: [10, 30], via_px: [[50, 70]], to_px: [90, 30]",
+            "leaves the picture of a.mp4",
+            "give points inside it",
+        ),
+        (
+            "from_px: [1, 55], via_px: [[30, 63], [70, 63]], to_px: [95, 55]",
+            "leaves the picture, 96 × 64",
+            "give points inside it",
+        ),
+        (
+            "from_px: [20, 20], via_px: [[60, 20]], to_px: [60, 50], width_mm: 30",
+            "bends with a radius of",
+            "fewer points",
+        ),
+    ],
+)
+def test_a_curve_that_leaves_the_picture_or_bends_too_sharply_is_refused(
+    folder: Path, given: str, said: str, remedy: str
+) -> None:
+    write_clip(folder / "a.mp4")
+    (problem,) = check(folder, "a.mp4", settings=SCALE + f"axis: {{{given}}}\n")
+    assert (problem.file, problem.column, problem.severity) == ("experiment.yaml", "axis", "error")
+    assert said in problem.message
+    assert remedy in problem.remedy
+
+
+def test_a_curve_within_the_picture_is_accepted(folder: Path) -> None:
+    write_clip(folder / "a.mp4")
+    settings = SCALE + "axis: {from_px: [5, 30], via_px: [[50, 34]], to_px: [90, 50], width_mm: 2}\n"
+    assert not [problem for problem in check(folder, "a.mp4", settings=settings) if problem.column == "axis"]
+
+
 def test_fifty_recordings_take_twenty_lines_however_many_are_bad(folder: Path) -> None:
     write_clip(folder / "a.mp4")
     names = [f"v{i}.mp4" for i in range(50)]

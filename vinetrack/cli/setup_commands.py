@@ -62,7 +62,8 @@ def _track(
         typer.Option("--calibration", metavar="FILE", help="An experiment.yaml whose `calibration:` is the scale."),
     ] = None,
     axis: Annotated[
-        str | None, typer.Option("--axis", metavar="x,y:x,y", help="Two points of the growth axis, px.")
+        str | None,
+        typer.Option("--axis", metavar="x,y:x,y", help="Points of the growth axis, px; more than two for a bend."),
     ] = None,
     frames: Annotated[
         str | None, typer.Option("--frames", metavar="FROM:TO", help="First and last frame to use, from 0.")

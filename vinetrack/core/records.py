@@ -57,11 +57,15 @@ friction was lost. At half of it such an error counts as 2 σ; at twice, errors 
 
 @dataclass(frozen=True)
 class PictureAxis:
-    """A line in the picture along which a trial moves: (x, y) of its ends, px; `width_m` is NaN where not given."""
+    """A line in the picture along which a trial moves: (x, y) of its ends, px; `width_m` is NaN where not given.
+
+    `via_px` are the points between its ends through which a path that bends goes, in order.
+    """
 
     from_px: tuple[float, float]
     to_px: tuple[float, float]
     width_m: float = math.nan
+    via_px: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ the column's own unit until a trial is made of them.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 from vinetrack.core.records import Bend, PictureAxis
@@ -18,6 +19,8 @@ Value = float | bool | str | tuple[float, float] | tuple[Bend, ...] | PictureAxi
 
 LEAST_AXIS_PX = 10
 """Chosen: an axis shorter than this has no direction to speak of; as `vinetrack.video.axis` has it."""
+LEAST_APART_PX = 2
+"""Chosen: nearer points of a path that bends say nothing of its direction; as `vinetrack.video.curved_axis` has it."""
 
 YES_NO = {"yes": True, "y": True, "true": True, "1": True, "no": False, "n": False, "false": False, "0": False}
 
@@ -234,19 +237,26 @@ def _read_window(text: str, decimal: str) -> tuple[float, float]:
 
 
 def _read_axis(text: str) -> PictureAxis:
-    """`x,y:x,y[:width_mm]`: two points of the picture, and how wide a strip along them is looked at."""
-    allowed = "x,y:x,y or x,y:x,y:width_mm, such as 161,40:151,799:20; in a sheet with commas between quotes"
-    points, width = text.split(":"), math.nan
-    if len(points) not in (2, 3) or any(point.count(",") != 1 for point in points[:2]):
+    """`x,y:x,y…[:width_mm]`: points of the picture, two or more, and how wide a strip along them is looked at."""
+    allowed = (
+        "x,y:x,y or x,y:x,y:width_mm, such as 161,40:151,799:20, with more points where the path bends; "
+        "in a sheet with commas between quotes"
+    )
+    parts, width = text.split(":"), math.nan
+    written = parts if "," in parts[-1] else parts[:-1]
+    if len(written) < 2 or any(point.count(",") != 1 for point in written):
         raise CellError("is no axis", allowed)
-    from_px, to_px = (tuple(_number(part, ".", allowed) for part in point.split(",")) for point in points[:2])
-    if math.dist(from_px, to_px) < LEAST_AXIS_PX:
+    points = [(_number(x, ".", allowed), _number(y, ".", allowed)) for x, y in (point.split(",") for point in written)]
+    if sum(math.dist(*pair) for pair in pairwise(points)) < LEAST_AXIS_PX:
         raise CellError(f"is shorter than {LEAST_AXIS_PX} pixels", allowed, "give two points far apart")
-    if len(points) == 3:
-        width = _number(points[2], ".", allowed) / 1000
+    if len(points) > 2 and min(math.dist(*pair) for pair in pairwise(points)) < LEAST_APART_PX:
+        message = f"has neighbouring points less than {LEAST_APART_PX} pixels apart"
+        raise CellError(message, allowed, "leave out the second of the two")
+    if len(parts) > len(written):
+        width = _number(parts[-1], ".", allowed) / 1000
         if width <= 0:
             raise CellError("has a width that is not positive", allowed)
-    return PictureAxis((from_px[0], from_px[1]), (to_px[0], to_px[1]), width)
+    return PictureAxis(points[0], points[-1], width, tuple(points[1:-1]))
 
 
 def _read_frames(text: str) -> tuple[int, int]:

@@ -33,7 +33,7 @@ _KIND_ALLOWED = {
     "path": "a path inside the folder",
     "bends": "start_mm:arc_mm:radius_mm;…",
     "window": "from_s:to_s",
-    "axis": "x,y:x,y[:width_mm]",
+    "axis": "x,y:x,y[:x,y…][:width_mm]",
     "frames": "from:to",
     "yes_no": "yes, no",
     "choice": "1, 2",
@@ -58,11 +58,18 @@ _PICTURE_MEANINGS = {
     "dictionary": ("Markers of the board, as OpenCV names them.", "The program that printed the board says it."),
     "from_px": ("First point, x to the right and y down from the upper left corner.", "Any picture viewer shows it."),
     "to_px": ("Second point.", "Any picture viewer shows it."),
+    "via_px": (
+        "Points between, in order, of a path that bends; a smooth curve goes through all.",
+        "As the ends.",
+    ),
     "length_mm": ("Distance between the two points.", "Two marks of a ruler in the plane of growth."),
     "mm_per_px": ("Scale of the picture.", "Length of a ruler in the plane of growth over its pixels."),
     "width_mm": ("How wide a strip along the axis is looked at.", "About the diameter of the vine."),
 }
 """Meaning of each of those keys, and how one comes by it."""
+
+_PICTURE_DEFAULTS = {"via_px": "none: a straight line"}
+"""Defaults of those that do not come from the motion."""
 
 _PAGE_HEAD = """# Every column and key
 
@@ -149,7 +156,7 @@ def picture_entries() -> list[Entry]:
                 ends = {"_per_px": "mm/px", "_mm": "mm", "_px": "px"}
                 unit = next((text for end, text in ends.items() if name.endswith(end)), "")
                 of_kind = f" (kind: {kind})" if kind else ""
-                default = "required" if field.is_required() else "by the motion"
+                default = "required" if field.is_required() else _PICTURE_DEFAULTS.get(name, "by the motion")
                 entries.append(Entry(f"{prefix}.{name}{of_kind}", unit, default, _allowed(field), *meaning))
     return entries
 

@@ -298,7 +298,7 @@ COLUMNS: dict[str, Column] = {
             field="axis",
             kind="axis",
             shared=False,
-            meaning="Growth axis in the picture for this trial alone: x,y:x,y[:width_mm], in pixels.",
+            meaning="Growth axis in the picture for this trial alone: x,y:x,y[:width_mm], px; more points for a bend.",
             default="the axis of all trials, or found from the motion",
         ),
         Column(

@@ -6,8 +6,10 @@ in step. An unknown key, a key written twice and a value that is not allowed are
 
 from __future__ import annotations
 
+import math
 import os
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -26,7 +28,7 @@ from vinetrack.core.constants import BASE_EFFECTS
 from vinetrack.core.problems import ExperimentError, Problem, did_you_mean
 from vinetrack.core.records import Bend
 from vinetrack.core.yaml_document import YamlDocument, read_yaml
-from vinetrack.experiment.cells import read_limit, read_range, read_value, steps_between
+from vinetrack.experiment.cells import LEAST_APART_PX, read_limit, read_range, read_value, steps_between
 from vinetrack.experiment.other_units import in_key_units
 from vinetrack.experiment.schema import COLUMNS, LIMITED, SHARED
 
@@ -62,11 +64,15 @@ class AxisSettings(_Strict):
 
     from_px: Pixel
     to_px: Pixel
+    via_px: tuple[Pixel, ...] | None = None
     width_mm: Positive | None = None
 
     @model_validator(mode="after")
     def _has_a_direction(self) -> AxisSettings:
-        if self.from_px == self.to_px:
+        through = (self.from_px, *(self.via_px or ()), self.to_px)
+        if self.via_px and any(math.dist(a, b) < LEAST_APART_PX for a, b in pairwise(through)):
+            raise ValueError(f"neighbouring points are less than {LEAST_APART_PX} pixels apart: leave out the second")
+        if not self.via_px and self.from_px == self.to_px:
             raise ValueError("from_px and to_px are the same point: name two")
         return self
 
@@ -205,7 +211,7 @@ class ExperimentSettings(_SharedColumns):
     strict: bool = False
     """Whether a fault of one trial stops all."""
     axis: AxisSettings | None = None
-    """The growth axis in the picture, from_px, to_px and width_mm; found from the motion where blank."""
+    """The growth axis in the picture, from_px, to_px, width_mm, and via_px where it bends; found where blank."""
     calibration: Calibration | None = None
     """kind: charuco, checkerboard, two_points or mm_per_px, with the keys of that kind."""
     limits: Limits = Limits()

@@ -23,6 +23,8 @@ from vinetrack.results.folder_layout import Results, ResultsError, read_json, re
 if TYPE_CHECKING:
     import pandas as pd
 
+    from vinetrack.video.axis import Axis
+
 WIDEST_PX = 960
 """Chosen: as wide as the page shows a recording."""
 
@@ -44,8 +46,7 @@ class RecordingView:
 
     trial: str
     path: Path
-    from_px: tuple[float, float]
-    direction: tuple[float, float]
+    axis: Axis
     half_width_px: float
     time_s: Floats
     edge_px: Floats
@@ -91,9 +92,9 @@ class RecordingView:
         """
         if frame is not None and frame < self.shake_px.size:
             along_px += float(self.shake_px[frame])
-        (x0, y0), (dx, dy), half = self.from_px, self.direction, self.half_width_px
-        x, y = x0 + along_px * dx, y0 + along_px * dy
-        return (x - half * dy, x + half * dy), (y + half * dx, y - half * dx)
+        half = self.half_width_px
+        (x0, y0), (x1, y1) = self.axis.points(np.full(2, along_px), np.array([half, -half]))
+        return (float(x0), float(x1)), (float(y0), float(y1))
 
 
 def view_of(results: Results, trial: Trial) -> RecordingView | str:
@@ -124,16 +125,16 @@ def view_of(results: Results, trial: Trial) -> RecordingView | str:
 
 
 def _view(trial: Trial, axis: dict[str, Any], table: pd.DataFrame) -> RecordingView:
-    (x0, y0), (x1, y1) = axis["from_px"], axis["to_px"]
-    length = float(np.hypot(x1 - x0, y1 - y0))
+    from vinetrack.video.curved_axis import axis_of_entry
+
+    line = axis_of_entry(axis)
     width = axis.get("width_px")
     assert trial.video is not None
     return RecordingView(
         trial=trial.name,
         path=trial.video,
-        from_px=(float(x0), float(y0)),
-        direction=((x1 - x0) / length, (y1 - y0) / length),
-        half_width_px=0.75 * float(width) if width else 0.05 * length,
+        axis=line,
+        half_width_px=0.75 * float(width) if width else 0.05 * line.length_px,
         time_s=table["time_s"].to_numpy(dtype=float),
         edge_px=table["edge_px"].to_numpy(dtype=float),
         lead_position_m=table["lead_position_m"].to_numpy(dtype=float),

@@ -29,6 +29,8 @@ Floats = NDArray[np.float64]
 TRACKED, BEFORE, AFTER = "#F0E442", VERMILLION, SKY
 """Okabe and Ito's yellow, vermillion and sky blue: told apart by anyone, and on any grey."""
 
+PATH = "#9aa3b0"
+"""Grey of a bent path: the edges stay the only colours."""
 BAR, BAR_INK, BAR_MUTED = "#16191e", "#f2f4f7", "#9aa3b0"
 _LARGEST_ZOOM = 2.0
 """Pixels of the clip for one of the recording; chosen: beyond twice, single pixels are seen and nothing else is."""
@@ -108,6 +110,8 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
     pen = ImageDraw.Draw(small)
     models = [edge for edge in edges[1:] if not edge.by_hand]
     seen = [edge for i, edge in enumerate(edges) if i == 0 or edge.by_hand]
+    if view.axis.bends:
+        _draw_path(pen, view)
     for edge, reach in (*zip(models, _REACHES, strict=False), *((edge, 0.0) for edge in seen)):
         _draw_edge(pen, view, edge, frame, reach)
     _scale_bar(pen, view, line_px)
@@ -129,6 +133,12 @@ def _font(size_px: int, bold: bool = False) -> FreeTypeFont:
 
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/{name}", size_px)
+
+
+def _draw_path(pen: ImageDraw, view: ClipView) -> None:
+    """Draw the axis of a vine that bends, thin: a straight one tells itself."""
+    places = view.axis.points(np.arange(0.0, view.axis.length_px, 3.0))
+    pen.line([tuple((place + 0.5) * view.zoom - 0.5) for place in places], fill=PATH, width=1)
 
 
 def _draw_edge(pen: ImageDraw, view: ClipView, edge: Edge, frame: int, reach: float) -> None:

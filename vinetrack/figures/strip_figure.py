@@ -142,6 +142,9 @@ def _draw_frame(ax: Axes, tracking: Tracking, frame: int, picture: np.ndarray) -
     ax.imshow(shrunk(picture, _FRAME_PX), cmap="gray", extent=whole, interpolation="none")
     ax.set(xticks=[], yticks=[])
     ax.grid(visible=False)
+    if tracking.axis.bends:
+        path = tracking.axis.points(np.arange(0.0, tracking.axis.length_px, 3.0))
+        ax.plot(path[:, 0], path[:, 1], color=SKY, linewidth=0.8, linestyle=":")
     track = tracking.track
     edge = float(track.edge_px[frame]) if frame < track.edge_px.size else np.nan
     if np.isfinite(edge):

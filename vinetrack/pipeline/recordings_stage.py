@@ -127,6 +127,8 @@ def _differences(trial: Trial, measurement: Measurement) -> list[Problem]:
 
 def _view(measurement: Measurement, image: str | None) -> dict[str, Any]:
     """What the scale of a recording rests on, and the axis its `edge_px` counts along."""
+    from vinetrack.video.curved_axis import axis_entry
+
     calibration = measurement.calibration
     entry: dict[str, Any] = {
         "kind": "sheet" if calibration is None else calibration.kind,
@@ -140,7 +142,7 @@ def _view(measurement: Measurement, image: str | None) -> dict[str, Any]:
     }
     axis = measurement.tracking.axis
     shake_px = measurement.tracking.shake_px
-    line = {"from_px": axis.from_px, "to_px": axis.to_px, "width_px": axis.width_px}
+    line = axis_entry(axis) | {"width_px": axis.width_px}
     line |= {"shake_px": shake_px.round(2)} if np.any(shake_px) else {}
     return {"calibration": entry, "axis": line}
 

@@ -256,6 +256,8 @@ def _write(
 
 
 def _seen(measurement: Measurement, table: pd.DataFrame, options: TrackOptions, rate: float) -> dict[str, Any]:
+    from vinetrack.video.curved_axis import axis_entry
+
     tracking = measurement.tracking
     edge_px = tracking.track.edge_px
     usable = np.isfinite(edge_px)
@@ -271,7 +273,7 @@ def _seen(measurement: Measurement, table: pd.DataFrame, options: TrackOptions, 
     return {
         "n_frames": len(edge_px),
         "n_known": int(usable.sum()),
-        "axis": {"from_px": axis.from_px, "to_px": axis.to_px},
+        "axis": axis_entry(axis),
         "axis_given": options.axis is not None,
         "mm_per_px": 1e3 * scale,
         "scale_rel_sigma": measurement.scale_rel_sigma,
@@ -288,6 +290,7 @@ def _seen(measurement: Measurement, table: pd.DataFrame, options: TrackOptions, 
 def _seen_lines(seen: dict[str, Any]) -> list[str]:
     ends = (*seen["axis"]["from_px"], *seen["axis"]["to_px"])
     axis = "Axis ({:.0f}, {:.0f}) → ({:.0f}, {:.0f}) px".format(*ends)
+    axis += ", a curve" if "via_px" in seen["axis"] else ""
     width = f"; tube {number(seen['tube_width_px'])} px wide" if math.isfinite(seen["tube_width_px"]) else ""
     metres = f" = {number(seen['growth_mm'])} mm" if math.isfinite(seen["growth_mm"]) else ""
     speed = f"{number(seen['fastest_px_per_frame'])} px a frame"

@@ -48,7 +48,7 @@ SHARED_ERROR = (
 METHODS = (
     (
         "Edge",
-        "A straight strip along the axis of growth is cut from every frame and freed of flicker and shake by what "
+        "A strip along the axis of growth is cut from every frame and freed of flicker and shake by what "
         "stands still beside the vine. A pixel that the vine covers changes once: its brightness before and after and "
         "the place of the edge in every frame are found in turns, the edge by maximum likelihood from a step blurred "
         "by optics and by its own motion, at mid-exposure. Time is the number of the frame over the rate of capture.",

@@ -23,6 +23,7 @@ from vinetrack.experiment.sheet import SHEET, read_row
 from vinetrack.tracks.importers import TrackError, read_pressure_trace
 from vinetrack.video.axis import Axis
 from vinetrack.video.board_search import find_board
+from vinetrack.video.curved_axis import CurvedAxis, axis_through
 from vinetrack.video.frames import RecordingError, inspect_recording, iterate_frames, read_frames
 from vinetrack.video.measure import Measurement, measure_recording
 from vinetrack.video.quick_look import proposed_axis
@@ -39,6 +40,9 @@ THUMBNAIL_PX = 220
 """Width of the pictures in the list; chosen: as wide as its column."""
 BLANK = 128
 """Grey level of the strip where no frame was decoded. Chosen between black and white; nothing depends on it."""
+PATH_STEP_PX = 4.0
+"""Distance of the places along a curve that the page gets, px. Chosen: between them it is drawn straight, off by less
+than 0.1 px at radii above 20 px; at half the page gets twice as many, at twice it is off by four times as much."""
 STRIP_PX = 1600
 """Longest side of a strip; chosen: twice the page's width on a common screen."""
 
@@ -203,10 +207,15 @@ def axis_json(axis: Axis) -> dict[str, Any]:
 
     Returns
     -------
-    mapping of JSON types: `from_px`, `to_px`, and `width_px`, None where unknown.
+    mapping of JSON types: `from_px`, `to_px`, of a curve `via_px` and places in equal steps along it, `path_px`; and
+        `width_px`, None where unknown.
     """
     width = round(axis.width_px, 2) if math.isfinite(axis.width_px) else None
-    ends = {"from_px": [round(v, 2) for v in axis.from_px], "to_px": [round(v, 2) for v in axis.to_px]}
+    ends: dict[str, Any] = {"from_px": [round(v, 2) for v in axis.from_px], "to_px": [round(v, 2) for v in axis.to_px]}
+    if isinstance(axis, CurvedAxis):
+        ends["via_px"] = [[round(v, 2) for v in point] for point in axis.via_px]
+        along = np.linspace(0.0, axis.length_px, max(2, round(axis.length_px / PATH_STEP_PX)))
+        ends["path_px"] = axis.points(along).round(2).tolist()
     return {**ends, "width_px": width}
 
 
@@ -299,8 +308,7 @@ def _axis_of(trial: Trial, settings: ExperimentSettings) -> Axis | None:
     given = trial.axis or settings.axis
     if given is None:
         return None
-    (from_x, from_y), (to_x, to_y) = given.from_px, given.to_px
-    return Axis((from_x, from_y), (to_x, to_y))
+    return axis_through((given.from_px, *(given.via_px or ()), given.to_px))
 
 
 def _track_json(tracking: Tracking) -> dict[str, Any]:

@@ -61,6 +61,11 @@ class Axis:
         return float(np.hypot(self.to_px[0] - self.from_px[0], self.to_px[1] - self.from_px[1]))
 
     @property
+    def bends(self) -> bool:
+        """Whether it is a curve; see `curved_axis`."""
+        return False
+
+    @property
     def direction(self) -> Floats:
         """Unit vector of growth (x, y), shape (2,)."""
         return np.subtract(self.to_px, self.from_px) / self.length_px

@@ -176,6 +176,7 @@ class Outline:
     `shift_px` and `slope` (px a px) are of the centreline across the strip; `half_px` is half of what holds all of the
     width, with room for its blur; `width_px` the width between the sides and `width_sigma_px` its standard error.
     `path_px`, shape (n_frames,), is a first path of the front and `passed` the first and last column passed.
+    `middles_px`, shape (n_parts,), is where the middle lies across at `places_px` along, of the parts of usual width.
     """
 
     shift_px: float
@@ -185,6 +186,8 @@ class Outline:
     width_sigma_px: float
     path_px: Floats
     passed: tuple[int, int]
+    places_px: Floats
+    middles_px: Floats
 
 
 def outline(strip: Strip, parts: int = 12) -> Outline:
@@ -222,12 +225,13 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     width = side[:, 1] - side[:, 0]
     alike = np.abs(width - np.median(width)) <= 0.15 * np.median(width) + 2
     alike |= ~alike.any()  # two kinds of width, as many of each: neither is the usual one
-    slope, begin = _robust_line(place[alike], side[alike].mean(axis=1))
+    place, centre = place[alike], side[alike].mean(axis=1)
+    slope, begin = _robust_line(place, centre)
     middle = float(np.median(width))
     scatter = 1.4826 * float(np.median(np.abs(width - middle))) / np.sqrt(len(width))
     faint = FAINT_PART * middle if float(np.median(contrasts)) < FAINT else 0.0
     sigma = float(np.linalg.norm([scatter, SIDES_PX, faint]))
-    return Outline(begin, slope, middle / 2 + 1.5, middle, sigma, path, passed)
+    return Outline(begin, slope, middle / 2 + 1.5, middle, sigma, path, passed, place, centre)
 
 
 def rough_growth(strip: Strip) -> tuple[float, float]:

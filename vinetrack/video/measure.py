@@ -14,6 +14,7 @@ from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.capture_clock import capture_rate
+from vinetrack.video.curved_axis import CurvedAxis, axis_through
 from vinetrack.video.event_frames import read_event
 from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording
 from vinetrack.video.sound_frames import sound_stretch
@@ -78,9 +79,16 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     axis = given_axis(trial, settings, m_per_px if calibration is None else calibration.m_per_px)
     if calibration is not None:
         axis = axis or _found_axis(_sound_luma(frames), trial)
-        along = calibration.along(axis.from_px, axis.to_px)
+        along = calibration.along_path(axis)
         m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
-    tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m)
+    along_path = None if calibration is None else calibration.along_path
+    tracking = track_frames(
+        frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m, along_path=along_path
+    )
+    if calibration is not None and isinstance(tracking.axis, CurvedAxis):
+        off_px = tracking.tube_width_sigma_px / 2 if math.isfinite(tracking.tube_width_sigma_px) else 0.0
+        along = calibration.along_path(tracking.axis, off_px)
+        m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
     # What is to be said of a scale that was merely given belongs to the experiment, not to each of its trials.
     notes = calibration.notes if calibration is not None and math.isfinite(calibration.reprojection_px) else ()
     tracking = replace(tracking, track=replace(tracking.track, notes=(*tracking.track.notes, *notes)))
@@ -128,13 +136,13 @@ def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> A
     in the picture, px; None where neither has one.
     """
     if trial.axis is not None:
-        return Axis(trial.axis.from_px, trial.axis.to_px, trial.axis.width_m / m_per_px)
+        given_here = trial.axis
+        return axis_through((given_here.from_px, *given_here.via_px, given_here.to_px), given_here.width_m / m_per_px)
     if settings.axis is None:
         return None
     given = settings.axis
     width_px = given.width_mm / 1e3 / m_per_px if given.width_mm is not None else math.nan
-    (from_x, from_y), (to_x, to_y) = given.from_px, given.to_px
-    return Axis((from_x, from_y), (to_x, to_y), width_px)
+    return axis_through((given.from_px, *(given.via_px or ()), given.to_px), width_px)
 
 
 def _sound_luma(frames: Frames) -> NDArray[Any]:

@@ -107,16 +107,28 @@ class PlaneMap:
         -------
         a fraction.
         """
-        ends = np.array([from_px, to_px], dtype=float)
+        return self.path_rel_sigma(np.array([from_px, to_px], dtype=float))
+
+    def path_rel_sigma(self, places_px: Floats) -> float:
+        """Return the relative standard error of the length of a path in the plane, from the covariance of the fit.
+
+        Parameters
+        ----------
+        places_px : (x, y) along the path, shape (n, 2), px.
+
+        Returns
+        -------
+        a fraction.
+        """
         gradient = np.zeros(self.parameters.size)
         steps = np.maximum(0.01 * np.sqrt(np.diag(self.covariance)), 1e-9).tolist()
         for k, step in enumerate(steps):
             change = np.zeros(self.parameters.size)
             change[k] = step
-            (a, b), (c, d) = (self._plane_m(self.parameters + sign * change, ends) for sign in (-1, 1))
-            gradient[k] = (np.linalg.norm(d - c) - np.linalg.norm(b - a)) / (2 * step)
+            less, more = (_length(self._plane_m(self.parameters + sign * change, places_px)) for sign in (-1, 1))
+            gradient[k] = (more - less) / (2 * step)
         variance = float(gradient @ self.covariance @ gradient)
-        return float(np.sqrt(max(variance, 0.0))) / self.length_m(from_px, to_px)
+        return float(np.sqrt(max(variance, 0.0))) / _length(self.plane_m(places_px))
 
     def _plane_m(self, parameters: Floats, picture_px: Floats) -> Floats:
         size = (self.width_px, self.height_px)
@@ -141,6 +153,11 @@ class PlaneFit:
     def reprojection_px(self) -> float:
         """Root mean square distance of corners from where the fit puts them, px."""
         return float(np.sqrt(np.mean(np.concatenate([(view**2).sum(axis=1) for view in self.residual_px]))))
+
+
+def _length(path_m: Floats) -> float:
+    """Length of a path through places of the plane, shape (n, 2), m."""
+    return float(sum(np.linalg.norm(step) for step in np.diff(path_m, axis=0)))
 
 
 def _half_diagonal_px(width_px: int, height_px: int) -> float:

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, SmallPictures, find_axis, is_orderly
+from vinetrack.video.curved_strip import curve_parts, cut_along
 from vinetrack.video.edge import Outline, outline, rough_growth
 from vinetrack.video.frames import Recording, RecordingError, iterate_frames
-from vinetrack.video.strip import Strip, cut_strip, squared
+from vinetrack.video.strip import Strip, squared
 from vinetrack.video.track import CENTRINGS, centred, whereabouts
 
 LOOKED_AT = 100
@@ -105,11 +106,11 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
 
 def _about_the_tube(luma: NDArray[Any], axis: Axis) -> tuple[Strip, Outline]:
     """A strip that is centred on the tube, and the tube's outline in it."""
-    strip = cut_strip(luma, squared(axis), 0.65 * axis.width_px + 3)
-    sides = outline(strip)
+    strip = cut_along(luma, squared(axis), 0.65 * axis.width_px + 3)
+    sides = outline(strip, curve_parts(axis))
     for _ in range(2 * CENTRINGS):
         before, strip = strip, centred(luma, strip, sides)
         if strip is before:
             break
-        sides = outline(strip)
+        sides = outline(strip, curve_parts(axis))
     return strip, sides

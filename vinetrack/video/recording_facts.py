@@ -18,6 +18,7 @@ from vinetrack.core.problems import Problem
 from vinetrack.core.records import Trial
 from vinetrack.core.terminal import table
 from vinetrack.video.axis import Axis
+from vinetrack.video.curved_axis import CurvedAxis, axis_entry
 from vinetrack.video.measure import Measurement
 from vinetrack.video.track import Tracking
 
@@ -212,7 +213,7 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
     """
     upright, level = [], []
     for fact, trial in zip(facts, trials, strict=True):
-        if fact.axis is None or trial.travel_ratio == 1:
+        if fact.axis is None or isinstance(fact.axis, CurvedAxis) or trial.travel_ratio == 1:
             continue
         right, down = (abs(b - a) for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
         slope_deg = math.degrees(math.atan2(down, right))
@@ -275,7 +276,7 @@ def facts_entry(facts: RecordingFacts) -> dict[str, Any]:
     units stand in the keys.
     """
     entry = {key: value for key, value in vars(facts).items() if key != "axis"}
-    axis = None if facts.axis is None else {"from_px": facts.axis.from_px, "to_px": facts.axis.to_px}
+    axis = None if facts.axis is None else axis_entry(facts.axis)
     return entry | {"duration_s": facts.duration_s, "axis": axis}
 
 

@@ -171,8 +171,10 @@ def squared(axis: Axis) -> Axis:
 
     Returns
     -------
-    the axis, or the same where it slopes by more.
+    the axis, or the same where it slopes by more or is a curve.
     """
+    if type(axis) is not Axis:
+        return axis
     (x0, y0), (x1, y1) = axis.from_px, axis.to_px
     if abs(y1 - y0) <= 0.4 and abs(x1 - x0) > 10:
         y = round((y0 + y1) / 2)

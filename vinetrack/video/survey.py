@@ -18,6 +18,7 @@ from vinetrack.core.records import PictureAxis, Trial
 from vinetrack.core.terminal import progress
 from vinetrack.experiment.settings import AxisSettings, ExperimentSettings
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
+from vinetrack.video.curved_axis import axis_through, curve_complaint
 from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.measure import given_axis
 from vinetrack.video.quick_look import look_at
@@ -218,18 +219,35 @@ def _judge_scale(
     elif unscaled:
         problems += _judge_calibration(settings, folder, sizes, calibrations)
     for trial, recording in opened.items():
-        if trial.axis is not None and not _inside(trial.axis, recording):
-            message = f"leaves the picture of {recording.path.name}, {recording.width} × {recording.height} pixels"
-            remedy = "give two points inside it"
-            problems.append(Problem(message=message, trial=trial.name, column="axis", remedy=remedy))
+        if trial.axis is not None:
+            problems += _judge_axis(trial, trial.axis, recording, {"trial": trial.name}, calibrations)
     if settings.axis is not None:
-        shared = [recording for trial, recording in opened.items() if trial.axis is None]
-        outside = [recording for recording in shared if not _inside(settings.axis, recording)]
-        if outside:
-            message = f"leaves the picture of {outside[0].path.name}, {outside[0].width} × {outside[0].height} pixels"
-            remedy = "give two points inside it"
-            problems.append(Problem(message=message, file=SETTINGS, column="axis", remedy=remedy))
+        for trial, recording in opened.items():
+            given = _judge_axis(trial, settings.axis, recording, {"file": SETTINGS}, calibrations)
+            if trial.axis is None and given:
+                problems += given
+                break
     return problems, calibrations
+
+
+def _judge_axis(
+    trial: Trial, given: AxisSettings | PictureAxis, recording: Recording, place: dict[str, Any],
+    calibrations: Calibrations,
+) -> list[Problem]:  # fmt: skip
+    """What is wrong with a given axis in the picture of one recording, told at its place in the files."""
+    through = (given.from_px, *(given.via_px or ()), given.to_px)
+    if not all(-0.5 <= x <= recording.width - 0.5 and -0.5 <= y <= recording.height - 0.5 for x, y in through):
+        message = f"leaves the picture of {recording.path.name}, {recording.width} × {recording.height} pixels"
+        remedy = f"give {'points' if given.via_px else 'two points'} inside it"
+        return [Problem(message=message, column="axis", remedy=remedy, **place)]
+    if not given.via_px:
+        return []
+    scale = calibrations.get((recording.width, recording.height))
+    m_per_px = trial.m_per_px if scale is None or math.isfinite(trial.m_per_px) else scale.m_per_px
+    width_mm = given.width_mm if isinstance(given, AxisSettings) else 1e3 * given.width_m
+    width_m = trial.diameter_m if width_mm is None or math.isnan(width_mm) else width_mm / 1e3
+    complaint = curve_complaint(axis_through(through), width_m / m_per_px / 2, (recording.width, recording.height))
+    return [] if complaint is None else [Problem(message=complaint[0], column="axis", remedy=complaint[1], **place)]
 
 
 def _judge_calibration(
@@ -253,11 +271,6 @@ def _judge_calibration(
         if image is not None:
             notes |= dict.fromkeys(calibration.notes)
     return [Problem(message=f"is weak: {note}", severity="warning", **place) for note in notes]
-
-
-def _inside(axis: AxisSettings | PictureAxis, recording: Recording) -> bool:
-    ends = (axis.from_px, axis.to_px)
-    return all(-0.5 <= x <= recording.width - 0.5 and -0.5 <= y <= recording.height - 0.5 for x, y in ends)
 
 
 def _unusable(error: Exception, name: str) -> Problem:

@@ -13,6 +13,15 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats, Indices, Track, Trial
 from vinetrack.video.axis import Axis, SmallPictures, centred_on_motion, find_axis, is_orderly
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
+from vinetrack.video.curved_axis import CurvedAxis
+from vinetrack.video.curved_strip import (
+    beside_curve,
+    curve_parts,
+    cut_along,
+    orderly_along,
+    refuse_poor_curve,
+    widest_px,
+)
 from vinetrack.video.event_frames import read_event
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording
@@ -20,10 +29,11 @@ from vinetrack.video.hand_corrections import corrected_by_hand
 from vinetrack.video.motion_end import cut_short, end_of_body, end_of_growth, is_grown
 from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
 from vinetrack.video.sound_frames import sound_stretch
-from vinetrack.video.strip import Strip, cut_strip, recut, squared
+from vinetrack.video.strip import Strip, recut, squared
 
 if TYPE_CHECKING:
     from vinetrack.video.body import EndOfWay
+    from vinetrack.video.calibration import AxisScale
     from vinetrack.video.edge import EdgeFit, Outline
 
 
@@ -152,6 +162,7 @@ def track_frames(
     *,
     m_per_px: float | None = None,
     position_m: Callable[[Floats], Floats] | None = None,
+    along_path: Callable[[Axis], AxisScale] | None = None,
 ) -> Tracking:
     """Track frames that are in memory already; see `track_recording`.
 
@@ -160,6 +171,7 @@ def track_frames(
     frames : decoded, with their capture periods.
     trial, axis, m_per_px, position_m : as in `track_recording`.
     capture_fps : frames a second.
+    along_path : the calibration's scale along a curve, which takes the place of `position_m` where the axis is one.
 
     Returns
     -------
@@ -232,6 +244,8 @@ def track_frames(
         notes.append(f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {first}")
     track = _assemble(frames, kept, edge_fit, sigma, verdict, capture_fps, exposure_s, notes)
     track = corrected_by_hand(track, trial.corrections)
+    if isinstance(strip.axis, CurvedAxis) and along_path is not None:
+        position_m = along_path(strip.axis).position_m
     track = _in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
     pictures = tuple((int(number[kept[i]]), luma[i].copy()) for i in chosen)
@@ -258,6 +272,8 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     axis, px; and False where the vine bends or sweeps away.
     """
     given = axis is not None
+    if isinstance(axis, CurvedAxis):
+        return _along_given_curve(luma, axis, trial, m_per_px)
     small = SmallPictures(luma)
     axis = axis if axis is not None else find_axis(small)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
@@ -269,13 +285,25 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     return axis, trial.travel_ratio == 1 or is_orderly(small, axis)
 
 
+def _along_given_curve(
+    luma: NDArray[Any], axis: CurvedAxis, trial: Trial, m_per_px: float | None
+) -> tuple[CurvedAxis, bool]:
+    """A given curve with a width, that of its strip at most; and whether what changes along it is one front."""
+    half = _half_width(axis, trial, m_per_px)
+    known = np.isfinite(axis.width_px) or np.isfinite(trial.diameter_m * (m_per_px or trial.m_per_px))
+    refuse_poor_curve(axis, half if known else math.nan, luma.shape[1:])
+    wide = min(2 * half + ROOM * axis.length_px, 2 * widest_px(axis))
+    axis = replace(axis, width_px=max(wide, 2 * half) if known else wide)
+    return axis, trial.travel_ratio == 1 or orderly_along(luma, axis)
+
+
 def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, orderly: bool) -> tuple[Strip, _Edge]:
     """Strip and positions; the axis is centred on what moves along it."""
     half = axis.width_px / 2
     if trial.travel_ratio == 1:
         from vinetrack.video.body import track_body
 
-        strip = cut_strip(luma, axis, 1.5 * half + 12)
+        strip = cut_along(luma, axis, 1.5 * half + 12)
         fit = track_body(strip)
         place = np.where(fit.unseen, np.nan, fit.position_px)
         return strip, _Edge(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end)
@@ -285,12 +313,12 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
         if not orderly:
             from vinetrack.video.kymograph import track_arrival
 
-            strip = cut_strip(luma, axis, min(8 * half, 0.3 * max(luma.shape[1:])))
+            strip = cut_along(luma, axis, min(8 * half, 0.3 * max(luma.shape[1:])))
             edge, sigma = track_arrival(strip)
             return strip, _Edge(edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames, 2.0)
-        strip = cut_strip(luma, squared(axis), 1.3 * half + 3)
+        strip = cut_along(luma, squared(axis), 1.3 * half + 3)
         for _ in range(CENTRINGS):
-            before, sides = strip, outline(strip)
+            before, sides = strip, outline(strip, curve_parts(axis))
             strip = centred(luma, strip, sides)
             if strip is before:
                 break
@@ -331,9 +359,14 @@ def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
     the strip.
     """
     shift, slope, half = sides.shift_px, sides.slope, sides.half_px
+    room = (strip.values.shape[1] - 1) / 2 - half - 3
+    if isinstance(strip.axis, CurvedAxis):
+        curve, away = beside_curve(strip.axis, sides)
+        if away < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
+            return strip
+        return cut_along(luma, curve, half * 1.15 + 5)
     tilt = slope * strip.axis.length_px
     middle = shift + tilt / 2
-    room = (strip.values.shape[1] - 1) / 2 - half - 3
     if abs(middle) + abs(tilt) / 2 < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
         return strip
     start = strip.axis.points(np.array(0.0), shift)

@@ -1,6 +1,6 @@
 // The motion: strip along the axis with the edge that is found, position against time, the measured pressure beside it.
 import {$, ask, changed, content, decimals, el, round, state} from "./state.js";
-import {row, showFrame, shownFrame} from "./picture.js";
+import {placesOf, row, showFrame, shownFrame} from "./picture.js";
 
 let last = null;
 
@@ -130,20 +130,40 @@ function point(i) {
 function edgeAt(i) {
   const made = last;
   if (!made) return null;
-  const {from_px: [x0, y0], to_px: [x1, y1]} = made.axis;
-  const length = Math.hypot(x1 - x0, y1 - y0);
-  const [ux, uy] = [(x1 - x0) / length, (y1 - y0) / length];
-  const half = 0.75 * (made.axis.width_px || 0.1 * length);
+  const places = placesOf(made.axis);
+  const step = made.length_px / (places.length - 1);
+  const half = 0.75 * (made.axis.width_px || 0.1 * made.length_px);
   const shake = made.shake_px[i] ?? 0;
   // A frame without an edge offers one where its neighbours have theirs.
   const edge = made.edge_px[i] ?? nearest(made.edge_px, i);
   if (edge === null) return null;
   const s = edge + shake;
-  const middle = () => [x0 + s * ux, y0 + s * uy];
+  const part = Math.max(0, Math.min(places.length - 2, Math.floor(s / step)));
+  const [mx, my, ux, uy] = along(places, part, step, s - part * step);
   return {
-    line: {x1: x0 + s * ux - half * uy, y1: y0 + s * uy + half * ux, x2: x0 + s * ux + half * uy, y2: y0 + s * uy - half * ux}, middle,
-    put: ([x, y]) => correct(i, "move", round((x - x0) * ux + (y - y0) * uy - shake, 2)),
+    line: {x1: mx - half * uy, y1: my + half * ux, x2: mx + half * uy, y2: my - half * ux}, middle: () => [mx, my],
+    put: (point) => correct(i, "move", round(nearestAlong(places, step, point) - shake, 2)),
   };
+}
+
+// Place and direction `by` px along one part of an axis, which goes straight on beyond its ends.
+function along(places, part, step, by) {
+  const [[x0, y0], [x1, y1]] = [places[part], places[part + 1]];
+  const [ux, uy] = [(x1 - x0) / step, (y1 - y0) / step];
+  return [x0 + by * ux, y0 + by * uy, ux, uy];
+}
+
+function nearestAlong(places, step, [x, y]) {
+  let [best, least] = [0, Infinity];
+  for (let part = 0; part < places.length - 1; part += 1) {
+    const [x0, y0, ux, uy] = along(places, part, step, 0);
+    const low = part === 0 ? -Infinity : 0;
+    const high = part === places.length - 2 ? Infinity : step;
+    const by = Math.max(low, Math.min(high, (x - x0) * ux + (y - y0) * uy));
+    const away = Math.hypot(x0 + by * ux - x, y0 + by * uy - y);
+    if (away < least) [best, least] = [part * step + by, away];
+  }
+  return best;
 }
 
 function nearest(values, i) {

@@ -81,7 +81,10 @@ export function drawPicture() {
 
 function ofCell(text) {
   const parts = (text ?? "").split(":").map((part) => part.split(",").map(Number));
-  return parts.length >= 2 && parts.every((part) => part.every(Number.isFinite)) ? {from_px: parts[0], to_px: parts[1], width: parts[2]?.[0]} : null;
+  const points = parts.filter((part) => part.length === 2);
+  if (points.length < 2 || !parts.every((part) => part.every(Number.isFinite))) return null;
+  const width = parts.at(-1).length === 1 ? parts.at(-1)[0] : undefined;
+  return {from_px: points[0], to_px: points.at(-1), via_px: points.slice(1, -1), width};
 }
 
 export function currentAxis() {
@@ -93,15 +96,21 @@ export function currentAxis() {
 
 function setAxis(axis, scope) {
   const ends = {from_px: axis.from_px.map((v) => round(v)), to_px: axis.to_px.map((v) => round(v))};
+  if (axis.via_px?.length) ends.via_px = axis.via_px.map((point) => point.map((v) => round(v)));
   if (scope === "trial") {
     const width = axis.width ? `:${axis.width}` : "";
-    row().axis = `${ends.from_px.join(",")}:${ends.to_px.join(",")}${width}`;
+    row().axis = `${[ends.from_px, ...(ends.via_px ?? []), ends.to_px].map((point) => point.join(",")).join(":")}${width}`;
     if (!state.sheet.columns.includes("axis")) state.sheet.columns.push("axis");
   } else {
     state.axis = {...(state.axis?.width_mm ? {width_mm: state.axis.width_mm} : {}), ...ends};
     if (row().axis) row().axis = "";
   }
   changed();
+}
+
+// Places along an axis in equal steps: those of a curve as the server laid it, else its points.
+export function placesOf(axis) {
+  return axis.path_px ?? [axis.from_px, ...(axis.via_px ?? []), axis.to_px];
 }
 
 function clearAxis() {
@@ -146,11 +155,13 @@ function drawEdge(over, unit) {
 
 function drawAxis(over, axis, unit, handles) {
   const kind = axis.given ? "axis-line given" : "axis-line proposed";
-  const [[x0, y0], [x1, y1]] = [axis.from_px, axis.to_px];
+  const places = placesOf(axis);
+  const [[x0, y0], [x1, y1]] = places.slice(-2);
+  if (places.length > 2) over.append(el("polyline", {class: kind, fill: "none", points: places.slice(0, -1).join(" "), "stroke-width": 2 * unit}));
   const line = (cls, dx, dy, width) => el("line", {class: cls, x1: x0 + dx, y1: y0 + dy, x2: x1 + dx, y2: y1 + dy, "stroke-width": width * unit});
   const length = Math.hypot(x1 - x0, y1 - y0);
   const half = (axis.width_px ?? 0) / 2;
-  if (half) for (const side of [-half, half]) over.append(line(`${kind} side`, (-side * (y1 - y0)) / length, (side * (x1 - x0)) / length, 1));
+  if (half && places.length === 2) for (const side of [-half, half]) over.append(line(`${kind} side`, (-side * (y1 - y0)) / length, (side * (x1 - x0)) / length, 1));
   over.append(line(kind, 0, 0, 2));
   const [ux, uy] = [(x1 - x0) / length, (y1 - y0) / length];
   const tip = 11 * unit;

@@ -1,0 +1,137 @@
+"""Recordings of a tube that grows along a curve, drawn by code that shares nothing with the package.
+
+The curve is a polyline sampled every 1/20 px from its own formula (lines and arcs of circles), the arc length that of
+those arcs; every pixel knows its nearest place. `bent_scene` draws frames in memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from plain_scene import texture
+from scipy.spatial import cKDTree
+
+
+@dataclass(frozen=True)
+class BentPlan:
+    """What is in the picture. Lengths in px, speeds in px a frame, brightness in grey levels of 255.
+
+    `pieces` are (length, turn in degrees, positive from x towards y) one behind the other from `from_px`, where the
+    tube points to `angle_deg`: straight where the turn is 0, else an arc of a circle.
+    """
+
+    pieces: tuple[tuple[float, float], ...]
+    seed: int = 0
+    width: int = 640
+    height: int = 640
+    from_px: tuple[float, float] = (40.0, 80.0)
+    angle_deg: float = 0.0
+    start_px: float = 60.0
+    rest_frames: int = 10
+    end_frames: int = 8
+    speed: float = 14.0
+    rise_frames: float = 8.0
+    exposure: float = 0.3
+    radius: float = 20.0
+    tip_depth: float = 8.0
+    background: float = 70.0
+    background_sd: float = 8.0
+    film: float = 165.0
+    opacity: float = 0.75
+    wall_sd: float = 10.0
+    tail_sd: float = 8.0
+    psf: float = 0.9
+    noise: float = 2.5
+
+
+@dataclass(frozen=True)
+class BentScene:
+    """Frames, shape (n, height, width), uint8; true arc length of the tip at mid-exposure, shape (n,), px from the
+    curve's beginning, which frames move, and the curve: places (x, y) and their arc length, px.
+    """
+
+    plan: BentPlan
+    frames: np.ndarray
+    edge_px: np.ndarray
+    moving: np.ndarray
+    curve_px: np.ndarray
+    arc_px: np.ndarray
+
+    def places(self, along_px: np.ndarray) -> np.ndarray:
+        """Places (x, y) of the curve, shape (n, 2), px."""
+        return np.stack([np.interp(along_px, self.arc_px, self.curve_px[:, k]) for k in (0, 1)], axis=1)
+
+
+BENDS: dict[str, dict] = {
+    "quarter": {"pieces": ((120.0, 0.0), (471.2, 90.0), (90.0, 0.0))},
+    "s_shape": {"pieces": ((80.0, 0.0), (260.0, 60.0), (260.0, -60.0), (80.0, 0.0)), "from_px": (30.0, 120.0)},
+    "gentle": {"pieces": ((80.0, 0.0), (480.0, 25.0)), "from_px": (30.0, 200.0)},
+    "kink": {"pieces": ((260.0, 0.0), (110.0, 70.0), (240.0, 0.0)), "from_px": (40.0, 120.0)},
+}
+"""Curves by name: a quarter circle of 300 px radius, an S of 248 px, a gentle bend of 1100 px, a sharp one of 90 px."""
+
+
+def curve_of(plan: BentPlan) -> tuple[np.ndarray, np.ndarray]:
+    """Places (x, y), shape (n, 2), and arc length, (n,), px, every 1/20 px along the plan's pieces."""
+    x, y, angle, done = *plan.from_px, np.radians(plan.angle_deg), 0.0
+    places, arcs = [], []
+    for length, turn in plan.pieces:
+        s = np.arange(0, length, 0.05)
+        bend = np.radians(turn) / length
+        if bend:
+            turned = angle + bend * np.append(s, length)
+            way = np.stack([np.sin(turned) - np.sin(angle), np.cos(angle) - np.cos(turned)], axis=1) / bend
+        else:
+            way = np.outer(np.append(s, length), [np.cos(angle), np.sin(angle)])
+        way += (x, y)
+        places.append(way[:-1])
+        arcs.append(s + done)
+        x, y, angle, done = *way[-1], angle + bend * length, done + length
+    return np.concatenate(places), np.concatenate(arcs)
+
+
+def bent_scene(plan: BentPlan) -> BentScene:
+    """Draw the plan: a textured tube with a rounded tip, blurred along its way by the exposure, over a still ground."""
+    rng = np.random.default_rng(plan.seed)
+    curve, arc = curve_of(plan)
+    end = float(arc[-1]) - 20.0
+
+    def travel(time: np.ndarray) -> np.ndarray:
+        t = np.clip(time - plan.rest_frames, 0.0, None)
+        run = plan.speed * (t - plan.rise_frames * (1 - np.exp(-t / plan.rise_frames)))
+        return np.minimum(plan.start_px + run, end)
+
+    n = int(np.argmax(travel(np.arange(5000.0)) >= end)) + plan.end_frames
+    h, w = plan.height, plan.width
+    yy, xx = np.mgrid[0:h, 0:w].astype(np.float32)
+    away, nearest = cKDTree(curve).query(np.column_stack([xx.ravel(), yy.ravel()]))
+    tangent = np.gradient(curve, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    offset = np.column_stack([xx.ravel(), yy.ravel()]) - curve[nearest]
+    unit = tangent[nearest]
+    along = (arc[nearest] + np.sum(offset * unit, axis=1)).reshape(h, w)
+    across = (unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]).reshape(h, w)
+    beside = away.reshape(h, w) < plan.radius + 8
+    back = plan.background + texture(rng, (h, w), 2.0, plan.background_sd)
+    wall, tail = texture(rng, (h, w), 2.5, plan.wall_sd), texture(rng, (64, 4096), 3.0, plan.tail_sd)
+    inside = np.clip(plan.radius - np.abs(across) + 0.5, 0, 1) * beside
+    bulge = plan.tip_depth * (1 - np.sqrt(np.clip(1 - (across / plan.radius) ** 2, 0, 1)))
+    shade = 1 - 0.25 * np.clip(across / plan.radius, -1, 1) ** 2
+    rows = np.clip(across + 32, 0, 63).astype(np.int32)
+    frames = np.empty((n, h, w), np.uint8)
+    for i in range(n):
+        steps = travel(i + plan.exposure * (np.arange(12) + 0.5) / 12)
+        cover, inner = np.zeros((h, w)), np.zeros((h, w))
+        for now in steps:
+            cover += np.clip(now - bulge - along + 0.5, 0, 1)
+            inner += tail[rows, np.mod((along - 2 * now).astype(np.int32), 4096)] * (np.abs(across) < 0.6 * plan.radius)
+        tube = plan.opacity * (plan.film * shade + wall) + (1 - plan.opacity) * back + inner / 12
+        picture = back + cover / 12 * inside * (tube - back)
+        picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
+        grain = rng.standard_normal((h, w)).astype(np.float32) * plan.noise * np.sqrt(np.clip(picture, 1, None) / 100)
+        frames[i] = np.clip(np.rint(picture + grain), 0, 255).astype(np.uint8)
+    edge = travel(np.arange(n) + plan.exposure / 2)
+    moving = (travel(np.arange(n) + plan.exposure) > plan.start_px) & (travel(np.arange(n, dtype=float)) < end)
+    return BentScene(plan, frames, edge, moving, curve, arc)

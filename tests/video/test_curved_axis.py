@@ -1,0 +1,177 @@
+"""A growth axis that bends: its geometry, the strip along it, positions along it and their scale."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bent_scene import BENDS, BentPlan, BentScene, bent_scene
+
+from vinetrack.core.records import Trial
+from vinetrack.video.axis import Axis
+from vinetrack.video.calibration import PlaneCalibration
+from vinetrack.video.curved_axis import CurvedAxis, axis_entry, axis_of_entry, axis_through, curve_complaint
+from vinetrack.video.curved_strip import cut_along, laid_straight
+from vinetrack.video.frames import Frames, Recording, RecordingError
+from vinetrack.video.plane_map import PlaneMap
+from vinetrack.video.track import Tracking, track_frames
+
+RADIUS = 300.0
+SIDE = 400
+
+
+def quarter(count: int = 25) -> CurvedAxis:
+    """A quarter of a circle about (20, 330), from (20, 30) downwards to the right."""
+    angle = np.linspace(0, math.pi / 2, count)
+    axis = axis_through(np.column_stack([20 + RADIUS * np.sin(angle), 330 - RADIUS * np.cos(angle)]))
+    assert isinstance(axis, CurvedAxis)
+    return axis
+
+
+def test_two_points_are_the_straight_axis() -> None:
+    axis = axis_through([(10.0, 30.0), (100.0, 70.0)], 12.0)
+    assert type(axis) is Axis
+    assert axis == Axis((10.0, 30.0), (100.0, 70.0), 12.0)
+    assert axis_of_entry(axis_entry(axis) | {"width_px": 12.0}) == axis
+    assert set(axis_entry(axis)) == {"from_px", "to_px"}
+
+
+def test_positions_on_a_quarter_of_a_circle_are_its_arc_length() -> None:
+    axis = quarter()
+    assert axis.length_px == pytest.approx(RADIUS * math.pi / 2, rel=2e-3)
+    angle = np.array([0.3, 0.8, 1.3])
+    place = axis.points(RADIUS * angle)
+    assert np.allclose(np.hypot(place[:, 0] - 20, place[:, 1] - 330), RADIUS, atol=0.6)
+    steps = axis.points(np.arange(0, axis.length_px, 1.0))
+    assert np.allclose(np.hypot(*np.diff(steps, axis=0).T), 1.0, atol=1e-4)
+    assert axis.turn_rad == pytest.approx(math.pi / 2, abs=0.06)
+
+
+def test_places_beside_a_curve_lie_on_its_normal_and_beyond_its_end_straight_on() -> None:
+    axis = quarter()
+    along = np.array([100.0, 250.0])
+    beside, middle = axis.points(along, 20.0), axis.points(along)
+    assert np.allclose(np.sum((beside - middle) * axis.direction_at(along), axis=1), 0, atol=1e-9)
+    assert np.allclose(np.hypot(*(beside - middle).T), 20.0)
+    ahead = axis.points(axis.length_px + np.array([0.0, 15.0]))
+    assert np.allclose(ahead[1] - ahead[0], 15.0 * axis.direction_at(axis.length_px))
+    assert np.allclose(axis.nearest_px(beside), along, atol=1e-2)
+
+
+def test_a_curve_does_not_overshoot_between_uneven_points() -> None:
+    axis = axis_through([(0.0, 0.0), (200.0, 0.0), (212.0, 5.0), (215.0, 200.0)])
+    places = axis.points(np.linspace(0, axis.length_px, 500))
+    assert places[:, 0].max() < 230
+    assert places[:, 1].min() > -6
+
+
+def test_a_curve_survives_being_written() -> None:
+    axis = replace(quarter(), width_px=14.0)
+    assert axis_of_entry(axis_entry(axis) | {"width_px": 14.0}) == axis
+    assert axis.moved(3.0, -2.0).via_px[0] == (axis.via_px[0][0] + 3.0, axis.via_px[0][1] - 2.0)
+
+
+def test_points_that_coincide_and_curves_that_cannot_be_cut_are_refused() -> None:
+    with pytest.raises(RecordingError, match="less than 2 pixels apart; leave out"):
+        axis_through([(10.0, 10.0), (10.5, 10.0), (90.0, 40.0)])
+    sharp = axis_through([(20.0, 20.0), (60.0, 20.0), (60.0, 50.0)])
+    complaint = curve_complaint(sharp, 40.0, (100, 100))
+    assert complaint is not None
+    assert "too sharply for a strip of 40 px" in complaint[0]
+    assert curve_complaint(sharp, math.nan, (100, 100)) is None
+    assert curve_complaint(Axis((0.0, 0.0), (500.0, 0.0)), 10.0, (100, 100)) is None
+    outside = curve_complaint(quarter(), 5.0, (310, 400))
+    assert outside is not None
+    assert outside[0] == "leaves the picture, 310 × 400 pixels"
+
+
+def test_rings_about_the_circles_middle_become_level_lines() -> None:
+    y, x = np.mgrid[:SIDE, :SIDE].astype(float)
+    rings = np.clip(128 + (np.hypot(x - 20, y - 330) - RADIUS), 0, 255)
+    strip = cut_along(np.repeat(rings[None], 4, axis=0).round().astype(np.uint8), quarter(), 12.0)
+    assert strip.values.shape == (4, 25, int(quarter().length_px) + 1)
+    # Across is from x towards y seen along the growth: towards the middle, where rings are darker.
+    assert np.abs(strip.values[0] - (128 - np.arange(-12, 13))[:, None].astype(float)).max() < 1.6
+    assert strip.axis == quarter()
+
+
+def test_room_beside_the_strip_is_taken_only_where_the_picture_has_it() -> None:
+    luma = np.zeros((2, SIDE, SIDE), np.uint8)
+    wide = laid_straight(luma, quarter(), 10.0)
+    assert wide.axis.from_px[1] == 30.0  # the middles of the uppermost pixels are 30 px away
+    assert wide.luma.shape[1] == 30 + 59 + 1
+
+
+@pytest.fixture(scope="module")
+def bent() -> BentScene:
+    return bent_scene(BentPlan(seed=3, speed=22.0, **BENDS["quarter"]))
+
+
+def drawn(scene: BentScene, count: int = 6, off_px: float = 3.0) -> Axis:
+    """An axis as a hand draws it: `count` points, each off by a few pixels."""
+    places = scene.places(np.linspace(8.0, scene.arc_px[-1] - 8.0, count))
+    return axis_through(places + np.random.default_rng(scene.plan.seed).normal(0, off_px, places.shape))
+
+
+def followed(scene: BentScene, axis: Axis, **given) -> Tracking:
+    n = len(scene.frames)
+    height, width = scene.frames.shape[1:]
+    recording = Recording(Path("bent.mp4"), "container", width, height, 8, n)
+    frames = Frames(recording, recording.whole, scene.frames, np.arange(n), np.zeros(n, dtype=bool))
+    trial = Trial(name="bent", capture_fps=1000.0, exposure_s=scene.plan.exposure / 1000, m_per_px=1e-3)
+    return track_frames(frames, trial, 1000.0, axis, **given)
+
+
+def test_the_edge_of_a_bent_tube_is_followed_to_a_fraction_of_a_pixel(bent: BentScene) -> None:
+    tracking = followed(bent, drawn(bent))
+    track = tracking.track
+    used = bent.moving & track.usable
+    assert used.sum() == bent.moving.sum()
+    error = track.edge_px[used] - bent.edge_px[used]
+    assert error.std() < 0.35
+    stated = float(np.sqrt(np.mean((track.lead_position_sigma_m[used] / 1e-3) ** 2)))
+    assert stated > 0.4 * error.std()
+    places = tracking.axis.points(track.edge_px[used])
+    assert np.hypot(*(places - bent.places(bent.edge_px[used])).T).max() < 2.0
+    assert tracking.tube_width_px == pytest.approx(2 * bent.plan.radius, rel=0.1)
+    assert not any("bends or sweeps" in note for note in track.notes)
+
+
+def test_metres_are_lengths_along_the_curve_in_the_tilted_plane(bent: BentScene) -> None:
+    parameters = np.array([0.45, 0.02, 0.0, -0.01, 0.4, 0.0, 0.08, 0.05, -0.05, 0.0])
+    covariance = np.diag((0.002 * np.abs(parameters)) ** 2)
+    plane = PlaneMap(bent.plan.width, bent.plan.height, parameters, covariance)
+    calibration = PlaneCalibration("charuco", plane, 0.1, 50, 1, 0.0, (0, 0, 639, 639))
+    tracking = followed(bent, drawn(bent), along_path=calibration.along_path)
+    used = bent.moving & tracking.track.usable
+    fine = np.arange(0.0, bent.arc_px[-1], 0.5)
+    steps = np.linalg.norm(np.diff(plane.plane_m(bent.places(fine)), axis=0), axis=1)
+    true_m = np.interp(bent.edge_px, fine, np.concatenate([[0.0], np.cumsum(steps)]))
+    error = tracking.track.lead_position_m[used] - true_m[used]
+    assert error.std() < 0.4 * 1.3e-3
+    scale = calibration.along_path(tracking.axis)
+    chord = calibration.along(tracking.axis.from_px, tracking.axis.to_px)
+    assert 0 < scale.scale_rel_sigma < 0.02
+    assert scale.scale_rel_sigma != pytest.approx(chord.scale_rel_sigma, rel=1e-3)
+    assert scale.m_per_px * tracking.axis.length_px == pytest.approx(
+        float(np.ptp(scale.position_m(tracking.axis.points(np.array([0.0, tracking.axis.length_px])))))
+    )
+    off = calibration.along_path(tracking.axis, off_px=0.5).scale_rel_sigma
+    added = 0.5 * abs(tracking.axis.turn_rad) / tracking.axis.length_px
+    assert off == pytest.approx(math.hypot(scale.scale_rel_sigma, added))
+
+
+def test_a_straight_calibrated_axis_has_the_scale_of_its_line() -> None:
+    plane = PlaneMap.from_scale(1e-3, 640, 640)
+    calibration = PlaneCalibration("two_points", plane, math.nan, 2, 1, 0.001, (0, 0, 639, 639))
+    straight = Axis((10.0, 20.0), (400.0, 90.0))
+    assert calibration.along_path(straight).m_per_px == calibration.along((10.0, 20.0), (400.0, 90.0)).m_per_px
+
+
+def test_a_curve_too_sharp_for_the_tube_is_refused_in_a_sentence(bent: BentScene) -> None:
+    sharp = axis_through([(20.0, 80.0), (200.0, 80.0), (205.0, 300.0)], 160.0)
+    with pytest.raises(RecordingError, match=r"bent.mp4: the growth axis bends with a radius of .* px, too sharply"):
+        followed(bent, sharp)

@@ -1,0 +1,257 @@
+"""A growth axis that bends: a smooth curve through points of the picture, positions along it being its arc length.
+
+The curve is a natural cubic spline over the centripetal parameter (steps of the square root of the distance between
+neighbours; Lee 1989), which neither overshoots nor loops between points that are spaced unevenly. Beyond its ends it
+goes on straight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial import KDTree
+
+from vinetrack.core.records import Floats
+from vinetrack.video.axis import Axis
+from vinetrack.video.frames import RecordingError
+
+Point = tuple[float, float]
+
+FINENESS = 8
+"""Places a pixel at which the arc length is summed. Derived: a chord of 1/8 px is short of its arc by less than
+(1/8)²/24R², 1e-6 of it for radii above 30 px."""
+NEAREST_PX = 2.0
+"""Least distance between neighbouring points. Chosen: a point picked by hand is off by half a pixel, so that nearer
+ones tell no direction. At half, a double click makes a kink; at twice, dense curves of programs are refused."""
+ROOM_INSIDE = 0.9
+"""Part of the least radius that a strip may reach inwards. Derived: at 1 its normals cross; at 0.9 a pixel there stands
+for a tenth of one. Half refuses sound curves."""
+
+
+@dataclass(frozen=True)
+class CurvedAxis(Axis):
+    """A curve in the picture along which a vine grows, from `from_px` through `via_px` to `to_px`: (x, y), px.
+
+    `direction` and `normal` are those of its chord; `points` follows the curve.
+    """
+
+    via_px: tuple[Point, ...] = ()
+
+    def __post_init__(self) -> None:
+        points = np.array(self.through_px)
+        if np.min(np.hypot(*np.diff(points, axis=0).T)) < NEAREST_PX:
+            raise RecordingError(
+                f"two neighbouring points of the growth axis are less than {NEAREST_PX:g} pixels apart; leave out one"
+            )
+        super().__post_init__()
+
+    @property
+    def bends(self) -> bool:
+        """Whether it is a curve."""
+        return True
+
+    @property
+    def through_px(self) -> tuple[Point, ...]:
+        """All points that it goes through, in order."""
+        return (self.from_px, *self.via_px, self.to_px)
+
+    @cached_property
+    def _table(self) -> tuple[CubicSpline, Floats, Floats]:
+        """The spline, and its parameter and arc length at many places."""
+        points = np.array(self.through_px)
+        apart = np.hypot(*np.diff(points, axis=0).T)
+        knots = np.concatenate([[0.0], np.cumsum(np.sqrt(apart))])
+        spline = CubicSpline(knots, points, bc_type="natural")
+        counts = np.ceil(FINENESS * apart).astype(int) + 1
+        parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots[:-1], knots[1:], counts, strict=True)]
+        parameter = np.concatenate([*parts, knots[-1:]])
+        steps = np.hypot(*np.diff(spline(parameter), axis=0).T)
+        return spline, parameter, np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
+    def length_px(self) -> float:
+        """Arc length between its ends."""
+        return float(self._table[2][-1])
+
+    @cached_property
+    def least_radius_px(self) -> float:
+        """Radius where it bends most sharply; infinite of a straight line."""
+        spline, parameter, _ = self._table
+        first, second = spline(parameter, 1), spline(parameter, 2)
+        speed = np.hypot(*first.T)
+        bend = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
+        return float(1 / max(float(bend.max()), 1e-12))
+
+    @cached_property
+    def turn_rad(self) -> float:
+        """By how much its direction turns between its ends, positive from x towards y."""
+        angle = np.unwrap(np.arctan2(*self.direction_at(np.linspace(0.0, self.length_px, 400)).T[::-1]))
+        return float(angle[-1] - angle[0])
+
+    def direction_at(self, along_px: Floats) -> Floats:
+        """Unit vectors of growth at places along the curve.
+
+        Parameters
+        ----------
+        along_px : arc length from `from_px`, any shape, px.
+
+        Returns
+        -------
+        (x, y), shape (..., 2).
+        """
+        spline, parameter, arc = self._table
+        slope = spline(np.interp(np.asarray(along_px, float), arc, parameter), 1)
+        return np.asarray(slope / np.linalg.norm(slope, axis=-1, keepdims=True))
+
+    def points(self, along_px: Floats, across_px: Floats | float = 0.0) -> Floats:
+        """Return picture coordinates of points given along the curve and across it, on its normal.
+
+        Parameters
+        ----------
+        along_px : arc length from `from_px`, any shape, px; beyond the ends straight on.
+        across_px : distance beside the curve, px; a number or of a shape that broadcasts.
+
+        Returns
+        -------
+        (x, y), shape (..., 2), px.
+        """
+        along, across = np.broadcast_arrays(np.asarray(along_px, float), np.asarray(across_px, float))
+        spline, parameter, arc = self._table
+        unit = self.direction_at(along)
+        beyond = along - np.clip(along, 0.0, self.length_px)
+        normal = np.stack([-unit[..., 1], unit[..., 0]], axis=-1)
+        on_curve = spline(np.interp(along, arc, parameter))
+        return np.asarray(on_curve + beyond[..., None] * unit + across[..., None] * normal)
+
+    def nearest_px(self, picture_px: Floats) -> Floats:
+        """Arc length of the places on the curve nearest to points of the picture.
+
+        Parameters
+        ----------
+        picture_px : (x, y), shape (n, 2), px.
+
+        Returns
+        -------
+        shape (n,), px; beyond an end where the nearest place is that end.
+        """
+        spline, parameter, arc = self._table
+        points = np.asarray(picture_px, dtype=float)
+        _, nearest = KDTree(spline(parameter)).query(np.where(np.isfinite(points), points, 0.0))
+        # Between the places of the table, and beyond the ends, along the tangent.
+        along = arc[nearest]
+        offset = points - spline(parameter[nearest])
+        return np.asarray(along + np.sum(offset * self.direction_at(along), axis=-1))
+
+    def moved(self, dx_px: float, dy_px: float) -> CurvedAxis:
+        """Return the same curve in a picture whose origin is elsewhere.
+
+        Parameters
+        ----------
+        dx_px, dy_px : what is added to all its points, px.
+
+        Returns
+        -------
+        the curve.
+        """
+        through = [(x + dx_px, y + dy_px) for x, y in self.through_px]
+        return CurvedAxis(through[0], through[-1], self.width_px, tuple(through[1:-1]))
+
+
+def axis_through(through_px: Sequence[Sequence[float]] | Floats, width_px: float = float("nan")) -> Axis:
+    """The growth axis through points: a straight line through two, a smooth curve through more.
+
+    Parameters
+    ----------
+    through_px : (x, y) in order of growth, px.
+    width_px : of what moves along it, NaN where unknown.
+
+    Returns
+    -------
+    the axis.
+
+    Raises
+    ------
+    RecordingError
+        Where the points give no axis.
+    """
+    points = [(float(x), float(y)) for x, y in through_px]
+    if len(points) == 2:
+        return Axis(points[0], points[1], width_px)
+    return CurvedAxis(points[0], points[-1], width_px, tuple(points[1:-1]))
+
+
+def length_along(path: Floats) -> Floats:
+    """Length along a path from its first place.
+
+    Parameters
+    ----------
+    path : places, shape (n, 2).
+
+    Returns
+    -------
+    shape (n,), in the unit of the places.
+    """
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+
+
+def axis_entry(axis: Axis) -> dict[str, Any]:
+    """The axis as JSON holds it, without its width: `from_px`, `to_px`, and of a curve `via_px`.
+
+    Parameters
+    ----------
+    axis : in the picture.
+
+    Returns
+    -------
+    mapping of JSON types.
+    """
+    entry: dict[str, Any] = {"from_px": axis.from_px, "to_px": axis.to_px}
+    return entry | ({"via_px": axis.via_px} if isinstance(axis, CurvedAxis) else {})
+
+
+def axis_of_entry(entry: Mapping[str, Any]) -> Axis:
+    """The axis that `axis_entry` wrote.
+
+    Parameters
+    ----------
+    entry : `from_px`, `to_px`, of a curve `via_px`, and `width_px` where it is known.
+
+    Returns
+    -------
+    the axis, px.
+    """
+    width = entry.get("width_px")
+    through = (entry["from_px"], *entry.get("via_px", ()), entry["to_px"])
+    return axis_through(through, float("nan") if width is None else float(width))
+
+
+def curve_complaint(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tuple[str, str] | None:
+    """What is wrong with a curve in a picture, and the remedy; None where nothing is, or where it is a straight line.
+
+    Parameters
+    ----------
+    axis : in the picture, px.
+    half_px : half the width of what moves along it, px; NaN where unknown.
+    size_px : width and height of the picture.
+
+    Returns
+    -------
+    what it does, as the end of a sentence that begins with the axis, and what to do; or None.
+    """
+    if not isinstance(axis, CurvedAxis):
+        return None
+    places = axis.points(np.linspace(0.0, axis.length_px, int(axis.length_px) + 2))
+    if (places < -0.5).any() or (places > np.array(size_px) - 0.5).any():
+        return f"leaves the picture, {size_px[0]} × {size_px[1]} pixels", "give points inside it"
+    if half_px > ROOM_INSIDE * axis.least_radius_px:
+        return (
+            f"bends with a radius of {axis.least_radius_px:.0f} px, too sharply for a strip of {half_px:.0f} px on "
+            "either side",
+            "give fewer points or a smaller width",
+        )
+    return None

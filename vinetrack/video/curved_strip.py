@@ -1,0 +1,208 @@
+"""The strip along an axis, straight or curved; along a curve the picture is laid straight by the curve's normals.
+
+What is laid straight is a picture like any other: its middle is a level axis, its columns are places a pixel of arc
+length apart, and all that works on straight strips works on it. The curve is then moved onto the middle of what grew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.core.records import Floats
+from vinetrack.video.axis import Axis, SmallPictures, is_orderly
+from vinetrack.video.curved_axis import NEAREST_PX, ROOM_INSIDE, CurvedAxis, axis_through, curve_complaint
+from vinetrack.video.frames import RecordingError
+from vinetrack.video.strip import BAND_PX, GAP_PX, Strip, cut_strip
+
+if TYPE_CHECKING:
+    from vinetrack.video.edge import Outline
+
+KNOT_PX = 40.0
+"""Distance of the knots of a curve moved onto the middle of a tube. Chosen: a tube bends over several of its widths,
+and its sides are told in stretches of 12 px at least. At half noise of the sides makes it wavy and too long, at twice
+bends of 100 px radius are cut short by their sagitta of 8 px."""
+STRETCH_PX = 30.0
+"""Length of the stretches in which the tube's middle is told along a curve. Chosen a little shorter than KNOT_PX; half
+or twice hardly matters, as a smooth curve is laid through them."""
+SPAN = 1.0
+"""Stretches, as the standard deviation of a Gaussian, over which the tube's middle is averaged. Measured on bends of 90
+to 1100 px radius: SD of 0.08 to 0.30 px; at twice 0.10 to 0.73 px, as sharp bends are cut. Half was not tried."""
+
+
+@dataclass(frozen=True)
+class LaidStraight:
+    """Pictures along a curve: `luma`, shape (n_frames, n_across, n_along), and the level `axis` along its middle."""
+
+    luma: NDArray[Any]
+    axis: Axis
+
+
+def widest_px(axis: Axis) -> float:
+    """Half the width of the widest strip whose normals do not cross, px; infinite along a straight line.
+
+    Parameters
+    ----------
+    axis : in the picture.
+
+    Returns
+    -------
+    px.
+    """
+    return ROOM_INSIDE * axis.least_radius_px if isinstance(axis, CurvedAxis) else float("inf")
+
+
+def laid_straight(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> LaidStraight:
+    """Lay pictures straight along a curve, by bicubic interpolation.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+    axis : in the picture, px.
+    half_px : what is wanted on either side, px; more is taken, for what stands still beside a strip, where the picture
+        and the curve's radius leave room for it.
+
+    Returns
+    -------
+    pictures and the axis in them.
+    """
+    import cv2
+
+    above, below = (_reach(axis, half_px, side, luma.shape[1:]) for side in (-1, 1))
+    n_along = int(np.floor(axis.length_px)) + 1
+    rows = np.arange(-above, below + 1, dtype=float)
+    place = axis.points(np.arange(n_along, dtype=float)[None, :], rows[:, None]).astype(np.float32)
+    x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
+    out = np.empty((len(luma), len(rows), n_along), luma.dtype)
+    for frame, straight in zip(luma, out, strict=True):
+        cv2.remap(frame, x, y, cv2.INTER_CUBIC, dst=straight, borderMode=cv2.BORDER_REPLICATE)
+    return LaidStraight(out, Axis((0.0, float(above)), (n_along - 1.0, float(above)), axis.width_px))
+
+
+def cut_along(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
+    """Cut, level and steady the strip on both sides of an axis, straight or curved; see `strip.cut_strip`.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+    axis : in the picture, px.
+    half_px : half the height of the strip, px; along a curve no more than its normals allow.
+
+    Returns
+    -------
+    the strip.
+    """
+    if not isinstance(axis, CurvedAxis):
+        return cut_strip(luma, axis, half_px)
+    half = min(half_px, max(widest_px(axis) - 1, 2.0))
+    straight = laid_straight(luma, axis, half)
+    return replace(cut_strip(straight.luma, straight.axis, half), axis=axis)
+
+
+def orderly_along(luma: NDArray[Any], axis: CurvedAxis) -> bool:
+    """Whether most of what changes along a curve is a front that passes once; see `axis.is_orderly`.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+    axis : in the picture, with its width, px.
+
+    Returns
+    -------
+    False where what moves leaves the curve as well.
+
+    Raises
+    ------
+    RecordingError
+        Where nothing moves along the curve.
+    """
+    straight = laid_straight(luma, axis, min(axis.width_px, max(widest_px(axis) - 1, 2.0)))
+    return is_orderly(SmallPictures(straight.luma), straight.axis)
+
+
+def refuse_poor_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:
+    """Refuse a curve that leaves the picture or bends more sharply than its strip is wide.
+
+    Parameters
+    ----------
+    axis : in the picture, px.
+    half_px : half the width of what moves along it, px; NaN where unknown.
+    shape : height and width of the picture.
+
+    Raises
+    ------
+    RecordingError
+        In one sentence.
+    """
+    complaint = curve_complaint(axis, half_px, (shape[1], shape[0]))
+    if complaint is not None:
+        raise RecordingError(f"the growth axis {complaint[0]}; {complaint[1]}")
+
+
+def curve_parts(axis: Axis) -> int:
+    """Stretches in which the sides of a tube along a curve are told.
+
+    Parameters
+    ----------
+    axis : in the picture.
+
+    Returns
+    -------
+    number: 12 along a straight line, no fewer along a curve.
+    """
+    return max(12, round(axis.length_px / STRETCH_PX)) if isinstance(axis, CurvedAxis) else 12
+
+
+def beside_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
+    """A curve along the middle of the tube, and how far from the one before that lies.
+
+    Parameters
+    ----------
+    axis : the curve along which the tube's sides were told.
+    sides : of the tube in the strip along it.
+
+    Returns
+    -------
+    curve, with the tube's width; the given one where the tube's middle makes none that a strip can be cut along.
+    distance : greatest distance between the two, px.
+    """
+    knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / KNOT_PX) + 1))
+    away = _averaged(sides.places_px, sides.middles_px, knots)
+    through = axis.points(knots, away)
+    kept = [0, *(k for k in range(1, len(through)) if np.hypot(*(through[k] - through[k - 1])) > NEAREST_PX)]
+    try:
+        curve = axis_through(through[kept], 2 * sides.half_px)
+    except RecordingError:
+        return axis, 0.0
+    if not isinstance(curve, CurvedAxis) or sides.half_px > widest_px(curve):
+        return axis, 0.0
+    return curve, float(np.abs(away).max())
+
+
+def _averaged(places: Floats, middles: Floats, at: Floats) -> Floats:
+    """Middle of the tube at places along it: local straight lines, weighted by distance; level beyond its ends."""
+    spacing = float(np.median(np.diff(places))) if len(places) > 1 else STRETCH_PX
+    at = np.clip(at, places[0], places[-1])
+    out = np.empty(len(at))
+    for k, place in enumerate(at):
+        offset = (places - place) / (SPAN * spacing)
+        weight = np.exp(-0.5 * offset**2)
+        design = np.column_stack([np.ones(len(places)), offset])
+        moments = (design.T * weight) @ design + np.diag([0.0, 1e-3 * weight.sum()])
+        out[k] = np.linalg.solve(moments, (design.T * weight) @ middles)[0]
+    return out
+
+
+def _reach(axis: CurvedAxis, half_px: float, side: int, shape: tuple[int, ...]) -> int:
+    """Rows on one side: those wanted, and as many more as lie in the picture along the whole curve without crossing."""
+    wanted = int(np.ceil(half_px))
+    most = min(wanted + GAP_PX + BAND_PX[1], int(widest_px(axis)))
+    along = np.linspace(0.0, axis.length_px, int(axis.length_px) + 2)
+    for reach in range(most, wanted, -1):
+        place = axis.points(along, side * float(reach))
+        if ((place > -0.5) & (place < [shape[1] - 0.5, shape[0] - 0.5])).all():
+            return reach
+    return wanted
