@@ -102,7 +102,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
 
 
 def errors_px(results: Path, name: str, truth: Truth) -> np.ndarray:
-    """Tracked minus true position while the edge moves, the median taken off (origins are arbitrary), and stated error.
+    """Tracked minus true position while the edge moves, the median taken off (origins are arbitrary), and stated.
 
     Shape (n_moving, 2), px.
     """
@@ -111,7 +111,7 @@ def errors_px(results: Path, name: str, truth: Truth) -> np.ndarray:
     moving = np.gradient(true_m) > 0.05 * PLAIN.m_per_px
     error_m = (track["lead_position_m"].to_numpy() - true_m)[moving]
     assert np.isfinite(error_m).all(), "a moving frame is lost"
-    stated_m = track["lead_position_sigma_m"].to_numpy()[moving]
+    stated_m = np.hypot(track["lead_position_sigma_m"], track["lead_position_systematic_m"]).to_numpy()[moving]
     return np.column_stack([error_m - np.median(error_m), stated_m]) / PLAIN.m_per_px
 
 

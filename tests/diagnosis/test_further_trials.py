@@ -60,7 +60,7 @@ def test_the_plan_keeps_its_promise_when_its_trials_are_in_the_sheet(
     count = len(design.trials) + len(added)
     made = replace(
         design, trials=(*design.trials, *added), cameras=design.cameras[:1] * count,
-        tracker_sigma_m=(math.nan,) * count, has_trace=(False,) * count,
+        slow_error_m=(math.nan,) * count, has_trace=(False,) * count,
     )  # fmt: skip
     again = effect_power(planned_questions(made)[0], "leak")
     assert again is not None

@@ -84,7 +84,7 @@ def test_heavy_tails_alone_are_not_louder_in_motion(heavy: bool, most: float) ->
         if heavy:
             white /= np.sqrt(draw.chisquare(5, (12, 16, 1)) / 5)
         trials = [SimpleNamespace(whitened=one.ravel()) for one in white]
-        data = SimpleNamespace(tracker_sigma_m=np.nan, gauge_error=0.0, n_rest=8 * STRETCH)
+        data = SimpleNamespace(slow_m=None, gauge_error=0.0, n_rest=8 * STRETCH)
         fit: Any = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
         alarms += noisier_in_motion(fit) < 0.01
     assert alarms / 600 < most

@@ -44,7 +44,9 @@ def test_the_edge_of_a_film_comes_out_in_pixels_of_the_picture(scene: Scene, cli
     assert f"{len(scene.frames)} frames of 640 × 160 px, 8 bit" in done.stdout
     assert "Rate of capture not known; it plays at 60 a second" in done.stdout
     table = pd.read_csv(tmp_path / "out" / "track.csv")
-    assert list(table) == ["frame", "time_s", "edge_px", "edge_sigma_px", "x_px", "y_px", "flag"]
+    assert list(table) == [
+        "frame", "time_s", "edge_px", "edge_sigma_px", "edge_systematic_px", "x_px", "y_px", "flag",
+    ]  # fmt: skip
     assert len(table) == len(scene.frames)
     assert table["time_s"].isna().all()
     off = (table["x_px"] - (scene.edge_px + 30.0))[scene.moving]
@@ -66,6 +68,7 @@ def test_rate_and_scale_give_seconds_and_metres(scene: Scene, clip: Path, tmp_pa
     assert table["time_s"][0] == pytest.approx(50e-6)
     assert np.allclose(table["position_m"], 0.25e-3 * table["edge_px"])
     assert np.allclose(table["sigma_m"], 0.25e-3 * table["edge_sigma_px"])
+    assert np.allclose(table["systematic_m"], 0.25e-3 * table["edge_systematic_px"])
 
 
 def test_scale_is_that_of_the_settings_of_an_experiment(clip: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from vinetrack.core.records import FLAGS, Trial, with_flag
 from vinetrack.tracks.frame_timing import correct_frames
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import Frames, Recording, RecordingError, Region
-from vinetrack.video.point_quality import FLOOR_PX, calibrated_sigma, judge, moving_range
+from vinetrack.video.point_quality import calibrated_sigma, judge, moving_range
 from vinetrack.video.track import track_frames, track_recording
 
 SHORT = {"width": 520, "height": 160, "from_px": (20.0, 80.0), "start_px": 50.0, "end_px": 430.0, "radius": 24.0}
@@ -232,7 +232,7 @@ def test_stated_errors_follow_the_roughness():
     noise = rng.normal(0, 0.5, 400)
     position = 0.02 * np.arange(400.0) ** 2 + noise
     scaled = calibrated_sigma(position, np.full(400, 0.2), np.ones(400, dtype=bool))
-    assert scaled.mean() == pytest.approx(np.hypot(0.5, FLOOR_PX), rel=0.15)
+    assert scaled.mean() == pytest.approx(0.5, rel=0.15)
 
 
 def test_moving_range_of_rest_run_and_rest():

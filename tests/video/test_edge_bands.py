@@ -40,13 +40,17 @@ def test_each_band_finds_its_own_edge():
 @pytest.mark.parametrize("sd_px", [0.2, 0.6])
 def test_disagreement_is_the_error_of_the_mean(sd_px):
     strip, state, own = jittered(sd_px)
-    found = disagreement(strip, state, state.edge, np.ones(N, dtype=bool))
+    found, slow_px = disagreement(strip, state, state.edge, np.ones(N, dtype=bool))
     true = float(np.std(own.mean(axis=1) - state.edge))
     assert float(np.sqrt(np.mean(found**2))) == pytest.approx(true, rel=0.35)
+    # It is another one in every frame.
+    assert slow_px < 0.35 * true
 
 
 def test_a_band_that_always_lags_is_no_error():
     strip, state, _ = jittered(0.0)
     lagging = np.repeat([0.0, 0.0, 1.5, 0.0], ROWS // BANDS)
     tilted = EdgeState(state.edge, state.lengths, lagging, BLUR, state.pictures, state.inflation)
-    assert disagreement(strip, tilted, state.edge, np.ones(N, dtype=bool)).max() < 0.1
+    error_px, slow_px = disagreement(strip, tilted, state.edge, np.ones(N, dtype=bool))
+    assert error_px.max() < 0.1
+    assert slow_px < 0.05

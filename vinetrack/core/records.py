@@ -219,9 +219,11 @@ class Track:
     """Where the leading edge was at each frame of one trial. All arrays have shape (n_frames,).
 
     `lead_position_m` is NaN where there is none; `lead_position_sigma_m` the random error of that point alone (NaN
-    where unknown); `flag` holds strings, see FLAGS; `pressure_Pa` the gauge pressure measured along with it, if any;
-    `notes` are sentences about the track as a whole that a person should read. `tracked_px` is `edge_px` as the tracker
-    saw it, before anything was corrected by hand; None where nothing was.
+    where unknown), `lead_position_systematic_m` that of its slow error, which neighbouring frames share and an average
+    over frames keeps (None or NaN where nothing is known of it). `flag` holds strings, see FLAGS; `pressure_Pa` is the
+    gauge pressure measured along with it, if any; `notes` are sentences about the track as a whole that a person should
+    read. `tracked_px` is `edge_px` as the tracker saw it, before anything was corrected by hand, None where nothing
+    was.
     """
 
     time_s: Floats
@@ -232,6 +234,7 @@ class Track:
     pressure_Pa: Floats | None = None
     notes: tuple[str, ...] = ()
     tracked_px: Floats | None = None
+    lead_position_systematic_m: Floats | None = None
 
     @property
     def usable(self) -> NDArray[np.bool_]:

@@ -74,17 +74,17 @@ def design_power(design: CampaignDesign, inputs: Sequence[PowerInput] = ()) -> P
 class CampaignDesign:
     """What a campaign is simulated from: the true model with its values, trials, cameras, between-trial spreads.
 
-    `cameras`, `tracker_sigma_m` and `has_trace` are of each trial: how it is filmed, the error that its tracker states
-    (NaN for positions measured elsewhere), and whether its pressure is measured. `candidates` are names of effects,
-    the catalogue where None. `other_values` are those of the parameters of an effect behind its first, SI, by its name,
-    as `EffectPower` has them.
+    `cameras`, `slow_error_m` and `has_trace` are of each trial: how it is filmed, the slow error that its tracker
+    states (NaN for positions measured elsewhere), and whether its pressure is measured. `candidates` are names of
+    effects, the catalogue where None. `other_values` are those of the parameters of an effect behind its first, SI, by
+    its name, as `EffectPower` has them.
     """
 
     model: Model
     trials: tuple[Trial, ...]
     cameras: tuple[FilmingPlan, ...]
     spreads: tuple[float, float]
-    tracker_sigma_m: tuple[float, ...]
+    slow_error_m: tuple[float, ...]
     has_trace: tuple[bool, ...]
     candidates: tuple[str, ...] | None = None
     other_values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -151,7 +151,7 @@ def design_of_fit(fitted: Fit, candidates: Sequence[str] | None = None) -> Campa
         trials=tuple(trials),
         cameras=tuple(cameras),
         spreads=(float(pressure), float(damping)),
-        tracker_sigma_m=tuple(trial_data.tracker_sigma_m for trial_data in data),
+        slow_error_m=tuple(math.nan if known.slow_m is None else float(np.median(known.slow_m)) for known in data),
         has_trace=tuple(trial_data.trace is not None for trial_data in data),
         candidates=None if candidates is None else tuple(candidates),
     )
@@ -206,7 +206,7 @@ def planned_questions(design: CampaignDesign) -> tuple[MisfitTests, dict[str, st
 
 
 def as_measured(design: CampaignDesign, pairs: Sequence[tuple[Trial, Track]]) -> list[tuple[Trial, Track]]:
-    """Give tracks the error that a tracker states, and the pressure where the campaign measures it.
+    """Give tracks the slow error that a tracker states, and the pressure where the campaign measures it.
 
     Parameters
     ----------
@@ -219,8 +219,8 @@ def as_measured(design: CampaignDesign, pairs: Sequence[tuple[Trial, Track]]) ->
     list of (Trial, Track)
     """
     measured = []
-    for (trial, track), sigma_m, has_trace in zip(pairs, design.tracker_sigma_m, design.has_trace, strict=True):
-        stated = np.full(track.time_s.size, sigma_m)
+    for (trial, track), slow_m, has_trace in zip(pairs, design.slow_error_m, design.has_trace, strict=True):
+        stated = np.full(track.time_s.size, slow_m)
         pressure = np.full(track.time_s.size, trial.pressure_Pa) if has_trace else None
-        measured.append((trial, replace(track, lead_position_sigma_m=stated, pressure_Pa=pressure)))
+        measured.append((trial, replace(track, lead_position_systematic_m=stated, pressure_Pa=pressure)))
     return measured

@@ -258,7 +258,7 @@ def _questions(design: CampaignDesign, added: Sequence[Condition], candidates: t
             *design.cameras,
             *(replace(design.cameras[k], stops_s=math.inf, longest_s=longest_s) for k in places),
         ),
-        tracker_sigma_m=(*design.tracker_sigma_m, *(design.tracker_sigma_m[k] for k in places)),
+        slow_error_m=(*design.slow_error_m, *(design.slow_error_m[k] for k in places)),
         has_trace=(*design.has_trace, *(design.has_trace[k] for k in places)),
         candidates=candidates,
     )

@@ -154,7 +154,7 @@ class MisfitTests:
         smooth = float(
             np.median([trial_data.position_systematic_m / np.ptp(trial_data.lead_position_m) for trial_data in data])
         )
-        slow = any(math.isfinite(trial_data.tracker_sigma_m) or trial_data.trace is not None for trial_data in data)
+        slow = any(trial_data.slow_m is not None or trial_data.trace is not None for trial_data in data)
         return max(OFF if slow else OFF_OTHERWISE, smooth)
 
     @property

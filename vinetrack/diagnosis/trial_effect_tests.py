@@ -118,7 +118,7 @@ def noisier_in_motion(fit: Fit) -> float:
     motion: list[Floats] = []
     freedom = 0.0
     for trial, trial_data in zip(fit.trials, fit.predictor.data, strict=True):
-        if math.isfinite(trial_data.tracker_sigma_m) or trial_data.gauge_error > 0:
+        if trial_data.slow_m is not None or trial_data.gauge_error > 0:
             continue
         here = _sums(trial.whitened[: trial_data.n_rest])
         if here.size < 2:

@@ -89,6 +89,8 @@ class FitTrial:
     `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
     changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
     the noise over speed that it follows from, 0 where it follows `stated_m`, the file's own standard deviations.
+    `slow_m` is the standard deviation of the tracker's slow error at each point, None where positions were measured
+    elsewhere.
     """
 
     trial: Trial
@@ -101,9 +103,9 @@ class FitTrial:
     trace: tuple[Floats, Floats] | None = None
     gauge_error: float = 0.0
     vague_rest: VagueRest | None = None
-    tracker_sigma_m: float = math.nan  #: median error of a position that was read from a recording
     position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
     stated_m: Floats | None = None
+    slow_m: Floats | None = None
     relative_sd: Floats | None = None
     blur_s: float = 0.0
 
@@ -177,7 +179,7 @@ def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:
 
     A tracker's own points are left as they are: it states what each errs by, and leaves out the worst.
     """
-    places = [i for i, trial_data in enumerate(data) if not math.isfinite(trial_data.tracker_sigma_m)]
+    places = [i for i, trial_data in enumerate(data) if trial_data.slow_m is None]
     shape = noise_shape(
         [data[i].time_s for i in places], [data[i].lead_position_m for i in places], [data[i].stated_m for i in places]
     )
@@ -240,7 +242,6 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     n_rest = rest_points(position_m)
     trace, gauge_error = _trace(track, time_s[max(n_rest - 1, 0) :])
     stated_m = track.lead_position_sigma_m[usable]
-    # Of positions that somebody else measured, an error is that of the point alone; a tracker errs slowly besides.
     filmed = trial.video is not None
     return FitTrial(
         trial=trial,
@@ -253,10 +254,19 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         trace=trace,
         gauge_error=gauge_error,
         vague_rest=vague_rest,
-        tracker_sigma_m=float(np.nanmedian(stated_m)) if filmed and np.isfinite(stated_m).any() else math.nan,
         position_systematic_m=_position_systematic_m(trial),
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
+        slow_m=_slow_error(track, usable) if filmed else None,
     )
+
+
+def _slow_error(track: Track, usable: NDArray[np.bool_]) -> Floats | None:
+    """The tracker's slow error at the usable points, m; between those that state one where others do not."""
+    slow_m = track.lead_position_systematic_m
+    if slow_m is None or not np.isfinite(slow_m[usable]).any():
+        return None
+    known = usable & np.isfinite(slow_m)
+    return np.interp(np.flatnonzero(usable), np.flatnonzero(known), slow_m[known])
 
 
 def _position_systematic_m(trial: Trial) -> float:
@@ -297,6 +307,8 @@ def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], 
     They would tell a tenth of what another tells, and count as much: one noise holds for all points of a trial.
     """
     sigma_m = track.lead_position_sigma_m
+    if track.lead_position_systematic_m is not None:
+        sigma_m = np.hypot(sigma_m, np.nan_to_num(track.lead_position_systematic_m))
     known = usable & np.isfinite(sigma_m)
     if not known.any():
         return np.zeros(usable.size, dtype=bool), None

@@ -30,13 +30,17 @@ PAYLOAD_STEP = 1e-2
 """Relative step of a payload's mass for its derivative. Derived: positions are linear in it to 1e-4."""
 
 WAVES = 6
-"""Half waves along the growth, at most, in which a tracker may be off by its stated error in all trials alike. Chosen:
+"""Half waves along the growth, at most, in which a tracker may be off by its slow error in all trials alike. Chosen:
 six half waves describe what lens and pixel texture leave; more pass for noise, half leave steps of a door."""
 
-BEGIN, END, COVERED = 0.015, 0.03, 4.0
-"""Parts of the growth at its begin and end in which it may be off by so many times that: a door hides half of the tip
-there, the last fold pulls it out of shape. Chosen after rendered recordings, in which frames behind a door and at the
-end of growth were off by several stated errors."""
+BEGIN = 0.015
+"""Part of the growth after which a slow error that is larger at the start may be another. Chosen: the tip passes a door
+in it. At half or twice doors are taken to hide it for so long."""
+
+END, COVERED = 0.1, 2.0
+"""Part of the growth before its end in which the tip changes its shape, and how many times its slow error an edge may
+be off there. Measured: in the last 5 per cent 2.2 times as much as in the middle, in the 15 before 1.9 (37 recordings
+of the tuning seeds of `benchmarks/tracking_accuracy.py`; 0.8 and 1.8 in 15 of another renderer)."""
 
 
 @dataclass(frozen=True)
@@ -164,26 +168,26 @@ def _one_each(columns: list[Floats], names: Sequence[Hashable | None]) -> System
 
 
 def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
-    """Slow errors along the picture, of the size of the error that is stated of positions read from recordings."""
-    stated = np.array([trial_data.tracker_sigma_m for trial_data in predictor.data])
-    if not np.isfinite(stated).any():
+    """Slow errors of positions read from recordings, as large as the tracks state; none for those from elsewhere."""
+    stated = [trial_data.slow_m for trial_data in predictor.data]
+    if all(slow_m is None for slow_m in stated):
         return [np.zeros((trial.time_s.size, 0)) for trial in trials]
-    sigma_m = float(np.nanmedian(stated))
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
     reach = max(float(np.max(growth_m)) for growth_m in grown)
-    waves = np.pi * np.arange(1, WAVES + 1)
-    slow = [sigma_m * np.cos(growth_m[:, None] / reach * waves) for growth_m in grown]
-    return [
-        np.column_stack([first, *_ends(growth_m / reach, COVERED * sigma_m)])
-        for first, growth_m in zip(slow, grown, strict=True)
-    ]
+    return [_slow_shapes(growth_m / reach, slow_m) for growth_m, slow_m in zip(grown, stated, strict=True)]
 
 
-def _ends(part: Floats, sigma_m: float) -> list[Floats]:
-    """Errors where the tip leaves what holds it, and where the film runs out and the tip changes its shape."""
-    last = float(np.max(part))
-    return [
-        sigma_m * np.exp(-part / BEGIN),
-        sigma_m * np.exp(-part / (3 * BEGIN)),
-        sigma_m * np.exp((part - last) / END),
-    ]
+def _slow_shapes(part: Floats, slow_m: Floats | None) -> Floats:
+    """One standard deviation of each slow error of a trial, shape (n_points, WAVES + 3), m.
+
+    Waves along the growth have the usual error of the trial between them; what is stated beyond that, near a door or
+    where contrast is low, is an error of its own at the very start and one after it; and one grows towards the end.
+    """
+    if slow_m is None:
+        return np.zeros((part.size, WAVES + 3))
+    usual = np.minimum(slow_m, np.median(slow_m))
+    beyond = np.sqrt(np.maximum(slow_m**2 - usual**2, 0.0))
+    waves = np.sqrt(2 / WAVES) * usual[:, None] * np.cos(np.pi * part[:, None] * np.arange(1, WAVES + 1))
+    start = np.exp(-np.maximum(part, 0.0) / BEGIN)
+    end = COVERED * usual * np.exp((part - np.max(part)) / END)
+    return np.column_stack([waves, beyond * start, beyond * (1 - start), end])

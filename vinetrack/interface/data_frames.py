@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 POSITION_COLUMNS = ("lead_position_m", "position_m")
+ERROR_COLUMNS = ("lead_position_sigma_m", "lead_position_systematic_m")
 NEEDED = ("diameter_mm", "thickness_um", "length_mm", "pressure_kPa")
 """Columns of the sheet that a vine in a frame of tracks needs; a body (`travel_ratio` 1) needs the diameter alone."""
 
@@ -32,10 +33,10 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
 
     Parameters
     ----------
-    frame : columns `trial, time_s` and `lead_position_m` (or `position_m`); where known `lead_position_sigma_m` and
-        `flag`; and the columns of a trial sheet, the same in every row of a trial: `diameter_mm, thickness_um,
-        length_mm, pressure_kPa, yield_pressure_kPa, …`, or in other units. A `pressure_kPa` that changes along a trial
-        is a measured trace; its first value is then the set pressure.
+    frame : columns `trial, time_s` and `lead_position_m` (or `position_m`); where known `lead_position_sigma_m`,
+        `lead_position_systematic_m` and `flag`; and the columns of a trial sheet, the same in every row of a trial:
+        `diameter_mm, thickness_um, length_mm, pressure_kPa, yield_pressure_kPa, …`, or in other units. A
+        `pressure_kPa` that changes along a trial is a measured trace; its first value is then the set pressure.
 
     Returns
     -------
@@ -66,7 +67,7 @@ def tracks_from_frame(frame: pd.DataFrame) -> list[tuple[Trial, Track]]:
 def _cells(name: str, part: pd.DataFrame) -> dict[str, str]:
     """What the sheet would say of a trial: its columns other than those of the track, as text."""
     cells = {"trial": name}
-    of_track = {"trial", "time_s", *POSITION_COLUMNS, "lead_position_sigma_m", "flag", "edge_px", "frame"}
+    of_track = {"trial", "time_s", *POSITION_COLUMNS, *ERROR_COLUMNS, "flag", "edge_px", "frame"}
     for column in part.columns:
         first = part[column].iloc[0]
         if column in of_track or _is_blank(first):
@@ -115,7 +116,7 @@ def _trials(rows: Sequence[dict[str, str]]) -> list[Trial]:
 def _track(part: pd.DataFrame, position: str) -> Track:
     count = len(part)
     unknown = np.full(count, math.nan)
-    sigma_m = part["lead_position_sigma_m"].to_numpy(dtype=float) if "lead_position_sigma_m" in part else unknown
+    sigma_m, slow_m = (part[name].to_numpy(dtype=float) if name in part else unknown for name in ERROR_COLUMNS)
     flag = part["flag"].fillna("").to_numpy(dtype=str) if "flag" in part else np.full(count, "", dtype=str)
     traced = "pressure_kPa" in part and not _is_constant(part["pressure_kPa"])
     return Track(
@@ -125,4 +126,5 @@ def _track(part: pd.DataFrame, position: str) -> Track:
         flag=flag,
         edge_px=unknown,
         pressure_Pa=1e3 * part["pressure_kPa"].to_numpy(dtype=float) if traced else None,
+        lead_position_systematic_m=slow_m,
     )

@@ -202,7 +202,7 @@ def _seen(shown: Candidates, design: Plan, vine_inputs: Sequence[PredictiveInput
         trials=trials,
         cameras=(camera,) * count,
         spreads=vine_inputs[0].spreads,
-        tracker_sigma_m=(math.nan,) * count,
+        slow_error_m=(math.nan,) * count,
         has_trace=(False,) * count,
     )
     try:

@@ -152,6 +152,7 @@ def read_back(trial: Trial, table: pd.DataFrame) -> Track:
         lead_position_sigma_m=table["lead_position_sigma_m"].to_numpy(dtype=float),
         flag=table["flag"].to_numpy(dtype=str),
         edge_px=table["edge_px"].to_numpy(dtype=float),
+        lead_position_systematic_m=table["lead_position_systematic_m"].to_numpy(dtype=float),
     )
     try:
         if trial.pressure_trace is not None:

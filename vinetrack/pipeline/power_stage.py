@@ -308,7 +308,7 @@ def _planned(asked: PowerAsked, planned: PlannedTrials) -> _Campaign:
         trials=trials,
         cameras=cameras,
         spreads=spreads or first.spreads,
-        tracker_sigma_m=(math.nan,) * len(trials),
+        slow_error_m=(math.nan,) * len(trials),
         has_trace=(False,) * len(trials),
         candidates=settings.candidates,
     )

@@ -140,7 +140,7 @@ def fingerprint(design: CampaignDesign) -> str:
     parts = (design.model.names, sorted(design.model.values.items(), key=str), design.trials, design.cameras)
     around = (
         design.spreads,
-        design.tracker_sigma_m,
+        design.slow_error_m,
         design.has_trace,
         design.candidates,
         sorted(design.other_values.items()),

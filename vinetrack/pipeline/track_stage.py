@@ -211,16 +211,19 @@ def _table(measurement: Measurement, scaled: bool) -> pd.DataFrame:
     tracking = measurement.tracking
     track = tracking.track
     place = tracking.axis.points(track.edge_px + tracking.shake_px)
+    slow_m = track.lead_position_systematic_m
+    assert slow_m is not None
     columns = {
         "frame": np.arange(len(track.time_s)),
         "time_s": track.time_s,
         "edge_px": track.edge_px,
         "edge_sigma_px": track.lead_position_sigma_m / measurement.m_per_px,
+        "edge_systematic_px": slow_m / measurement.m_per_px,
         "x_px": place[:, 0],
         "y_px": place[:, 1],
     }
     if scaled:
-        columns |= {"position_m": track.lead_position_m, "sigma_m": track.lead_position_sigma_m}
+        columns |= {"position_m": track.lead_position_m, "sigma_m": track.lead_position_sigma_m, "systematic_m": slow_m}
     return pd.DataFrame(columns | {"flag": track.flag})
 
 

@@ -268,6 +268,7 @@ def _track_table(track: Track) -> pd.DataFrame:
         track.lead_position_sigma_m,
         track.flag,
         track.edge_px if track.tracked_px is None else track.tracked_px,
+        np.nan if track.lead_position_systematic_m is None else track.lead_position_systematic_m,
     )
     return pd.DataFrame(dict(zip(TRACK_COLUMNS, columns, strict=True)))
 

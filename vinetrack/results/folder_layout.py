@@ -16,7 +16,16 @@ from vinetrack.core.tables import result_file
 if TYPE_CHECKING:
     import pandas as pd
 
-TRACK_COLUMNS = ("frame", "time_s", "edge_px", "lead_position_m", "lead_position_sigma_m", "flag", "tracked_edge_px")
+TRACK_COLUMNS = (
+    "frame",
+    "time_s",
+    "edge_px",
+    "lead_position_m",
+    "lead_position_sigma_m",
+    "flag",
+    "tracked_edge_px",
+    "lead_position_systematic_m",
+)
 KINEMATICS_COLUMNS = (
     "time_s",
     "lead_position_m",

@@ -34,6 +34,7 @@ from vinetrack.video.edge_state import (
     seen_exposure,
 )
 from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors
+from vinetrack.video.slow_errors import noise_and_slow, slow_error_px
 from vinetrack.video.strip import Strip
 
 START_PX = 0.08
@@ -90,8 +91,10 @@ class EdgeFit:
     """Leading edge in strip pixels, all arrays of shape (n_frames,).
 
     `edge_px` at mid-exposure, `sigma_px` its random error by the likelihood, `apart_sigma_px` what is to be added to
-    it in square: by the disagreement of bands, and near the start (see START_PX). `misfit` is the mean squared
-    residual in units of the noise (1 is perfect), `amplitude` the contrast relative to that of the pixels it passes;
+    it in square: by the disagreement of bands, and near the start (see START_PX). `bands_sigma_px` is the part of that
+    which differs from frame to frame, and `slow_px` the error that neighbouring frames share. `misfit` is
+    the mean squared residual in units of the noise (1 is perfect), `amplitude` the contrast relative to that of the
+    pixels it passes;
     `contrast` is their mean signed contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far
     each row of the tip lags behind its foremost point; `passed` the first and last column passed; `hidden` marks
     frames in which a door or the mouth of a launcher may hide the tip.
@@ -110,6 +113,8 @@ class EdgeFit:
     tip_lag_px: Floats
     passed: tuple[int, int]
     hidden: Bools
+    bands_sigma_px: Floats
+    slow_px: Floats
     seen_exposure_frames: float = np.nan
     fast_px_per_frame: float = np.nan
 
@@ -424,13 +429,17 @@ def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed
     trouble = float(np.clip((np.mean(misfit_ratio[close]) - 1) / FULL_TROUBLE, 0, 1)) if close.any() else 0.0
     door = DOOR_PX * disturbed_start(strip, state) * trouble
     doubt = (START_PX + door) * near_start
-    apart = disagreement(strip, state, edge_now, core) * (1 - 0.5 * near_start)
-    apart = np.hypot(apart * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), doubt)
-    apart = hidden_errors(fit, misfit_ratio, edge_now, apart)
+    bands, shared = disagreement(strip, state, edge_now, core)
+    bands *= 1 - 0.5 * near_start
+    seen = np.hypot(bands * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), doubt)
+    apart = hidden_errors(fit, misfit_ratio, edge_now, seen)
     mouth = find_mouth(strip, state, edge_now)
     apart = np.where(mouth.before, np.maximum(apart, NO_EDGE_PX if mouth.moved_behind else GUESSED_PX), apart)
     # A door adds more to the error than any start has: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_PX) | mouth.before
+    bands, lasting = noise_and_slow(bands, seen, apart)
+    slow = np.hypot(lasting, slow_error_px(edge_now, contrast, shared))
     return EdgeFit(
-        edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed, hidden
-    )
+        edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed, hidden,
+        bands, slow,
+    )  # fmt: skip

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.edge_state import EdgeState, core_frames, fit_edges, moving_frames
+from vinetrack.video.slow_errors import shared_disagreement
 from vinetrack.video.strip import Strip
 
 ASTRAY_PX = 3.0
@@ -165,8 +166,8 @@ MEDIAN_TO_MEAN = 1.27
 """Mean over median of χ² with three degrees of freedom. Derived: 3/2.366."""
 
 
-def disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> Floats:
-    """Error of the edge by how far the bands disagree, shape (n_frames,), px; zeros where there is one band only.
+def disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.bool_]) -> tuple[Floats, float]:
+    """Error of the edge by how far the bands disagree, and the part of it that neighbouring frames share.
 
     The weighted mean of K independent bands errs by Σ w (y − ȳ)² / ((K − 1) Σ w). What a band is ahead or behind
     for long in the `core` frames is the shape of the tip, not an error.
@@ -180,12 +181,14 @@ def disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.
 
     Returns
     -------
-    standard error, shape (n_frames,), px.
+    standard error, shape (n_frames,), px; zeros where there is one band only
+    slow error of all frames, px; see `slow_errors.shared_disagreement`
     """
     edges, sigmas = band_fits(strip, state, edge)
     if edges.shape[1] < 2:
-        return np.zeros(len(edge))
+        return np.zeros(len(edge)), 0.0
     off = np.nan_to_num(edges - edge[:, None])
+    slow = shared_disagreement(off[core])
     off = off - _habit(off, edge, np.flatnonzero(core))
     weight = np.where(np.isfinite(sigmas), 1 / (np.nan_to_num(sigmas, nan=1.0) ** 2 + 1e-4), 1e-4)
     middle = np.median(off, axis=1, keepdims=True)
@@ -196,7 +199,7 @@ def disagreement(strip: Strip, state: EdgeState, edge: Floats, core: NDArray[np.
     variance = (weight * (off - mean[:, None]) ** 2).sum(axis=1) / (off.shape[1] - 1) / total
     padded = np.pad(variance, NEIGHBOURS, mode="edge")
     usual = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1), axis=1)
-    return np.asarray(np.sqrt(MEDIAN_TO_MEAN * usual))
+    return np.asarray(np.sqrt(MEDIAN_TO_MEAN * usual)), slow
 
 
 def band_fits(strip: Strip, state: EdgeState, edge: Floats) -> tuple[Floats, Floats]:

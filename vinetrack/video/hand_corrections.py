@@ -11,6 +11,7 @@ import numpy as np
 
 from vinetrack.core.records import Correction, Track, join_flags
 from vinetrack.video.calibration import CLICK_SIGMA_PX
+from vinetrack.video.slow_errors import SLOW_PX
 
 SETTLED = frozenset({"doubtful", "lost", "rejected", "after_end"})
 """Flags that no longer hold of a point that a person has placed or confirmed."""
@@ -36,6 +37,7 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
     if not corrections:
         return track
     edge, sigma = track.edge_px.copy(), track.lead_position_sigma_m.copy()
+    slow = None if track.lead_position_systematic_m is None else track.lead_position_systematic_m.copy()
     flag = track.flag.astype("<U80")
     done: Counter[str] = Counter()
     notes = []
@@ -49,6 +51,8 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
         kept = [part for part in str(flag[point.frame]).split(";") if part not in SETTLED]
         if point.action == "move":
             edge[point.frame], sigma[point.frame] = point.edge_px, CLICK_SIGMA_PX
+            if slow is not None:
+                slow[point.frame] = SLOW_PX
         elif point.action == "drop":
             edge[point.frame] = sigma[point.frame] = math.nan
             kept.append("rejected")
@@ -61,6 +65,7 @@ def corrected_by_hand(track: Track, corrections: Sequence[Correction]) -> Track:
         track,
         edge_px=edge,
         lead_position_sigma_m=sigma,
+        lead_position_systematic_m=slow,
         flag=np.asarray(flag),
         tracked_px=track.edge_px,
         notes=(*track.notes, *notes),

@@ -20,10 +20,13 @@ FLOOR_PX = 0.04
 """Errors that all rows share (blur, exposure, level) show neither as roughness nor between bands. Chosen between 0.03
 and 0.06 px, which they came to. At half good frames state errors that are too small, at twice too large."""
 
-FEWEST_DIFFERENCES, LARGEST_FACTOR = 8, 6.0
-"""Fourth differences that tell of the roughness, and the factor of errors at most. Chosen: the median of eight is known
-to a third, and beyond six the motion is no smooth one. By reasoning: half or twice changes stated errors of short and
-of rough tracks alone."""
+FEWEST_DIFFERENCES, SMALLEST_FACTOR, LARGEST_FACTOR = 8, 0.5, 6.0
+"""Fourth differences that tell of the roughness, and the factor of errors at least and at most. Chosen: the median of
+eight is known to a third, and beyond six the motion is no smooth one. By reasoning: half or twice changes stated errors
+of short and of rough tracks alone."""
+LARGEST_BODY_FACTOR = 20.0
+"""The same of a body that is matched with itself, whose likelihood knows nothing of pixels between pixels. Measured: 5
+to 14 on rendered balls (tuning seeds 1 and 2). By reasoning: at half errors of bright balls are a third too small."""
 REST_SIGMAS, REST_PX, END_REST_PX = 3.0, 0.4, 0.25
 """An edge stands that stays this near to its level, in standard errors and in px at the start and at the end. Chosen:
 one point of 370 by chance; ringing of coders moves an edge by some tenths of a pixel. By reasoning: at half coders'
@@ -71,18 +74,17 @@ class Judgement:
     departure_px: Floats
 
 
-def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: float = 0.5) -> Floats:
+def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, *, largest: float = LARGEST_FACTOR) -> Floats:
     """Stated errors scaled to the roughness of the track itself, shape (n_frames,).
 
     Fourth differences cancel any cubic motion and have variance Σ c² σ², c = (1, −4, 6, −4, 1). Their median size in
-    units of the stated errors is the factor, left at 1 where fewer than FEWEST_DIFFERENCES exist; FLOOR_PX is added in
-    square.
+    units of the stated errors is the factor, left at 1 where fewer than FEWEST_DIFFERENCES exist.
 
     Parameters
     ----------
     edge_px, sigma_px : positions and stated errors, shape (n_frames,), px; NaN where the edge was not found.
     use : mask of the frames that count, shape (n_frames,).
-    smallest : factor at least; LARGEST_FACTOR at most.
+    largest : factor at most; SMALLEST_FACTOR at least.
 
     Returns
     -------
@@ -90,15 +92,15 @@ def calibrated_sigma(edge_px: Floats, sigma_px: Floats, use: Bools, smallest: fl
     """
     weights = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
     if len(edge_px) < 5:
-        return np.hypot(sigma_px, FLOOR_PX)
+        return sigma_px
     windows = np.lib.stride_tricks.sliding_window_view
     difference = windows(edge_px, 5) @ weights
     expected = np.sqrt(windows(sigma_px**2, 5) @ weights**2)
     inside = windows(use, 5).all(axis=1) & np.isfinite(difference) & (expected > 0)
     if inside.sum() < FEWEST_DIFFERENCES:
-        return np.hypot(sigma_px, FLOOR_PX)
+        return sigma_px
     factor = 1.4826 * float(np.median(np.abs(difference[inside] / expected[inside])))
-    return np.hypot(sigma_px * float(np.clip(factor, smallest, LARGEST_FACTOR)), FLOOR_PX)
+    return sigma_px * float(np.clip(factor, SMALLEST_FACTOR, largest))
 
 
 def moving_range(edge_px: Floats, sigma_px: Floats) -> tuple[int, int]:

@@ -27,7 +27,16 @@ from vinetrack.video.frame_faults import odd_frames, repeated_frames
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording
 from vinetrack.video.hand_corrections import corrected_by_hand
 from vinetrack.video.motion_end import cut_short, end_of_body, end_of_growth, is_grown
-from vinetrack.video.point_quality import FLOOR_PX, LOST_SIGMA_PX, Judgement, calibrated_sigma, judge
+from vinetrack.video.point_quality import (
+    FLOOR_PX,
+    LARGEST_BODY_FACTOR,
+    LARGEST_FACTOR,
+    LOST_SIGMA_PX,
+    Judgement,
+    calibrated_sigma,
+    judge,
+)
+from vinetrack.video.slow_errors import ARRIVAL_PX, SLOW_PX
 from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.strip import Strip, recut, squared
 
@@ -115,6 +124,8 @@ class _Edge:
     exposure_frames: float
     reach_px: float
     apart_sigma_px: Floats | float = 0.0
+    bands_sigma_px: Floats | float = 0.0
+    slow_px: Floats | float = SLOW_PX
     end: EndOfWay | None = None
     width_px: tuple[float, float] = (math.nan, math.nan)
     seen_exposure: tuple[float, float] = (math.nan, math.nan)
@@ -203,9 +214,11 @@ def track_frames(
         raise RecordingError(f"{name}: {error}") from error
     repeated = repeated_frames(strip, edge_fit.edge_px)
     moving = np.gradient(edge_fit.edge_px) > MOVING_PX if len(kept) > 1 else np.ones(len(kept), bool)
-    sigma = calibrated_sigma(edge_fit.edge_px, edge_fit.sigma_px, moving & np.isfinite(edge_fit.edge_px))
+    largest = LARGEST_BODY_FACTOR if trial.travel_ratio == 1 else LARGEST_FACTOR
+    known = np.isfinite(edge_fit.edge_px)
+    noise = calibrated_sigma(edge_fit.edge_px, edge_fit.sigma_px, moving & known, largest=largest)
     # Roughness and the bands' disagreement tell of the same noise; the larger one also of what the other is blind to.
-    sigma = np.maximum(sigma, np.hypot(edge_fit.apart_sigma_px, FLOOR_PX))
+    sigma = np.maximum(np.hypot(noise, FLOOR_PX), np.hypot(edge_fit.apart_sigma_px, FLOOR_PX))
     sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
     end_px = strip.axis.length_px - edge_fit.reach_px
     verdict = judge(
@@ -213,6 +226,9 @@ def track_frames(
         end_px=end_px,
     )  # fmt: skip
     sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
+    noise = np.minimum(np.hypot(np.maximum(noise, edge_fit.bands_sigma_px), verdict.departure_px), LOST_SIGMA_PX)
+    slow = np.hypot(np.broadcast_to(edge_fit.slow_px, noise.shape), STEADIED_PX if strip.steadied else 0.0)
+    slow = np.minimum(slow, LOST_SIGMA_PX)
     if verdict.last_moving < 0:
         if np.mean(~(sigma < LOST_SIGMA_PX)) > MOSTLY_LOST:
             raise RecordingError(
@@ -242,7 +258,7 @@ def track_frames(
     if rejected.any():
         first = int(number[rejected][0])
         notes.append(f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {first}")
-    track = _assemble(frames, kept, edge_fit, sigma, verdict, capture_fps, exposure_s, notes)
+    track = _assemble(frames, kept, edge_fit, (noise, slow), verdict, capture_fps, exposure_s, notes)
     track = corrected_by_hand(track, trial.corrections)
     if isinstance(strip.axis, CurvedAxis) and along_path is not None:
         position_m = along_path(strip.axis).position_m
@@ -315,7 +331,9 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
 
             strip = cut_along(luma, axis, min(8 * half, 0.3 * max(luma.shape[1:])))
             edge, sigma = track_arrival(strip)
-            return strip, _Edge(edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames, 2.0)
+            return strip, _Edge(
+                edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames, 2.0, slow_px=ARRIVAL_PX
+            )
         strip = cut_along(luma, squared(axis), 1.3 * half + 3)
         for _ in range(CENTRINGS):
             before, sides = strip, outline(strip, curve_parts(axis))
@@ -328,7 +346,7 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
     reach = 3 * front.blur_px + 1
     return strip, _Edge(
         front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames, reach,
-        front.apart_sigma_px, width_px=(sides.width_px, sides.width_sigma_px),
+        front.apart_sigma_px, front.bands_sigma_px, front.slow_px, width_px=(sides.width_px, sides.width_sigma_px),
         seen_exposure=(front.seen_exposure_frames, front.fast_px_per_frame),
     )  # fmt: skip
 
@@ -387,37 +405,36 @@ def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
 
 
 def _assemble(
-    frames: Frames, kept: NDArray[np.int_], edge_fit: _Edge, sigma: Floats, verdict: Judgement, capture_fps: float,
-    exposure_s: float, notes: list[str],
+    frames: Frames, kept: NDArray[np.int_], edge_fit: _Edge, errors_px: tuple[Floats, Floats], verdict: Judgement,
+    capture_fps: float, exposure_s: float, notes: list[str],
 ) -> Track:  # fmt: skip
     """A row for every decoded frame; those rejected, or after the end of what follows the axis, have no position."""
     n = len(frames)
-    edge, error = np.full(n, np.nan), np.full(n, np.nan)
+    edge, noise, slow = np.full((3, n), np.nan)
     flag = np.full(n, "rejected", dtype="<U64")
     flag[int(kept[-1]) + 1 :] = "after_end"
     flag[frames.damaged] = "rejected"
     slot = frames.slot.astype(float)
     edge[kept] = np.where(verdict.unseen, np.nan, edge_fit.edge_px)
-    error[kept] = np.where(verdict.unseen, np.nan, sigma)
+    noise[kept], slow[kept] = np.where(verdict.unseen, np.nan, errors_px)
     flag[kept] = verdict.flag
     slot[kept] = verdict.slot
     # Frames that were not decoded, since nothing moves in them, have rows as well.
     before, after = frames.slots_before, frames.slots_after
     slot = np.concatenate([before, slot, after + (slot[-1] - frames.slot[-1])])
     flag = np.concatenate([np.full(len(before), "before_release"), flag, np.full(len(after), "after_end")])
-    edge, error = (np.pad(values, (len(before), len(after)), constant_values=np.nan) for values in (edge, error))
+    edge, noise, slow = np.pad([edge, noise, slow], ((0, 0), (len(before), len(after))), constant_values=np.nan)
     time = slot / capture_fps + (exposure_s / 2 if np.isfinite(exposure_s) else 0.0)
-    return Track(time, np.full(len(edge), np.nan), error, flag.astype("<U64"), edge, None, tuple(notes))
+    return Track(
+        time, np.full(len(edge), np.nan), noise, flag.astype("<U64"), edge, notes=tuple(notes),
+        lead_position_systematic_m=slow,
+    )  # fmt: skip
 
 
 def _in_metres(track: Track, axis: Axis, m_per_px: float, position_m: Callable[[Floats], Floats] | None) -> Track:
     """Positions and errors in metres; NaN without a scale."""
     if position_m is None:
-        return replace(
-            track,
-            lead_position_m=track.edge_px * m_per_px,
-            lead_position_sigma_m=track.lead_position_sigma_m * m_per_px,
-        )
+        return _scaled(track, track.edge_px * m_per_px, m_per_px)
     finite = np.isfinite(track.edge_px)
     position = np.full(len(track.edge_px), np.nan)
     local = np.full(len(track.edge_px), np.nan)
@@ -425,7 +442,18 @@ def _in_metres(track: Track, axis: Axis, m_per_px: float, position_m: Callable[[
         along = track.edge_px[finite]
         position[finite] = position_m(axis.points(along))
         local[finite] = position_m(axis.points(along + 0.5)) - position_m(axis.points(along - 0.5))
-    return replace(track, lead_position_m=position, lead_position_sigma_m=track.lead_position_sigma_m * np.abs(local))
+    return _scaled(track, position, np.abs(local))
+
+
+def _scaled(track: Track, position_m: Floats, m_per_px: Floats | float) -> Track:
+    """The track with positions in metres, and its errors from pixels to metres."""
+    slow_px = track.lead_position_systematic_m
+    return replace(
+        track,
+        lead_position_m=position_m,
+        lead_position_sigma_m=track.lead_position_sigma_m * m_per_px,
+        lead_position_systematic_m=None if slow_px is None else slow_px * m_per_px,
+    )
 
 
 def _kymograph(strip: Strip) -> NDArray[np.float32]:
