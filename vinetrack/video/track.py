@@ -39,6 +39,7 @@ from vinetrack.video.point_quality import (
 from vinetrack.video.slow_errors import ARRIVAL_PX, SLOW_PX
 from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.strip import Strip, recut, squared
+from vinetrack.video.track_scale import in_metres
 
 if TYPE_CHECKING:
     from vinetrack.video.body import EndOfWay
@@ -262,7 +263,7 @@ def track_frames(
     track = corrected_by_hand(track, trial.corrections)
     if isinstance(strip.axis, CurvedAxis) and along_path is not None:
         position_m = along_path(strip.axis).position_m
-    track = _in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
+    track = in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
     pictures = tuple((int(number[kept[i]]), luma[i].copy()) for i in chosen)
     shake_px = np.zeros(frames.n_recorded)
@@ -429,31 +430,6 @@ def _assemble(
         time, np.full(len(edge), np.nan), noise, flag.astype("<U64"), edge, notes=tuple(notes),
         lead_position_systematic_m=slow,
     )  # fmt: skip
-
-
-def _in_metres(track: Track, axis: Axis, m_per_px: float, position_m: Callable[[Floats], Floats] | None) -> Track:
-    """Positions and errors in metres; NaN without a scale."""
-    if position_m is None:
-        return _scaled(track, track.edge_px * m_per_px, m_per_px)
-    finite = np.isfinite(track.edge_px)
-    position = np.full(len(track.edge_px), np.nan)
-    local = np.full(len(track.edge_px), np.nan)
-    if finite.any():
-        along = track.edge_px[finite]
-        position[finite] = position_m(axis.points(along))
-        local[finite] = position_m(axis.points(along + 0.5)) - position_m(axis.points(along - 0.5))
-    return _scaled(track, position, np.abs(local))
-
-
-def _scaled(track: Track, position_m: Floats, m_per_px: Floats | float) -> Track:
-    """The track with positions in metres, and its errors from pixels to metres."""
-    slow_px = track.lead_position_systematic_m
-    return replace(
-        track,
-        lead_position_m=position_m,
-        lead_position_sigma_m=track.lead_position_sigma_m * m_per_px,
-        lead_position_systematic_m=None if slow_px is None else slow_px * m_per_px,
-    )
 
 
 def _kymograph(strip: Strip) -> NDArray[np.float32]:
