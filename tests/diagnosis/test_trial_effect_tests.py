@@ -93,6 +93,6 @@ def test_heavy_tails_alone_are_not_louder_in_motion(heavy: bool, most: float) ->
 def test_recordings_are_not_held_against_their_rest() -> None:
     filmed = []
     for trial, track in wandering(at_rest=False):
-        stated = replace(track, lead_position_sigma_m=np.full(track.time_s.size, 1e-4))
+        stated = replace(track, lead_position_systematic_m=np.full(track.time_s.size, 1e-4))
         filmed.append((replace(trial, video=Path("filmed.mp4")), stated))
     assert noisier_in_motion(fitted(filmed)) == 1.0
