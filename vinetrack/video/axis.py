@@ -8,7 +8,6 @@ how much change a monotone path along it collects; the best is refined by the pi
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,17 +16,8 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import fan_gains, passing_times
-from vinetrack.video.order_kernels import (
-    BINS_A_LEVEL,
-    block_means,
-    largest_steps,
-    median,
-    ratio_medians,
-)
+from vinetrack.video.small_pictures import SmallPictures, changed_pixels
 
-SMALL_PX = 240
-"""Longest side of the pictures in which the axis is sought. Chosen: a vine of 3 % of it is then 7 px wide;
-at half a thin vine is lost, at twice time is fourfold."""
 ORDERLY = 0.45
 """Share of all change that one front explains where nothing else of weight goes on. Chosen: a swinging door takes a
 fifth; by reasoning, at half it is taken for the axis, at twice payloads make a recording disorderly."""
@@ -36,8 +26,6 @@ MOST_TURN_DEG = 8.0
 or two; with half of it an axis 5 degrees off stays off, with twice of it a wide strip lets in what crosses it."""
 PREFIXES = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Parts of a recording, from its beginning, that may be orderly. Chosen: steps of a quarter; more cost time alone."""
-MAX_FRAMES = 150
-"""Frames, spread evenly over the changes, in which it is sought. Chosen for time; they resolve 1 % of the growth."""
 
 
 @dataclass(frozen=True)
@@ -107,23 +95,6 @@ class Axis:
         return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
 
 
-class SmallPictures:
-    """The frames of a recording, shrunk once for all that look for its axis.
-
-    `frames` has shape (n_frames, height, width) in grey levels of 255, free of flicker; `factor` is by how much they
-    shrank and `shape` the height and width before, px.
-    """
-
-    def __init__(self, luma: NDArray[Any]) -> None:
-        self.frames, self.factor = _small_frames(luma)
-        self.shape = luma.shape[1:]
-
-    @cached_property
-    def changed(self) -> tuple[Floats, Floats, Floats, Floats, int]:
-        """Pixels that change: x, y, when and worth, shape (n_pixels,) each; and the number of times looked at."""
-        return _changed_pixels(self.frames, len(self.frames))
-
-
 def find_axis(luma: NDArray[Any] | SmallPictures) -> Axis:
     """Find the axis of growth from the motion itself.
 
@@ -183,7 +154,7 @@ def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
     if near.sum() < 12:
         raise RecordingError("nothing moves along the axis")
     line = x[near], y[near], time[near], weight[near]
-    agree, _, _ = _agreeing(*line, n_times, angle, np.array(scaled.from_px), band)
+    agree, _, _ = agreeing(*line, n_times, angle, np.array(scaled.from_px), band)
     return bool(line[3][agree].sum() >= ORDERLY * line[3].sum())
 
 
@@ -251,18 +222,9 @@ def _shrunk(axis: Axis, factor: float) -> Axis:
     return Axis(ends[0], ends[1], axis.width_px / factor)
 
 
-def _changed_pixels(small: NDArray[np.float32], count: int) -> tuple[Floats, Floats, Floats, Floats, int]:
-    """Pixels that change within the first `count` frames: x, y, when, worth; and the number of times looked at."""
-    picked = _busy_frames(small[:count])
-    when, worth = _changes(small[picked])
-    rows, columns = np.nonzero(worth > 0)
-    time = when[rows, columns].astype(float)
-    return columns.astype(float), rows.astype(float), time, worth[rows, columns].astype(float), len(picked)
-
-
 def _find_line(small: NDArray[np.float32], count: int, patient: bool = False) -> _Line:
     """The best line in the first `count` frames; collects nothing where there is none (an error unless `patient`)."""
-    return _line_of(small, _changed_pixels(small, count), patient)
+    return _line_of(small, changed_pixels(small, count), patient)
 
 
 def _line_of(
@@ -326,48 +288,6 @@ def _line_near(
     return _Line(angle, point, half, ends, collected, collected / float(weight.sum()))
 
 
-def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
-    """Pictures no longer than SMALL_PX, brightness freed of flicker, and the factor by which they shrank."""
-    import cv2
-
-    n, height, width = luma.shape
-    factor = max(1.0, max(height, width) / SMALL_PX)
-    size = (max(8, round(width / factor)), max(8, round(height / factor)))
-    side = round(factor)
-    if side == factor and height % side == 0 and width % side == 0 and 8 * side <= min(height, width):
-        small = block_means(luma, side)
-    else:
-        small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in luma]).astype(np.float32)
-    gain = ratio_medians(small[:, ::2, ::2], small[n // 2, ::2, ::2] + np.float32(1.0))
-    small /= np.clip(gain, 0.2, 5.0)[:, None, None]
-    return small * np.float32(255.0 / max(float(small.max()), 1.0)), factor
-
-
-def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
-    """At most MAX_FRAMES frames, spread evenly over what changes rather than over time."""
-    n = len(small)
-    if n <= MAX_FRAMES:
-        return np.arange(n)
-    change = np.abs(np.diff(small, axis=0))
-    activity = np.partition(change.reshape(n - 1, -1), -20, axis=1)[:, -200:].mean(axis=1)
-    floor = float(np.quantile(activity, 0.2))
-    busy = np.clip(activity - 1.5 * floor, 0, None) + 0.02 * floor + 1e-6
-    total = np.concatenate([[0.0], np.cumsum(np.minimum(busy, 4 * np.quantile(busy, 0.9)))])
-    return np.unique(np.searchsorted(total, np.linspace(0, total[-1], MAX_FRAMES)).clip(0, n - 1))
-
-
-def _changes(frames: NDArray[np.float32]) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
-    """Frame at which each pixel changes most and for good, and what that change is worth; shapes (height, width)."""
-    n = len(frames)
-    window = int(np.clip(n // 6, 2, 8))
-    changes = np.abs(np.diff(frames[:: max(1, n // 30)], axis=0)).ravel()
-    noise = 1.4826 * float(median(changes, np.ones(changes.size, np.int8), BINS_A_LEVEL)) / np.sqrt(2)
-    when, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))
-    unit = max(noise, 0.7) ** 2
-    floor = max(30.0 * unit, 0.02 * float(np.quantile(best, 0.995)))
-    return when, np.where(best > floor, np.log(np.maximum(best, unit) / unit), 0.0).astype(np.float32)
-
-
 def _best_line(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, band: float, diagonal: float
 ) -> tuple[float, Floats]:
@@ -389,10 +309,23 @@ def _best_line(
     return chosen
 
 
-def _agreeing(
+def agreeing(
     x: Floats, y: Floats, time: Floats, weight: Floats, n_times: int, angle: float, middle: Floats, band: float
 ) -> tuple[NDArray[np.bool_], Floats, Floats]:
-    """Pixels that change when the best ordered path along a line passes them; and their places along and across."""
+    """Find the pixels that change when the best ordered path along a line passes them.
+
+    Parameters
+    ----------
+    x, y : places of pixels that change, shape (n_pixels,), px.
+    time, weight : when, counted in pictures, and how much; shape (n_pixels,).
+    n_times : pictures.
+    angle, middle : direction of the line, rad, and a point on it, px.
+    band : distance from the line within which pixels count, px.
+
+    Returns
+    -------
+    which agree, shape (n_pixels,), and the places of all along and across the line, px.
+    """
     along = (x - middle[0]) * np.cos(angle) + (y - middle[1]) * np.sin(angle)
     across = -(x - middle[0]) * np.sin(angle) + (y - middle[1]) * np.cos(angle)
     place = ((along - float(along.min())) / 2).astype(int)
@@ -409,7 +342,7 @@ def _refine(
 ) -> tuple[float, Floats, float, tuple[float, float], float]:
     """Line through the pixels that agree with a path: direction, point, half width, ends along it, their worth."""
     along_unit = np.array([np.cos(angle), np.sin(angle)])
-    agree, _, _ = _agreeing(x, y, time, weight, n_times, angle, middle, band)
+    agree, _, _ = agreeing(x, y, time, weight, n_times, angle, middle, band)
     if agree.sum() < 8:
         raise RecordingError("what moves in the picture follows no line; give the axis in the settings")
     w = weight[agree]

@@ -147,6 +147,22 @@ class CurvedAxis(Axis):
         offset = points - spline(parameter[nearest])
         return np.asarray(along + np.sum(offset * self.direction_at(along), axis=-1))
 
+    def along_and_across(self, picture_px: Floats) -> tuple[Floats, Floats]:
+        """Return where points of the picture lie along and across the curve, by their nearest place on it.
+
+        Parameters
+        ----------
+        picture_px : (x, y), shape (n, 2), px.
+
+        Returns
+        -------
+        arc length from `from_px` and distance on the normal, shape (n,) each, px.
+        """
+        points = np.asarray(picture_px, dtype=float)
+        along = self.nearest_px(points)
+        unit, offset = self.direction_at(along), points - self.points(along)
+        return along, unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]
+
     def moved(self, dx_px: float, dy_px: float) -> CurvedAxis:
         """Return the same curve in a picture whose origin is elsewhere.
 

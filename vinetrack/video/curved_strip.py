@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
-from vinetrack.video.axis import Axis, SmallPictures, is_orderly
+from vinetrack.video.axis import Axis, is_orderly
 from vinetrack.video.curved_axis import NEAREST_PX, ROOM_INSIDE, CurvedAxis, axis_through, curve_complaint
 from vinetrack.video.frames import RecordingError
+from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import BAND_PX, GAP_PX, Strip, cut_strip
 
 if TYPE_CHECKING:

@@ -28,8 +28,8 @@ SPARSEST = 120
 missed; a film with fewer key frames is decoded once to be looked at. At half they are decoded twice for
 little."""
 LOOK_PX = 320
-"""Longer side of the pictures that are compared, px. Chosen near SMALL_PX of `axis`; half or twice takes a quarter or
-four times the memory."""
+"""Longer side of the pictures that are compared, px. Chosen near SMALL_PX of `small_pictures`; half or twice takes a
+quarter or four times the memory."""
 CHANGED = 6.0
 """Change in units of the noise of a pixel that counts. Measured (still pictures of 320 x 256, noise of 1, 3, 6 and 10
 grey levels, 120 pictures each, seeds 20980 to 20989): no event was seen in any of 40; at 5 in three. By

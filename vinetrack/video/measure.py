@@ -14,9 +14,11 @@ from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.capture_clock import capture_rate
+from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis, axis_through
 from vinetrack.video.event_frames import read_event
 from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording
+from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.track import Tracking, track_frames
 
@@ -153,6 +155,6 @@ def _sound_luma(frames: Frames) -> NDArray[Any]:
 
 def _found_axis(luma: NDArray[Any], trial: Trial) -> Axis:
     try:
-        return find_axis(luma)
+        return find_growth_axis(SmallPictures(luma), luma) if trial.travel_ratio == 2 else find_axis(luma)
     except RecordingError as error:
         raise RecordingError(f"{trial.video.name if trial.video else trial.name}: {error}") from error

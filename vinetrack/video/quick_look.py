@@ -14,10 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
-from vinetrack.video.axis import Axis, SmallPictures, find_axis, is_orderly
+from vinetrack.video.axis import Axis, is_orderly
+from vinetrack.video.curve_search import find_growth_axis
+from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import curve_parts, cut_along
 from vinetrack.video.edge import Outline, outline, rough_growth
 from vinetrack.video.frames import Recording, RecordingError, iterate_frames
+from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.strip import Strip, squared
 from vinetrack.video.track import CENTRINGS, centred, whereabouts
 
@@ -95,8 +98,8 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
         Where nothing moves along one line.
     """
     small = SmallPictures(luma)
-    axis = find_axis(small)
-    if not is_orderly(small, axis):
+    axis = find_growth_axis(small, luma)
+    if not isinstance(axis, CurvedAxis) and not is_orderly(small, axis):
         return axis
     try:
         return _about_the_tube(luma, axis)[0].axis

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Indices, Track, Trial
-from vinetrack.video.axis import Axis, SmallPictures, centred_on_motion, find_axis, is_orderly
+from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
+from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import (
     beside_curve,
@@ -37,6 +38,7 @@ from vinetrack.video.point_quality import (
     judge,
 )
 from vinetrack.video.slow_errors import ARRIVAL_PX, SLOW_PX
+from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.sound_frames import sound_stretch
 from vinetrack.video.strip import Strip, recut, squared
 from vinetrack.video.track_scale import in_metres
@@ -292,8 +294,12 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     if isinstance(axis, CurvedAxis):
         return _along_given_curve(luma, axis, trial, m_per_px)
     small = SmallPictures(luma)
+    if axis is None and trial.travel_ratio == 2:
+        axis = find_growth_axis(small, luma)
     axis = axis if axis is not None else find_axis(small)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
+    if isinstance(axis, CurvedAxis):
+        return axis, True
     if given:
         # Room for an axis that is a few degrees off; it is centred on what moves, here or in `_follow`.
         axis = replace(axis, width_px=axis.width_px + ROOM * axis.length_px)

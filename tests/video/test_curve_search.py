@@ -1,0 +1,63 @@
+"""The curve along which a vine grew, found from its motion; straight vines keep their straight axis."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bent_scene import BENDS, BentPlan, BentScene, bent_scene
+from plain_scene import HARDER, Plan, plain_scene
+
+from vinetrack.core.records import Trial
+from vinetrack.video.axis import find_axis
+from vinetrack.video.curve_search import find_curve, find_growth_axis, share_in_order
+from vinetrack.video.curved_axis import CurvedAxis
+from vinetrack.video.frames import Frames, Recording
+from vinetrack.video.quick_look import proposed_axis
+from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.track import Tracking, track_frames
+
+
+@pytest.fixture(scope="module", params=["quarter", "gentle"])
+def bent(request: pytest.FixtureRequest) -> BentScene:
+    return bent_scene(BentPlan(seed=4, speed=22.0, **BENDS[request.param]))
+
+
+def followed(frames: np.ndarray, exposure: float) -> Tracking:
+    n, height, width = frames.shape
+    recording = Recording(Path("bent.mp4"), "container", width, height, 8, n)
+    decoded = Frames(recording, recording.whole, frames, np.arange(n), np.zeros(n, dtype=bool))
+    trial = Trial(name="bent", capture_fps=1000.0, exposure_s=exposure / 1000, m_per_px=1e-3)
+    return track_frames(decoded, trial, 1000.0)
+
+
+def test_a_bent_vine_is_followed_along_the_curve_that_is_found(bent: BentScene) -> None:
+    tracking = followed(bent.frames, bent.plan.exposure)
+    assert isinstance(tracking.axis, CurvedAxis)
+    track = tracking.track
+    used = bent.moving & track.usable
+    assert used.sum() == bent.moving.sum()
+    error = track.edge_px[used] - bent.edge_px[used]
+    assert error.std() < 0.4
+    away = np.hypot(*(tracking.axis.points(track.edge_px[used]) - bent.places(bent.edge_px[used])).T)
+    assert away.max() < 2.5
+    assert not any("bends or sweeps" in note for note in track.notes)
+
+
+def test_its_curve_explains_nearly_all_that_changes_and_points_along_the_growth(bent: BentScene) -> None:
+    small = SmallPictures(bent.frames)
+    curve = find_curve(small)
+    assert curve is not None
+    assert share_in_order(small, curve) > 0.95
+    along, across = curve.along_and_across(bent.places(np.array([100.0, 300.0, 500.0])))
+    assert (np.diff(along) > 150).all()
+    assert np.abs(across).max() < 8
+    assert isinstance(proposed_axis(bent.frames), CurvedAxis)
+
+
+@pytest.mark.parametrize("name", ["door", "shake", "reversal", "oblique", "payload"])
+def test_a_straight_vine_keeps_the_straight_axis_it_had(name: str) -> None:
+    plan = Plan(**({"seed": 5, "width": 640, "end_px": 540.0} | HARDER[name]))
+    small = SmallPictures(plain_scene(plan).frames)
+    assert find_growth_axis(small, small.frames) == find_axis(small)
