@@ -44,6 +44,7 @@ class BentPlan:
     tail_sd: float = 8.0
     psf: float = 0.9
     noise: float = 2.5
+    shake: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -113,23 +114,30 @@ def bent_scene(plan: BentPlan) -> BentScene:
     unit = tangent[nearest]
     along = (arc[nearest] + np.sum(offset * unit, axis=1)).reshape(h, w)
     across = (unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]).reshape(h, w)
-    beside = away.reshape(h, w) < plan.radius + 8
     back = plan.background + texture(rng, (h, w), 2.0, plan.background_sd)
     wall, tail = texture(rng, (h, w), 2.5, plan.wall_sd), texture(rng, (64, 4096), 3.0, plan.tail_sd)
-    inside = np.clip(plan.radius - np.abs(across) + 0.5, 0, 1) * beside
-    bulge = plan.tip_depth * (1 - np.sqrt(np.clip(1 - (across / plan.radius) ** 2, 0, 1)))
-    shade = 1 - 0.25 * np.clip(across / plan.radius, -1, 1) ** 2
-    rows = np.clip(across + 32, 0, 63).astype(np.int32)
+    # Only the tube's own pixels are drawn anew in each of the parts of an exposure.
+    tube = np.nonzero((away.reshape(h, w) < plan.radius + 8) & (np.abs(across) < plan.radius + 0.5))
+    off, s = across[tube], along[tube]
+    inside = np.clip(plan.radius - np.abs(off) + 0.5, 0, 1)
+    bulge = plan.tip_depth * (1 - np.sqrt(np.clip(1 - (off / plan.radius) ** 2, 0, 1)))
+    shade = 1 - 0.25 * np.clip(off / plan.radius, -1, 1) ** 2
+    film = plan.opacity * (plan.film * shade + wall[tube]) + (1 - plan.opacity) * back[tube]
+    rows = np.clip(off + 32, 0, 63).astype(np.int32)
+    phase = rng.uniform(0, 2 * np.pi, 2)
     frames = np.empty((n, h, w), np.uint8)
     for i in range(n):
-        steps = travel(i + plan.exposure * (np.arange(12) + 0.5) / 12)
-        cover, inner = np.zeros((h, w)), np.zeros((h, w))
-        for now in steps:
-            cover += np.clip(now - bulge - along + 0.5, 0, 1)
-            inner += tail[rows, np.mod((along - 2 * now).astype(np.int32), 4096)] * (np.abs(across) < 0.6 * plan.radius)
-        tube = plan.opacity * (plan.film * shade + wall) + (1 - plan.opacity) * back + inner / 12
-        picture = back + cover / 12 * inside * (tube - back)
+        cover, inner = np.zeros(len(s)), np.zeros(len(s))
+        for now in travel(i + plan.exposure * (np.arange(12) + 0.5) / 12):
+            cover += np.clip(now - bulge - s + 0.5, 0, 1) / 12
+            inner += tail[rows, np.mod((s - 2 * now).astype(np.int32), 4096)] * (np.abs(off) < 0.6 * plan.radius) / 12
+        picture = back.copy()
+        picture[tube] += cover * inside * (film + inner - back[tube])
         picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
+        if plan.shake:
+            dx, dy = plan.shake * np.sin(0.55 * i + phase[0]), plan.shake * np.sin(0.37 * i + phase[1])
+            move = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
+            picture = cv2.warpAffine(picture, move, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         grain = rng.standard_normal((h, w)).astype(np.float32) * plan.noise * np.sqrt(np.clip(picture, 1, None) / 100)
         frames[i] = np.clip(np.rint(picture + grain), 0, 255).astype(np.uint8)
     edge = travel(np.arange(n) + plan.exposure / 2)

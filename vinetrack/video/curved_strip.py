@@ -17,6 +17,7 @@ from vinetrack.video.axis import Axis, is_orderly
 from vinetrack.video.curved_axis import NEAREST_PX, ROOM_INSIDE, CurvedAxis, axis_through, curve_complaint
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
+from vinetrack.video.still_ground import picture_shake
 from vinetrack.video.strip import BAND_PX, GAP_PX, Strip, cut_strip
 
 if TYPE_CHECKING:
@@ -32,6 +33,13 @@ or twice hardly matters, as a smooth curve is laid through them."""
 SPAN = 1.0
 """Stretches, as the standard deviation of a Gaussian, over which the tube's middle is averaged. Measured on bends of 90
 to 1100 px radius: SD of 0.08 to 0.30 px; at twice 0.10 to 0.73 px, as sharp bends are cut. Half was not tried."""
+
+
+SLOW_PX_PER_RAD = 0.06
+"""Slow error of a position along a curve for each radian by which that turns: where the curve lies beside the tube's
+middle, the way along it is a little longer or shorter. Measured on sixteen drawn clips, seeds 1 to 4 of `bent` of
+`benchmarks/tracking_accuracy.py`, as what errors exceed their noise by: 0.00 to 0.09 px a radian. At half or twice the
+slow error of curves is so."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +64,7 @@ def widest_px(axis: Axis) -> float:
     return ROOM_INSIDE * axis.least_radius_px if isinstance(axis, CurvedAxis) else float("inf")
 
 
-def laid_straight(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> LaidStraight:
+def laid_straight(luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px: Floats | None = None) -> LaidStraight:
     """Lay pictures straight along a curve, by bicubic interpolation.
 
     Parameters
@@ -65,6 +73,7 @@ def laid_straight(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> LaidS
     axis : in the picture, px.
     half_px : what is wanted on either side, px; more is taken, for what stands still beside a strip, where the picture
         and the curve's radius leave room for it.
+    shake_px : how far each picture moved right and down, which is undone; shape (n_frames, 2), px.
 
     Returns
     -------
@@ -78,12 +87,13 @@ def laid_straight(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> LaidS
     place = axis.points(np.arange(n_along, dtype=float)[None, :], rows[:, None]).astype(np.float32)
     x, y = np.ascontiguousarray(place[..., 0]), np.ascontiguousarray(place[..., 1])
     out = np.empty((len(luma), len(rows), n_along), luma.dtype)
-    for frame, straight in zip(luma, out, strict=True):
-        cv2.remap(frame, x, y, cv2.INTER_CUBIC, dst=straight, borderMode=cv2.BORDER_REPLICATE)
+    moved = np.zeros((len(luma), 2)) if shake_px is None else shake_px
+    for frame, straight, (dx, dy) in zip(luma, out, moved.astype(np.float32), strict=True):
+        cv2.remap(frame, x + dx, y + dy, cv2.INTER_CUBIC, dst=straight, borderMode=cv2.BORDER_REPLICATE)
     return LaidStraight(out, Axis((0.0, float(above)), (n_along - 1.0, float(above)), axis.width_px))
 
 
-def cut_along(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
+def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | None = None) -> Strip:
     """Cut, level and steady the strip on both sides of an axis, straight or curved; see `strip.cut_strip`.
 
     Parameters
@@ -91,16 +101,59 @@ def cut_along(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
     luma : grey levels, shape (n_frames, height, width).
     axis : in the picture, px.
     half_px : half the height of the strip, px; along a curve no more than its normals allow.
+    before : a strip along a neighbouring curve, which knows the camera's shake.
 
     Returns
     -------
-    the strip.
+    the strip; its `shift_px` is along and across a straight axis, right and down beside a curve.
     """
     if not isinstance(axis, CurvedAxis):
         return cut_strip(luma, axis, half_px)
     half = min(half_px, max(widest_px(axis) - 1, 2.0))
-    straight = laid_straight(luma, axis, half)
-    return replace(cut_strip(straight.luma, straight.axis, half), axis=axis)
+    shake_px = picture_shake(luma, axis, half) if before is None else _shake_of(before)
+    straight = laid_straight(luma, axis, half, shake_px)
+    strip = replace(cut_strip(straight.luma, straight.axis, half, still=True), axis=axis)
+    return strip if shake_px is None else replace(strip, shift_px=shake_px, steadied=True)
+
+
+def path_error_px(axis: Axis) -> float:
+    """Return the slow error that a path's own shape adds to positions along it.
+
+    Parameters
+    ----------
+    axis : in the picture.
+
+    Returns
+    -------
+    px; 0 along a straight line.
+    """
+    if not isinstance(axis, CurvedAxis):
+        return 0.0
+    direction = axis.direction_at(np.linspace(0.0, axis.length_px, 400))
+    turns = np.arctan2(*direction.T[::-1])
+    return SLOW_PX_PER_RAD * float(np.abs(np.diff(np.unwrap(turns))).sum())
+
+
+def _shake_of(strip: Strip) -> Floats | None:
+    return strip.shift_px if strip.steadied else None
+
+
+def shake_along(strip: Strip, edge_px: Floats) -> Floats:
+    """Return how far along the axis, where the edge is, a shaken camera moved each picture.
+
+    Parameters
+    ----------
+    strip : steadied.
+    edge_px : along its axis, shape (n_frames,), px; NaN where unknown.
+
+    Returns
+    -------
+    shape (n_frames,), px.
+    """
+    if not isinstance(strip.axis, CurvedAxis):
+        return strip.shift_px[:, 0]
+    known = np.where(np.isfinite(edge_px), edge_px, 0.5 * strip.axis.length_px)
+    return np.asarray(np.sum(strip.shift_px * strip.axis.direction_at(known), axis=1))
 
 
 def orderly_along(luma: NDArray[Any], axis: CurvedAxis) -> bool:

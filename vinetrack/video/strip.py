@@ -54,7 +54,7 @@ class Strip:
     steadied: bool
 
 
-def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
+def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, still: bool = False) -> Strip:
     """Cut, level and steady the strip on both sides of an axis.
 
     Parameters
@@ -62,6 +62,7 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
     luma : grey levels, shape (n_frames, height, width).
     axis : in the picture, px.
     half_px : half the height of the strip, px.
+    still : whether the pictures are known not to shake: they are levelled alone.
 
     Returns
     -------
@@ -69,12 +70,12 @@ def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float) -> Strip:
     """
     half = int(np.ceil(half_px))
     bands = _band_rows(luma.shape[1:], axis, half)
-    unit = _unit(luma)
+    unit = camera_unit(luma)
     n = len(luma)
     scale, offset, shift = np.full(n, unit), np.zeros(n), np.zeros((n, 2))
     steadied = False
     if bands:
-        scale, offset, shift, steadied = _steady(luma, axis, bands, unit)
+        scale, offset, shift, steadied = _steady(luma, axis, bands, unit, still)
     values = sample(luma, axis, np.arange(-half, half + 1), shift if steadied else None)
     return Strip(values, scale, offset, shift, _noise(values, scale), axis, steadied)
 
@@ -185,8 +186,17 @@ def squared(axis: Axis) -> Axis:
     return axis
 
 
-def _unit(luma: NDArray[Any]) -> float:
-    """Grey levels of 255 in one unit of the camera's."""
+def camera_unit(luma: NDArray[Any]) -> float:
+    """Return the grey levels of 255 in one unit of the camera's.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+
+    Returns
+    -------
+    grey levels.
+    """
     if luma.dtype == np.uint8:
         return 1.0
     top = float(np.max(luma[:: max(1, len(luma) // 8), ::2, ::2]))
@@ -209,7 +219,7 @@ def _band_rows(shape: tuple[int, ...], axis: Axis, half: int) -> list[NDArray[np
 
 
 @dataclass(frozen=True)
-class _Reference:
+class Reference:
     """Pixels of the bands with which frames are compared: where they lie, and what they show on average.
 
     `along_px` and `across_px`, shape (n_pixels,), whole numbers; `basis`, shape (4, n_pixels): mean picture, one, and
@@ -222,7 +232,7 @@ class _Reference:
 
 
 def _steady(
-    luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], unit: float
+    luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], unit: float, still: bool
 ) -> tuple[Floats, Floats, Floats, bool]:
     """Gain, level and shift of every frame against the mean picture of its bands."""
     n = len(luma)
@@ -232,10 +242,10 @@ def _steady(
     means = _mean_pictures(luma, axis, bands, picks, None)
     reference = _reference(means, bands)
     for turn in range(4):
-        fit, sd = _register(luma, axis, reference, shift if turn else None, unit)
+        fit, sd = register(luma, axis, reference, shift if turn else None, unit)
         if turn == 0:
             strength = float(np.median(np.abs(fit[:, 2:]))), float(np.median(sd))
-            if not np.isfinite(strength[1]) or strength[0] < max(SHAKE_FLOOR_PX, 2.5 * strength[1]):
+            if still or not np.isfinite(strength[1]) or strength[0] < max(SHAKE_FLOOR_PX, 2.5 * strength[1]):
                 break
             if not _halves_agree(luma, axis, bands, means, unit):
                 break
@@ -259,7 +269,7 @@ def _halves_agree(
     columns = means[0].shape[1]
     parts = []
     for low, high in ((0, columns // 2), (columns // 2, columns)):
-        parts.append(_register(luma, axis, _reference(means, bands, (low, high)), None, unit))
+        parts.append(register(luma, axis, _reference(means, bands, (low, high)), None, unit))
     (first, first_sd), (second, second_sd) = parts
     apart, both = np.abs(first[:, 2] - second[:, 2]), np.abs(first[:, 2] + second[:, 2])
     most = apart + both >= np.quantile(apart + both, 0.75)
@@ -278,7 +288,7 @@ def _mean_pictures(
 
 def _reference(
     means: list[NDArray[np.float32]], bands: list[NDArray[np.int_]], columns: tuple[int, int] | None = None
-) -> _Reference:
+) -> Reference:
     """About PIXELS pixels of the bands, between two columns, with what they show on average."""
     low, high = columns or (0, means[0].shape[1])
     parts, along, across = [], [], []
@@ -291,13 +301,13 @@ def _reference(
         across.append(grid[1].ravel())
     basis = np.concatenate(parts, axis=1)
     every = max(1, basis.shape[1] // PIXELS)
-    return _Reference(
+    return Reference(
         np.concatenate(along)[::every].astype(float), np.concatenate(across)[::every].astype(float),
         np.ascontiguousarray(basis[:, ::every], dtype=np.float64),
     )  # fmt: skip
 
 
-def _pixels(luma: NDArray[Any], axis: Axis, reference: _Reference, shift_px: Floats | None) -> NDArray[Any]:
+def _pixels(luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floats | None) -> NDArray[Any]:
     """The pixels of a reference in every frame, as `sample` would cut them, shape (n_frames, n_pixels)."""
     import cv2
 
@@ -318,13 +328,25 @@ def _pixels(luma: NDArray[Any], axis: Axis, reference: _Reference, shift_px: Flo
     return out
 
 
-def _register(
-    luma: NDArray[Any], axis: Axis, reference: _Reference, shift_px: Floats | None, unit: float
+def register(
+    luma: NDArray[Any], axis: Axis, reference: Reference, shift_px: Floats | None, unit: float
 ) -> tuple[Floats, Floats]:
-    """Gain, level, shift along and across of every frame (n, 4), and the error of the shift (n,), robustly.
+    """Compare every frame with what stands still, robustly.
 
     frame(x) = gain · picture(x − shift) + level. Where the bands show no texture the level is held near zero and the
     shift is left at zero.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+    axis : the reference's places lie along and across it, px.
+    reference : what stands still.
+    shift_px : what every frame is moved back by first, along and across, shape (n_frames, 2), px.
+    unit : grey levels in one unit of the camera's.
+
+    Returns
+    -------
+    gain, level, shift along and across of every frame, shape (n_frames, 4), and the error of the shift, (n_frames,).
     """
     basis = reference.basis
     level = float(np.abs(basis[0]).mean()) + 1e-9

@@ -20,7 +20,9 @@ from vinetrack.video.curved_strip import (
     curve_parts,
     cut_along,
     orderly_along,
+    path_error_px,
     refuse_poor_curve,
+    shake_along,
     widest_px,
 )
 from vinetrack.video.event_frames import read_event
@@ -231,6 +233,7 @@ def track_frames(
     sigma = np.where(sigma < LOST_SIGMA_PX, np.minimum(np.hypot(sigma, verdict.departure_px), LOST_SIGMA_PX), sigma)
     noise = np.minimum(np.hypot(np.maximum(noise, edge_fit.bands_sigma_px), verdict.departure_px), LOST_SIGMA_PX)
     slow = np.hypot(np.broadcast_to(edge_fit.slow_px, noise.shape), STEADIED_PX if strip.steadied else 0.0)
+    slow = np.hypot(slow, path_error_px(strip.axis))
     slow = np.minimum(slow, LOST_SIGMA_PX)
     if verdict.last_moving < 0:
         if np.mean(~(sigma < LOST_SIGMA_PX)) > MOSTLY_LOST:
@@ -269,7 +272,7 @@ def track_frames(
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
     pictures = tuple((int(number[kept[i]]), luma[i].copy()) for i in chosen)
     shake_px = np.zeros(frames.n_recorded)
-    shake_px[number[kept]] = strip.shift_px[:, 0] if strip.steadied else 0.0
+    shake_px[number[kept]] = shake_along(strip, edge_fit.edge_px) if strip.steadied else 0.0
     return Tracking(
         track, strip.axis, _kymograph(strip), pictures, edge_fit.blur_px, edge_fit.exposure_frames, shake_px,
         *edge_fit.width_px, *edge_fit.seen_exposure, strip_frames=number[kept],
@@ -389,7 +392,7 @@ def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
         curve, away = beside_curve(strip.axis, sides)
         if away < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
             return strip
-        return cut_along(luma, curve, half * 1.15 + 5)
+        return cut_along(luma, curve, half * 1.15 + 5, strip)
     tilt = slope * strip.axis.length_px
     middle = shift + tilt / 2
     if abs(middle) + abs(tilt) / 2 < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
