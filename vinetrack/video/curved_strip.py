@@ -35,6 +35,10 @@ SPAN = 1.0
 to 1100 px radius: SD of 0.08 to 0.30 px; at twice 0.10 to 0.73 px, as sharp bends are cut. Half was not tried."""
 
 
+SETTLED_PX = 0.3
+"""Greatest distance from the tube's middle at which a curve is left alone. Measured on drawn curves, seeds 1 to 4 of
+`bent` of `benchmarks/tracking_accuracy.py`, with twice the rounds of a straight strip: SD of 0.13 px at sharp bends and
+0.09 along an S; 0.24 and 0.13 at 0.8 px and as many rounds as a straight strip. Half was not tried."""
 SLOW_PX_PER_RAD = 0.06
 """Slow error of a position along a curve for each radian by which that turns: where the curve lies beside the tube's
 middle, the way along it is a little longer or shorter. Measured on sixteen drawn clips, seeds 1 to 4 of `bent` of

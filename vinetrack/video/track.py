@@ -16,6 +16,7 @@ from vinetrack.video.capture_clock import capture_exposure, capture_rate
 from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import (
+    SETTLED_PX,
     beside_curve,
     curve_parts,
     cut_along,
@@ -345,7 +346,7 @@ def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float
                 edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames, 2.0, slow_px=ARRIVAL_PX
             )
         strip = cut_along(luma, squared(axis), 1.3 * half + 3)
-        for _ in range(CENTRINGS):
+        for _ in range(2 * CENTRINGS if axis.bends else CENTRINGS):
             before, sides = strip, outline(strip, curve_parts(axis))
             strip = centred(luma, strip, sides)
             if strip is before:
@@ -390,7 +391,7 @@ def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
     room = (strip.values.shape[1] - 1) / 2 - half - 3
     if isinstance(strip.axis, CurvedAxis):
         curve, away = beside_curve(strip.axis, sides)
-        if away < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
+        if away < SETTLED_PX and 0 <= room < 0.3 * half + 6:
             return strip
         return cut_along(luma, curve, half * 1.15 + 5, strip)
     tilt = slope * strip.axis.length_px
