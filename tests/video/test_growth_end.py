@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from plain_scene import Plan, plain_scene
 
 from vinetrack.core.records import Trial
@@ -18,13 +19,17 @@ from vinetrack.video.track import track_frames
 END_PX, SPEED = 200, 5.0
 
 
-def grown(flies, rows=40, columns=330, n=60):
-    """Film of brightness 160 on 60 that stops at END_PX; a dark body 24 px long leaves it at twice the speed."""
+def grown(flies, rows=40, columns=330, n=60, flight=2.0):
+    """Film of brightness 160 on 60 that stops at END_PX; a dark body 24 px long leaves it at `flight` times the speed.
+
+    At twice the speed, that of the tail, it comes out bit by bit; a slower one has come out whole a frame later.
+    """
     rng = np.random.default_rng(301)
     time = np.arange(n, dtype=float)
     edge = np.minimum(20 + SPEED * time, END_PX)
     end = (END_PX - 20) / SPEED
-    body = np.where(time > end, END_PX + 2 * SPEED * (time - end), -100.0)
+    out = 0.0 if flight > 1.5 else 24.0
+    body = np.where(time > end, END_PX + out + flight * SPEED * (time - end), -100.0)
     background, film = rng.normal(60, 6, (rows, columns)), rng.normal(160, 8, (rows, columns))
     s = np.arange(columns)
     values = np.where(s < edge[:, None, None], film, background)
@@ -38,8 +43,9 @@ def grown(flies, rows=40, columns=330, n=60):
     return strip, np.minimum(np.maximum(edge, body) if flies else edge, columns)
 
 
-def test_a_payload_that_flies_on_ends_growth():
-    strip, path = grown(flies=True)
+@pytest.mark.parametrize("flight", [2.0, 1.0, 0.5])
+def test_a_payload_that_flies_on_ends_growth(flight):
+    strip, path = grown(flies=True, flight=flight)
     assert abs(growth_end(strip, path, (20, int(path[-1]))) - END_PX) <= 3
 
 
@@ -59,14 +65,15 @@ def test_growth_that_quickens_is_no_flight():
     assert growth_end(faster, quick, (20, int(quick[-1]))) == int(quick[-1])
 
 
-def test_a_track_does_not_follow_the_payload():
+@pytest.mark.parametrize("flight", [2.0, 1.0])
+def test_a_track_does_not_follow_the_payload(flight):
     plan = Plan(seed=302, width=520, height=160, from_px=(20.0, 80.0), start_px=50.0, end_px=330.0, radius=24.0)
     scene = plain_scene(plan)
     luma = scene.frames.copy()
     last = int(np.flatnonzero(scene.moving)[-1])
     speed = scene.edge_px[last - 1] - scene.edge_px[last - 2]
     for t in range(last - 1, len(luma)):
-        x = plan.from_px[0] + plan.end_px + 2 * speed * (t - last + 1)
+        x = plan.from_px[0] + plan.end_px + (28 if flight < 2 else 0) + flight * speed * (t - last + 1)
         disc = cv2.circle(np.zeros_like(luma[t], np.float32), (round(x), 80), 14, 1.0, -1, cv2.LINE_AA)
         luma[t] = np.rint(luma[t] * (1 - disc) + 12 * disc).astype(np.uint8)
     n, height, width = luma.shape
@@ -78,3 +85,4 @@ def test_a_track_does_not_follow_the_payload():
     error = track.edge_px + tracking.axis.from_px[0] - plan.from_px[0] - scene.edge_px
     assert np.abs(error[track.usable]).max() < 2.0
     assert all("after_end" in flag for flag in track.flag[last + 2 :])
+    assert not any("missing" in note for note in track.notes)

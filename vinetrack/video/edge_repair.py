@@ -264,7 +264,7 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
     """Column where the film ends although what moves goes on, or the end of `passed` where nothing does.
 
     From the last column passed backwards: what flies (no longer than the tube is wide), then columns that look as
-    they did before anything came, then film. What flies must be faster than the edge was.
+    they did before anything came, then film. What flies must be faster than the edge was, or have leapt ahead of it.
 
     Parameters
     ----------
@@ -286,8 +286,12 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
     i = _first_bare(back, strip.values.shape[1])
     if i < 3 * SHORTEST_PX or back[i - 2 * SHORTEST_PX : i].mean() > 0.3:
         return passed[1]
-    flight = _speed(arrival, i + 2, len(columns))
-    return int(columns[i]) + 1 if flight > RUNS_AWAY * _speed(arrival, i - 6 * SHORTEST_PX, i - 5) else passed[1]
+    growth, flight = _speed(arrival, i - 6 * SHORTEST_PX, i - 5), _speed(arrival, i + 2, len(columns))
+    # What comes out is ahead of the film at once by its own length, however slowly it then flies.
+    out = int(arrival[i])
+    leap = float(np.diff(path)[max(out - 2, 0) : out + 2].max(initial=0.0))
+    leaves = flight > RUNS_AWAY * growth or leap > max(RUNS_AWAY * growth, growth + SHORTEST_PX / 2)
+    return int(columns[i]) + 1 if leaves else passed[1]
 
 
 def _first_bare(back: NDArray[np.bool_], longest: int) -> int:
