@@ -43,6 +43,7 @@ def test_a_bent_vine_is_followed_along_the_curve_that_is_found(bent: BentScene) 
     away = np.hypot(*(tracking.axis.points(track.edge_px[used]) - bent.places(bent.edge_px[used])).T)
     assert away.max() < 2.5
     assert not any("bends or sweeps" in note for note in track.notes)
+    assert any("along a curve that was found" in note for note in track.notes)
 
 
 def test_its_curve_explains_nearly_all_that_changes_and_points_along_the_growth(bent: BentScene) -> None:

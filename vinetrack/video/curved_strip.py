@@ -133,9 +133,30 @@ def path_error_px(axis: Axis) -> float:
     """
     if not isinstance(axis, CurvedAxis):
         return 0.0
+    return SLOW_PX_PER_RAD * _bent_rad(axis)
+
+
+def curve_found(axis: CurvedAxis) -> str:
+    """Say that the axis of growth was found to be a curve.
+
+    Parameters
+    ----------
+    axis : in the picture.
+
+    Returns
+    -------
+    sentence, without an end.
+    """
+    return (
+        f"the vine bends by {np.degrees(_bent_rad(axis)):.0f}° in all, and positions are those along a curve that was"
+        " found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
+    )
+
+
+def _bent_rad(axis: CurvedAxis) -> float:
+    """By how much a curve turns in all, to either side."""
     direction = axis.direction_at(np.linspace(0.0, axis.length_px, 400))
-    turns = np.arctan2(*direction.T[::-1])
-    return SLOW_PX_PER_RAD * float(np.abs(np.diff(np.unwrap(turns))).sum())
+    return float(np.abs(np.diff(np.unwrap(np.arctan2(*direction.T[::-1])))).sum())
 
 
 def _shake_of(strip: Strip) -> Floats | None:

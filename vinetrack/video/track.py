@@ -18,6 +18,7 @@ from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import (
     SETTLED_PX,
     beside_curve,
+    curve_found,
     curve_parts,
     cut_along,
     orderly_along,
@@ -214,7 +215,7 @@ def track_frames(
     kept = np.flatnonzero(sound & ~rejected)
     luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
     try:
-        axis, orderly = whereabouts(luma, axis, trial, m_per_px)
+        given, (axis, orderly) = axis is not None, whereabouts(luma, axis, trial, m_per_px)
         strip, edge_fit = _follow(luma, trial, axis, exposure_s * capture_fps, orderly)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
@@ -251,6 +252,8 @@ def track_frames(
         notes += end_of_growth(luma, verdict, edge_fit.edge_px, name, number[kept])
         if trial.travel_ratio == 2 and trial.frames_used is None and number[kept[-1]] == frames.n_recorded - 1:
             notes += cut_short(edge_fit.edge_px, verdict, trial.length_m / scale, name)
+    if isinstance(strip.axis, CurvedAxis) and not given:
+        notes.append(f"{name}: {curve_found(strip.axis)}")
     if not orderly:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
