@@ -261,12 +261,15 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
 
 
 def _slow_error(track: Track, usable: NDArray[np.bool_]) -> Floats | None:
-    """The tracker's slow error at the usable points, m; between those that state one where others do not."""
-    slow_m = track.lead_position_systematic_m
-    if slow_m is None or not np.isfinite(slow_m[usable]).any():
-        return None
-    known = usable & np.isfinite(slow_m)
-    return np.interp(np.flatnonzero(usable), np.flatnonzero(known), slow_m[known])
+    """The tracker's slow error at the usable points, m; between those that state one where others do not.
+
+    Where a track states one error in all, as results of 0.1.0 do, it is taken for the slow one, by which it errs most.
+    """
+    for slow_m in (track.lead_position_systematic_m, track.lead_position_sigma_m):
+        if slow_m is not None and np.isfinite(slow_m[usable]).any():
+            known = usable & np.isfinite(slow_m)
+            return np.interp(np.flatnonzero(usable), np.flatnonzero(known), slow_m[known])
+    return None
 
 
 def _position_systematic_m(trial: Trial) -> float:

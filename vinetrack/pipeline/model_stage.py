@@ -146,15 +146,14 @@ def read_back(trial: Trial, table: pd.DataFrame) -> Track:
     """
     from vinetrack.tracks.importers import TrackError, attach_pressure, load_track, read_pressure_trace
 
-    # Results of 0.1.0 state noise and slow error as one.
-    slow_m = table.get("lead_position_systematic_m", table["lead_position_sigma_m"])
+    slow_m = table.get("lead_position_systematic_m")  # results of 0.1.0 have no such column
     track = Track(
         time_s=table["time_s"].to_numpy(dtype=float),
         lead_position_m=table["lead_position_m"].to_numpy(dtype=float),
         lead_position_sigma_m=table["lead_position_sigma_m"].to_numpy(dtype=float),
         flag=table["flag"].to_numpy(dtype=str),
         edge_px=table["edge_px"].to_numpy(dtype=float),
-        lead_position_systematic_m=slow_m.to_numpy(dtype=float),
+        lead_position_systematic_m=None if slow_m is None else slow_m.to_numpy(dtype=float),
     )
     try:
         if trial.pressure_trace is not None:
