@@ -274,7 +274,7 @@ def bent_row(name: str, path: Path, scene, drawn: Axis | None, curves: bool) -> 
         with mock.patch.object(track, "find_growth_axis", search):
             tracking = track_frames(frames, trial, CAPTURE_FPS, drawn)
     except RecordingError as error:
-        return Row(name, moving, moving, np.nan, np.nan, np.nan, np.nan, str(error))
+        return Row(name, moving, moving, np.nan, np.nan, np.nan, np.nan, note=str(error))
     spent = (time.perf_counter() - start) / len(frames) * 1e3
     row = compare(name, tracking, scene.edge_px, scene.moving, spent)
     used = scene.moving & tracking.track.usable
