@@ -62,3 +62,16 @@ def test_a_straight_vine_keeps_the_straight_axis_it_had(name: str) -> None:
     plan = Plan(**({"seed": 5, "width": 640, "end_px": 540.0} | HARDER[name]))
     small = SmallPictures(plain_scene(plan).frames)
     assert find_growth_axis(small, small.frames) == find_axis(small)
+
+
+@pytest.mark.parametrize(("length_px", "width_px"), [(21, 2), (3, 10), (9, 3), (14, 1), (40, 40)])
+def test_what_is_hardly_longer_than_wide_has_no_curve_and_stops_nothing(length_px: int, width_px: int) -> None:
+    rng = np.random.default_rng(2211)
+    for _ in range(10):
+        frames = rng.normal(60, 2, (20, 99, 134))
+        x, y = rng.integers(0, 90), rng.integers(0, 55)
+        for t in range(20):
+            frames[t, y : y + width_px, x : x + length_px * t // 20 + 1] += 100
+        small = SmallPictures(np.clip(frames, 0, 255).astype(np.uint8))
+        curve = find_curve(small)
+        assert curve is None or curve.length_px > 2 * curve.width_px

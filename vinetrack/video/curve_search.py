@@ -121,6 +121,8 @@ def find_curve(small: SmallPictures, band: Band | None = None) -> CurvedAxis | N
     if band is None or path is None or len(path) < LEAST_LENGTH * band.width:
         return None
     middle = _smoothed(_in_time(path, band), max(KNOT_WIDTHS * band.width, 6.0))
+    if middle is None:
+        return None
     size = small.shape[1], small.shape[0]
     try:
         axis = axis_through((middle + 0.5) * small.factor - 0.5, band.width * small.factor)
@@ -207,15 +209,18 @@ def _in_time(path: Floats, band: Band) -> Floats:
     return path if later >= 0 else path[::-1]
 
 
-def _smoothed(path: Floats, apart: float) -> Floats:
-    """Knots of a penalised spline through a way of whole pixels, `apart` from each other, shape (n, 2).
+def _smoothed(path: Floats, apart: float) -> Floats | None:
+    """Knots of a penalised spline through a way of whole pixels, `apart` from each other, shape (n, 2), n ≥ 4.
 
-    The ends of the way run into the corners of the band and are left out: half a distance of knots each.
+    The ends of the way run into the corners of the band and are left out: half a distance of knots each. None where
+    fewer than five pixels are left between them, the fewest that a cubic spline goes through.
     """
     from scipy.interpolate import make_smoothing_spline
 
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
     inner = (along >= apart / 2) & (along <= along[-1] - apart / 2)
+    if inner.sum() < 5:
+        return None
     # A wave of the length of two knots' distances is damped to a half: penalty λ k⁴ = 1 at k = π / apart.
     penalty = (apart / np.pi) ** 4
     splines = [make_smoothing_spline(along[inner], path[inner, k], lam=penalty) for k in (0, 1)]
