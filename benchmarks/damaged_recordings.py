@@ -100,7 +100,7 @@ def judge(trial: Trial, truth_m: np.ndarray, answer: Any) -> None:
             use = track.usable & np.isfinite(track.lead_position_m) & (slot < len(truth_m))
             error = track.lead_position_m[use] - truth_m[slot[use]]
             error = np.abs(error - np.median(error)) if error.size else np.zeros(0)
-            sure = track.lead_position_sigma_m[use] < WRONG_M / 5
+            sure = np.hypot(track.lead_position_sigma_m, track.lead_position_systematic_m)[use] < WRONG_M / 5
             outcome = "confident and wrong" if np.any(sure & (error > WRONG_M)) else "tracked"
         except RecordingError:
             outcome = "refused in a sentence"

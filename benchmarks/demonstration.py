@@ -82,7 +82,7 @@ def compare(name: str, measured: Measurement, truth: Truth) -> Row:
     moving = (np.diff(true_px, append=true_px[-1]) > 0.05) & truth.in_frame & np.isfinite(true_px)
     used = moving & track.usable
     error_px = track.edge_px[used] - true_px[used]
-    stated_px = track.lead_position_sigma_m[used] / measured.m_per_px
+    stated_px = np.hypot(track.lead_position_sigma_m, track.lead_position_systematic_m)[used] / measured.m_per_px
     off = error_px - np.median(error_px)
     first, last = np.flatnonzero(moving)[[0, -1]]
     true_m = truth.lead_position_m[last] - truth.lead_position_m[first]
