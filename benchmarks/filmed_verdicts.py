@@ -6,8 +6,8 @@ The campaigns are those of `benchmarks/hidden/` (see `hidden_effects.py`), which
 model; the virtual laboratory films them with distortion, blur, photon noise and compression, beside a calibration
 board. What is analysed is a folder of recordings and a sheet, as anybody's.
 
-SD: of tracked minus true position, px, after the mean is taken out, the median of the trials. An offset of all frames
-is no error, any analysis has an origin of its own.
+SD: of tracked minus true position, px, after the mean is taken out, the median of the trials with sure frames. An
+offset of all frames is no error, any analysis has an origin of its own.
 
 Seeds 950–974 are kept for this and were chosen by the length of their recordings, the shortest first.
 """
@@ -87,6 +87,8 @@ def tracked_sd_px(campaign: Hidden, tracks: dict[str, Track]) -> float:
             continue
         seen = tracks[trial.name]
         sure = seen.usable & (seen.flag == "")
+        if sure.sum() < 2:
+            continue
         error = seen.lead_position_m[sure] - np.interp(seen.time_s[sure], true.time_s, true.lead_position_m)
         errors.append(float(np.std(error)) / m_per_px)
     return float(np.median(errors))
