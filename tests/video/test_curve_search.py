@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bent_scene import BENDS, BentPlan, BentScene, bent_scene
-from plain_scene import HARDER, Plan, plain_scene
+from plain_scene import HARDER, Plan, plain_scene, write_images
 
-from vinetrack.core.records import Trial
+from vinetrack.core.records import PictureAxis, Trial
+from vinetrack.experiment.settings import ExperimentSettings, MmPerPx
 from vinetrack.video.axis import find_axis
 from vinetrack.video.curve_search import find_curve, find_growth_axis, share_in_order
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.frames import Frames, Recording
+from vinetrack.video.measure import measure_recording
 from vinetrack.video.quick_look import proposed_axis
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.track import Tracking, track_frames
@@ -44,6 +47,19 @@ def test_a_bent_vine_is_followed_along_the_curve_that_is_found(bent: BentScene) 
     assert away.max() < 2.5
     assert not any("bends or sweeps" in note for note in track.notes)
     assert any("along a curve that was found" in note for note in track.notes)
+
+
+def test_a_calibrated_recording_says_that_its_curve_was_found_and_not_where_it_was_drawn(tmp_path: Path) -> None:
+    scene = bent_scene(BentPlan(seed=4, speed=22.0, **BENDS["quarter"]))
+    video = write_images(tmp_path / "bent", scene.frames)
+    trial = Trial(name="bent", video=video, capture_fps=1000.0, exposure_s=scene.plan.exposure / 1000)
+    settings = ExperimentSettings(calibration=MmPerPx(kind="mm_per_px", mm_per_px=1.0))
+    drawn = [(float(x), float(y)) for x, y in scene.places(np.linspace(8.0, scene.arc_px[-1] - 8.0, 6))]
+    given = PictureAxis(drawn[0], drawn[-1], via_px=tuple(drawn[1:-1]))
+    for axis, count in ((None, 1), (given, 0)):
+        tracking = measure_recording(replace(trial, axis=axis), settings, tmp_path).tracking
+        assert isinstance(tracking.axis, CurvedAxis)
+        assert sum("along a curve that was found" in note for note in tracking.track.notes) == count
 
 
 def test_its_curve_explains_nearly_all_that_changes_and_points_along_the_growth(bent: BentScene) -> None:

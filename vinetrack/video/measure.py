@@ -16,6 +16,7 @@ from vinetrack.video.calibration import CalibrationError, PlaneCalibration, cali
 from vinetrack.video.capture_clock import capture_rate
 from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis, axis_through
+from vinetrack.video.curved_strip import curve_found
 from vinetrack.video.event_frames import read_event
 from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording
 from vinetrack.video.small_pictures import SmallPictures
@@ -79,6 +80,7 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
     frames = read_event(recording, trial.frames_used)
     m_per_px, rel_sigma, position_m = trial.m_per_px, math.nan, None
     axis = given_axis(trial, settings, m_per_px if calibration is None else calibration.m_per_px)
+    is_given = axis is not None
     if calibration is not None:
         axis = axis or _found_axis(_sound_luma(frames), trial)
         along = calibration.along_path(axis)
@@ -91,9 +93,13 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
         off_px = tracking.tube_width_sigma_px / 2 if math.isfinite(tracking.tube_width_sigma_px) else 0.0
         along = calibration.along_path(tracking.axis, off_px)
         m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
+    notes = [*tracking.track.notes]
+    if calibration is not None and not is_given and isinstance(tracking.axis, CurvedAxis):
+        notes.append(f"{recording.path.name}: {curve_found(tracking.axis)}")
     # What is to be said of a scale that was merely given belongs to the experiment, not to each of its trials.
-    notes = calibration.notes if calibration is not None and math.isfinite(calibration.reprojection_px) else ()
-    tracking = replace(tracking, track=replace(tracking.track, notes=(*tracking.track.notes, *notes)))
+    if calibration is not None and math.isfinite(calibration.reprojection_px):
+        notes += calibration.notes
+    tracking = replace(tracking, track=replace(tracking.track, notes=tuple(notes)))
     return Measurement(tracking, m_per_px, rel_sigma, calibration, capture_fps, recording)
 
 
