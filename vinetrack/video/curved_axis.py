@@ -88,10 +88,20 @@ class CurvedAxis(Axis):
         return float(1 / max(float(bend.max()), 1e-12))
 
     @cached_property
+    def _angles_rad(self) -> Floats:
+        """Its direction at many equal steps, without jumps, positive from x towards y."""
+        direction = self.direction_at(np.linspace(0.0, self.length_px, 400))
+        return np.unwrap(np.arctan2(*direction.T[::-1]))
+
+    @property
     def turn_rad(self) -> float:
         """By how much its direction turns between its ends, positive from x towards y."""
-        angle = np.unwrap(np.arctan2(*self.direction_at(np.linspace(0.0, self.length_px, 400)).T[::-1]))
-        return float(angle[-1] - angle[0])
+        return float(self._angles_rad[-1] - self._angles_rad[0])
+
+    @property
+    def bent_rad(self) -> float:
+        """By how much it turns in all, to either side."""
+        return float(np.abs(np.diff(self._angles_rad)).sum())
 
     def direction_at(self, along_px: Floats) -> Floats:
         """Unit vectors of growth at places along the curve.

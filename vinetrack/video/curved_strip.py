@@ -131,9 +131,7 @@ def path_error_px(axis: Axis) -> float:
     -------
     px; 0 along a straight line.
     """
-    if not isinstance(axis, CurvedAxis):
-        return 0.0
-    return SLOW_PX_PER_RAD * _bent_rad(axis)
+    return SLOW_PX_PER_RAD * axis.bent_rad if isinstance(axis, CurvedAxis) else 0.0
 
 
 def curve_found(axis: CurvedAxis) -> str:
@@ -148,15 +146,9 @@ def curve_found(axis: CurvedAxis) -> str:
     sentence, without an end.
     """
     return (
-        f"the vine bends by {np.degrees(_bent_rad(axis)):.0f}° in all, and positions are those along a curve that was"
+        f"the vine bends by {np.degrees(axis.bent_rad):.0f}° in all, and positions are those along a curve that was"
         " found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
     )
-
-
-def _bent_rad(axis: CurvedAxis) -> float:
-    """By how much a curve turns in all, to either side."""
-    direction = axis.direction_at(np.linspace(0.0, axis.length_px, 400))
-    return float(np.abs(np.diff(np.unwrap(np.arctan2(*direction.T[::-1])))).sum())
 
 
 def _shake_of(strip: Strip) -> Floats | None:
