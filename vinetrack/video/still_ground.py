@@ -19,6 +19,9 @@ from vinetrack.video.strip import (
     PIXELS,
     REFERENCE_FRAMES,
     SHAKE_FLOOR_PX,
+    SHAKE_ROUNDS,
+    SHAKE_SETTLED_PX,
+    SHAKE_STEP_PX,
     Reference,
     camera_unit,
     register,
@@ -27,12 +30,6 @@ from vinetrack.video.strip import (
 BESIDE_PX = 120
 """Distance from the tube within which ground counts. Chosen: some thousand pixels lie there, of the plane in which the
 vine grows; half leaves fewer, twice lets more in that moves by itself."""
-ROUNDS = 4
-"""Chosen: each leaves a small part of the shift of the one before; more cost time alone. As along straight strips."""
-STEP_PX = 1.5
-"""Most that a round shifts. Chosen: slopes of a picture tell of no more; as along straight strips."""
-SETTLED_PX = 0.02
-"""Shift of a round below which it is done. Chosen: a fifth of the error of a shake that was taken off."""
 
 
 def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Floats | None:
@@ -71,11 +68,11 @@ def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Float
         return None
     whole = _reference(picture, x, y)
     shift = np.zeros((len(luma), 2))
-    for turn in range(ROUNDS):
+    for turn in range(SHAKE_ROUNDS):
         fit, _ = register(luma, level, whole, shift if turn else None, unit)
-        step = np.clip(fit[:, 2:], -STEP_PX, STEP_PX)
+        step = np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
         shift = shift + step
-        if np.abs(step).max() < SETTLED_PX:
+        if np.abs(step).max() < SHAKE_SETTLED_PX:
             break
         if turn == 0:
             whole = _reference(np.median(_moved_back(luma[picks], shift[picks]), axis=0), x, y)

@@ -33,6 +33,16 @@ a pixel and noise of 5: 1/√9000 = 0.01 px."""
 SHAKE_FLOOR_PX = 0.04
 """Shake below this is left alone: moving a picture by it costs more than it mends. Chosen as FLOOR_PX of
 `point_quality`."""
+SHAKE_ROUNDS = 4
+"""Times that a shake is measured, each against what the one before left. Chosen: each leaves a small part of it, more
+cost time alone. Derived: pictures are followed over SHAKE_ROUNDS · SHAKE_STEP_PX = 6 px at most, at half over 3 px, at
+twice over 12 px."""
+SHAKE_STEP_PX = 1.5
+"""Most that a round moves a picture. Chosen: its slopes tell of no more. Half or twice halves or doubles the 6 px of
+SHAKE_ROUNDS; at twice a picture that departs for other reasons is also moved by twice as much."""
+SHAKE_SETTLED_PX = 0.02
+"""Shift of a round below which it is the last. Chosen: a fifth of the error of a shake that was taken off, and half of
+SHAKE_FLOOR_PX. At half another round is made, at twice up to that floor is left."""
 
 
 @dataclass(frozen=True)
@@ -241,7 +251,7 @@ def _steady(
     picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
     means = _mean_pictures(luma, axis, bands, picks, None)
     reference = _reference(means, bands)
-    for turn in range(4):
+    for turn in range(SHAKE_ROUNDS):
         fit, sd = register(luma, axis, reference, shift if turn else None, unit)
         if turn == 0:
             strength = float(np.median(np.abs(fit[:, 2:]))), float(np.median(sd))
@@ -250,10 +260,10 @@ def _steady(
             if not _halves_agree(luma, axis, bands, means, unit):
                 break
             steadied = True
-        shift = shift + np.clip(fit[:, 2:], -1.5, 1.5)
+        shift = shift + np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
         if turn == 1:
             reference = _reference(_mean_pictures(luma, axis, bands, picks, shift), bands)
-        if turn > 1 and float(np.abs(fit[:, 2:]).max()) < 0.02:
+        if turn > 1 and float(np.abs(fit[:, 2:]).max()) < SHAKE_SETTLED_PX:
             break
     gain = np.clip(fit[:, 0], 0.2, 5.0)
     return unit / gain, -fit[:, 1] * unit / gain, shift, steadied
