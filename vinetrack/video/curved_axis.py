@@ -87,6 +87,11 @@ class CurvedAxis(Axis):
         bend = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
         return float(1 / max(float(bend.max()), 1e-12))
 
+    @property
+    def largest_half_px(self) -> float:
+        """Half the width of the widest strip along it whose normals do not cross."""
+        return ROOM_INSIDE * self.least_radius_px
+
     @cached_property
     def _angles_rad(self) -> Floats:
         """Its direction at many equal steps, without jumps, positive from x towards y."""
@@ -274,7 +279,7 @@ def curve_complaint(axis: Axis, half_px: float, size_px: tuple[int, int]) -> tup
     places = axis.points(np.linspace(0.0, axis.length_px, int(axis.length_px) + 2))
     if (places < -0.5).any() or (places > np.array(size_px) - 0.5).any():
         return f"leaves the picture, {size_px[0]} × {size_px[1]} pixels", "give points inside it"
-    if half_px > ROOM_INSIDE * axis.least_radius_px:
+    if half_px > axis.largest_half_px:
         return (
             f"bends with a radius of {axis.least_radius_px:.0f} px, too sharply for a strip of {half_px:.0f} px on "
             "either side",

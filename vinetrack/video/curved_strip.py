@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis, is_orderly
-from vinetrack.video.curved_axis import NEAREST_PX, ROOM_INSIDE, CurvedAxis, axis_through, curve_complaint
+from vinetrack.video.curved_axis import NEAREST_PX, CurvedAxis, axis_through, curve_complaint
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.still_ground import picture_shake
@@ -52,20 +52,6 @@ class LaidStraight:
 
     luma: NDArray[Any]
     axis: Axis
-
-
-def widest_px(axis: Axis) -> float:
-    """Half the width of the widest strip whose normals do not cross, px; infinite along a straight line.
-
-    Parameters
-    ----------
-    axis : in the picture.
-
-    Returns
-    -------
-    px.
-    """
-    return ROOM_INSIDE * axis.least_radius_px if isinstance(axis, CurvedAxis) else float("inf")
 
 
 def laid_straight(luma: NDArray[Any], axis: CurvedAxis, half_px: float, shake_px: Floats | None = None) -> LaidStraight:
@@ -113,7 +99,7 @@ def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
     """
     if not isinstance(axis, CurvedAxis):
         return cut_strip(luma, axis, half_px)
-    half = min(half_px, max(widest_px(axis) - 1, 2.0))
+    half = min(half_px, max(axis.largest_half_px - 1, 2.0))
     shake_px = picture_shake(luma, axis, half) if before is None else _shake_of(before)
     straight = laid_straight(luma, axis, half, shake_px)
     strip = replace(cut_strip(straight.luma, straight.axis, half, still=True), axis=axis)
@@ -190,7 +176,7 @@ def orderly_along(luma: NDArray[Any], axis: CurvedAxis) -> bool:
     RecordingError
         Where nothing moves along the curve.
     """
-    straight = laid_straight(luma, axis, min(axis.width_px, max(widest_px(axis) - 1, 2.0)))
+    straight = laid_straight(luma, axis, min(axis.width_px, max(axis.largest_half_px - 1, 2.0)))
     return is_orderly(SmallPictures(straight.luma), straight.axis)
 
 
@@ -248,7 +234,7 @@ def beside_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
         curve = axis_through(through[kept], 2 * sides.half_px)
     except RecordingError:
         return axis, 0.0
-    if not isinstance(curve, CurvedAxis) or sides.half_px > widest_px(curve):
+    if not isinstance(curve, CurvedAxis) or sides.half_px > curve.largest_half_px:
         return axis, 0.0
     return curve, float(np.abs(away).max())
 
@@ -270,7 +256,7 @@ def _averaged(places: Floats, middles: Floats, at: Floats) -> Floats:
 def _reach(axis: CurvedAxis, half_px: float, side: int, shape: tuple[int, ...]) -> int:
     """Rows on one side: those wanted, and as many more as lie in the picture along the whole curve without crossing."""
     wanted = int(np.ceil(half_px))
-    most = min(wanted + GAP_PX + BAND_PX[1], int(widest_px(axis)))
+    most = min(wanted + GAP_PX + BAND_PX[1], int(axis.largest_half_px))
     along = np.linspace(0.0, axis.length_px, int(axis.length_px) + 2)
     for reach in range(most, wanted, -1):
         place = axis.points(along, side * float(reach))

@@ -25,7 +25,6 @@ from vinetrack.video.curved_strip import (
     path_error_px,
     refuse_poor_curve,
     shake_along,
-    widest_px,
 )
 from vinetrack.video.event_frames import read_event
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
@@ -322,7 +321,7 @@ def _along_given_curve(
     half = _half_width(axis, trial, m_per_px)
     known = np.isfinite(axis.width_px) or np.isfinite(trial.diameter_m * (m_per_px or trial.m_per_px))
     refuse_poor_curve(axis, half if known else math.nan, luma.shape[1:])
-    wide = min(2 * half + ROOM * axis.length_px, 2 * widest_px(axis))
+    wide = min(2 * half + ROOM * axis.length_px, 2 * axis.largest_half_px)
     axis = replace(axis, width_px=max(wide, 2 * half) if known else wide)
     return axis, trial.travel_ratio == 1 or orderly_along(luma, axis)
 
