@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.experiment.cells import LEAST_AXIS_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import fan_gains, passing_times
 from vinetrack.video.small_pictures import SmallPictures, changed_pixels
@@ -40,8 +41,10 @@ class Axis:
     width_px: float = float("nan")
 
     def __post_init__(self) -> None:
-        if self.length_px < 10:
-            raise RecordingError("the growth axis is shorter than 10 pixels; move from_px and to_px apart")
+        if self.length_px < LEAST_AXIS_PX:
+            raise RecordingError(
+                f"the growth axis is shorter than {LEAST_AXIS_PX} pixels; move from_px and to_px apart"
+            )
 
     @property
     def length_px(self) -> float:

@@ -17,6 +17,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
 from vinetrack.core.records import Floats
+from vinetrack.experiment.cells import LEAST_APART_PX
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import RecordingError
 
@@ -25,9 +26,6 @@ Point = tuple[float, float]
 FINENESS = 8
 """Places a pixel at which the arc length is summed. Derived: a chord of 1/8 px is short of its arc by less than
 (1/8)²/24R², 1e-6 of it for radii above 30 px."""
-NEAREST_PX = 2.0
-"""Least distance between neighbouring points. Chosen: a point picked by hand is off by half a pixel, so that nearer
-ones tell no direction. At half, a double click makes a kink; at twice, dense curves of programs are refused."""
 ROOM_INSIDE = 0.9
 """Part of the least radius that a strip may reach inwards. Derived: at 1 its normals cross; at 0.9 a pixel there stands
 for a tenth of one. Half refuses sound curves."""
@@ -44,9 +42,9 @@ class CurvedAxis(Axis):
 
     def __post_init__(self) -> None:
         points = np.array(self.through_px)
-        if np.min(np.hypot(*np.diff(points, axis=0).T)) < NEAREST_PX:
+        if np.min(np.hypot(*np.diff(points, axis=0).T)) < LEAST_APART_PX:
             raise RecordingError(
-                f"two neighbouring points of the growth axis are less than {NEAREST_PX:g} pixels apart; leave out one"
+                f"two neighbouring points of the growth axis are less than {LEAST_APART_PX} pixels apart; leave out one"
             )
         super().__post_init__()
 

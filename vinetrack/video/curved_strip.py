@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.experiment.cells import LEAST_APART_PX
 from vinetrack.video.axis import Axis, is_orderly
-from vinetrack.video.curved_axis import NEAREST_PX, CurvedAxis, axis_through, curve_complaint
+from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_complaint
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.still_ground import picture_shake
@@ -229,7 +230,7 @@ def beside_curve(axis: CurvedAxis, sides: Outline) -> tuple[CurvedAxis, float]:
     knots = np.linspace(0.0, axis.length_px, max(4, round(axis.length_px / KNOT_PX) + 1))
     away = _averaged(sides.places_px, sides.middles_px, knots)
     through = axis.points(knots, away)
-    kept = [0, *(k for k in range(1, len(through)) if np.hypot(*(through[k] - through[k - 1])) > NEAREST_PX)]
+    kept = [0, *(k for k in range(1, len(through)) if np.hypot(*(through[k] - through[k - 1])) > LEAST_APART_PX)]
     try:
         curve = axis_through(through[kept], 2 * sides.half_px)
     except RecordingError:
