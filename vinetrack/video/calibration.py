@@ -48,7 +48,7 @@ SEARCHED_FRAMES = 300
 a second; at twice a vine may already stand before the target."""
 
 
-PATH_STEP_PX = 4.0
+CHORD_PX = 4.0
 """Distance of the places between which a curve is summed in the plane. Derived: a chord of 4 px of a curve of 30 px
 radius is short by 4²/24·30² = 0.07 %, of 100 px by 0.007 %."""
 
@@ -152,7 +152,7 @@ class PlaneCalibration:
         """
         if not isinstance(axis, CurvedAxis):
             return self.along(axis.from_px, axis.to_px)
-        along_px = np.linspace(0.0, axis.length_px, int(axis.length_px / PATH_STEP_PX) + 2)
+        along_px = np.linspace(0.0, axis.length_px, int(axis.length_px / CHORD_PX) + 2)
         places_px = axis.points(along_px)
         path_m = length_along(self.plane.plane_m(places_px))
         rel_sigma = math.hypot(self.plane.path_rel_sigma(places_px), self.own_rel_sigma)
