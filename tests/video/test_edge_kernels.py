@@ -52,7 +52,7 @@ def test_evidence_of_film_is_the_difference_of_clipped_distances() -> None:
     a = np.minimum((level - pictures[0]) ** 2 / (pictures[2] + 25.0), kernels.FOREIGN * 6.25)
     b = np.minimum((level - pictures[1]) ** 2 / (pictures[3] + 25.0), 6.25)
     found = kernels.film_evidence(strip, scale, offset, pictures, 5.0, 2.5)
-    assert np.allclose(found, (a - b - kernels.DOUBT).sum(axis=1), atol=1e-3)
+    assert np.allclose(found, (a - b - kernels.FILM_BIAS).sum(axis=1), atol=1e-3)
 
 
 def test_what_is_seen_bare_and_covered_is_counted_apart_and_strays_hardly() -> None:

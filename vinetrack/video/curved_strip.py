@@ -34,8 +34,6 @@ or twice hardly matters, as a smooth curve is laid through them."""
 SPAN = 1.0
 """Stretches, as the standard deviation of a Gaussian, over which the tube's middle is averaged. Measured on bends of 90
 to 1100 px radius: SD of 0.08 to 0.30 px; at twice 0.10 to 0.73 px, as sharp bends are cut. Half was not tried."""
-
-
 SETTLED_PX = 0.3
 """Greatest distance from the tube's middle at which a curve is left alone. Measured on drawn curves, seeds 1 to 4 of
 `bent` of `benchmarks/tracking_accuracy.py`, with twice the rounds of a straight strip: SD of 0.13 px at sharp bends and

@@ -428,10 +428,10 @@ def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed
     close = (near_start > NEAR_START) & moving_frames(state.edge) & np.isfinite(misfit_ratio)
     trouble = float(np.clip((np.mean(misfit_ratio[close]) - 1) / FULL_TROUBLE, 0, 1)) if close.any() else 0.0
     door = DOOR_PX * disturbed_start(strip, state) * trouble
-    doubt = (START_PX + door) * near_start
+    start_error = (START_PX + door) * near_start
     bands, shared = disagreement(strip, state, edge_now, core)
     bands *= 1 - 0.5 * near_start
-    seen = np.hypot(bands * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), doubt)
+    seen = np.hypot(bands * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
     apart = hidden_errors(fit, misfit_ratio, edge_now, seen)
     mouth = find_mouth(strip, state, edge_now)
     apart = np.where(mouth.before, np.maximum(apart, NO_EDGE_PX if mouth.moved_behind else GUESSED_PX), apart)

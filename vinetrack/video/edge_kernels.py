@@ -20,7 +20,7 @@ Chosen: nearly two lengths of MEMORY in `edge_state`. Half or twice changes only
 FOREIGN = 1.7
 """How much farther than background film is from what resembles neither. Chosen above 1, so that what resembles neither
 hides background. By reasoning: nearer 1 a payload counts as film, farther a stain on the film does as background."""
-DOUBT = 0.1
+FILM_BIAS = 0.1
 """By how much a pixel that could be either is called film: one that never changed was film from the start. Chosen
 small beside the clip of 6: only pixels without contrast are decided by it."""
 
@@ -48,7 +48,7 @@ def film_evidence(
     """
     n, rows, columns = strip.shape
     out = np.zeros((n, columns), np.float32)
-    unity, doubt, wide = np.float32(1.0), np.float32(DOUBT), np.float32(width * width)
+    unity, bias, wide = np.float32(1.0), np.float32(FILM_BIAS), np.float32(width * width)
     top, far = np.float32(clip * clip), np.float32(FOREIGN * clip * clip)
     weight = unity / (pictures[2:] + wide)
     for t in range(n):
@@ -61,7 +61,7 @@ def film_evidence(
                 value = values[s] * gain + level
                 a, b = value - after[s], value - before[s]
                 a, b = a * a * after_weight[s], b * b * before_weight[s]
-                line[s] += (a if a < far else far) - (b if b < top else top) - doubt
+                line[s] += (a if a < far else far) - (b if b < top else top) - bias
     return out
 
 

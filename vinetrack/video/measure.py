@@ -144,13 +144,13 @@ def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> A
     in the picture, px; None where neither has one.
     """
     if trial.axis is not None:
-        given_here = trial.axis
-        return axis_through((given_here.from_px, *given_here.via_px, given_here.to_px), given_here.width_m / m_per_px)
+        axis = trial.axis
+        return axis_through((axis.from_px, *axis.via_px, axis.to_px), axis.width_m / m_per_px)
     if settings.axis is None:
         return None
-    given = settings.axis
-    width_px = given.width_mm / 1e3 / m_per_px if given.width_mm is not None else math.nan
-    return axis_through((given.from_px, *(given.via_px or ()), given.to_px), width_px)
+    shared = settings.axis
+    width_px = shared.width_mm / 1e3 / m_per_px if shared.width_mm is not None else math.nan
+    return axis_through((shared.from_px, *(shared.via_px or ()), shared.to_px), width_px)
 
 
 def _sound_luma(frames: Frames) -> NDArray[Any]:

@@ -60,11 +60,12 @@ def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Float
     halves = [_reference(picture, x[part], y[part]) for part in (x < np.median(x), x >= np.median(x))]
     (first, first_sd), (second, second_sd) = (register(luma, level, half, None, unit) for half in halves)
     strength = float(np.median(np.abs(np.concatenate([first[:, 2:], second[:, 2:]]))))
-    doubt = float(np.median(first_sd + second_sd))
+    sd_sum = float(np.median(first_sd + second_sd))
     apart = np.hypot(*(first - second)[:, 2:].T)
     both = np.hypot(*(first + second)[:, 2:].T)
     most = apart + both >= np.quantile(apart + both, 0.75)
-    if not strength > max(SHAKE_FLOOR_PX, 1.25 * doubt) or apart[most].mean() > max(0.7 * both[most].mean(), 2 * doubt):
+    disagree = apart[most].mean() > max(0.7 * both[most].mean(), 2 * sd_sum)
+    if not strength > max(SHAKE_FLOOR_PX, 1.25 * sd_sum) or disagree:
         return None
     whole = _reference(picture, x, y)
     shift = np.zeros((len(luma), 2))

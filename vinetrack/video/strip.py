@@ -283,8 +283,8 @@ def _halves_agree(
     (first, first_sd), (second, second_sd) = parts
     apart, both = np.abs(first[:, 2] - second[:, 2]), np.abs(first[:, 2] + second[:, 2])
     most = apart + both >= np.quantile(apart + both, 0.75)
-    doubt = 2 * float(np.median(first_sd + second_sd))
-    return float(np.mean(apart[most])) < max(0.7 * float(np.mean(both[most])), doubt)
+    sd_sum = float(np.median(first_sd + second_sd))
+    return float(np.mean(apart[most])) < max(0.7 * float(np.mean(both[most])), 2 * sd_sum)
 
 
 def _mean_pictures(
