@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial import KDTree
 
 from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import LEAST_APART_PX
 from vinetrack.video.axis import Axis
 from vinetrack.video.frames import RecordingError
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 Point = tuple[float, float]
 
@@ -61,6 +62,8 @@ class CurvedAxis(Axis):
     @cached_property
     def _table(self) -> tuple[CubicSpline, Floats, Floats]:
         """The spline, and its parameter and arc length at many places."""
+        from scipy.interpolate import CubicSpline
+
         points = np.array(self.through_px)
         apart = np.hypot(*np.diff(points, axis=0).T)
         knots = np.concatenate([[0.0], np.cumsum(np.sqrt(apart))])
@@ -152,6 +155,8 @@ class CurvedAxis(Axis):
         -------
         shape (n,), px; beyond an end where the nearest place is that end.
         """
+        from scipy.spatial import KDTree
+
         spline, parameter, arc = self._table
         points = np.asarray(picture_px, dtype=float)
         _, nearest = KDTree(spline(parameter)).query(np.where(np.isfinite(points), points, 0.0))
