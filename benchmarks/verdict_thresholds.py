@@ -48,7 +48,7 @@ time of a search, or the words of a sentence, are not among them."""
 KINDS = (
     *("null:anything", "null:correlated", "null:large_B_scatter", "null:trace"),
     *("reservoir_depletion", "inlet_loss", "tail_friction", "leak", "payload_friction", "air_drag"),
-    *("length_scale", "lens", "pressure_gauge", "outsider:rough_patch"),
+    *("length_scale", "perspective", "pressure_gauge", "outsider:rough_patch"),
 )
 FACTORS = (0.5, 2.0)
 AS_IT_IS = ("as it is", 1.0)

@@ -65,7 +65,7 @@ def make(kind: str, seed: int, *, filmed: bool = False, trials: int = 0) -> Hidd
 
     One to be `filmed` has the positions as they were: noise, lost frames and late starts are the camera's business.
     With a number of `trials` the conditions are those of the kind and seed all the same, each repeated as often as it
-    takes.
+    takes, and at least once.
 
     Raises
     ------
@@ -122,7 +122,9 @@ def _attempt(kind: str, seed: int, draw: np.random.Generator, *, filmed: bool, t
     names, outsider, regime_name = _parts(kind)
     settings = design(draw, _wants(names, outsider, kind))
     if trials:
-        settings = [settings[k % len(settings)] for k in range(trials)]
+        by_repeat = sorted(settings, key=lambda setting: setting.replicate)
+        conditions = sum(setting.replicate == 0 for setting in settings)
+        settings = [by_repeat[k % len(by_repeat)] for k in range(max(trials, conditions))]
     how = _nuisances(kind, regime_name, draw)
     if filmed:
         how = replace(how, noise="white", noise_m=0.0, dropped=0.0, without_rest=0.0, trace_sigma_kPa=math.nan)
