@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from by_hand import BARE, LOADED, Vine, simulated, whole_catalogue
 
+import vinetrack
 from vinetrack.core.records import Bend, Trial
 from vinetrack.dynamics.equations import TrialArrays
 from vinetrack.dynamics.force_terms import evaluate
-from vinetrack.dynamics.kernel import PACKAGE, kernel
+from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import Model, base_model, effects_on
 from vinetrack.dynamics.simulate import simulate, trial_inputs
 from vinetrack.effects import catalogue
 
+PACKAGE = Path(vinetrack.__file__).parent
 BENDS = (Bend(0.05, 0.06, 0.05), Bend(0.18, 0.04, 0.08))
 
 
@@ -53,24 +55,42 @@ def test_each_effect(name: str, vine: Vine) -> None:
     np.testing.assert_allclose(accelerations(model, trial, time, y, v, chamber), terms.acceleration_m_s2, rtol=1e-9)
 
 
+DRIFT = '''"""Drift: a force that does not let go.
+
+    tail force −F
+"""
+
+from vinetrack.effects import Parameter
+
+PARAMETERS = (Parameter("F", "F", "N", 0.5),)
+
+
+def tail_force(s, rig, F):
+    return -F + 0.0 * s.time
+'''
+
 FALL = """
 import numpy as np
 import vinetrack as vt
 from vinetrack.core.records import Trial
 trial = Trial(name="ball", travel_ratio=1.0, payload_kg=1.0)
 model = vt.base_model() - "pressure_drive" - "eversion_damping" - "yield_pressure"
+model += vt.effects.own_effects(["drift.py"])["drift"]
 print(vt.simulate(model, trial, np.linspace(0, 0.2, 5)).lead_position_m.tolist())
 """
 
 
-def test_copies_of_the_package_share_what_is_compiled(tmp_path: Path) -> None:
+def test_copies_of_the_package_and_of_an_own_effect_share_what_is_compiled(tmp_path: Path) -> None:
     copy, cache = tmp_path / "elsewhere", tmp_path / "cache"
     shutil.copytree(PACKAGE, copy / "vinetrack", ignore=shutil.ignore_patterns("__pycache__"))
     said, compiled = [], []
     for place in (PACKAGE.parent, copy):
+        folder = tmp_path / f"with_{place.name}"
+        folder.mkdir()
+        (folder / "drift.py").write_text(DRIFT, encoding="utf-8")
         environment = {**os.environ, "PYTHONPATH": str(place), "VINETRACK_CACHE": str(cache)}
         run = subprocess.run(
-            [sys.executable, "-c", FALL], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+            [sys.executable, "-c", FALL], env=environment, cwd=folder, capture_output=True, text=True, check=True
         )
         said.append(run.stdout)
         compiled.append(sorted((path.name, path.stat().st_mtime_ns) for path in cache.rglob("kernel_*")))

@@ -11,9 +11,11 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
+from vinetrack.dynamics.kernel import kernel
 from vinetrack.dynamics.model import base_model, make_model
 from vinetrack.dynamics.simulate import simulate
-from vinetrack.effects import EffectError, catalogue, load_effect
+from vinetrack.effects import Effect, EffectError, catalogue, load_effect
+from vinetrack.effects._catalogue import _same_anywhere
 from vinetrack.effects._own import UNCHANGED, behaviour_faults, own_effects
 
 BRUSH = '''"""Brush: bristles at the mouth hold the tail back, the more the further it has run.
@@ -53,14 +55,40 @@ def refusal(folder: Path, text: str, name: str = "brush.py") -> str:
     return message
 
 
-def test_it_is_simulated_like_any_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("VINETRACK_CACHE", str(tmp_path))  # its path is new each time: nothing to keep
+def test_it_is_simulated_like_any_other(tmp_path: Path) -> None:
     brush = own_effects([written(tmp_path)])
     model = make_model([*base_model().names, "brush"], brush).with_values({"eversion_damping.B": LOADED.B})
     travel = followed(lambda _t, x, v: (LOADED.base(x, v) - 0.8 * max(x, 0.0) ** 0.5) / LOADED.m(x), 1.8 * LOADED.L)
     times = np.linspace(0, travel.end, 41)  # type: ignore[attr-defined]
     got = simulate(model, LOADED.trial(), times).lead_position_m
     np.testing.assert_allclose(got, travel(times) / 2, rtol=0, atol=1e-5 * LOADED.L)
+
+
+def copies(folder: Path, text: str) -> list[Effect]:
+    """The effect of this text at two places."""
+    for name in "ab":
+        (folder / name).mkdir()
+    return [own_effects([written(folder / name, text)])["brush"] for name in "ab"]
+
+
+def test_one_text_at_two_places_is_compiled_once_and_each_is_traced_to_its_file(tmp_path: Path) -> None:
+    one, other = copies(tmp_path, BRUSH)
+    assert kernel((base_model() + one).effects) is kernel((base_model() + other).effects)
+    for effect, name in ((one, "a"), (other, "b")):
+        assert effect.path == tmp_path / name / "brush.py"
+        assert effect.functions["tail_force"].__code__.co_filename == str(effect.path)
+
+
+@pytest.mark.parametrize(
+    "line", ["from pathlib import Path", "import brushes", "from .brushes import q", "PLACE = __file__"]
+)
+def test_what_may_depend_on_its_place_is_compiled_at_each(tmp_path: Path, line: str) -> None:
+    """A table or a module beside a file may be another beside its copy."""
+    assert _same_anywhere(BRUSH.encode())
+    assert not _same_anywhere(f"{BRUSH}\n{line}\n".encode())
+    if "brushes" not in line:
+        one, other = copies(tmp_path, f"{BRUSH}\n{line}\n")
+        assert kernel((base_model() + one).effects) is not kernel((base_model() + other).effects)
 
 
 def test_a_missed_worked_number_is_told_with_its_arithmetic(tmp_path: Path) -> None:

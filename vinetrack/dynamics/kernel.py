@@ -23,27 +23,20 @@ from vinetrack.core import constants
 from vinetrack.dynamics.integrator import BATCH
 from vinetrack.effects import Effect, TrialInputs
 
-PACKAGE = Path(__file__).parents[1]
-
 PARTS = ("equations.py", "radau.py", "slack_tail.py", "row_readout.py", "integrator.py")
 """Files of the integrator, which the compiled form of a model holds too: an edit of one must compile anew."""
 
 _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
 
-from pathlib import Path
-
 from numba import njit
 
-import vinetrack
 from vinetrack.dynamics.equations import (
     Equations, angle_passed, compiled, never_slack, no, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
     not_slack_at_rest, trace_at, yes,
 )
 from vinetrack.dynamics.integrator import integrate_trials
 from vinetrack.dynamics.slack_tail import follow_slack, slack_at_rest, slack_fraction
-from vinetrack.effects import State, TrialInputs, load_effect
-
-PACKAGE = Path(vinetrack.__file__).parent
+from vinetrack.effects import State, TrialInputs
 
 '''
 
@@ -104,7 +97,7 @@ class _Writer:
                 continue
             arguments = "".join(f", theta[{offsets[i] + j}]" for j in range(len(effect.parameters)))
             name = f"{effect.name}__{hook}"
-            self.loads[name] = f"{name} = compiled(load_effect({_place(effect.path)}).functions[{hook!r}])"
+            self.loads[name] = f"{name} = compiled(EFFECTS[{i}].functions[{hook!r}])"
             # A measured trace already holds what happens in the chamber.
             condition = f"on[{i}] and not measured" if effect.in_trace else f"on[{i}]"
             lines += [f"if {condition}:", f"    {target.format(call=f'{name}({state}, rig{arguments})')}"]
@@ -170,13 +163,6 @@ def _modules(effect: Effect) -> list[str]:
     return sorted({function.__module__ for function in effect.functions.values()})
 
 
-def _place(path: Path) -> str:
-    """Where an effect's file is, in Python: those of the package wherever it stands, so that every copy shares them."""
-    if path.is_relative_to(PACKAGE):
-        return f"PACKAGE / {path.relative_to(PACKAGE).as_posix()!r}"
-    return f"Path({str(path)!r})"
-
-
 def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     """Python text of the module with the `vinetrack.dynamics.equations.Equations` of this sum of effects.
 
@@ -190,7 +176,7 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     Returns
     -------
     str
-        The text; `kernel` writes it to a file and imports it.
+        The text; `kernel` writes it to a file and imports it, with the effects as `EFFECTS`. It names no place.
     """
     write = _Writer(effects)
     both = [*write.mass(), *write.pressure(), *write.forces()]
@@ -257,6 +243,10 @@ def _cache_folder() -> Path:
     raise OSError("No folder can be written to keep the compiled model; set VINETRACK_CACHE to one.")
 
 
+_LOADED: dict[str, ModuleType] = {}
+"""Kernels of this process by what they depend on: effects of the same text at two places share theirs."""
+
+
 @lru_cache(maxsize=64)
 def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     """The compiled module for these effects; its `integrate_many` is described in `vinetrack.dynamics.integrator`.
@@ -286,6 +276,8 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     # What is compiled names the modules of its effects, and is of use only where they have the same names.
     parts += [text for effect in effects for text in (effect.path.read_text(), *_modules(effect))]
     digest = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
+    if digest in _LOADED:
+        return _LOADED[digest]
     path = _cache_folder() / f"kernel_{digest}.py"
     if not path.is_file():
         handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
@@ -296,6 +288,8 @@ def kernel(effects: tuple[Effect, ...], tail_free: bool = False) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    module.__dict__["EFFECTS"] = effects
     sys.modules[path.stem] = module  # numba finds its cached form by the module's name
     spec.loader.exec_module(module)
+    _LOADED[digest] = module
     return module

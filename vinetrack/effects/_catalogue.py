@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
 import hashlib
 import importlib.util
@@ -31,34 +32,60 @@ class EffectError(UserError, ValueError):
     """A file that should be an effect is not one, or a name is not in the catalogue; the message says what to mend."""
 
 
+_MODULES: dict[tuple[Path, str], ModuleType] = {}
+"""Effect files that have run, by place and name of the module: each place has functions of its own to be traced to."""
+
+_PLAIN_MODULES = frozenset(("__future__", "math", "numpy", "vinetrack"))
+"""What an effect may import and still do the same wherever its file lies."""
+
+
 def _load_module(path: Path) -> ModuleType:
     """Run one effect file and return it as a module.
 
-    It is entered in `sys.modules` under a name made of its place and text: the compiled form of a model looks there.
-    The place of an effect of the catalogue is that in the package: copies of the package share what is compiled.
+    It is entered in `sys.modules` under a name made of its text, and of its place where it may depend on that: the
+    compiled form of a model looks there. Files of the same text share what is compiled, as do copies of the package.
 
     Raises
     ------
     EffectError
         If the file cannot be run.
     """
-    whole, package = path.resolve(), Path(__file__).resolve().parents[1]
-    place = whole.relative_to(package).as_posix() if whole.is_relative_to(package) else str(whole)
-    digest = hashlib.sha256(place.encode() + path.read_bytes()).hexdigest()[:12]
+    whole, text, package = path.resolve(), path.read_bytes(), Path(__file__).resolve().parents[1]
+    if whole.is_relative_to(package):
+        place = whole.relative_to(package).as_posix()
+    else:
+        place = "" if _same_anywhere(text) else str(whole)
+    digest = hashlib.sha256(place.encode() + text).hexdigest()[:12]
     name = f"vinetrack_effect_{path.stem}_{digest}"
-    if name in sys.modules:
-        return sys.modules[name]
+    if (whole, name) in _MODULES:
+        return _MODULES[whole, name]
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise EffectError(f"{path}: an effect is a Python file whose name ends in .py.")
     module = importlib.util.module_from_spec(spec)
+    before = sys.modules.get(name)
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
         raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
+    if before is not None:
+        sys.modules[name] = before
+    _MODULES[whole, name] = module
     return module
+
+
+def _same_anywhere(text: bytes) -> bool:
+    """Whether an effect does the same wherever its file lies: it imports nothing from there and asks for no place."""
+    try:
+        nodes = list(ast.walk(ast.parse(text)))
+    except (SyntaxError, ValueError):
+        return False
+    imported = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    imported += ["." * node.level + (node.module or "") for node in nodes if isinstance(node, ast.ImportFrom)]
+    names = [node.id for node in nodes if isinstance(node, ast.Name)]
+    return {name.split(".")[0] for name in imported} <= _PLAIN_MODULES and not any(n.startswith("__") for n in names)
 
 
 def load_effect(path: Path | str) -> Effect:
