@@ -76,24 +76,29 @@ def test_stated_errors_are_those_that_are_made(changes: dict[str, float]) -> Non
 
 @pytest.mark.parametrize("periods", [(11, 17), (43, 67)])
 def test_what_misleads_bands_of_rows_slowly_is_an_error_though_the_track_is_smooth(periods: tuple[int, int]) -> None:
+    """By root mean squares over three draws: that of one, with four bands of which two mirror two, is known to half.
+
+    Waves of eleven frames are part noise and part slow error, and both together are judged; long ones are slow.
+    """
     frames = np.arange(100.0)
-    draw = np.random.default_rng(333)
-    phase = draw.uniform(0, 2 * np.pi, (2, BANDS))
-    # Two waves for every band, which its neighbours do not have: differences of the track hardly see any of them.
-    waves = [0.6 * np.sin(2 * np.pi * frames[:, None] / period + p) for period, p in zip(periods, phase, strict=True)]
-    slow = np.sum(waves, axis=0)
-    true = grown_px(frames)
-    moves = (frames > 12)[:, None]
-    luma = step_frames((true[:, None] + slow * moves)[:, None, :])
-    tracking = tracked(luma, 0.05, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
-    use = (frames > 25) & (frames < 95) & tracking.track.usable
-    assert use.sum() > 60
-    error = (tracking.track.edge_px + tracking.axis.from_px[0] - true)[use]
-    assert tracking.track.lead_position_systematic_m is not None
-    noise = tracking.track.lead_position_sigma_m[use] * 1e4
-    shared = tracking.track.lead_position_systematic_m[use] * 1e4
-    assert 0.4 < error.std() / np.sqrt(np.mean(noise**2 + shared**2)) < 2.0
-    assert 0.4 < error.std() / np.sqrt(np.mean(shared**2)) < 2.5
+    true, moves = grown_px(frames), (frames > 12)[:, None]
+    errors, noises, shares = [], [], []
+    for seed in (333, 334, 335):
+        phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, BANDS))
+        # Two waves for every band, which its neighbours do not have: differences of the track hardly see any of them.
+        waves = [0.6 * np.sin(2 * np.pi * frames[:, None] / T + p) for T, p in zip(periods, phase, strict=True)]
+        luma = step_frames((true[:, None] + np.sum(waves, axis=0) * moves)[:, None, :])
+        tracking = tracked(luma, 0.05, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
+        use = (frames > 25) & (frames < 95) & tracking.track.usable
+        assert use.sum() > 60
+        error = (tracking.track.edge_px + tracking.axis.from_px[0] - true)[use]
+        errors.append(error.var())
+        assert tracking.track.lead_position_systematic_m is not None
+        noises.append(np.mean((tracking.track.lead_position_sigma_m[use] * 1e4) ** 2))
+        shares.append(np.mean((tracking.track.lead_position_systematic_m[use] * 1e4) ** 2))
+    assert 0.6 < np.sqrt(np.mean(errors) / (np.mean(noises) + np.mean(shares))) < 1.8
+    if min(periods) > 40:
+        assert 0.6 < np.sqrt(np.mean(errors) / np.mean(shares)) < 1.9
 
 
 @pytest.mark.parametrize("exposure", [0.1, 0.9])

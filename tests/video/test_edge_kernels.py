@@ -31,17 +31,27 @@ def test_a_table_of_covers_is_the_normal_distribution_averaged_over_the_motion(l
 
 
 LAG = 0.02 * (np.arange(9) - 4.0) ** 2
+NO_SHADING = np.zeros(65)
+RIM = 40 * np.exp(-0.5 * ((np.arange(65) - 32 + 4.0) / 2.0) ** 2)
+"""Shading of a tip with a bright rim 4 px behind its edge, grey levels, by distance ahead of it from −32 px on."""
 
 
-def stepping(seed: int = 961) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def shaded(distance: np.ndarray) -> np.ndarray:
+    """What the rim adds, linear between whole distances ahead of the edge, grey levels."""
+    return np.interp(distance, np.arange(65) - 32.0, RIM, left=0.0, right=0.0)
+
+
+def stepping(seed: int = 961, rim: bool = False, contrast: float = 110.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A strip with a noisy edge, its place, and brightness and variances on either side."""
     rng = np.random.default_rng(seed)
     edge = 30.31 + 3.73 * np.arange(16)
     x = np.arange(120)
     cover = np.clip(edge[:, None, None] - LAG[:, None] - x + 0.5, 0, 1)
-    pictures = np.stack([150 + rng.normal(0, 9, (9, 120)), 40 + rng.normal(0, 9, (9, 120)),
+    pictures = np.stack([40 + contrast + rng.normal(0, 9, (9, 120)), 40 + rng.normal(0, 9, (9, 120)),
                          np.full((9, 120), 12.0), np.full((9, 120), 9.0)]).astype(np.float32)  # fmt: skip
     values = pictures[1] + cover * (pictures[0] - pictures[1]) + rng.normal(0, 3, cover.shape)
+    if rim:
+        values = values + shaded(x - (edge[:, None, None] - LAG[:, None]))
     return np.clip(values, 0, 255).astype(np.uint8), edge, pictures
 
 
@@ -62,7 +72,9 @@ def test_what_is_seen_bare_and_covered_is_counted_apart_and_strays_hardly() -> N
     scale, offset, zeros = np.ones(16), np.zeros(16), np.zeros(16)
     early, late = (np.interp(np.arange(120) + d, edge, np.arange(16.0)) for d in (-4, 4))
     seen = [
-        picture_kernels.gather(strip, scale, offset, edge, zeros, np.zeros(9), 0.5, early, late, 6.0, pictures, clip)
+        picture_kernels.gather(
+            strip, scale, offset, edge, zeros, np.zeros(9), 0.5, early, late, 6.0, pictures, clip, NO_SHADING
+        )
         for clip in (0.0, 10.0)
     ]
     frames = np.arange(16)
@@ -81,7 +93,7 @@ def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     start = edge + 1.4
     start[5] = np.nan
     fit = kernels.fit_edges(
-        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12
+        strip, np.ones(16), np.zeros(16), start, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12, NO_SHADING
     )
     assert np.isnan(fit[5]).all()
     sound = np.arange(16) != 5
@@ -91,14 +103,47 @@ def test_the_edge_of_every_frame_is_found_in_noise() -> None:
     )  # 110 grey levels, variance 10.5: (9 · 110² / 10.5 / 2√π 0.4)^−½
 
 
+@pytest.mark.parametrize("contrast", [110.0, -15.0, 0.0])
+def test_a_rim_that_moves_with_the_tip_tells_of_its_edge_even_where_film_looks_like_background(contrast: float) -> None:
+    strip, edge, pictures = stepping(rim=True, contrast=contrast)
+    known, ignored = (
+        kernels.fit_edges(
+            strip, np.ones(16), np.zeros(16), edge - 1.4, np.zeros(16), LAG, 0.4, pictures, np.ones(3), 0.15, 6.0, 12,
+            shading,
+        )[:, 0] - edge
+        for shading in (RIM, NO_SHADING)
+    )  # fmt: skip
+    assert np.abs(known).max() < 0.15
+    assert np.abs(ignored).max() > 2 * np.abs(known).max()
+
+
+def test_the_rim_is_no_part_of_what_film_looks_like() -> None:
+    bare, edge, pictures = stepping()
+    strip, *_ = stepping(rim=True)
+    zeros = np.zeros(16)
+    early, late = (np.interp(np.arange(120) + d, edge, np.arange(16.0)) for d in (-4, 4))
+    clean, freed, ignored = (
+        picture_kernels.gather(
+            seen, np.ones(16), zeros, edge, zeros, LAG, 0.5, early, late, 6.0, pictures, 0.0, shading
+        )
+        for seen, shading in ((bare, NO_SHADING), (strip, RIM), (strip, NO_SHADING))
+    )
+    film = slice(31, 80)  # columns that the rim has crossed
+    level = [sums[9, 4, film] / sums[8, 4, film] for sums in (clean, freed, ignored)]
+    assert np.abs(level[1] - level[0]).max() < 1.0
+    assert np.mean(level[2] - level[0]) > 2.0
+
+
 def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
-    strip, edge, pictures = stepping()
+    strip, edge, pictures = stepping(rim=True)
     blur, margin = 0.8, 6.0
     fit = np.column_stack([edge, np.zeros((16, 2)), np.full(16, 0.03), np.full(16, -0.02), np.zeros(16)])
     use = np.arange(16) % 3 != 0
-    found = kernels.residual_sums(strip, np.ones(16), np.zeros(16), fit, np.zeros(16), LAG, blur, pictures, margin, use)
+    found = kernels.residual_sums(
+        strip, np.ones(16), np.zeros(16), fit, np.zeros(16), LAG, blur, pictures, margin, use, 0.5 * RIM
+    )
     half = edge_cover.cover_reach(0.0, blur) + margin
-    by_distance, by_row, logs = np.zeros_like(found[0]), np.zeros((9, 2)), []
+    by_distance, by_row, by_place, logs = np.zeros_like(found[0]), np.zeros((9, 2)), np.zeros((65, 2)), []
     for t in np.flatnonzero(use):
         sums: dict[int, np.ndarray] = {}
         for u in range(9):
@@ -109,9 +154,12 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
                 p = 0.5 * math.erfc(-x / blur / math.sqrt(2))
                 slope = math.exp(-0.5 * (x / blur) ** 2) / blur / math.sqrt(2 * math.pi)
                 after, before, va, vb = pictures[:, u, s].astype(float)
-                r = strip[t, u, s] - before - (after - before) * (1.03 * p - 0.02)
+                r = strip[t, u, s] - before - (after - before) * (1.03 * p - 0.02) - 0.5 * float(shaded(np.array(-x)))
                 v = p**2 * va + (1 - p) ** 2 * vb
                 w, g = 1 / (v + r * r / 9), -(after - before) * slope
+                ahead, part = divmod(-x, 1.0)
+                by_place[int(ahead) + 32] += (1 - part) * w * np.array([r, 1.0])
+                by_place[int(ahead) + 33] += part * w * np.array([r, 1.0])
                 i = int(len(by_distance) // 2 - x)
                 sums[i] = sums.get(i, np.zeros(2)) + w * (after - before) * np.array([r, after - before])
                 by_row[u] += w * g * np.array([r, g])
@@ -121,6 +169,7 @@ def test_what_a_fit_leaves_is_summed_by_distance_by_row_and_in_all() -> None:
     assert np.allclose(found[0], by_distance, rtol=0.01, atol=0.02)
     assert np.allclose(found[1], by_row, rtol=0.01, atol=0.02 * np.abs(by_row).max())
     assert found[2] == pytest.approx(np.mean(logs), rel=1e-3)
+    assert np.allclose(found[3], by_place, rtol=0.01, atol=0.01 * np.abs(by_place).max(axis=0))
 
 
 def test_paths_across_a_fan_collect_what_a_plain_search_collects() -> None:

@@ -2,7 +2,8 @@
 
 Alternating least squares. Given the edge, every pixel's brightness before and after its passing follows from a
 2 by 2 system (no frame need be free of motion); given those, the edge of every frame follows by maximum likelihood
-from a step blurred by optics and by its own motion. Tip shape, optical blur and exposure are estimated on the way.
+from a step blurred by optics and by its own motion. Tip shape, optical blur, exposure and what of light and shade the
+tip carries along are estimated on the way.
 """
 
 from __future__ import annotations
@@ -18,24 +19,27 @@ from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
 from vinetrack.video.edge_repair import ASTRAY_PX, disagreement, growth_end, mend_jumps
 from vinetrack.video.edge_state import (
-    ASSUMED_EXPOSURE,
-    OPTICAL_BLUR_PX,
     EdgeState,
     blur_lengths,
     core_frames,
-    find_exposure,
-    find_shape,
     fit_edges,
     frames_that_tell,
     held_at_rest,
     moving_frames,
     repicture,
     residuals,
-    seen_exposure,
 )
 from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors
 from vinetrack.video.slow_errors import noise_and_slow, slow_error_px
 from vinetrack.video.strip import Strip
+from vinetrack.video.tip_shape import (
+    ASSUMED_EXPOSURE,
+    OPTICAL_BLUR_PX,
+    find_exposure,
+    find_shading,
+    find_shape,
+    seen_exposure,
+)
 
 START_PX = 0.08
 """Error near the start, where background is seen briefly or never. Chosen: twice FLOOR_PX of `point_quality`. At half
@@ -155,8 +159,9 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
         seen = frames_that_tell(state.edge)
         if turn == 1 and not np.isfinite(exposure_frames):
             exposure = find_exposure(strip, state, fit)
-        if turn < 3:
-            state = find_shape(strip, state, fit, turn == 0)
+        state = find_shape(strip, state, fit, turn == 0)
+        if turn > 0:
+            state = find_shading(strip, state, fit)
         fit = mend_jumps(strip, state, _fit_some(strip, state, seen), seen)
         if turn >= rounds - 1 and float(np.nanmax(np.abs(fit[:, 0] - before)[moving_frames(state.edge)])) < SETTLED_PX:
             break
@@ -405,7 +410,7 @@ def _restate(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> Ed
     edge = held_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), frames_that_tell(state.edge))
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
     state = repicture(strip, state, 4 * strip.noise + 4)
-    by_distance, _, _ = residuals(strip, state, fit, core_frames(state, fit))
+    by_distance, *_ = residuals(strip, state, fit, core_frames(state, fit))
     seen = by_distance[:, 1] > 4
     ratio = np.where(seen, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
     smooth = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")

@@ -79,6 +79,7 @@ def fit_edges(
     prior_sd: float,
     margin: float,
     rounds: int,
+    shading: np.ndarray,
 ) -> np.ndarray:
     """Most likely edge in every frame by Gauss-Newton; shape (n_frames, 6).
 
@@ -95,6 +96,8 @@ def fit_edges(
     prior_sd : standard deviation of relative amplitude and level.
     margin : pixels beyond the blurred edge that take part.
     rounds : steps at most.
+    shading : brightness of the tip beyond that of film and background, by distance ahead of the edge, 1 px apart about
+        its middle, shape (n_distances,); VECTOR + 4 px wider than what takes part, grey levels.
 
     Returns
     -------
@@ -115,15 +118,15 @@ def fit_edges(
             wider[k] = inflation[min(max(len(inflation) // 2 - middle + k - 1, 0), len(inflation) - 1)]
         most = rows * (2 * middle + 2) + VECTOR
         covers, slopes, steps = np.empty(most), np.empty(most), np.empty(most)
-        left, variances = np.empty(most), np.empty(most)
+        left, variances, falls = np.empty(most), np.empty(most), np.empty(most)
         amplitude, level = 0.0, 0.0
         for _ in range(rounds):
             first = max(0, math.ceil(y - half - deepest))
             last = min(columns, int(y + half) + 1)
             # All rows of pixels behind one another first: sums over them are then one long loop.
             used = _line_up(
-                strip[t], scale[t], offset[t], pictures, y, lag, half, first, last, middle, table, wider,
-                covers, slopes, steps, left, variances,
+                strip[t], scale[t], offset[t], pictures, y, lag, half, first, last, middle, table, wider, shading,
+                covers, slopes, steps, left, variances, falls,
             )  # fmt: skip
             yy, yg, yl, gg, gl, ll = 1e-12, 0.0, 0.0, prior_sd**-2, 0.0, prior_sd**-2
             ry, rg, rl = 0.0, -amplitude * prior_sd**-2, -level * prior_sd**-2
@@ -131,7 +134,7 @@ def fit_edges(
             for i in range(used):
                 contrast = steps[i]
                 dg = contrast * covers[i]
-                dy = contrast * (1 + amplitude) * slopes[i]
+                dy = contrast * (1 + amplitude) * slopes[i] + falls[i]
                 r = left[i] - (1 + amplitude) * dg - contrast * level
                 w = 1 / (variances[i] + r * r / 9)
                 yy += w * dy * dy
@@ -168,10 +171,11 @@ def fit_edges(
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
 def _line_up(
     picture: np.ndarray, gain: float, level: float, pictures: np.ndarray, y: float, lag: np.ndarray, half: float,
-    first: int, last: int, middle: int, table: np.ndarray, wider: np.ndarray,
+    first: int, last: int, middle: int, table: np.ndarray, wider: np.ndarray, shading: np.ndarray,
     covers: np.ndarray, slopes: np.ndarray, steps: np.ndarray, left: np.ndarray, variances: np.ndarray,
+    falls: np.ndarray,
 ) -> int:  # fmt: skip
-    """What each pixel about an edge at `y` says, row behind row, into the last five arrays; how many there are."""
+    """What each pixel about an edge at `y` says, row behind row, into the last six arrays; how many there are."""
     columns = picture.shape[1]
     used = 0
     for u in range(picture.shape[0]):
@@ -190,13 +194,16 @@ def _line_up(
         values, after, before = picture[u, a:b], pictures[0, u, a:b], pictures[1, u, a:b]
         after_variance, before_variance = pictures[2, u, a:b], pictures[3, u, a:b]
         cover, slope, step_of = covers[used:to], slopes[used:to], steps[used:to]
-        rest_of, variance_of = left[used:to], variances[used:to]
+        rest_of, variance_of, fall_of = left[used:to], variances[used:to], falls[used:to]
+        fraction, shaded = at - whole, a - whole + (len(shading) - 1) // 2
+        shade_before, shade_after = shading[shaded - 1 : shaded - 1 + full], shading[shaded : shaded + full]
         for i in range(full):
             p = low[i] + f * (high[i] - low[i])
             cover[i] = p
             slope[i] = low_slope[i] + f * (high_slope[i] - low_slope[i])
             step_of[i] = after[i] - before[i]
-            rest_of[i] = values[i] * gain + level - before[i]
+            fall_of[i] = shade_before[i] - shade_after[i]
+            rest_of[i] = values[i] * gain + level - before[i] - shade_after[i] - fraction * fall_of[i]
             variance_of[i] = (p * p * after_variance[i] + (1 - p) * (1 - p) * before_variance[i]) * factor[i]
         used += m
     return used
@@ -214,30 +221,33 @@ def residual_sums(
     pictures: np.ndarray,
     margin: float,
     use: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, float]:
+    shading: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """What the fit leaves: by distance ahead of the edge, by row, and in all.
 
     First answer: shape (n, 2), bins of 1 px about the middle: the sum over frames of z² / var z, z = Σ C r / v over
     all rows of a column, and the count: 1 on average for white noise, more where noise adds up across
     neighbours (grain of the film, its tail moving inside). Second: shape (n_across, 2), Σ g r and Σ g² with g the
     slope of the model in the row's own lag. Third: the mean of log(1 + r²/9v̄), v̄ the mean
-    of the two variances: a robust misfit for comparing blurs.
+    of the two variances: a robust misfit for comparing blurs. Fourth: shape (n_distances, 2), Σ w r and Σ w by
+    distance ahead of the row's own edge, places as those of `shading`.
 
     Parameters
     ----------
-    strip, scale, offset, lengths, lag, blur, pictures, margin : as in `fit_edges`.
+    strip, scale, offset, lengths, lag, blur, pictures, margin, shading : as in `fit_edges`.
     fit : from `fit_edges`, shape (n_frames, 6).
     use : mask of frames, shape (n_frames,).
 
     Returns
     -------
-    three sums, as above.
+    four sums, as above.
     """
     n, rows, columns = strip.shape
     bins = int(2 * (0.5 * max(lengths.max(), 0.0) + 4 * blur + margin + lag.max())) + 5
     centre = bins // 2
     by_distance = np.zeros((bins, 2))
     by_row = np.zeros((rows, 2))
+    by_place = np.zeros((len(shading), 2))
     misfit, count = 0.0, 0
     for t in range(n):
         if not use[t]:
@@ -265,16 +275,23 @@ def residual_sums(
             values, after, before = strip[t, u, a:b], pictures[0, u, a:b], pictures[1, u, a:b]
             after_variance, before_variance = pictures[2, u, a:b], pictures[3, u, a:b]
             tops, squares = column[0, k + even : k + even + m], column[1, k + even : k + even + m]
+            fraction, shaded = at - whole, a - whole + (len(shading) - 1) // 2
             top, square = 0.0, 0.0
             for i in range(m):
                 p = low[i] + f * (high[i] - low[i])
                 slope = low_slope[i] + f * (high_slope[i] - low_slope[i])
                 contrast = after[i] - before[i]
                 r = values[i] * scale[t] + offset[t] - before[i] - contrast * ((1 + fit[t, 3]) * p + fit[t, 4])
+                d = shaded + i
+                r -= shading[d] + fraction * (shading[d - 1] - shading[d])
                 v = p * p * after_variance[i] + (1 - p) * (1 - p) * before_variance[i]
                 w = 1 / (v + r * r / 9)
                 tops[i] += w * contrast * r
                 squares[i] += w * contrast * contrast
+                by_place[d, 0] += w * (1 - fraction) * r
+                by_place[d, 1] += w * (1 - fraction)
+                by_place[d - 1, 0] += w * fraction * r
+                by_place[d - 1, 1] += w * fraction
                 g = -contrast * slope
                 top += w * g * r
                 square += w * g * g
@@ -288,7 +305,7 @@ def residual_sums(
                 i = min(max(centre - middle + k - 1, 0), bins - 1)
                 by_distance[i, 0] += column[0, k] * column[0, k] / column[1, k]
                 by_distance[i, 1] += 1
-    return by_distance, by_row, misfit / max(count, 1)
+    return by_distance, by_row, misfit / max(count, 1), by_place
 
 
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")

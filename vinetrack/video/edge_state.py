@@ -1,13 +1,12 @@
 """What the edge tracker alternates between: where the edge is, what lies before and after it, and how it is pictured.
 
-The end of the file estimates the shape of the tip, the optical blur and the exposure from what the edge leaves
-unexplained.
+What the tip looks like, the optical blur and the exposure are estimated in `vinetrack.video.tip_shape`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import picture_kernels
+from vinetrack.video.edge_cover import VECTOR, cover_reach
 from vinetrack.video.strip import Strip
 
 MEMORY_FRAMES = 6.0
@@ -35,6 +35,10 @@ a tip. By reasoning: at half changes of light displace the edge, at twice a payl
 MARGIN_PX = 6.0
 """Pixels beyond the blurred edge that take part: they hold amplitude and level. Chosen: six pixels on either side know
 level and amplitude better than their prior. At half worse, at twice other things come in."""
+SHADED_PX = 24
+"""Distance from the edge within which the tip may show light and shade of its own. Chosen: about the length of the tip
+of the smallest vines. Measured (`contrast_reversal`, tuning seeds 3 to 6): errors of 0.41, 0.43, 0.32 and 0.68 px, at
+half 0.96, 0.60, 0.76 and 1.02, at twice 0.41, 0.44, 0.31 and 0.65; elsewhere the same to 0.01 px at all three."""
 SELFSAME = 0.4
 """Share of the usual contrast under which film and background near the start are the same thing seen twice. Chosen
 below half. By reasoning: at half film over itself is tracked as an edge; near 1 every start is taken for it."""
@@ -50,7 +54,8 @@ class EdgeState:
 
     The edge (n_frames,) and its blur lengths, the tip's lag by row and optical blur, and the pictures
     (4, n_across, n_along): brightness after and before the edge and the variance about each. `inflation` multiplies
-    those variances by distance ahead of the edge, 1 px a bin about its middle.
+    those variances by distance ahead of the edge, 1 px a bin about its middle. `shading` (2 SHADED_PX + 1,) is what the
+    tip shows beyond film and background, such as a bright rim that moves with it, grey levels, in bins like those.
     """
 
     edge: Floats
@@ -59,6 +64,7 @@ class EdgeState:
     blur: float
     pictures: NDArray[np.float32]
     inflation: Floats
+    shading: Floats = field(default_factory=lambda: np.zeros(2 * SHADED_PX + 1))
 
 
 def blur_lengths(edge: Floats, exposure_frames: float) -> Floats:
@@ -144,7 +150,7 @@ def repicture(strip: Strip, state: EdgeState, clip: float) -> EdgeState:
     early, late = _passing(state, strip.values.shape[2])
     sums = picture_kernels.gather(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, early, late,
-        MEMORY_FRAMES, state.pictures, clip,
+        MEMORY_FRAMES, state.pictures, clip, state.shading,
     )  # fmt: skip
     half = len(strip.values) // 2
     middle = float(np.median(strip.values[half])) * float(strip.scale[half]) + float(strip.offset[half])
@@ -242,11 +248,20 @@ def fit_edges(strip: Strip, state: EdgeState) -> Floats:
     """
     return kernels.fit_edges(
         strip.values, strip.scale, strip.offset, state.edge, state.lengths, state.lag, state.blur, state.pictures,
-        state.inflation, PRIOR_SD, MARGIN_PX, 12,
+        state.inflation, PRIOR_SD, MARGIN_PX, 12, _shading_as_wide(state, MARGIN_PX),
     )  # fmt: skip
 
 
-def residuals(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats, float]:
+def _shading_as_wide(state: EdgeState, margin_px: float) -> Floats:
+    """The shading of the tip with zeros about it, as wide as the compiled loops read."""
+    longest = float(np.nanmax(state.lengths, initial=0.0))
+    reach = math.ceil(cover_reach(longest, state.blur) + margin_px) + VECTOR + 4
+    return np.pad(state.shading, max(reach - SHADED_PX, 0))
+
+
+def residuals(
+    strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float = MARGIN_PX
+) -> tuple[Floats, Floats, float, Floats]:
     """What the fit leaves in the frames of `use`; see `edge_kernels.residual_sums`.
 
     Parameters
@@ -255,164 +270,15 @@ def residuals(strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_
     state : where the edge is, and what lies before and after it.
     fit : from `fit_edges`, shape (n_frames, 6).
     use : mask, shape (n_frames,).
+    margin_px : pixels beyond the blurred edge that take part.
 
     Returns
     -------
-    sums by distance, by row, and the misfit.
+    sums by distance, by row, the misfit, and sums by distance from each row's own edge.
     """
     filled = np.nan_to_num(fit)
     filled[:, 0] = state.edge
     return kernels.residual_sums(
         strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.pictures,
-        MARGIN_PX, use,
+        margin_px, use, _shading_as_wide(state, margin_px),
     )  # fmt: skip
-
-
-BLURS_PX = np.array([0.5, 0.7, 0.9, 1.2, 1.6, 2.1, 2.8])
-EXPOSURES = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0])
-ASSUMED_EXPOSURE = 0.25
-"""Exposure over frame period until it is estimated. Chosen as usual for high-speed cameras; it is replaced after the
-second round."""
-FEWEST_FAST = 6
-"""Chosen: frames from which a blur is told from the shape of the tip; a clip of eight frames, five of them in motion
-and without any blur, showed one of 0.4 frames. The fastest trials of the demonstration have seven."""
-CONTRADICTED = 1.01
-"""Measured (seeds 20900 and up): the true exposure leaves a misfit within 1.003 of the least of any exposure but in
-one recording of eight (1.012); twice the true one or more leaves 1.02 to 1.35 where the edge moves 7 px a frame."""
-FASTEST_LAG_STEP_PX = 4.0
-"""Largest change of a row's lag in one round. Chosen as trust region; only the number of rounds depends on it."""
-
-DEEPEST_LAG_PX = 60.0
-"""Largest lag of a row behind the foremost point. Chosen: above the radius of the widest tip, 36 px at 3 px/mm."""
-
-FEW_FRAMES = 16
-"""Frames from which the blur is told. Chosen for time; at half the blur scatters by 1.4 more."""
-
-OPTICAL_BLUR_PX = (0.4, 3.0)
-"""From a sharp pixel to a picture out of focus; more is taken for blur only where noise drowns the edge. Chosen;
-sharper is not sampled, and wider is noise."""
-
-
-def find_shape(strip: Strip, state: EdgeState, fit: Floats, anew: bool) -> EdgeState:
-    """Estimate how far each row of the tip lags behind its foremost point, then the optical blur.
-
-    From the core frames with less blur by motion: not those in which a door may still stand before the tip.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : the last estimate.
-    fit : from `fit_edges`, shape (n_frames, 6).
-    anew : whether the blur is looked for everywhere, not only near the last one.
-
-    Returns
-    -------
-    the state with new `lag` and `blur`, and the edge moved to the foremost point.
-    """
-    core = core_frames(state, fit)
-    slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
-    for _ in range(3):
-        _, by_row, _ = residuals(strip, state, fit, slow)
-        step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
-        step = np.clip(step, -FASTEST_LAG_STEP_PX, FASTEST_LAG_STEP_PX)
-        lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
-        state = replace(state, lag=lag, edge=state.edge - lead)
-    candidates = BLURS_PX if anew else state.blur * np.array([0.7, 0.85, 1, 1.2, 1.4])
-    few = np.flatnonzero(slow)[:: max(1, int(slow.sum()) // FEW_FRAMES)]
-    misfits = [_misfit_refitted(strip, replace(state, blur=float(blur)), few) for blur in candidates]
-    return replace(state, blur=float(np.clip(_least(candidates, np.array(misfits)), *OPTICAL_BLUR_PX)))
-
-
-def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_]) -> float:
-    """Misfit of some frames with their edges sought anew: a blur must not be judged by edges fitted with another."""
-    edge = np.full(len(state.edge), np.nan)
-    edge[frames] = state.edge[frames]
-    fit = fit_edges(strip, replace(state, edge=edge))
-    use = np.isfinite(fit[:, 0])
-    edge[use] = fit[use, 0]
-    return residuals(strip, replace(state, edge=edge), fit, use)[2]
-
-
-def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
-    """Exposure in frame periods that explains the blur of the faster frames best; a guess where none moves 2 px.
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : the last estimate.
-    fit : from `fit_edges`, shape (n_frames, 6).
-
-    Returns
-    -------
-    exposure over frame period.
-    """
-    core = core_frames(state, fit)
-    speed = blur_lengths(state.edge, 1.0)
-    fast = core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
-    if not fast.any():
-        return ASSUMED_EXPOSURE
-    misfits = [residuals(strip, replace(state, lengths=speed * tau), fit, fast)[2] for tau in EXPOSURES]
-    return _least(EXPOSURES, np.array(misfits))
-
-
-def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: float) -> tuple[float, float]:
-    """Find the exposure that the blur shows in place of a stated one.
-
-    The exposure is NaN where the stated one explains the blur as well (misfit within CONTRADICTED).
-
-    Parameters
-    ----------
-    strip : along the axis.
-    state : the last estimate.
-    fit : from `fit_edges`, shape (n_frames, 6).
-    stated_frames : stated exposure over frame period.
-
-    Returns
-    -------
-    exposure over frame period, NaN where the stated one explains the blur as well (misfit within CONTRADICTED); and the
-        median speed of the frames used, px a frame.
-    """
-    core = core_frames(state, fit)
-    speed = blur_lengths(state.edge, 1.0)
-    fast = core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2) if core.any() else core
-    if fast.sum() < FEWEST_FAST:
-        return np.nan, np.nan
-    tried = np.append(EXPOSURES, stated_frames)
-    misfits = np.array([residuals(strip, replace(state, lengths=speed * tau), fit, fast)[2] for tau in tried])
-    contradicted = misfits[-1] > CONTRADICTED * misfits.min()
-    seen = _least(EXPOSURES, misfits[:-1]) if contradicted else np.nan
-    return seen, float(np.median(speed[fast]))
-
-
-def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
-    """Smooth slightly along the rows, by weight, and set zero at the foremost point of the tip; what was taken off.
-
-    That point is the vertex of a parabola through the foremost third of the rows that show an edge at all: the least
-    of them would follow their noise.
-    """
-    kernel = np.exp(-0.5 * (np.arange(-3, 4) / 0.8) ** 2)
-    weight = weight + 1e-6 * float(weight.max() + 1e-12)
-    top = np.convolve(np.pad(lag * weight, 3, mode="edge"), kernel, mode="valid")
-    smooth = top / np.convolve(np.pad(weight, 3, mode="edge"), kernel, mode="valid")
-    seen = np.flatnonzero(weight > 0.1 * float(np.median(weight[weight >= np.median(weight)])))
-    front = seen[np.argsort(smooth[seen])[: max(len(seen) // 3, 3)]]
-    lead = float(np.average(smooth[front], weights=weight[front]))
-    if len(front) >= 6:
-        middle = float(front.mean())
-        curve = np.polyfit(front - middle, smooth[front], 2, w=np.sqrt(weight[front]))
-        vertex = -curve[1] / (2 * curve[0]) if curve[0] > 1e-6 else np.inf
-        if front.min() <= vertex + middle <= front.max():
-            lead = float(np.polyval(curve, vertex))
-    return np.clip(smooth - lead, -3.0, DEEPEST_LAG_PX), lead
-
-
-def _least(candidates: Floats, misfits: Floats) -> float:
-    """Candidate of least misfit, refined by a parabola through its neighbours in its logarithm."""
-    i = int(np.argmin(misfits))
-    if i in (0, len(candidates) - 1):
-        return float(candidates[i])
-    x, y = np.log(candidates[i - 1 : i + 2]), misfits[i - 1 : i + 2]
-    curve = np.polyfit(x - x[1], y, 2)
-    if curve[0] <= 0:
-        return float(candidates[i])
-    return float(np.exp(x[1] + np.clip(-curve[1] / (2 * curve[0]), x[0] - x[1], x[2] - x[1])))

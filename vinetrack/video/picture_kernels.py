@@ -41,6 +41,7 @@ def gather(
     memory_frames: float,
     pictures: np.ndarray,
     clip: float,
+    shading: np.ndarray,
 ) -> np.ndarray:
     """Sums for the least squares of (before, after) at every pixel; shape (11, n_across, n_along).
 
@@ -61,6 +62,7 @@ def gather(
     memory_frames : frames after which weights fall to 1/e.
     pictures : the last solution of `solve`; unused where `clip` is 0.
     clip : grey levels.
+    shading : as in `edge_kernels.fit_edges`; taken off what is seen.
 
     Returns
     -------
@@ -90,6 +92,7 @@ def gather(
         if limits[t, 1] > limits[t, 0]:
             table = cover_table(lengths[t], blur, cover_reach(max(lengths[t], 0.02), blur))
             tables[t, :, : table.shape[2]] = table[0]
+    bright = np.empty(columns, np.float32)
     # A few rows at a time, so that their sums stay near the processor.
     for block in range(0, rows, ROWS_AT_ONCE):
         for t in range(n):
@@ -101,7 +104,7 @@ def gather(
             gain, level = np.float32(scale[t]), np.float32(offset[t])
             _gather_rows(
                 strip[t], block, min(block + ROWS_AT_ONCE, rows), gain, level, edge[t], lag, table, middle, first, last,
-                bare_weight, film_weight, early, late, t, pictures, tight, sums,
+                bare_weight, film_weight, early, late, t, pictures, tight, shading, bright, sums,
             )  # fmt: skip
     return sums
 
@@ -110,7 +113,8 @@ def gather(
 def _gather_rows(
     picture: np.ndarray, low: int, high: int, gain: np.float32, level: np.float32, edge: float, lag: np.ndarray,
     table: np.ndarray, middle: int, first: int, last: int, bare_weight: np.ndarray, film_weight: np.ndarray,
-    early: np.ndarray, late: np.ndarray, t: int, pictures: np.ndarray, tight: np.float32, sums: np.ndarray,
+    early: np.ndarray, late: np.ndarray, t: int, pictures: np.ndarray, tight: np.float32,
+    shading: np.ndarray, bright: np.ndarray, sums: np.ndarray,
 ) -> None:  # fmt: skip
     """Add what rows `low` to `high` of one frame show to `sums`; see `gather`."""
     unity = np.float32(1.0)
@@ -119,15 +123,23 @@ def _gather_rows(
         whole, j, f, _ = phase(at)
         behind = min(max(whole - middle + 1, first), last)
         ahead = min(max(whole + middle + 1, first), last)
-        _count(picture[u, first:behind], gain, level, film_weight[first:behind], pictures[0, u, first:behind], tight,
+        values = picture[u]
+        for s in range(first, last):
+            bright[s] = values[s] * gain + level
+        centre = (len(shading) - 1) // 2
+        fraction = at - whole
+        for s in range(max(first, whole - centre + 1), min(last, whole + centre)):
+            d = s - whole + centre
+            bright[s] -= np.float32(shading[d] + fraction * (shading[d - 1] - shading[d]))
+        _count(bright[first:behind], film_weight[first:behind], pictures[0, u, first:behind], tight,
                sums[8, u, first:behind], sums[9, u, first:behind], sums[10, u, first:behind])  # fmt: skip
-        _count(picture[u, ahead:last], gain, level, bare_weight[ahead:last], pictures[1, u, ahead:last],
+        _count(bright[ahead:last], bare_weight[ahead:last], pictures[1, u, ahead:last],
                tight, sums[5, u, ahead:last], sums[6, u, ahead:last], sums[7, u, ahead:last])  # fmt: skip
         for s in range(behind, ahead):
             k = s - whole + middle
             p = np.float32(table[j, k] + f * (table[j + 1, k] - table[j, k]))
             q = unity - p
-            value = picture[u, s] * gain + level
+            value = bright[s]
             w = bare_weight[s]
             if p > COVERED:
                 w = film_weight[s]
@@ -155,13 +167,13 @@ def _gather_rows(
 
 @njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy", **BORROWED)
 def _count(
-    values: np.ndarray, gain: np.float32, level: np.float32, weight: np.ndarray, picture: np.ndarray, tight: np.float32,
+    values: np.ndarray, weight: np.ndarray, picture: np.ndarray, tight: np.float32,
     count: np.ndarray, total: np.ndarray, squares: np.ndarray,
 ) -> None:  # fmt: skip
     """Add the pixels of a row that are bare, or covered, to their weight, sum and sum of squares."""
     unity = np.float32(1.0)
     for k in range(len(values)):
-        value = values[k] * gain + level
+        value = values[k]
         r = value - picture[k]
         w = weight[k] / (unity + r * r * tight)
         count[k] += w
