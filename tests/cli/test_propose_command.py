@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from grown import effect_file, grown, sheet
+from grown import FORCES, effect_file, grown, sheet
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
@@ -25,8 +25,8 @@ def run(*arguments: str | Path) -> tuple[int, str]:
 def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """An experiment whose vines feel a force that grows with time, and its results; one candidate, which is not it."""
     place = tmp_path_factory.mktemp("lawful")
-    hidden = effect_file(place, "hidden", ["s.time / 0.2"])
-    virtual = grown(sheet((4,)), 103, own=[hidden], values={"hidden.a": -0.3, "hidden.kind": 0.0})
+    values = {"hidden.a": -0.3, "hidden.kind": float(list(FORCES).index("growing"))}
+    virtual = grown(sheet((4,)), 103, own=[effect_file(place)], values=values)
     experiment, results = place / "bench", place / "results"
     write_experiment(virtual, experiment, "candidates: [air_drag]\n")
     for stage in (("tracks", experiment, results), ("gather", experiment, results), ("damping", results)):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grown import effect_file, grown, pairs_of, sheet
+from grown import hidden_force, sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis.force_refinement import Place, _as_driven, normal_equations
@@ -22,9 +22,8 @@ from vinetrack.inference.sensitivity import ORIGIN, OWN, PRESSURE, RELEASE
 @pytest.fixture(scope="module")
 def slowed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fit, LinearMisfit]:
     """Vines that felt a friction along the growth, and the model without it."""
-    hidden = effect_file(tmp_path_factory.mktemp("slowed"), "hidden", ["(s.lead_position / 0.28) ** 2"])
-    values = {"hidden.a": -1.2, "hidden.kind": 0.0}
-    fit = vt.fit(vt.base_model(), pairs_of(grown(sheet((4,), 2), 231, own=[hidden], values=values)), profile=False)
+    pairs = hidden_force(sheet((4,), 2), 231, "square", -1.2, tmp_path_factory.mktemp("slowed"))
+    fit = vt.fit(vt.base_model(), pairs, profile=False)
     return fit, linear_misfit(fit)
 
 

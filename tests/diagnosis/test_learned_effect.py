@@ -10,15 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-from grown import effect_file, grown, pairs_of, sheet
 
-import vinetrack as vt
 from vinetrack.diagnosis.force_surface import Domain, Surface
 from vinetrack.diagnosis.learned_effect import even_coefficients, table_name, table_text
 from vinetrack.diagnosis.learned_force import LearnedForce
 from vinetrack.diagnosis.learned_variables import dependence, not_excluded
-from vinetrack.diagnosis.propose import propose
-from vinetrack.effects import State, own_effects
+from vinetrack.effects import own_effects
 
 DOMAINS = [
     Domain(("growth",), (0.0,), (0.25,), (24,), (math.inf,)),
@@ -130,19 +127,3 @@ def test_what_trials_do_not_tell_is_said_of_what_they_do() -> None:
     assert "is most likely described by the time" in dependence("time", {"time": 0.9}, [])
     unlike = dependence("growth", {"growth": 0.6}, ["speed+time"])
     assert "by the growth (60%) or by the speed of the tail and the time since release:" in unlike
-
-
-def test_a_force_in_no_list_is_proposed_as_a_table_that_mends_the_model(tmp_path: Path) -> None:
-    """Waves along the growth that become shorter: no formula of the list follows them."""
-    hidden = effect_file(tmp_path, "hidden", ["np.sin(2 * np.pi * (s.lead_position / 0.12) ** 1.5)"])
-    pairs = pairs_of(grown(sheet((4,)), 131, own=[hidden], values={"hidden.a": -0.3, "hidden.kind": 0.0}))
-    proposal = propose(vt.base_model(), pairs, lambda _: None)
-    table = proposal.table
-    assert table is not None
-    assert table.effect.name == "learned_growth"
-    size = next(number for number in table.ratio.fit.numbers if number.key == "learned_growth.a")
-    assert size.value == pytest.approx(1.0, abs=0.1)
-    assert table.ratio.fit.chi2_per_dof < 1.5 < proposal.before.chi2_per_dof
-    assert "No formula tried does what the learned force does." in proposal.sentences()[-1]
-    zero = State(*(0.0,) * len(State._fields))
-    assert math.isfinite(table.effect.functions["tail_force"](zero, None, 1.0))

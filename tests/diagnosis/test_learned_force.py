@@ -9,13 +9,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from grown import effect_file, grown, pairs_of, sheet
+from grown import grown, hidden_force, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis.force_surface import ANY, CONSTANT, NOTHING, Domain, Surface, covariance_root, curves
 from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS
 from vinetrack.diagnosis.learned_variables import following
-from vinetrack.diagnosis.missing_force import MissingForce, missing_force
+from vinetrack.diagnosis.missing_force import missing_force
+from vinetrack.diagnosis.propose import Proposal, propose
+from vinetrack.effects import State
 
 GROWTH = Domain(("growth",), (0.0,), (0.25,), (12,), (math.inf,))
 BOTH = Domain(("growth", "speed"), (0.0, 0.0), (0.25, 8.0), (12, 8), (math.inf, math.inf))
@@ -101,20 +103,27 @@ def test_a_variable_that_follows_from_those_named_is_told_and_one_that_varies_fr
 
 
 @pytest.fixture(scope="module")
-def waves(tmp_path_factory: pytest.TempPathFactory) -> MissingForce:
-    """Vines that felt waves along the growth which become shorter."""
-    hidden = effect_file(
-        tmp_path_factory.mktemp("waves"), "hidden", ["np.sin(2 * np.pi * (s.lead_position / 0.12) ** 1.5)"]
-    )
-    values = {"hidden.a": -0.3, "hidden.kind": 0.0}
-    return missing_force(
-        vt.fit(vt.base_model(), pairs_of(grown(sheet((4,)), 131, own=[hidden], values=values)), profile=False)
-    )
+def proposal(tmp_path_factory: pytest.TempPathFactory) -> Proposal:
+    """Of vines that felt waves along the growth which become shorter: no formula of the list follows them."""
+    pairs = hidden_force(sheet((4,)), 131, "waves", -0.3, tmp_path_factory.mktemp("waves"))
+    return propose(vt.base_model(), pairs, lambda _: None)
 
 
-def test_waves_along_the_growth_are_learned_with_their_variable_and_their_size(waves: MissingForce) -> None:
-    learned = waves.learned
-    assert learned is not None
+def test_a_force_in_no_list_is_proposed_as_a_table_that_mends_the_model(proposal: Proposal) -> None:
+    table = proposal.table
+    assert table is not None
+    assert table.effect.name == "learned_growth"
+    size = next(number for number in table.ratio.fit.numbers if number.key == "learned_growth.a")
+    assert size.value == pytest.approx(1.0, abs=0.1)
+    assert table.ratio.fit.chi2_per_dof < 1.5 < proposal.before.chi2_per_dof
+    assert "No formula tried does what the learned force does." in proposal.sentences()[-1]
+    zero = State(*(0.0,) * len(State._fields))
+    assert math.isfinite(table.effect.functions["tail_force"](zero, None, 1.0))
+
+
+def test_waves_along_the_growth_are_learned_with_their_variable_and_their_size(proposal: Proposal) -> None:
+    assert proposal.table is not None
+    learned = proposal.table.learned
     assert learned.variables == ("growth",)
     assert sum(learned.weights.values()) == pytest.approx(1.0)
     assert tuple(learned.table.columns) == LEARNED_COLUMNS
@@ -128,13 +137,14 @@ def test_waves_along_the_growth_are_learned_with_their_variable_and_their_size(w
     assert np.isnan(grid["pressure_Pa"]).all()
 
 
-def test_it_says_what_it_depends_on_and_goes_into_a_file(waves: MissingForce) -> None:
-    content = json.loads(json.dumps(waves.to_json()))["learned"]
+def test_it_says_what_it_depends_on_and_goes_into_a_file(proposal: Proposal) -> None:
+    assert proposal.table is not None
+    force = missing_force(proposal.before, learn=False)
+    content = json.loads(json.dumps(replace(force, learned=proposal.table.learned).to_json()))["learned"]
     assert content["variables"] == ["growth"]
     assert "is described by the growth" in content["sentence"]
     assert set(content["length_scales"]) == {"growth"}
-    without = replace(waves, learned=None).to_json()
-    assert without["learned"] is None
+    assert force.to_json()["learned"] is None
 
 
 def test_where_nothing_is_missing_no_force_is_learned() -> None:

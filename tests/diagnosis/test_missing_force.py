@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from grown import effect_file, grown, pairs_of, sheet
+from grown import FORCES, effect_file, grown, hidden_force, pairs_of, sheet
 from threadpoolctl import threadpool_info
 
 import vinetrack as vt
@@ -23,31 +23,20 @@ from vinetrack.dynamics.simulate import simulate_many
 from vinetrack.effects import own_effects
 from vinetrack.inference.fit_result import Fit
 
-FORCES = {
-    "patch": "0.5 * (np.tanh((s.lead_position - 0.12) / 0.003) - np.tanh((s.lead_position - 0.15) / 0.003))",
-    "ripple": "np.sin(2 * np.pi * s.lead_position / 0.06)",
-    "stribeck": "np.exp(-s.tail_velocity / 1.5)",
-    "growing": "s.time / 0.2",
-    "odd": "np.sin(2 * np.pi * s.lead_position / 0.1) * np.sin(s.pressure / 3e3)",
-    "bump": "np.exp(-0.5 * ((s.lead_position - 0.08) / 0.01) ** 2)",
-    "slow": "1 / (0.3 + s.tail_velocity)",
-}
 
-
-@pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return effect_file(tmp_path_factory.mktemp("effects"), "hidden", list(FORCES.values()))
-
-
-def fitted(path: Path, name: str, size_N: float, seed: int, scales: tuple[int, ...] = (4,)) -> Fit:
+def fitted(folder: Path, name: str, size_N: float, seed: int) -> Fit:
     """The base model fitted to vines that felt this force as well."""
-    values = {"hidden.a": size_N, "hidden.kind": float(list(FORCES).index(name))}
-    return vt.fit(vt.base_model(), pairs_of(grown(sheet(scales), seed, own=[path], values=values)), profile=False)
+    return vt.fit(vt.base_model(), hidden_force(sheet((4,)), seed, name, size_N, folder), profile=False)
+
+
+def laws_of(fit: Fit) -> MissingForce:
+    """The force held against laws; learned as a smooth function it is in `test_learned_force`."""
+    return missing_force(fit, learn=False)
 
 
 @pytest.fixture(scope="module")
-def patch(path: Path) -> MissingForce:
-    return missing_force(fitted(path, "patch", -0.4, 91))
+def patch(tmp_path_factory: pytest.TempPathFactory) -> MissingForce:
+    return laws_of(fitted(tmp_path_factory.mktemp("effects"), "patch", -0.4, 91))
 
 
 def test_a_rough_patch_is_found_where_it_is_with_its_size(patch: MissingForce) -> None:
@@ -71,24 +60,24 @@ def test_the_force_drawn_lies_on_the_patch_in_every_condition(patch: MissingForc
         assert -0.7 < lowest["force_N"] - one["force_N"].median() < -0.2
 
 
-def test_a_ripple_along_the_film_is_found_with_its_period(path: Path) -> None:
-    found = missing_force(fitted(path, "ripple", -0.5, 92))
+def test_a_ripple_along_the_film_is_found_with_its_period(tmp_path: Path) -> None:
+    found = laws_of(fitted(tmp_path, "ripple", -0.5, 92))
     assert found.laws["law"].iloc[0] == "periodic"
     period = float(found.laws["words"].iloc[0].split("every ")[1].split(" mm")[0])
     assert period == pytest.approx(60, abs=1)
     assert found.laws["amplitude_N"].iloc[0] == pytest.approx(0.5, abs=0.07)
 
 
-def test_a_friction_that_falls_with_speed_is_told_from_all_others(path: Path) -> None:
-    found = missing_force(fitted(path, "stribeck", -1.5, 93))
+def test_a_friction_that_falls_with_speed_is_told_from_all_others(tmp_path: Path) -> None:
+    found = laws_of(fitted(tmp_path, "stribeck", -1.5, 93))
     assert found.laws["law"].iloc[0] in ("falling_with_speed", "inverse_speed")
     assert found.laws["amplitude_N"].iloc[0] < 0
     assert "falls with speed" in found.sentence
     assert found.depends_on["speed"] > 0.9
 
 
-def test_a_force_that_grows_with_time_is_told_from_one_that_grows_with_travel(path: Path) -> None:
-    found = missing_force(fitted(path, "growing", -0.3, 94))
+def test_a_force_that_grows_with_time_is_told_from_one_that_grows_with_travel(tmp_path: Path) -> None:
+    found = laws_of(fitted(tmp_path, "growing", -0.3, 94))
     assert found.laws["law"].iloc[0] == "time"
     assert "grows in proportion to time" in found.sentence
     assert found.depends_on["time"] > 0.95
@@ -96,12 +85,12 @@ def test_a_force_that_grows_with_time_is_told_from_one_that_grows_with_travel(pa
 
 @pytest.mark.parametrize(("seed", "scales"), [(95, (4,)), (96, (2, 4))])
 def test_where_nothing_is_missing_no_force_is_told(seed: int, scales: tuple[int, ...]) -> None:
-    found = missing_force(vt.fit(vt.base_model(), pairs_of(grown(sheet(scales), seed)), profile=False))
+    found = laws_of(vt.fit(vt.base_model(), pairs_of(grown(sheet(scales), seed)), profile=False))
     assert found.sentence.startswith("No further force on the tail can be told")
 
 
-def test_a_force_of_no_simple_law_is_said_to_be_none(path: Path) -> None:
-    found = missing_force(fitted(path, "odd", 0.4, 97))
+def test_a_force_of_no_simple_law_is_said_to_be_none(tmp_path: Path) -> None:
+    found = laws_of(fitted(tmp_path, "odd", 0.4, 97))
     assert "like none of the simple laws" in found.sentence
 
 
@@ -114,7 +103,7 @@ def test_it_goes_into_a_file(patch: MissingForce) -> None:
     assert tuple(patch.laws.columns) == LAW_COLUMNS
 
 
-def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(path: Path) -> None:
+def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(tmp_path: Path) -> None:
     """The integrator with a tolerance far below its usual: a narrow force lies between its usual steps."""
     model = vt.base_model() + vt.effects.reservoir_depletion
     virtual = grown(sheet(payloads_g=(0.0, 20.0), replicates=1), 98, ["reservoir_depletion"])
@@ -128,7 +117,7 @@ def test_what_a_small_force_does_is_what_the_integrator_makes_of_it(path: Path) 
     answers = force_sensitivities(found, own, motions, lambda m: np.column_stack([f(m) for f in shapes.values()]))
     jobs = found.predictor.jobs(found.solution.state.theta, own)
     times = [item.time_s - job.release_s for item, job in zip(found.predictor.data, jobs, strict=True)]
-    with_force = model + own_effects([path])["hidden"]
+    with_force = model + own_effects([effect_file(tmp_path)])["hidden"]
     for k, name in enumerate(shapes):
         kind = float(list(FORCES).index(name))
         moved = [

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from grown import effect_file, grown, pairs_of, sheet
+from grown import grown, hidden_force, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis.force_laws import Law
@@ -64,8 +64,7 @@ def test_sizes_have_the_unit_that_makes_a_force(law: Law, unit: str) -> None:
 
 
 def test_a_force_that_grows_with_time_is_proposed_and_mends_left_out_conditions(tmp_path: Path) -> None:
-    hidden = effect_file(tmp_path, "hidden", ["s.time / 0.2"])
-    pairs = pairs_of(grown(sheet((4,)), 101, own=[hidden], values={"hidden.a": -0.3, "hidden.kind": 0.0}))
+    pairs = hidden_force(sheet((4,)), 101, "growing", -0.3, tmp_path)
     proposal = propose(vt.base_model(), pairs, lambda _: None)
     best = proposal.tied[0]
     assert best.effect.name == "proposed_time"

@@ -14,6 +14,18 @@ from vinetrack.laboratory.tracks import BASE, Nature, VirtualTrial, grow
 from vinetrack.laboratory.vine_campaigns import CAPTURE_FPS, campaign, damping_values, isometric_vine
 
 Pairs = list[tuple[Trial, Track]]
+FORCES = {
+    "patch": "0.5 * (np.tanh((s.lead_position - 0.12) / 0.003) - np.tanh((s.lead_position - 0.15) / 0.003))",
+    "ripple": "np.sin(2 * np.pi * s.lead_position / 0.06)",
+    "stribeck": "np.exp(-s.tail_velocity / 1.5)",
+    "growing": "s.time / 0.2",
+    "odd": "np.sin(2 * np.pi * s.lead_position / 0.1) * np.sin(s.pressure / 3e3)",
+    "bump": "np.exp(-0.5 * ((s.lead_position - 0.08) / 0.01) ** 2)",
+    "slow": "1 / (0.3 + s.tail_velocity)",
+    "waves": "np.sin(2 * np.pi * (s.lead_position / 0.12) ** 1.5)",
+    "square": "(s.lead_position / 0.28) ** 2",
+}
+"""Forces that no catalogue has, of size 1."""
 PRESSURES = {1: (16.0, 22.0, 30.0), 2: (30.0, 40.0, 50.0, 60.0), 4: (24.0, 30.0, 38.0, 48.0)}
 
 
@@ -71,13 +83,13 @@ def pairs_of(virtual: Sequence[VirtualTrial]) -> Pairs:
     return [(one.stated, one.track) for one in virtual]
 
 
-def effect_file(folder: Path, name: str, forces: Sequence[str]) -> Path:
-    """A user's effect: a tail force of size `a`, N, times one of these expressions of `s` and `rig`, by `kind`.
+def effect_file(folder: Path) -> Path:
+    """A user's effect `hidden`: a tail force of size `a`, N, times that of `FORCES` whose place is `kind`.
 
-    One file for many forces is compiled once.
+    One file for all of them is compiled once.
     """
     choices = "\n".join(
-        f"    if kind == {k}.0:\n        return a * ({force}) + 0.0 * s.time" for k, force in enumerate(forces)
+        f"    if kind == {k}.0:\n        return a * ({force}) + 0.0 * s.time" for k, force in enumerate(FORCES.values())
     )
     text = f'''"""Forces that no catalogue has.
 
@@ -101,6 +113,12 @@ def tail_force(s, rig, a, kind):
 {choices}
     return 0.0 * s.time
 '''
-    path = folder / f"{name}.py"
+    path = folder / "hidden.py"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def hidden_force(trials: Sequence[Trial], seed: int, name: str, size_N: float, folder: Path) -> Pairs:
+    """Trials that felt one of `FORCES` of this size; its file is written to the folder."""
+    values = {"hidden.a": size_N, "hidden.kind": float(list(FORCES).index(name))}
+    return pairs_of(grown(trials, seed, own=[effect_file(folder)], values=values))
