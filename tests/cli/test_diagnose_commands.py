@@ -29,7 +29,7 @@ def run(*arguments: str | Path) -> tuple[int, str]:
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hidden") / "campaign"
-    trials = sheet()
+    trials = sheet()[6:]  # one vine at three pressures, twice each
     nature = Nature(
         effects=(*BASE, "reservoir_depletion"),
         values={**damping_values(trials), "reservoir_depletion.gamma": 1.2},
@@ -82,7 +82,7 @@ def test_the_stage_writes_the_contract(results: Path) -> None:
 
 def test_every_trial_has_what_both_models_say_of_it(results: Path) -> None:
     paths = sorted((results / "diagnosis" / "predictions").glob("*.csv"))
-    assert len(paths) == 12
+    assert len(paths) == 6
     assert paths[0].read_text().splitlines()[0] == "time_s,lead_position_m,model_before_m,model_after_m"
 
 

@@ -11,6 +11,8 @@ from grown import FORCES, effect_file, grown, sheet
 from typer.testing import CliRunner
 
 from vinetrack.cli.main import app
+from vinetrack.diagnosis import propose as search
+from vinetrack.diagnosis.propose import propose
 from vinetrack.effects import own_effects
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.laboratory.tracks import write_experiment
@@ -26,7 +28,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """An experiment whose vines feel a force that grows with time, and its results; one candidate, which is not it."""
     place = tmp_path_factory.mktemp("lawful")
     values = {"hidden.a": -0.3, "hidden.kind": float(list(FORCES).index("growing"))}
-    virtual = grown(sheet((4,)), 103, own=[effect_file(place)], values=values)
+    virtual = grown(sheet((4,), replicates=2), 103, own=[effect_file(place)], values=values)
     experiment, results = place / "bench", place / "results"
     write_experiment(virtual, experiment, "candidates: [air_drag]\n")
     for stage in (("tracks", experiment, results), ("gather", experiment, results), ("damping", results)):
@@ -39,15 +41,20 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return experiment, results
 
 
-def test_a_law_is_written_beside_the_experiment_and_added(bench: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_law_is_written_beside_the_experiment_and_added(
+    bench: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     experiment, results = bench
     assert json.loads((results / "diagnosis.json").read_text())["verdict"] == "unexplained"
+    proposals = []
+    monkeypatch.setattr(search, "propose", lambda *given: proposals.append(propose(*given)) or proposals[-1])
     code, output = run("propose", results)
     assert code == 0, output
     assert "Proposed: a force that grows in proportion to time" in output
     path = experiment / "proposed_time.py"
     effect = own_effects([path])["proposed_time"]
-    assert "12 trials of bench" in effect.text
+    assert "8 trials of bench" in effect.text
+    monkeypatch.setattr(search, "propose", lambda *_: proposals[0])  # the same once more, without the search
     code, output = run("propose", results)
     assert code == 1
     assert "is there already" in output

@@ -68,15 +68,17 @@ def behind_a_known_lens(pairs: Pairs) -> Pairs:
     return [(replace(trial, position_systematic_m=0.0), track) for trial, track in pairs]
 
 
-@pytest.mark.parametrize(
-    "times",
-    [4, 5],
-)
-def test_a_size_well_beyond_what_could_hide_would_have_been_seen(times: int) -> None:
-    """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
+@pytest.fixture(scope="module")
+def largest() -> float:
+    """Friction that could hide behind a known lens."""
     nothing = vt.diagnose(behind_a_known_lens(grown(seed=7000)), ladder=False, advice=False)
-    largest = next(o for o in nothing.rounds[0].ranking if o.effect == "tail_friction").largest
-    hidden = grown({"tail_friction.mu_w": times * largest["tail_friction.mu_w"]}, seed=7000)
+    return next(o for o in nothing.rounds[0].ranking if o.effect == "tail_friction").largest["tail_friction.mu_w"]
+
+
+@pytest.mark.parametrize("times", [4, 5])
+def test_a_size_well_beyond_what_could_hide_would_have_been_seen(largest: float, times: int) -> None:
+    """Behind a known lens. Where 0.1 mm of smooth error is allowed for, it takes six times the limit."""
+    hidden = grown({"tail_friction.mu_w": times * largest}, seed=7000)
     diagnosis = vt.diagnose(behind_a_known_lens(hidden), ladder=False, advice=False)
     assert diagnosis.verdict in ("missing", "ambiguous")
     assert "tail_friction" in diagnosis.answer_set
@@ -157,7 +159,8 @@ def test_a_wrong_scale_is_an_artefact_with_a_calibration_to_do() -> None:
 
 
 def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
-    trial, track = next((trial, track) for trial, track in depleted_pairs if trial.pressure_Pa == 40e3)
+    once = depleted_pairs[::2]  # one trial of every condition
+    trial, track = next((trial, track) for trial, track in once if trial.pressure_Pa == 40e3)
     moving = int(np.searchsorted(track.lead_position_m, track.lead_position_m[0] + 0.05))
     keep = np.arange(track.time_s.size) != moving
     time_s = track.time_s[:-1]
@@ -169,7 +172,7 @@ def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
         flag=track.flag[keep],
         edge_px=track.edge_px[keep],
     )
-    others = [(one, other) for one, other in depleted_pairs if one.name != trial.name]
+    others = [(one, other) for one, other in once if one.name != trial.name]
     few = ["reservoir_depletion", "tail_friction", "length_scale"]
     found = vt.diagnose([(trial, cut), *others], candidates=few, ladder=False, advice=False)
     assert (found.verdict, found.answer_set) == ("artefact", (DROPPED_FRAMES,))
@@ -213,7 +216,7 @@ def _with_own(effect: vt.effects.Effect, size: float, *, seed: int) -> Pairs:
 
 def test_what_no_effect_explains_is_unexplained_and_drawn() -> None:
     pairs = []
-    for trial, track in grown(seed=7004):
+    for trial, track in grown(seed=7004, trials=sheet()[:6]):  # one vine
         y = track.lead_position_m - track.lead_position_m[:5].mean()
         bump = 1.5e-3 * np.sin(2 * math.pi * np.clip(y, 0, None) / 0.05) * (y > 0.03)
         pairs.append((trial, replace(track, lead_position_m=track.lead_position_m + bump)))
@@ -223,6 +226,7 @@ def test_what_no_effect_explains_is_unexplained_and_drawn() -> None:
     assert found.missing_force is not None
     assert found.force_table is not None
     assert len(found.force_table)
+    assert found.learned_table is not None
 
 
 def test_an_unknown_candidate_is_an_error_that_suggests(depleted_pairs: Pairs) -> None:

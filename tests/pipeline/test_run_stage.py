@@ -106,6 +106,7 @@ def write_campaign(folder: Path) -> None:
         (folder / f"p{kPa}.csv").write_text("\n".join(["time_s,position_m", *lines, ""]))
         rows.append(f"p{kPa},p{kPa}.csv,12,100,300,{kPa},3,0\n")
     (folder / "trials.csv").write_text(SHEET + "".join(rows))
+    (folder / "experiment.yaml").write_text("candidates: [tail_friction]\n")
 
 
 @pytest.mark.pipeline
