@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge_repair import BANDS
+from vinetrack.video.edge_repair import BANDS, dwell_error_px
 from vinetrack.video.frames import Frames, Recording, Region
 from vinetrack.video.track import Tracking, track_frames
 
@@ -115,3 +115,30 @@ def test_an_edge_that_speeds_up_is_placed_where_it_was_at_mid_exposure(exposure:
     assert use.sum() >= 7
     error = (tracking.track.edge_px + tracking.axis.from_px[0] - place(frames))[use]
     assert abs(error.mean()) < 0.05
+
+
+def test_an_edge_that_stops_within_an_exposure_is_no_surer_than_its_dwell_allows() -> None:
+    """Half of an exposure at 20 px a frame, half at rest: seen on average vτ/8 behind where it is in the middle."""
+    frames, exposure, stop = np.arange(36.0), 0.5, 380.0
+    instants = frames[:, None] + exposure * (np.arange(SUB_INSTANTS) + 0.5 - SUB_INSTANTS / 2) / SUB_INSTANTS
+
+    def place(time: np.ndarray) -> np.ndarray:
+        return np.minimum(60.0 + 20.0 * np.clip(time - 12.0, 0.0, None), stop)
+
+    tracking = tracked(step_frames(place(instants), noise=1.0), exposure, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
+    error = tracking.track.edge_px + tracking.axis.from_px[0] - place(frames)
+    sigma = tracking.track.lead_position_sigma_m * 1e4
+    last = int(np.flatnonzero(place(frames) >= stop)[0])
+    assert 0.8 * 20.0 * exposure / 8 < sigma[last] < 3.0  # by the edge as measured, which is behind itself
+    assert np.abs(error[14 : last + 1] / np.hypot(sigma, 0.1)[14 : last + 1]).max() < 4.0
+    assert sigma[16 : last - 4].max() < 0.5
+
+
+@pytest.mark.parametrize(("exposure", "speed"), [(0.5, 20.0), (0.1, 8.0)])
+def test_the_error_of_dwell_is_that_of_a_stop_and_none_of_an_even_motion(exposure: float, speed: float) -> None:
+    even = 3.0 + speed * np.arange(30.0) + 0.4 * np.arange(30.0) ** 2
+    assert dwell_error_px(even, exposure)[5:25].max() < 0.01
+    stopped = np.minimum(speed * np.arange(30.0), 20 * speed)
+    found = dwell_error_px(stopped, exposure)
+    assert found[20] == pytest.approx(speed * exposure / 8)
+    assert np.delete(found, 20).max() == 0.0

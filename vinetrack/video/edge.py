@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
-from vinetrack.video.edge_repair import ASTRAY_PX, disagreement, growth_end, mend_jumps
+from vinetrack.video.edge_repair import ASTRAY_PX, disagreement, dwell_error_px, growth_end, mend_jumps
 from vinetrack.video.edge_state import (
     EdgeState,
     blur_lengths,
@@ -435,7 +435,7 @@ def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed
     door = DOOR_PX * disturbed_start(strip, state) * trouble
     start_error = (START_PX + door) * near_start
     bands, shared = disagreement(strip, state, edge_now, core)
-    bands *= 1 - 0.5 * near_start
+    bands = np.hypot(bands * (1 - 0.5 * near_start), dwell_error_px(edge_now, exposure))
     seen = np.hypot(bands * (UNFIT if state.blur >= OPTICAL_BLUR_PX[1] else 1.0), start_error)
     apart = hidden_errors(fit, misfit_ratio, edge_now, seen)
     mouth = find_mouth(strip, state, edge_now)
