@@ -9,7 +9,7 @@ import json
 
 import pandas as pd
 import pytest
-from hidden_truth import grown
+from hidden_truth import Pairs, grown, sheet
 
 import vinetrack as vt
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
@@ -26,16 +26,20 @@ TRUTH = {
 }
 
 
+def campaign() -> Pairs:
+    """Each condition once."""
+    return grown(TRUTH, seed=7200, trials=sheet()[::2])
+
+
 @pytest.fixture(scope="module")
 def three_missing() -> Diagnosis:
-    return vt.diagnose(grown(TRUTH, seed=7200), candidates=CANDIDATES, ladder=False, advice=False)
+    return vt.diagnose(campaign(), candidates=CANDIDATES, ladder=False, advice=False)
 
 
 @pytest.fixture(scope="module")
 def one_not_asked() -> Diagnosis:
-    pairs = grown(TRUTH, seed=7200)
     asked = [name for name in CANDIDATES if name != "latch_release"]
-    return vt.diagnose(pairs, candidates=asked, advice=False)
+    return vt.diagnose(campaign(), candidates=asked, advice=False)
 
 
 def test_three_effects_are_found_one_after_the_other(three_missing: Diagnosis) -> None:
