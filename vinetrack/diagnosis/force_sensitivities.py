@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.force_kernels import answers
 from vinetrack.dynamics.force_terms import evaluate
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.simulate import Trajectory, simulate_many
@@ -312,24 +313,11 @@ def _at(since_s: Floats, motion: FittedMotion, values: Floats) -> Floats:
 
 def _followed(motions: Sequence[FittedMotion], push: Floats) -> tuple[Floats, Floats]:
     """δx and δẋ of every trial for further accelerations `push`, all of shape (n_trials, STEPS + 1, n), m and m/s."""
-    time_s = np.array([motion.time_s for motion in motions])
-    k, c = (np.array([getattr(motion, name) for motion in motions])[:, :, None] for name in ("stiffness", "friction"))
-    x, v = np.zeros_like(push[:, 0]), np.zeros_like(push[:, 0])
-    moved, sped = np.zeros_like(push), np.zeros_like(push)
-    for i in range(STEPS):
-        h = (time_s[:, i + 1] - time_s[:, i])[:, None]
-        inside = [(1 - STAGE) * course[:, i] + STAGE * course[:, i + 1] for course in (k, c, push)]
-        _, _, dx, dv = _stage(x, v, STAGE * h, *inside)
-        x, v = x + (1 - STAGE) * h * dx, v + (1 - STAGE) * h * dv
-        x, v, _, _ = _stage(x, v, STAGE * h, k[:, i + 1], c[:, i + 1], push[:, i + 1])
-        moved[:, i + 1], sped[:, i + 1] = x, v
+    time_s, k, c = (
+        np.array([getattr(motion, name) for motion in motions]) for name in ("time_s", "stiffness", "friction")
+    )
+    moved, sped = answers(time_s, k, c, np.ascontiguousarray(push), STAGE)
+    # What is compiled raises nothing by itself.
+    if np.geterr()["over"] == "raise" and not (np.isfinite(moved).all() and np.isfinite(sped).all()):
+        raise FloatingPointError("answers to a force that are not finite")
     return moved, sped
-
-
-def _stage(
-    x: Floats, v: Floats, h: Floats, stiffness: Floats, friction: Floats, push: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Where (x, v) and its rates are once (x, v) = before + h·rates holds with the rates there."""
-    rate = (stiffness * (x + h * v) + friction * v + push) / (1 - h * friction - h * h * stiffness)
-    speed = v + h * rate
-    return x + h * speed, speed, speed, rate

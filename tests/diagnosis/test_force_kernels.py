@@ -1,0 +1,59 @@
+"""The compiled loop of answers to forces: that of the arrays, and a closed form."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from vinetrack.core.records import Floats
+from vinetrack.diagnosis.force_kernels import answers
+from vinetrack.diagnosis.force_sensitivities import STAGE, _followed
+
+TRIALS, STEPS, COLUMNS = 3, 400, 4
+
+
+def courses(seed: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """Times, stiffness, friction and pushes of any size, of trials that differ."""
+    draw = np.random.default_rng(seed)
+    shape = (TRIALS, STEPS + 1)
+    time_s = 0.3 * np.sort(draw.uniform(size=shape))
+    return time_s, -4e3 * draw.uniform(size=shape), -900 * draw.uniform(size=shape), draw.normal(size=(*shape, COLUMNS))
+
+
+def stepped(x: Floats, v: Floats, h: Floats, k: Floats, c: Floats, push: Floats) -> tuple[Floats, Floats, Floats]:
+    """Where (x, v) = before + h·rates holds with the rates there, and the acceleration."""
+    rate = (k * (x + h * v) + c * v + push) / (1 - h * c - h * h * k)
+    return x + h * (v + h * rate), v + h * rate, rate
+
+
+def test_it_does_what_the_arrays_do() -> None:
+    time_s, k, c, push = courses(3)
+    x, v = np.zeros((2, TRIALS, COLUMNS))
+    moved, sped = answers(time_s, k, c, push, STAGE)
+    for i in range(STEPS):
+        h = (time_s[:, i + 1] - time_s[:, i])[:, None]
+        inside = [(1 - STAGE) * each[:, i] + STAGE * each[:, i + 1] for each in (k[:, :, None], c[:, :, None], push)]
+        _, speed, rate = stepped(x, v, STAGE * h, *inside)
+        x, v = x + (1 - STAGE) * h * speed, v + (1 - STAGE) * h * rate
+        x, v, _ = stepped(x, v, STAGE * h, k[:, i + 1, None], c[:, i + 1, None], push[:, i + 1])
+        np.testing.assert_allclose(moved[:, i + 1], x, rtol=1e-12)
+        np.testing.assert_allclose(sped[:, i + 1], v, rtol=1e-12)
+
+
+def test_a_spring_that_is_pushed_swings_about_where_it_comes_to_rest() -> None:
+    """ẍ = 1 − ω²x from rest: x = (1 − cos ωt)/ω²."""
+    omega, time_s = 20.0, np.linspace(0, 0.3, STEPS + 1)[None]
+    moved, sped = answers(time_s, np.full_like(time_s, -(omega**2)), 0 * time_s, np.ones((*time_s.shape, 1)), STAGE)
+    assert moved[0, :, 0] == pytest.approx((1 - np.cos(omega * time_s[0])) / omega**2, abs=1e-4 / omega**2)
+    assert sped[0, :, 0] == pytest.approx(np.sin(omega * time_s[0]) / omega, abs=1e-4 / omega)
+
+
+def test_what_overflows_is_raised_where_numpy_is_told_to_raise() -> None:
+    time_s, k, c, push = courses(4)
+    motions = [SimpleNamespace(time_s=t, stiffness=s, friction=f) for t, s, f in zip(time_s, -1e5 * k, c, strict=True)]
+    with np.errstate(all="ignore"):
+        assert not np.isfinite(_followed(motions, 1e300 * push)[0]).all()  # type: ignore[arg-type]
+    with np.errstate(all="raise", under="ignore"), pytest.raises(FloatingPointError):
+        _followed(motions, 1e300 * push)  # type: ignore[arg-type]
