@@ -11,7 +11,7 @@ from scipy.special import ndtr
 
 from vinetrack.core.records import Trial
 from vinetrack.video.axis import Axis
-from vinetrack.video.edge_repair import BANDS, dwell_error_px
+from vinetrack.video.edge_repair import BANDS, LENGTH_PART, dwell_error_px
 from vinetrack.video.frames import Frames, Recording, Region
 from vinetrack.video.track import Tracking, track_frames
 
@@ -134,11 +134,20 @@ def test_an_edge_that_stops_within_an_exposure_is_no_surer_than_its_dwell_allows
     assert sigma[16 : last - 4].max() < 0.5
 
 
-@pytest.mark.parametrize(("exposure", "speed"), [(0.5, 20.0), (0.1, 8.0)])
-def test_the_error_of_dwell_is_that_of_a_stop_and_none_of_an_even_motion(exposure: float, speed: float) -> None:
-    even = 3.0 + speed * np.arange(30.0) + 0.4 * np.arange(30.0) ** 2
-    assert dwell_error_px(even, exposure)[5:25].max() < 0.01
-    stopped = np.minimum(speed * np.arange(30.0), 20 * speed)
-    found = dwell_error_px(stopped, exposure)
-    assert found[20] == pytest.approx(speed * exposure / 8)
-    assert np.delete(found, 20).max() == 0.0
+@pytest.mark.parametrize("exposure", [0.9, 0.5, 0.1])
+@pytest.mark.parametrize("stop", [-0.2, 0.0, 0.04, 0.3])
+@pytest.mark.parametrize("sense", [1, -1])
+def test_the_error_of_dwell_is_the_mean_place_over_the_exposure(exposure: float, stop: float, sense: int) -> None:
+    """At 20 px a frame, stopping so many frames from the middle of frame 20's exposure; or setting off then."""
+    middle = np.arange(41.0)
+    instants = middle[:, None] + exposure * np.linspace(-0.5, 0.5, 2001)
+    place = 20.0 * np.minimum(sense * (instants - 20.0), sense * stop).mean(axis=1)
+    edge = 20.0 * np.minimum(sense * (middle - 20.0), sense * stop)
+    unsure_px = LENGTH_PART * exposure / 4 * np.abs(np.diff(np.pad(edge, 1, mode="edge"), 2))
+    assert dwell_error_px(edge, exposure)[2:-2] == pytest.approx(np.hypot(edge - place, unsure_px)[2:-2], abs=0.01)
+
+
+def test_an_even_motion_has_no_error_of_dwell_and_one_that_speeds_up_hardly_any() -> None:
+    frames = np.arange(40.0)
+    assert dwell_error_px(7.0 * frames, 0.5)[2:-2].max() < 1e-9
+    assert dwell_error_px(0.5 * (frames + 3) ** 2, 0.5)[2:-2].max() < 0.04
