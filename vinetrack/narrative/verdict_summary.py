@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vinetrack.core.numbers import number, with_error
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.confounder import Confounder, left_open
+from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, UNEXPLAINED
 from vinetrack.narrative.between_text import difference_headline, trials_differ
 
 if TYPE_CHECKING:
@@ -21,24 +22,15 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.result import Candidate, Diagnosis
     from vinetrack.inference.fit_result import Number
 
-BADGES = {
-    "missing": "missing",
-    "ambiguous": "ambiguous",
-    "artefact": "artefact",
-    "adequate": "adequate",
-    "unexplained": "unexplained",
-    "none": "not diagnosed",
-}
-
 MEANINGS = {
-    "missing": "An effect is missing from the model. It was identified, added, and the model fitted again.",
-    "ambiguous": "An effect is missing, and these trials cannot tell which of a few it is: nothing was added. "
+    MISSING: "An effect is missing from the model. It was identified, added, and the model fitted again.",
+    AMBIGUOUS: "An effect is missing, and these trials cannot tell which of a few it is: nothing was added. "
     "The next trial, which would tell them apart, is below.",
-    "artefact": "The misfit is explained by a fault of the measurement, not by physics: nothing was added. "
+    ARTEFACT: "The misfit is explained by a fault of the measurement, not by physics: nothing was added. "
     "Correct the measurement first.",
-    "adequate": "Every candidate was tested, and none improves the fit significantly. "
+    ADEQUATE: "Every candidate was tested, and none improves the fit significantly. "
     "Upper limits on the size of each are listed below.",
-    "unexplained": "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
+    UNEXPLAINED: "The misfit exceeds the replicate scatter, and no effect of the catalogue explains it. "
     "The missing force is drawn below; vinetrack propose seeks a law for it.",
 }
 """What each verdict means."""
@@ -48,11 +40,11 @@ TRIALS_DIFFER = (
 )
 
 THEREAFTER = {
-    "missing": "A further effect is still missing.",
-    "ambiguous": "A further effect is missing, and these trials cannot tell which.",
-    "artefact": "The remaining misfit is explained by a fault of the measurement.",
-    "adequate": "With it, no further effect can be detected.",
-    "unexplained": "With it, the model still fails, and no effect of the catalogue explains the remaining misfit.",
+    MISSING: "A further effect is still missing.",
+    AMBIGUOUS: "A further effect is missing, and these trials cannot tell which.",
+    ARTEFACT: "The remaining misfit is explained by a fault of the measurement.",
+    ADEQUATE: "With it, no further effect can be detected.",
+    UNEXPLAINED: "With it, the model still fails, and no effect of the catalogue explains the remaining misfit.",
 }
 """The verdict on the model with all added effects."""
 
@@ -133,17 +125,17 @@ def sentence(diagnosis: Diagnosis) -> str:
     """
     verdict, answers = diagnosis.verdict, list(diagnosis.answer_set)
     added = list(diagnosis.effects)
-    if verdict == "missing":
+    if verdict == MISSING:
         return f"Missing from the model: {listed(added or answers, 'and')}."
-    if verdict == "ambiguous":
+    if verdict == AMBIGUOUS:
         return f"Missing from the model: {listed(answers, 'or')}. These trials cannot tell which."
-    if verdict == "artefact" and trials_differ(answers):
+    if verdict == ARTEFACT and trials_differ(answers):
         return f"Trials differ, the physics holds: {difference_headline(answers)}."
-    if verdict == "artefact":
+    if verdict == ARTEFACT:
         return f"A fault of the measurement, not of the physics: {listed(answers, 'or')}."
-    if verdict == "adequate":
+    if verdict == ADEQUATE:
         return "No missing effect can be detected."
-    if verdict == "unexplained":
+    if verdict == UNEXPLAINED:
         return "The model fails, and no effect of the catalogue explains it."
     return "No diagnosis could be made."
 
@@ -160,7 +152,7 @@ def meaning(diagnosis: Diagnosis) -> str:
     str
     """
     text = MEANINGS.get(diagnosis.verdict, diagnosis.refused)
-    if diagnosis.verdict == "artefact" and trials_differ(list(diagnosis.answer_set)):
+    if diagnosis.verdict == ARTEFACT and trials_differ(list(diagnosis.answer_set)):
         text = TRIALS_DIFFER
     added = diagnosis.effects
     then = THEREAFTER.get(diagnosis.final_verdict, "") if added else ""
@@ -209,13 +201,13 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
     tested = [row for row in ranking if known(row.delta_chi2)]
     others = [row for row in tested if not row.in_answer_set]
     best = max(tested, key=_gain, default=None)
-    if verdict == "adequate":
+    if verdict == ADEQUATE:
         # By the score: a predicted gain may belong to a size of the wrong sign.
         scored = [row for row in ranking if known(row.sigma)]
         best = max(scored, key=lambda row: abs(row.sigma), default=None)
         note = f"the best of {len(scored)} candidates: {plain(best.effect)}" if best else ""
         return Fact("Most significant candidate", f"{_sigmas(best)} σ", note) if best else None
-    if verdict == "unexplained" and best is not None:
+    if verdict == UNEXPLAINED and best is not None:
         note = f"{_sigmas(best)} σ better" + (f", but {best.reason}" if best.reason else "")
         return Fact("Nearest candidate", plain(best.effect), note)
     inside = [row for row in tested if row.in_answer_set]
@@ -332,7 +324,7 @@ def size_interval(entry: Number) -> str:
 
 def _upper_limits(diagnosis: Diagnosis) -> Fact | None:
     bounded = [row for row in diagnosis.ranking if row.largest]
-    if diagnosis.verdict != "adequate" or not bounded:
+    if diagnosis.verdict != ADEQUATE or not bounded:
         return None
     return Fact("Upper limits", f"{len(bounded)} candidates", "the largest undetected size of each is listed below")
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from vinetrack.core.numbers import with_error
 from vinetrack.core.tables import write_csv, write_json
+from vinetrack.diagnosis.result import UNEXPLAINED
 from vinetrack.narrative.diagnosis_text import GO_ON, verdict_line
 from vinetrack.narrative.power_text import power_brief
 from vinetrack.narrative.verdict_summary import facts, joined, settled_rows
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Report = Callable[[str], None]
-DOUBT = "But what was seen contradicts the sheet in"
+CAVEAT = "But what was seen contradicts the sheet in"
 _BETWEEN_SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-Z])")
 PREDICTION_COLUMNS = ("time_s", "lead_position_m", "model_before_m", "model_after_m")
 
@@ -118,10 +119,10 @@ def beside_contradictions(diagnosis: Diagnosis, results: Results, pairs: Sequenc
     if not contradicted:
         return diagnosis
     columns = joined(list(contradicted))
-    doubt = f"{DOUBT} {columns}: put that right before you believe this verdict."
+    caveat = f"{CAVEAT} {columns}: put that right before you believe this verdict."
     return replace(
         diagnosis,
-        explanation=f"{diagnosis.explanation} {doubt}",
+        explanation=f"{diagnosis.explanation} {caveat}",
         notes=(*diagnosis.notes, *contradicted.values()),
     )
 
@@ -353,17 +354,17 @@ def diagnosis_lines(folder: Path) -> list[str]:
     if not diagnosis.verdict:
         return [diagnosis.explanation]
     beside = power_brief(diagnosis.power) if diagnosis.power is not None else ""
-    reasons, _, contradicted = diagnosis.explanation.partition(DOUBT)
+    reasons, _, contradicted = diagnosis.explanation.partition(CAVEAT)
     sizes = [fact.answer for fact in facts(diagnosis, None) if fact.question.startswith(("Significance", "Size of"))]
     told = f" ({'; '.join(sizes)})" if sizes else ""
     headline = f"{verdict_line(diagnosis)}{told}"
     return [
-        f"{headline}. {DOUBT}{contradicted}" if contradicted else headline,
+        f"{headline}. {CAVEAT}{contradicted}" if contradicted else headline,
         *(f"  {line}" for line in _BETWEEN_SENTENCES.split(reasons.strip())),
         *([f"{beside[0].upper()}{beside[1:]}"] if beside and beside not in headline else []),
         *_damping_line(diagnosis),
         *(f"! {note}" for note in diagnosis.notes),
-        *([GO_ON] if "unexplained" in (diagnosis.verdict, diagnosis.final_verdict) else []),
+        *([GO_ON] if UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict) else []),
     ]
 
 

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.results.folder_layout import Results, ResultsError, read_json
 from vinetrack.results.stored_diagnosis import read_diagnosis
-
-_ADEQUATE = "adequate"
 
 
 @dataclass(frozen=True)
@@ -50,17 +49,17 @@ def choose_fit(folder: Path, anyway: bool = False) -> ChosenFit:
         return ChosenFit(
             in_use, (f"! {folder} has no diagnosis: whether this model describes the trials is not known",)
         )
-    if diagnosis.verdict == _ADEQUATE:
+    if diagnosis.verdict == ADEQUATE:
         return ChosenFit(in_use, ())
     final = read_json(results.final_fit) if results.final_fit.exists() else None
     added = " + ".join(diagnosis.effects)
-    if diagnosis.final_verdict == _ADEQUATE and final is not None:
+    if diagnosis.final_verdict == ADEQUATE and final is not None:
         return ChosenFit(final, (f"by the model that the diagnosis ended with, {added} added",))
     verdict = f"{diagnosis.final_verdict or diagnosis.verdict}: {diagnosis.explanation}"
     if not anyway:
         why = (
             f"the model with {added} is not stored there: run it again"
-            if diagnosis.final_verdict == _ADEQUATE
+            if diagnosis.final_verdict == ADEQUATE
             else "the diagnosis refuted the model and ended with none that describes the trials"
         )
         raise ResultsError(f"{folder}: no prediction, {why}; or predict from it with --anyway. {verdict}")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.problems import ExperimentError, Problem
 from vinetrack.core.tables import write_json
+from vinetrack.diagnosis.result import ADEQUATE
 from vinetrack.diagnosis.stopping import STOP, CampaignLook, look_at, trials_to_go
 from vinetrack.experiment.provenance import PROVENANCE
 
@@ -120,7 +121,7 @@ def _next(diagnosis: Diagnosis, look: CampaignLook) -> str:
     further = trials_to_go(look)
     if further:
         return f"About {further} further trials like those so far, by how the evidence has grown."
-    if look.verdict == "adequate":
+    if look.verdict == ADEQUATE:
         return (
             "Widen what varies: other pressures, payloads, chambers, connectors or vines. Or choose the effect and the "
             "size that matter: `vinetrack power TARGET --effect NAME=SIZE --reach 0.9` says which trials would show it."

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.numbers import interval, number, with_error
 from vinetrack.core.units import display_unit
-from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, Candidate, Diagnosis, Round
+from vinetrack.diagnosis.result import ADEQUATE, NOT_TESTABLE, REFITTED, VERDICTS, Candidate, Diagnosis, Round
 from vinetrack.experiment.schema import LIMITED
 from vinetrack.figures.candidate_figures import TIED_COSINE
 from vinetrack.inference.fit_result import Number
 from vinetrack.narrative.law_text import PREFERRED
 from vinetrack.narrative.power_text import HEAD as POWER_HEAD
 from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence, power_rows
-from vinetrack.narrative.verdict_summary import BADGES, facts, known, listed, meaning, plain, sentence, size, sizes
+from vinetrack.narrative.verdict_summary import facts, known, listed, meaning, plain, sentence, size, sizes
 from vinetrack.report.section import ReportTable
 
 if TYPE_CHECKING:
@@ -69,8 +69,8 @@ def diagnosis_section(result: DiagnosisResult | None) -> dict[str, Any] | None:
     diagnosis = result.diagnosis
     drifting = [str(row["sentence"]) for row in diagnosis.drift if row.get("sentence") and row.get("significant", True)]
     return {
-        "badge": BADGES.get(diagnosis.verdict, BADGES["none"]),
-        "kind": diagnosis.verdict if diagnosis.verdict in BADGES else "none",
+        "badge": diagnosis.verdict if diagnosis.verdict in VERDICTS else "not diagnosed",
+        "kind": diagnosis.verdict if diagnosis.verdict in VERDICTS else "none",
         "sentence": sentence(diagnosis),
         "meaning": meaning(diagnosis),
         "summaries": [
