@@ -77,15 +77,15 @@ def gauge(campaign: Hidden, motion: FittedMotion, chosen: NDArray[np.int_]) -> F
 
 def errors(campaign: Hidden, learned: LearnedForce) -> dict[str, float]:
     """Parts of the visited points where the learned force is within 10 % of the range of the truth, or in its band."""
-    place, force_of = learned.place, true_force(campaign)
+    force_of = true_force(campaign)
     true, alone, sigma, values, shifts = [], [], [], [], []
-    for motion in place.motions:
+    for motion in learned.motions:
         counts = (motion.lead_position_m > 0) & (motion.time_s <= motion.counts_until_s)
         chosen = np.flatnonzero(counts)[::EVERY]
         courses = (motion.time_s, motion.lead_position_m, motion.tail_velocity_m_s, motion.pressure_Pa)
         true.append(force_of(*(course[chosen] for course in courses)))
-        at = [course[chosen] for course in place.law.domain.of_motion(motion)]
-        force_N, sigma_N = learned.force(at)
+        at = [course[chosen] for course in learned.domain.of_motion(motion)]
+        force_N, sigma_N = learned.best.force(at)
         alone.append(force_N)
         sigma.append(sigma_N)
         values.append(np.column_stack(at))
@@ -119,7 +119,7 @@ def ask(seed: int, with_law: bool) -> dict[str, object]:
     row: dict[str, object] = {"seed": seed, "law": law, "n_trials": len(pairs), "chi2_per_dof": fit.chi2_per_dof}
     row["processor_s"] = time.process_time() - begun
     if learned is not None:
-        row["variables"] = "+".join(learned.variables)
+        row["variables"] = learned.domain.name
         row["weight"] = learned.weights[row["variables"]]
         row["beside"] = ", ".join(learned.beside)
         row["in_set"] = LAWS[law] in (row["variables"], *learned.beside)

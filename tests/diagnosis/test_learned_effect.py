@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vinetrack.diagnosis.force_surface import Domain, Surface
+from vinetrack.diagnosis.force_evidence import Beginning
+from vinetrack.diagnosis.force_surface import NOTHING, Domain, Surface
 from vinetrack.diagnosis.learned_effect import even_coefficients, table_name, table_text
 from vinetrack.diagnosis.learned_force import LearnedForce
 from vinetrack.diagnosis.learned_variables import dependence, not_excluded
@@ -34,30 +35,17 @@ def learned(domain: Domain, seed: int) -> LearnedForce:
         "pressure_Pa": [2e4, 2.5e4],
     }
     table = pd.DataFrame({**places, "force_N": [-0.1, -0.3], "sigma_N": 0.01, "trials": [2, 3], "condition": ["", ""]})
-    place = SimpleNamespace(law=Surface(domain, np.eye(domain.size)), amplitude=coefficients)
-    known = np.eye(domain.size) * 1e-4
-    return LearnedForce(
-        domain.variables,
-        {domain.name: 1.0},
-        (),
-        {},
-        1.0,
-        50.0,
-        0.99,
-        table,
-        "It depends.",
-        place,
-        known,  # type: ignore[arg-type]
-    )
+    surface, lengths = Surface(domain, np.eye(domain.size)), (1.0,) * len(domain.variables)
+    best = Beginning(NOTHING, 50.0, surface, lengths, coefficients, np.eye(domain.size) * 1e-4, 1.0)
+    return LearnedForce(best, (), {domain.name: 1.0}, (), 50.0, 0.99, table, "It depends.")
 
 
 def test_a_learned_force_gives_itself_and_its_error_anywhere() -> None:
     force = learned(DOMAINS[0], 3)
-    assert isinstance(force.place.law, Surface)
     at = [np.full(1, value) for value in DOMAINS[0].low]
-    (value,), (sigma,) = force.force(at)
+    (value,), (sigma,) = force.best.force(at)
     # At the edge the first spline alone is not nothing, and it is 1.
-    assert value == pytest.approx(force.place.amplitude[0])
+    assert value == pytest.approx(force.best.mean[0])
     assert sigma == pytest.approx(0.01)
 
 
@@ -76,7 +64,7 @@ def test_the_file_holds_the_force_that_was_learned_wherever_trials_have_been(dom
     ]
     names = {"growth": "lead_position", "speed": "tail_velocity", "time": "time", "pressure": "pressure"}
     state = SimpleNamespace(**{names[name]: value for name, value in zip(domain.variables, at, strict=True)})
-    expected = domain.basis(at) @ force.place.amplitude
+    expected = domain.basis(at) @ force.best.mean
     shown = effect.functions["tail_force"](state, None, 1.0)
     assert shown == pytest.approx(expected, abs=1e-4 * np.abs(expected).max())
     assert effect.functions["tail_force"](state, None, 0.0) == pytest.approx(0.0 * expected)

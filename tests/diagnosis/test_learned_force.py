@@ -124,7 +124,7 @@ def test_a_force_in_no_list_is_proposed_as_a_table_that_mends_the_model(proposal
 def test_waves_along_the_growth_are_learned_with_their_variable_and_their_size(proposal: Proposal) -> None:
     assert proposal.table is not None
     learned = proposal.table.learned
-    assert learned.variables == ("growth",)
+    assert learned.domain.variables == ("growth",)
     assert sum(learned.weights.values()) == pytest.approx(1.0)
     assert tuple(learned.table.columns) == LEARNED_COLUMNS
     grid = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]

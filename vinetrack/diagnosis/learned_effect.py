@@ -17,7 +17,7 @@ import textwrap
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.force_surface import VARIABLES, Domain, Surface, curves
+from vinetrack.diagnosis.force_surface import VARIABLES, Domain, curves
 from vinetrack.diagnosis.learned_force import LearnedForce
 from vinetrack.diagnosis.learned_variables import named
 from vinetrack.narrative.verdict_summary import joined
@@ -46,7 +46,7 @@ def table_name(learned: LearnedForce) -> str:
     -------
     str
     """
-    return "_".join(["learned", *learned.variables])
+    return "_".join(["learned", *learned.domain.variables])
 
 
 def table_text(learned: LearnedForce, remark: str = "") -> str:
@@ -54,17 +54,15 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
 
     Parameters
     ----------
-    learned : the force with the place where its fit ended.
+    learned : the force.
     remark : sentences about the data that it comes from, for the docstring.
 
     Returns
     -------
     str
     """
-    place = learned.place
-    assert isinstance(place.law, Surface)
-    domain = place.law.domain
-    table = even_coefficients(domain, place.law.mix @ place.amplitude)
+    domain = learned.domain
+    table = even_coefficients(domain, learned.best.mean)
     over = named(domain.name)
     symbols = ", ".join(_SYMBOL[name] for name in domain.variables)
     ranges = joined(
@@ -73,7 +71,7 @@ def table_text(learned: LearnedForce, remark: str = "") -> str:
             for name, low, high in zip(domain.variables, domain.low, domain.high, strict=True)
         ]
     )
-    state, worked = _worked(learned, domain)
+    state, worked = _worked(learned)
     axes = [line for k in range(len(domain.variables)) for line in _axis(domain, k)]
     counts = " × ".join(str(count) for count in domain.counts)
     parts = [
@@ -191,13 +189,10 @@ def _table_lines(table: Floats) -> list[str]:
     return ["TABLE = np.array((  # N", *rows, "))"]
 
 
-def _worked(learned: LearnedForce, domain: Domain) -> tuple[dict[str, float], float]:
+def _worked(learned: LearnedForce) -> tuple[dict[str, float], float]:
     """The state of the worked number, where the force is largest among places that trials came to, and the force."""
     seen = learned.table[(learned.table["condition"] == "") & (learned.table["trials"] > 0)]
     largest = int(np.argmax(np.abs(seen["force_N"].to_numpy(float))))
-    at = {name: float(f"{seen[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in domain.variables}
-    law = learned.place.law
-    assert isinstance(law, Surface)
-    basis = domain.basis([np.array([at[name]]) for name in domain.variables])
-    force_N = float((basis @ (law.mix @ learned.place.amplitude))[0])
-    return {_STATE[name]: value for name, value in at.items()}, force_N
+    at = {name: float(f"{seen[VARIABLES[name]].to_numpy(float)[largest]:.5g}") for name in learned.domain.variables}
+    force_N, _ = learned.best.force([np.array([value]) for value in at.values()])
+    return {_STATE[name]: value for name, value in at.items()}, float(force_N[0])

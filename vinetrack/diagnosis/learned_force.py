@@ -43,7 +43,7 @@ from vinetrack.diagnosis.force_evidence import (
 from vinetrack.diagnosis.force_inversion import ForceFit
 from vinetrack.diagnosis.force_refinement import SETTLED, Place, followed, normal_equations
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, motions_of
-from vinetrack.diagnosis.force_surface import ANY, CONSTANT, NOTHING, VARIABLES, Surface, domains, standard_error
+from vinetrack.diagnosis.force_surface import ANY, CONSTANT, VARIABLES, Domain, Surface, domains
 from vinetrack.diagnosis.learned_variables import dependence, named, not_excluded, reference
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
 from vinetrack.diagnosis.smoothed_motions import on_tracks
@@ -91,56 +91,39 @@ must have come to have been there. Chosen for the picture."""
 class LearnedForce:
     """The missing force over the variables that it most likely depends on.
 
-    `weights` are posterior, by `growth`, `growth+speed`, …; `beside` names the choices that are not excluded either;
-    `lengths` by variable, as parts of what was visited; `amplitude_N` the standard deviation of the process. `table`,
-    columns `LEARNED_COLUMNS`, holds the force on a grid (condition blank; `trials` counts those that came near) and
-    along the first trial of each condition; variables that do not count are NaN. `place` is where the fit ended, and
-    `covariance` that of its coefficients, N²; `begins` what the force is where growth begins, and `undecided_N` the
-    standard error of a part of it that is the same all along the growth, N: beside B, n and P_y, which are the vine's
-    where growth begins.
+    `best` is the force itself, with its error; `motions` are those of the trials where its fit ended. `weights` are
+    posterior, by `growth`, `growth+speed`, …; `beside` names the choices that are not excluded either. `table`, columns
+    `LEARNED_COLUMNS`, holds the force on a grid (condition blank; `trials` counts those that came near) and along the
+    first trial of each condition; variables that do not count are NaN. `undecided_N` is the standard error of a part of
+    it that is the same all along the growth, N: beside B, n and P_y, which are the vine's where growth begins.
     """
 
-    variables: tuple[str, ...]
+    best: Beginning
+    motions: Sequence[FittedMotion]
     weights: Mapping[str, float]
     beside: tuple[str, ...]
-    lengths: Mapping[str, float]
-    amplitude_N: float
     log_bayes_factor: float
     explained: float
     table: pd.DataFrame
     sentence: str
-    place: Place
-    covariance: Floats
-    begins: str = NOTHING
     undecided_N: float = 0.0
 
-    def force(self, values: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """The force at values of its variables, SI, and its standard error, each of shape (n,), N.
-
-        Parameters
-        ----------
-        values : sequence of arrays, shape (n,), SI
-            One a variable.
-
-        Returns
-        -------
-        force, sigma : arrays, shape (n,), N
-        """
-        assert isinstance(self.place.law, Surface)
-        basis = self.place.law.domain.basis(values) @ self.place.law.mix
-        return basis @ self.place.amplitude, standard_error(basis, self.covariance)
+    @property
+    def domain(self) -> Domain:
+        """The variables that it depends on, with their ranges."""
+        return self.best.surface.domain
 
     def to_json(self) -> dict[str, Any]:
         """As `diagnosis.json` holds it."""
         return {
-            "variables": list(self.variables),
+            "variables": list(self.domain.variables),
             "weights": dict(self.weights),
             "not_excluded": list(self.beside),
-            "length_scales": dict(self.lengths),
-            "amplitude_N": self.amplitude_N,
+            "length_scales": dict(zip(self.domain.variables, self.best.lengths, strict=True)),
+            "amplitude_N": self.best.surface.sd_N,
             "log_bayes_factor": self.log_bayes_factor,
             "explained": self.explained,
-            "begins": self.begins,
+            "begins": self.best.begins,
             "undecided_N": self.undecided_N,
             "sentence": self.sentence,
         }
@@ -214,7 +197,6 @@ def learned_force(
     )
     # Forces that begin in different ways are weighed at one place: how far the fit has settled they share.
     best = choice.best(shared)
-    place = replace(place, amplitude=best.mean)
     bayes = next(choice.log_evidence for choice, _ in linear if choice.domain == best.surface.domain) - silent
     remarks = []
     if not replicates:
@@ -228,7 +210,7 @@ def learned_force(
     beside = not_excluded(best.surface.domain, weights, losses, ANSWER_SET * error, everything, motions)
     if beside:
         remarks.append("Trials that pass the same growth otherwise, at further pressures or payloads, tell.")
-    return _told(fit, best, place, weights, bayes, remarks, beside, choice.undecided_N)
+    return _told(fit, best, place.motions, weights, bayes, remarks, beside, choice.undecided_N)
 
 
 def _again(
@@ -294,7 +276,7 @@ def _followed(
 def _told(
     fit: ForceFit,
     best: Beginning,
-    place: Place,
+    motions: Sequence[FittedMotion],
     weights: Mapping[str, float],
     bayes: float,
     remarks: Sequence[str],
@@ -302,24 +284,18 @@ def _told(
     undecided_N: float,
 ) -> LearnedForce:
     """The force of the best choice with its table and the words for it."""
-    domain = best.surface.domain
     misfit = max(fit.chi2 - fit.points, 1e-300)
-    table = _table(best, place.motions)
-    lengths = dict(zip(domain.variables, best.lengths, strict=True))
+    table = _table(best, motions)
     explained = min(max((fit.chi2 - best.left) / misfit, 0.0), 1.0)
     return LearnedForce(
-        variables=domain.variables,
+        best=best,
+        motions=motions,
         weights=weights,
         beside=tuple(beside),
-        lengths=lengths,
-        amplitude_N=best.surface.sd_N,
         log_bayes_factor=bayes,
         explained=explained,
         table=table,
         sentence=" ".join([_sentence(best, weights, beside, explained, table, undecided_N), *remarks]),
-        place=place,
-        covariance=best.covariance,
-        begins=best.begins,
         undecided_N=undecided_N,
     )
 
