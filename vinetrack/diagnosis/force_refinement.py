@@ -68,7 +68,7 @@ the ranking."""
 
 @dataclass(frozen=True)
 class Refined:
-    """A law as the full fit found it: amplitudes, N, with the error of one, errors of its place or scale, what is left.
+    """A law as the full fit found it: amplitudes, N, with the error of one, and what is left.
 
     `numbers` is how far the model's own numbers moved, as the fit holds them.
     """
@@ -76,7 +76,6 @@ class Refined:
     law: Law
     amplitude: Floats
     sigma: float
-    shape_sigma: Floats
     chi2: float
     numbers: Floats
 
@@ -140,7 +139,6 @@ def refine(
         law=place.law if isinstance(place.law, Law) else law,
         amplitude=place.amplitude,
         sigma=max(float(np.sqrt(np.mean(sigma[p : p + q] ** 2))), relative * float(np.hypot.reduce(place.amplitude))),
-        shape_sigma=sigma[p + q : p + q + len(place.law.shape_names)],
         chi2=normal.cost,
         numbers=place.theta - fit.state.theta,
     )

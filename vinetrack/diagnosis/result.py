@@ -31,7 +31,7 @@ ADEQUATE, MISSING, AMBIGUOUS, ARTEFACT, UNEXPLAINED = VERDICTS = (
     "unexplained",
 )
 
-REFITTED, SCREENED, NOT_TESTABLE = STATUSES = ("refitted", "screened", "not testable here")
+REFITTED, SCREENED, NOT_TESTABLE = "refitted", "screened", "not testable here"
 """How much is known of a candidate: its own fit, only what the sensitivities predict, or why these data are blind."""
 
 DROPPED_FRAMES = "dropped_frames"

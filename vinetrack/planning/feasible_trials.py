@@ -21,7 +21,7 @@ from vinetrack.experiment.schema import COLUMNS
 from vinetrack.experiment.settings import Limits
 from vinetrack.planning.scaling_priors import hoop_stress_Pa
 
-SAME_RIG, OTHER_RIG, NEW_VINE = EFFORTS = (0, 1, 2)
+SAME_RIG, OTHER_RIG, NEW_VINE = 0, 1, 2
 """What a trial asks for: nothing new; another chamber, connector or angle; a vine that has to be made. Defined in order
 of effort; nothing but their order counts."""
 

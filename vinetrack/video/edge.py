@@ -96,12 +96,10 @@ class EdgeFit:
 
     `edge_px` at mid-exposure, `sigma_px` its random error by the likelihood, `apart_sigma_px` what is to be added to
     it in square: by the disagreement of bands, and near the start (see START_PX). `bands_sigma_px` is the part of that
-    which differs from frame to frame, and `slow_px` the error that neighbouring frames share. `misfit` is
-    the mean squared residual in units of the noise (1 is perfect), `amplitude` the contrast relative to that of the
-    pixels it passes;
-    `contrast` is their mean signed contrast by column (n_along,), NaN where unknown; `tip_lag_px` (n_across,) how far
-    each row of the tip lags behind its foremost point; `passed` the first and last column passed; `hidden` marks
-    frames in which a door or the mouth of a launcher may hide the tip.
+    which differs from frame to frame, and `slow_px` the error that neighbouring frames share. `misfit` is the mean
+    squared residual in units of the noise (1 is perfect), `amplitude` the contrast relative to that of the pixels it
+    passes; `contrast` is their mean signed contrast by column (n_along,), NaN where unknown; `passed` the first and
+    last column passed; `hidden` marks frames in which a door or the mouth of a launcher may hide the tip.
     `seen_exposure_frames` is what the blur shows where it contradicts a stated exposure, else NaN, and
     `fast_px_per_frame` the speed at which it does.
     """
@@ -114,7 +112,6 @@ class EdgeFit:
     contrast: Floats
     blur_px: float
     exposure_frames: float
-    tip_lag_px: Floats
     passed: tuple[int, int]
     hidden: Bools
     bands_sigma_px: Floats
@@ -445,6 +442,6 @@ def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed
     bands, lasting = noise_and_slow(bands, seen, apart)
     slow = np.hypot(lasting, slow_error_px(edge_now, contrast, shared))
     return EdgeFit(
-        edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, state.lag, passed, hidden,
+        edge, sigma, apart, fit[:, 2], 1 + fit[:, 3], contrast, state.blur, exposure, passed, hidden,
         bands, slow,
     )  # fmt: skip
