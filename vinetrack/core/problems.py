@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 COMES_CLOSE = 0.6
 """Chosen: part of the letters that two names share from which one may be a slip for the other; difflib's default."""
@@ -35,6 +36,23 @@ class Problem:
     allowed: str = ""
     remedy: str = ""
     of_a_measurement: bool = False
+
+    @classmethod
+    def from_error(cls, error: Exception, file: str, **details: Any) -> Problem:
+        """The problem that the words of an error state: what is wrong, then after a colon the remedy.
+
+        Parameters
+        ----------
+        error : with such words.
+        file : that it was met in.
+        details : further fields.
+
+        Returns
+        -------
+        Problem
+        """
+        message, _, remedy = str(error).partition(": ")
+        return cls(message=message, file=file, remedy=remedy, **details)
 
     @property
     def reason(self) -> str:

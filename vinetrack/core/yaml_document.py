@@ -68,8 +68,7 @@ def read_yaml(path: Path) -> YamlDocument:
     try:
         text = read_text(path)
     except TableError as error:
-        message, _, remedy = str(error).partition(": ")
-        raise ExperimentError([Problem(message=message, file=path.name, remedy=remedy)]) from None
+        raise ExperimentError([Problem.from_error(error, path.name)]) from None
     return parse_yaml(text, path.name)
 
 

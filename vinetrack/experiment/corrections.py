@@ -38,8 +38,7 @@ def read_corrections(folder: Path) -> tuple[dict[str, tuple[Correction, ...]], l
     try:
         table = read_table(path)
     except TableError as error:
-        message, _, remedy = str(error).partition(": ")
-        return {}, [Problem(message=message, file=CORRECTIONS, remedy=remedy)]
+        return {}, [Problem.from_error(error, CORRECTIONS)]
     missing = [name for name in COLUMNS_OF_CORRECTIONS if name not in table.columns]
     if missing:
         remedy = f"its columns are {', '.join(COLUMNS_OF_CORRECTIONS)}"

@@ -198,7 +198,7 @@ def _read_settings(folder: Path, problems: list[Problem]) -> ExperimentSettings 
         try:
             safe_join(folder, relative)
         except TableError as error:
-            problems.append(_from_table_error(error, SETTINGS, column=key, value=relative))
+            problems.append(Problem.from_error(error, SETTINGS, column=key, value=relative))
     for name in SHARED:
         value = getattr(settings, name)
         if COLUMNS[name].kind == "number" and value is not None and (hint := oddity(COLUMNS[name], value)):
@@ -226,7 +226,7 @@ def _read_sheet(folder: Path, problems: list[Problem]) -> Table | None:
     try:
         table = read_table(folder / SHEET)
     except TableError as error:
-        problems.append(_from_table_error(error, SHEET))
+        problems.append(Problem.from_error(error, SHEET))
         return None
     table, converted = in_sheet_units(table, SHEET)
     problems += [*converted, *_judge_columns(table)]
@@ -322,11 +322,6 @@ def _merge_warnings(problems: Iterable[Problem]) -> list[Problem]:
     ]
 
 
-def _from_table_error(error: Exception, file: str, **details: Any) -> Problem:
-    message, _, remedy = str(error).partition(": ")
-    return Problem(message=message, file=file, remedy=remedy, **details)
-
-
 Survey = Callable[[Experiment, list[Trial]], Iterable[Problem]]
 
 
@@ -382,7 +377,7 @@ def _check_track(trial: Trial) -> list[Problem]:
     try:
         track = load_track(trial)
     except TrackError as error:
-        return [_from_table_error(error, SHEET, **place)]
+        return [Problem.from_error(error, SHEET, **place)]
     remarks = []
     frames = float(np.median(np.diff(track.time_s))) * trial.capture_fps
     if abs(frames - 1) > 0.02:

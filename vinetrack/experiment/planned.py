@@ -111,8 +111,7 @@ def planned_sheet(path: Path, *, every_row: bool = False) -> PlannedTrials:
     try:
         table = read_table(file)
     except TableError as error:
-        message, _, remedy = str(error).partition(": ")
-        raise ExperimentError([Problem(message=message, file=file.name, remedy=remedy)]) from None
+        raise ExperimentError([Problem.from_error(error, file.name)]) from None
     table, converted = in_sheet_units(table, file.name)
     settings = read_experiment_settings(file.parent / "experiment.yaml")
     if not table.rows:

@@ -52,8 +52,7 @@ def read_settings_text(folder: Path) -> str:
     try:
         text = read_text(path)
     except TableError as error:
-        message, _, remedy = str(error).partition(": ")
-        raise ExperimentError([Problem(message=message, file=SETTINGS, remedy=remedy)]) from None
+        raise ExperimentError([Problem.from_error(error, SETTINGS)]) from None
     parse_yaml(text, SETTINGS)
     return text
 

@@ -58,8 +58,7 @@ def read_draft(folder: Path) -> SheetDraft:
     try:
         table = read_table(path)
     except TableError as error:
-        message, _, remedy = str(error).partition(": ")
-        raise ExperimentError([Problem(message=message, file=SHEET, remedy=remedy)]) from None
+        raise ExperimentError([Problem.from_error(error, SHEET)]) from None
     loose = [line for line, extra in zip(table.lines, table.extra, strict=True) if extra]
     if loose or table.nameless:
         message = "has cells without a column, which would be lost"
