@@ -15,7 +15,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.candidates import CandidateShape, is_plausible
-from vinetrack.dynamics.model import Value
+from vinetrack.dynamics.model import Value, values_by_key
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import refit
@@ -150,17 +150,11 @@ class SubsetFitter:
 
 def _values(layout: ParameterMap, theta: Floats) -> dict[str, Value]:
     """Parameters by name, those of single vines as mappings; yield pressures have priors and find their way."""
-    values: dict[str, Value] = {}
-    for number, value in zip(layout.free, layout.values(theta), strict=True):
-        if number.key == YIELD_PRESSURE:
-            continue
-        if number.vine:
-            former = values.get(number.key, {})
-            assert isinstance(former, dict)
-            values[number.key] = {**former, number.vine: float(value)}
-        else:
-            values[number.key] = float(value)
-    return values
+    return values_by_key(
+        (number.key, number.vine, float(value))
+        for number, value in zip(layout.free, layout.values(theta), strict=True)
+        if number.key != YIELD_PRESSURE
+    )
 
 
 def _one_of_each(data: Sequence[FitTrial]) -> list[int]:

@@ -19,6 +19,26 @@ Value = float | Mapping[str, float]
 """A parameter's value: one number, or one for each vine by name."""
 
 
+def values_by_key(numbers: Iterable[tuple[str, str, float]]) -> dict[str, Value]:
+    """Values as `Model.with_values` takes them: those of single vines become a mapping.
+
+    Parameters
+    ----------
+    numbers : key (`effect.parameter`), vine (blank for all) and value, SI, of each.
+
+    Returns
+    -------
+    dict
+    """
+    values: dict[str, Any] = {}
+    for key, vine, value in numbers:
+        if vine:
+            values.setdefault(key, {})[vine] = value
+        else:
+            values[key] = value
+    return values
+
+
 @dataclass(frozen=True, repr=False)
 class Model:
     """A sum of effects; `model + effect` and `model - effect` (or its name) give new models.

@@ -12,7 +12,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats
 from vinetrack.core.units import display_unit
-from vinetrack.dynamics.model import Model, Value
+from vinetrack.dynamics.model import Model, values_by_key
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, TrialFit
 from vinetrack.inference.intervals import Precision, among_first, near_bound, precision, profile_interval, student
@@ -196,17 +196,13 @@ def log_likelihood(solution: Solution) -> float:
 
 def _fitted_model(layout: ParameterMap, numbers: Sequence[Number]) -> Model:
     """The model with the fitted values; yield pressures belong to the trials and stay in the numbers."""
-    values: dict[str, Value] = {}
-    for number in numbers:
-        if number.key == YIELD_PRESSURE or layout.term(number.key) is not None:
-            continue
-        if number.vine:
-            former = values.get(number.key, {})
-            assert isinstance(former, dict)
-            values[number.key] = {**former, number.vine: number.value}
-        else:
-            values[number.key] = number.value
-    return layout.model.with_values(values)
+    return layout.model.with_values(
+        values_by_key(
+            (number.key, number.vine, number.value)
+            for number in numbers
+            if number.key != YIELD_PRESSURE and layout.term(number.key) is None
+        )
+    )
 
 
 def _numbers(

@@ -16,6 +16,7 @@ import numpy as np
 from vinetrack.core.notebook import html_table
 from vinetrack.core.numbers import or_nan
 from vinetrack.core.records import Floats
+from vinetrack.dynamics.model import Value, values_by_key
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, number_row, numbers_text
 
 if TYPE_CHECKING:
@@ -61,15 +62,9 @@ class FitSummary(NumberTable):
     between: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
-    def fitted_values(self) -> dict[str, float | dict[str, float]]:
+    def fitted_values(self) -> dict[str, Value]:
         """Fitted values by `effect.parameter`, SI, as `Model.with_values` takes them."""
-        values: dict[str, Any] = {}
-        for number in self.numbers:
-            if number.vine:
-                values.setdefault(number.key, {})[number.vine] = number.value
-            else:
-                values[number.key] = number.value
-        return values
+        return values_by_key((number.key, number.vine, number.value) for number in self.numbers)
 
     def trial_table(self) -> pd.DataFrame:
         """A row a trial: `trial, release_s, release_sigma_s, origin_m, …`; deviations are relative."""
