@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -81,13 +81,18 @@ def measured(campaign: Campaign, shown: Sequence[int]) -> Columns:
     -------
     dict, lists by column
     """
+    trials = [campaign.trials[i] for i in shown]
+    return _a_line_each(campaign, [(seen, seen.time_s, seen.growth_m) for seen in trials])
+
+
+def _a_line_each(campaign: Campaign, lines: Iterable[tuple[ShownTrial, Floats, Floats]]) -> Columns:
+    """A line a trial, of what stands along and what stands up, in thousandths of their units."""
     colour = colours(campaign)
     columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
-    for i in shown:
-        seen = campaign.trials[i]
+    for seen, along, up in lines:
         rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
-        columns["xs"].append(1e3 * seen.time_s[rows])
-        columns["ys"].append(1e3 * _broken(seen, rows, seen.growth_m[rows]))
+        columns["xs"].append(1e3 * along[rows])
+        columns["ys"].append(1e3 * _broken(seen, rows, up[rows]))
         columns["colour"].append(colour[seen.condition])
         columns["trial"].append(seen.name)
         columns["condition"].append(campaign.labels[seen.condition])
@@ -165,17 +170,8 @@ def residuals(campaign: Campaign, curves: Curves, shown: Sequence[int]) -> Colum
     -------
     dict, lists by column
     """
-    colour = colours(campaign)
-    columns: Columns = {"xs": [], "ys": [], "colour": [], "trial": [], "condition": []}
-    for i in shown:
-        seen, motion = campaign.trials[i], curves[i]
-        rows = thinned(seen.time_s.size, seen.counts_from(seen.release_s))
-        columns["xs"].append(1e3 * seen.growth_m[rows])
-        columns["ys"].append(1e3 * _broken(seen, rows, motion.residual_m[rows]))
-        columns["colour"].append(colour[seen.condition])
-        columns["trial"].append(seen.name)
-        columns["condition"].append(campaign.labels[seen.condition])
-    return columns
+    trials = [(campaign.trials[i], curves[i]) for i in shown]
+    return _a_line_each(campaign, [(seen, seen.growth_m, motion.residual_m) for seen, motion in trials])
 
 
 def error_bars(
