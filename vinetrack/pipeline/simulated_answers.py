@@ -160,10 +160,6 @@ def kept_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
     -------
     list of SimulatedAnswer
     """
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
     return [
         SimulatedAnswer(
             effect=row["effect"],
@@ -175,20 +171,24 @@ def kept_answers(path: Path, mark: str) -> list[SimulatedAnswer]:
             seconds=float(row["seconds"] or "nan"),
             failed=row["failed"],
         )
-        for row in rows
+        for row in _kept_rows(path, mark)
     ]
 
 
 def _kept_chances(path: Path, mark: str) -> list[TestChances]:
     """Chances that an earlier run has kept about this design."""
+    return [
+        TestChances(int(row["seed"]), {name: float(row[name]) for name in TESTS if row[name]}, row["failed"])
+        for row in _kept_rows(path, mark)
+    ]
+
+
+def _kept_rows(path: Path, mark: str) -> list[dict[str, str]]:
+    """Whole rows of a file that are about this design; none where there is no file."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
-    return [
-        TestChances(int(row["seed"]), {name: float(row[name]) for name in TESTS if row[name]}, row["failed"])
-        for row in rows
-    ]
+        return [row for row in csv.DictReader(stream) if row.get("design") == mark and row.get("failed") is not None]
 
 
 def _row(mark: str, answer: SimulatedAnswer) -> list[object]:
