@@ -323,15 +323,11 @@ class CandidateFits:
                 if abs(other.delta_chi2 - hypothesis.delta_chi2) < _same_place(other.fit, hypothesis.fit):
                     self.same_end.add(name)
                     break
-        return max(ends, key=_gain)
+        return max(ends, key=lambda hypothesis: hypothesis.delta_chi2)
 
     def _from_climb(self, climb: SubsetFit, best: float, *, led: bool, afresh: bool = False) -> LikelihoodRatio | None:
         fit = full_fit(self.questions.fit, climb, best, afresh=afresh, led=led)
         return None if fit is None else likelihood_ratio(self.questions.fit, climb.effects, fit)
-
-
-def _gain(hypothesis: LikelihoodRatio) -> float:
-    return hypothesis.delta_chi2
 
 
 def _same_place(*fits: Fit) -> float:

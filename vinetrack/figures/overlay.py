@@ -104,7 +104,7 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
     from PIL import Image, ImageDraw
 
     width, height = view.picture_px
-    line_px = _line_height(width)
+    line_px = max(round(width / 48), 11)
     bar_px = _even(1.35 * line_px * max(len(edges), 2) + 0.8 * line_px)
     small = Image.fromarray(picture).resize((width, height), Image.Resampling.BILINEAR).convert("RGB")
     pen = ImageDraw.Draw(small)
@@ -120,10 +120,6 @@ def compose(view: ClipView, picture: NDArray[Any], frame: int, time_ms: float, e
     whole.paste(small, (0, bar_px))
     _numbers(ImageDraw.Draw(whole), view, edges, frame, time_ms, line_px)
     return np.asarray(whole)
-
-
-def _line_height(width_px: int) -> int:
-    return max(round(width_px / 48), 11)
 
 
 @lru_cache(maxsize=8)

@@ -122,7 +122,7 @@ def find_axis(luma: NDArray[Any] | SmallPictures) -> Axis:
     if best.order < ORDERLY:
         # It meets a wall, bends, sweeps: the longest beginning that is orderly tells the axis.
         for part in PREFIXES:
-            shorter = _find_line(small, max(3, int(part * len(small))), patient=True)
+            shorter = _line_of(small, changed_pixels(small, max(3, int(part * len(small)))), patient=True)
             worth = shorter.order * shorter.collected
             if shorter.order >= ORDERLY and (best.order < ORDERLY or worth > best.order * best.collected):
                 best = shorter
@@ -223,11 +223,6 @@ def _shrunk(axis: Axis, factor: float) -> Axis:
     (a, b), (c, d) = axis.from_px, axis.to_px
     ends = [((x + 0.5) / factor - 0.5, (y + 0.5) / factor - 0.5) for x, y in ((a, b), (c, d))]
     return Axis(ends[0], ends[1], axis.width_px / factor)
-
-
-def _find_line(small: NDArray[np.float32], count: int, patient: bool = False) -> _Line:
-    """The best line in the first `count` frames; collects nothing where there is none (an error unless `patient`)."""
-    return _line_of(small, changed_pixels(small, count), patient)
 
 
 def _line_of(

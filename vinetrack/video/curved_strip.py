@@ -99,7 +99,7 @@ def cut_along(luma: NDArray[Any], axis: Axis, half_px: float, before: Strip | No
     if not isinstance(axis, CurvedAxis):
         return cut_strip(luma, axis, half_px)
     half = min(half_px, max(axis.largest_half_px - 1, 2.0))
-    shake_px = picture_shake(luma, axis, half) if before is None else _shake_of(before)
+    shake_px = picture_shake(luma, axis, half) if before is None else before.shake_px
     straight = laid_straight(luma, axis, half, shake_px)
     strip = replace(cut_strip(straight.luma, straight.axis, half, still=True), axis=axis)
     return strip if shake_px is None else replace(strip, shift_px=shake_px, steadied=True)
@@ -134,10 +134,6 @@ def curve_found(axis: CurvedAxis) -> str:
         f"the vine bends by {np.degrees(axis.bent_rad):.0f}° in all, and positions are those along a curve that was"
         " found: look at its overlay, and draw the curve (column `axis`) if the edge is not on it"
     )
-
-
-def _shake_of(strip: Strip) -> Floats | None:
-    return strip.shift_px if strip.steadied else None
 
 
 def shake_along(strip: Strip, edge_px: Floats) -> Floats:

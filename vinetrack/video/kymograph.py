@@ -89,14 +89,8 @@ def _collect_path(score: np.ndarray) -> np.ndarray:
     came = np.zeros((n, columns + 1), np.uint8)
     for t in range(n):
         for s in range(columns + 1):
-            top = -1.0
-            if t > 0:
-                top = best[t - 1, s]
-            elif s == 0:
-                top = 0.0
-            else:
-                # A path may begin anywhere: columns behind its beginning were covered before the first frame.
-                top = 0.0
+            # A path may begin anywhere: columns behind its beginning were covered before the first frame.
+            top = best[t - 1, s] if t > 0 else 0.0
             if s > 0 and t > 0:
                 across = best[t, s - 1] + score[t, s - 1]
                 if across > top:

@@ -63,6 +63,11 @@ class Strip:
     axis: Axis
     steadied: bool
 
+    @property
+    def shake_px(self) -> Floats | None:
+        """`shift_px` where a shake was taken off, else None."""
+        return self.shift_px if self.steadied else None
+
 
 def cut_strip(luma: NDArray[Any], axis: Axis, half_px: float, still: bool = False) -> Strip:
     """Cut, level and steady the strip on both sides of an axis.
@@ -105,7 +110,7 @@ def recut(strip: Strip, luma: NDArray[Any], axis: Axis, half_px: float) -> Strip
     the strip.
     """
     half = int(np.ceil(half_px))
-    values = sample(luma, axis, np.arange(-half, half + 1), strip.shift_px if strip.steadied else None)
+    values = sample(luma, axis, np.arange(-half, half + 1), strip.shake_px)
     return replace(strip, values=values, axis=axis)
 
 
