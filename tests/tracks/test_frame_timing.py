@@ -82,6 +82,17 @@ def test_after_dropped_frames_times_go_on_by_as_many(count):
     assert ("1 frame is missing" if count == 1 else f"{count} frames are missing") in out.notes[0]
 
 
+@pytest.mark.parametrize(("stated_m", "told"), [(2e-5, True), (np.nan, True), (5e-4, False)])
+def test_a_long_step_between_points_that_are_stated_to_be_unsure_is_no_dropped_frame(stated_m, told):
+    """Where a door half hides the tip its points leap, and say so."""
+    track = dropped(steady_track(), 60)
+    sigma_m = track.lead_position_sigma_m.copy()
+    sigma_m[58:62] = stated_m
+    corrected = correct_frames(replace(track, lead_position_sigma_m=sigma_m))
+    assert bool(corrected.notes) is told
+    assert bool(flags(corrected)) is told
+
+
 def test_several_faults_in_one_track_are_all_put_right():
     clean = steady_track()
     out = correct_frames(stale(inserted(dropped(clean, 60), 80), 100))

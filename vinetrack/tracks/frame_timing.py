@@ -197,7 +197,8 @@ def _next_event(track: Track, after: int, step_s: float, noise_m: float, rho: fl
     frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
     y = track.lead_position_m[rows]
     speed = np.diff(y) / np.diff(frame)
-    for i in _suspects(speed, noise_m):
+    stated = track.lead_position_sigma_m[rows]
+    for i in _suspects(speed, np.fmax(noise_m, np.fmax(stated[:-1], stated[1:]))):
         if rows[i + 1] <= after:
             continue
         event = _judge_drop(frame, y, i, noise_m, rho, rows) or _judge_repeat(frame, y, i, noise_m, rho, rows)
@@ -206,8 +207,11 @@ def _next_event(track: Track, after: int, step_s: float, noise_m: float, rho: fl
     return None
 
 
-def _suspects(speed: Floats, noise_m: float) -> NDArray[np.int_]:
-    """Steps that stand out from the smaller or larger of their neighbours: a cheap first sieve."""
+def _suspects(speed: Floats, noise_m: Floats) -> NDArray[np.int_]:
+    """Steps that stand out from the smaller or larger of their neighbours, and from their own noise: a first sieve.
+
+    A point that is stated to be unsure, such as one that a door half hides, makes no step that tells of frames.
+    """
     before, after = _neighbours(speed)
     usual = np.fmin(np.abs(before), np.abs(after))
     clear = np.fmax(before, after) > CLEAR_STEP_SIGMAS * noise_m
