@@ -29,7 +29,7 @@ from vinetrack.video.edge_state import (
     repicture,
     residuals,
 )
-from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors
+from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors, leap_error_px
 from vinetrack.video.slow_errors import noise_and_slow, slow_error_px
 from vinetrack.video.strip import Strip
 from vinetrack.video.tip_shape import (
@@ -439,6 +439,7 @@ def _finish(strip: Strip, state: EdgeState, fit: Floats, exposure: float, passed
     apart = np.where(mouth.before, np.maximum(apart, NO_EDGE_PX if mouth.moved_behind else GUESSED_PX), apart)
     # A door adds more to the error than any start has: the tip is half behind it, or was a moment before.
     hidden = (door * near_start > START_PX) | mouth.before
+    apart = np.maximum(apart, leap_error_px(edge_now, hidden))
     bands, lasting = noise_and_slow(bands, seen, apart)
     slow = np.hypot(lasting, slow_error_px(edge_now, contrast, shared))
     return EdgeFit(

@@ -71,6 +71,14 @@ FRAMES_OUT = 5
 """Frames after the tip has come out by which speed and acceleration there are judged. Chosen: three numbers of a
 parabola, and two frames more."""
 
+LEAPS = 3.0
+"""Change of the step, in the largest of the next four, from which hidden frames are not of the motion that follows.
+Chosen: from rest steps grow evenly, and release between two frames makes one change 1.5 times the next. By reasoning:
+at half such releases count as leaps, at twice a door that was followed passes for the tip."""
+LEAST_LEAP_PX = 3.0
+"""The same at least. Chosen: ASTRAY_PX, what a guess may be off by. At half the noise of slow starts counts as a leap,
+at twice small ones pass."""
+
 
 @dataclass(frozen=True)
 class Mouth:
@@ -207,3 +215,36 @@ def _moved_behind(edge: Floats, place: float) -> bool:
     bend, speed, begin = np.polyfit(np.arange(FRAMES_OUT), edge, 2)
     run = speed**2 / (4 * bend) if bend > 0 else np.inf
     return bool(run > 2 * (begin - place) + 5)
+
+
+def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
+    """How far hidden frames are from where the motion that follows comes from, if they do not lead up to it.
+
+    What swings before the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps to it.
+    Back from the first frames that are not hidden, a step that differs from the one after it by more than LEAPS times
+    what any of the next four do is such a leap. Before it the motion is followed back at their mean acceleration, no
+    slower than rest, and the edge is off by as much as it differs from that.
+
+    Parameters
+    ----------
+    edge : shape (n_frames,), px.
+    hidden : frames in which something may hide the tip, mask (n_frames,).
+
+    Returns
+    -------
+    shape (n_frames,), px; 0 where the edge leads up to the motion.
+    """
+    out = np.zeros(len(edge))
+    seen = np.flatnonzero(~hidden)
+    if not hidden.any() or not len(seen):
+        return out
+    steps = np.diff(edge)
+    bends = np.diff(steps)  # bends[t] is between the steps from t and from t + 1
+    for t in range(int(seen[0]) - 1, -1, -1):
+        later = bends[t + 1 : t + FRAMES_OUT]
+        if len(later) < FRAMES_OUT - 1 or not abs(bends[t]) > max(LEAPS * np.abs(later).max(), LEAST_LEAP_PX):
+            continue
+        back = np.maximum(steps[t + 1] - max(float(later.mean()), 0.0) * np.arange(1, t + 2), 0.0)
+        out[t::-1] = np.abs(edge[t::-1] - (edge[t + 1] - np.cumsum(back)))
+        break
+    return np.nan_to_num(out)

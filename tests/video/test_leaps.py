@@ -1,0 +1,38 @@
+"""Hidden frames that do not lead up to the motion after them: something else was followed in place of the tip."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinetrack.video.hidden_tip import leap_error_px
+
+FRAMES = np.arange(40.0)
+
+
+def released(frame: float, acceleration: float = 3.0) -> np.ndarray:
+    """At rest at 100 px until a moment between frames, then at an even acceleration."""
+    return 100.0 + 0.5 * acceleration * np.clip(FRAMES - frame, 0.0, None) ** 2
+
+
+@pytest.mark.parametrize("frame", [8.0, 8.3, 8.7, 8.99])
+@pytest.mark.parametrize("seed", [351, 352])
+def test_a_tip_that_was_followed_from_rest_makes_no_leap(frame: float, seed: int) -> None:
+    edge = released(frame) + np.random.default_rng(seed).normal(0, 0.1, FRAMES.size)
+    assert leap_error_px(edge, FRAMES < 14).max() == 0.0
+
+
+def test_a_door_followed_in_place_of_the_tip_is_off_by_how_far_it_is_from_the_way_back() -> None:
+    true = released(8.3)
+    edge = true.copy()
+    edge[:14] = 130.0 + 0.8 * FRAMES[:14]  # the tip comes out at frame 14, at 149 px
+    error = leap_error_px(edge, FRAMES < 16)
+    assert error[14:].max() == 0.0
+    assert error[:14] == pytest.approx(np.abs(edge - true)[:14], abs=6.0)
+    assert error[:10].min() > 20.0
+
+
+def test_frames_that_nothing_hides_are_not_judged() -> None:
+    edge = released(8.3)
+    edge[:14] = 130.0
+    assert leap_error_px(edge, np.zeros(40, dtype=bool)).max() == 0.0
