@@ -22,6 +22,12 @@ def test_a_tip_that_was_followed_from_rest_makes_no_leap(frame: float, seed: int
     assert leap_error_px(edge, FRAMES < 14).max() == 0.0
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_a_vine_whose_speed_settles_within_a_frame_makes_no_leap(share: float) -> None:
+    edge = 100.0 + 20.0 * np.clip(FRAMES - 8.0 - share, 0.0, None)
+    assert leap_error_px(edge, FRAMES < 14).max() == 0.0
+
+
 def test_a_door_followed_in_place_of_the_tip_is_off_by_how_far_it_is_from_the_way_back() -> None:
     true = released(8.3)
     edge = true.copy()

@@ -79,6 +79,11 @@ LEAST_LEAP_PX = 3.0
 """The same at least. Chosen: ASTRAY_PX, what a guess may be off by. At half the noise of slow starts counts as a leap,
 at twice small ones pass."""
 
+SPEEDS_UP = 0.3
+"""Gain of speed over the next four frames, in the step after a leap, from which a motion still speeds up. Chosen: force
+and damping B·v^0.37 leave a third of the first acceleration at 0.3 of the final speed, so that a step reached within a
+frame is followed by less. By reasoning: at half vines whose speed settles count as leaps, at twice some leaps pass."""
+
 
 @dataclass(frozen=True)
 class Mouth:
@@ -222,8 +227,9 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
 
     What swings before the tip may be followed in its place, smoothly, until the tip comes out and the edge leaps to it.
     Back from the first frames that are not hidden, a step that differs from the one after it by more than LEAPS times
-    what any of the next four do is such a leap. Before it the motion is followed back at their mean acceleration, no
-    slower than rest, and the edge is off by as much as it differs from that.
+    what any of the next four do is such a leap, if these still speed up (SPEEDS_UP): a vine whose speed settles within
+    a frame may set off like that, one that goes on speeding up was no faster to begin with. Before the leap the motion
+    is followed back at their mean acceleration, no slower than rest, and the edge is off by as much as it differs.
 
     Parameters
     ----------
@@ -242,7 +248,9 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
     bends = np.diff(steps)  # bends[t] is between the steps from t and from t + 1
     for t in range(int(seen[0]) - 1, -1, -1):
         later = bends[t + 1 : t + FRAMES_OUT]
-        if len(later) < FRAMES_OUT - 1 or not abs(bends[t]) > max(LEAPS * np.abs(later).max(), LEAST_LEAP_PX):
+        if len(later) < FRAMES_OUT - 1 or not later.sum() > SPEEDS_UP * steps[t + 1]:
+            continue
+        if abs(bends[t]) <= max(LEAPS * np.abs(later).max(), LEAST_LEAP_PX):
             continue
         back = np.maximum(steps[t + 1] - max(float(later.mean()), 0.0) * np.arange(1, t + 2), 0.0)
         out[t::-1] = np.abs(edge[t::-1] - (edge[t + 1] - np.cumsum(back)))
