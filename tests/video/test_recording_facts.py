@@ -20,7 +20,13 @@ from vinetrack.video.axis import Axis
 from vinetrack.video.capture_clock import capture_rate
 from vinetrack.video.frames import RecordingError, inspect_recording, read_frames
 from vinetrack.video.quick_look import look_at, proposed_axis
-from vinetrack.video.recording_facts import RecordingFacts, direction_notes, exposure_problems, size_problems
+from vinetrack.video.recording_facts import (
+    RecordingFacts,
+    axis_notes,
+    direction_notes,
+    exposure_problems,
+    size_problems,
+)
 from vinetrack.video.survey import Surveyor
 from vinetrack.video.track import track_recording
 
@@ -92,6 +98,25 @@ def test_growth_that_looks_otherwise_than_stated_is_noted(
     trials = [replace(VINE, name=name, growth_angle_rad=np.radians(angle_deg)) for name in "ab"]
     notes = direction_notes([replace(FACTS, axis=ALONG[picture])] * 2, trials, ["a", "b"] if blank else [])
     assert [note.startswith(words or "") for note in notes] == ([True] if words else [])
+
+
+@pytest.mark.parametrize(("slopes_deg", "named"), [
+    ([0, 1, -2, 179, 1], ""),
+    ([0, 1, -2, 60, 1], "d"),
+    ([0, 1, -2, 60, -35], "2 recordings, d first"),
+    ([0, 1, 60, 61], ""),
+    ([0, 60], ""),
+    ([88, 90, -89, 0], "d"),
+])  # fmt: skip
+def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg: list[float], named: str) -> None:
+    trials = [replace(VINE, name=name) for name in "abcdefgh"[: len(slopes_deg)]]
+    ends = [(100 + 200 * np.cos(np.radians(s)), 100 + 200 * np.sin(np.radians(s))) for s in slopes_deg]
+    facts = [replace(FACTS, axis=Axis((100.0, 100.0), end)) for end in ends]
+    notes = axis_notes(facts, trials)
+    assert len(notes) == bool(named)
+    assert all(f"recordings was found ({named}): where" in note for note in notes)
+    given = [replace(trial, axis=Axis((100.0, 100.0), end)) for trial, end in zip(trials, ends, strict=True)]
+    assert axis_notes(facts, given) == []
 
 
 @pytest.fixture(scope="module")

@@ -51,7 +51,7 @@ def check_folder(folder: Path) -> Checked:
     from vinetrack.pipeline.workflow import path_problems
     from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
     from vinetrack.tracks.importers import TrackError, load_track
-    from vinetrack.video.recording_facts import direction_notes, facts_entry, facts_rows
+    from vinetrack.video.recording_facts import axis_notes, direction_notes, facts_entry, facts_rows
     from vinetrack.video.survey import Surveyor
 
     surveyor = Surveyor()
@@ -75,5 +75,5 @@ def check_folder(folder: Path) -> Checked:
     lines = facts_rows(seen, trials) if seen else []
     if 0 < len(surveyor.looked_into) < len(seen):
         lines.append(f"{len(surveyor.looked_into)} of {len(seen)} recordings were looked into, one of each condition")
-    notes = [*experiment.blank_notes, *direction_notes(seen, trials, experiment.angle_blank)]
+    notes = [*experiment.blank_notes, *direction_notes(seen, trials, experiment.angle_blank), *axis_notes(seen, trials)]
     return Checked(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(notes))

@@ -43,6 +43,13 @@ SAME_FACTOR = 0.1
 """Width and growth that are off by factors within a tenth of each other are off by one factor: the scale. Chosen:
 widths and growths are seen to some per cent. At half true errors of scale are told as two faults, at twice two faults
 as one of scale."""
+ASKEW_DEG = 10.0
+"""Angle between a recording's axis and that of most others from which it is named. Chosen: axes that are found err by a
+degree or two, and a door that swings before a tip turns them by 30 or more. At half axes of short growth are named; at
+twice one that leads past the tube's far end is not."""
+FEWEST_ALIKE = 3
+"""Recordings whose axes agree, from which the others are judged. Chosen: two may agree by chance. By reasoning: with
+two a pair of wrong ones accuses a right one, with six small campaigns are never judged."""
 STEEP = 60.0
 """Degrees between growth in the picture and its rows from which it runs up or down, and to its columns from which it
 runs level. Chosen: a camera is held askew by some degrees; at 45 a tilted rig would be told, at 75 a camera askew by 20
@@ -225,6 +232,47 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
         (level, "level", "a blank growth_angle_deg means straight down: write 90 unless the camera lay on its side"),
     )
     return [f"growth runs {way} in the picture ({_some(names)}) and {remark}" for names, way, remark in told if names]
+
+
+def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
+    """Name recordings whose axis was found askew to that of most others, which the same camera films.
+
+    Something else that moves, such as a door as long as the growth, is then taken for the tube.
+
+    Parameters
+    ----------
+    facts, trials : of the same recordings, in the same order.
+
+    Returns
+    -------
+    a sentence, or none.
+    """
+    slopes_deg: dict[str, float] = {}
+    for fact, trial in zip(facts, trials, strict=True):
+        if fact.axis is None or trial.axis is not None or trial.travel_ratio == 1:
+            continue
+        # A curve where others are straight is askew as well.
+        right, down = (b - a for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
+        bent = isinstance(fact.axis, CurvedAxis)
+        slopes_deg[trial.name] = math.nan if bent else math.degrees(math.atan2(down, right))
+    straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
+    alike = max(
+        straight, key=lambda slope: sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight), default=0.0
+    )
+    askew = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, alike) < ASKEW_DEG]
+    agreed = len(slopes_deg) - len(askew)
+    if not askew or agreed < FEWEST_ALIKE or agreed <= len(askew):
+        return []
+    return [
+        f"a growth axis other than that of {agreed} recordings was found ({_some(askew)}): where one camera filmed "
+        "them all, something else that moves (a door, a hand) was taken for the tube; give the axis of those (column "
+        "`axis`)"
+    ]
+
+
+def _apart_deg(slope_deg: float, other_deg: float) -> float:
+    """Angle between two lines, whichever way they run, 0 to 90 degrees."""
+    return abs((slope_deg - other_deg + 90.0) % 180.0 - 90.0)
 
 
 def _some(names: list[str]) -> str:
