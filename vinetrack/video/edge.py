@@ -407,7 +407,7 @@ def _restate(strip: Strip, state: EdgeState, fit: Floats, exposure: float) -> Ed
     edge = held_at_rest(np.where(np.isfinite(fit[:, 0]), fit[:, 0], state.edge), frames_that_tell(state.edge))
     state = replace(state, edge=edge, lengths=blur_lengths(edge, exposure))
     state = repicture(strip, state, 4 * strip.noise + 4)
-    by_distance, *_ = residuals(strip, state, fit, core_frames(state, fit))
+    by_distance = residuals(strip, state, fit, core_frames(state, fit)).by_distance
     seen = by_distance[:, 1] > 4
     ratio = np.where(seen, by_distance[:, 0] / np.maximum(by_distance[:, 1], 1), 1.0)
     smooth = np.convolve(np.pad(ratio, 2, mode="edge"), np.ones(5) / 5, mode="valid")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -259,9 +260,18 @@ def _shading_as_wide(state: EdgeState, margin_px: float) -> Floats:
     return np.pad(state.shading, max(reach - SHADED_PX, 0))
 
 
+class Residuals(NamedTuple):
+    """What a fit leaves, in sums that `edge_kernels.residual_sums` describes."""
+
+    by_distance: Floats
+    by_row: Floats
+    misfit: float
+    by_place: Floats
+
+
 def residuals(
     strip: Strip, state: EdgeState, fit: Floats, use: NDArray[np.bool_], margin_px: float = MARGIN_PX
-) -> tuple[Floats, Floats, float, Floats]:
+) -> Residuals:
     """What the fit leaves in the frames of `use`; see `edge_kernels.residual_sums`.
 
     Parameters
@@ -274,11 +284,12 @@ def residuals(
 
     Returns
     -------
-    sums by distance, by row, the misfit, and sums by distance from each row's own edge.
+    Residuals
     """
     filled = np.nan_to_num(fit)
     filled[:, 0] = state.edge
-    return kernels.residual_sums(
+    sums = kernels.residual_sums(
         strip.values, strip.scale, strip.offset, filled, state.lengths, state.lag, state.blur, state.pictures,
         margin_px, use, _shading_as_wide(state, margin_px),
     )  # fmt: skip
+    return Residuals(*sums)

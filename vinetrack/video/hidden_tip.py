@@ -70,15 +70,13 @@ backgrounds with strong marks count as mouths; at twice, a mouth as bright as th
 FRAMES_OUT = 5
 """Frames after the tip has come out by which speed and acceleration there are judged. Chosen: three numbers of a
 parabola, and two frames more."""
-
 LEAPS = 3.0
 """Change of the step, in the largest of the next four, from which hidden frames are not of the motion that follows.
 Chosen: from rest steps grow evenly, and release between two frames makes one change 1.5 times the next. By reasoning:
 at half such releases count as leaps, at twice a door that was followed passes for the tip."""
-LEAST_LEAP_PX = 3.0
-"""The same at least. Chosen: ASTRAY_PX, what a guess may be off by. At half the noise of slow starts counts as a leap,
-at twice small ones pass."""
-
+LEAST_LEAP_PX = ASTRAY_PX
+"""The same at least. Chosen: what a guess may be off by. At half the noise of slow starts counts as a leap, at twice
+small ones pass."""
 SPEEDS_UP = 0.3
 """Gain of speed over the next four frames, in the step after a leap, from which a motion still speeds up. Chosen: force
 and damping B·v^0.37 leave a third of the first acceleration at 0.3 of the final speed, so that a step reached within a
@@ -241,12 +239,11 @@ def leap_error_px(edge: Floats, hidden: Bools) -> Floats:
     shape (n_frames,), px; 0 where the edge leads up to the motion.
     """
     out = np.zeros(len(edge))
-    seen = np.flatnonzero(~hidden)
-    if not hidden.any() or not len(seen):
+    if hidden.all():
         return out
     steps = np.diff(edge)
     bends = np.diff(steps)  # bends[t] is between the steps from t and from t + 1
-    for t in range(int(seen[0]) - 1, -1, -1):
+    for t in range(int(np.argmin(hidden)) - 1, -1, -1):
         later = bends[t + 1 : t + FRAMES_OUT]
         if len(later) < FRAMES_OUT - 1 or not later.sum() > SPEEDS_UP * steps[t + 1]:
             continue

@@ -256,10 +256,9 @@ def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
         bent = isinstance(fact.axis, CurvedAxis)
         slopes_deg[trial.name] = math.nan if bent else math.degrees(math.atan2(down, right))
     straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
-    alike = max(
-        straight, key=lambda slope: sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight), default=0.0
-    )
-    askew = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, alike) < ASKEW_DEG]
+    agreeing = [sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight) for slope in straight]
+    usual = straight[int(np.argmax(agreeing))] if straight else 0.0
+    askew = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, usual) < ASKEW_DEG]
     agreed = len(slopes_deg) - len(askew)
     if not askew or agreed < FEWEST_ALIKE or agreed <= len(askew):
         return []

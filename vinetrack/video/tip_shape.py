@@ -67,7 +67,7 @@ def find_shape(strip: Strip, state: EdgeState, fit: Floats, anew: bool) -> EdgeS
     core = core_frames(state, fit)
     slow = core & (state.lengths <= max(2.0, float(np.quantile(state.lengths[core], 0.5))))
     for _ in range(3):
-        _, by_row, _, _ = residuals(strip, state, fit, slow)
+        by_row = residuals(strip, state, fit, slow).by_row
         step = by_row[:, 0] / (by_row[:, 1] + 0.02 * float(by_row[:, 1].max()) + 1e-9)
         step = np.clip(step, -FASTEST_LAG_STEP_PX, FASTEST_LAG_STEP_PX)
         lag, lead = _smooth_lag(state.lag + step, by_row[:, 1])
@@ -100,7 +100,7 @@ def find_shading(strip: Strip, state: EdgeState, fit: Floats) -> EdgeState:
     """
     core = core_frames(state, fit)
     for _ in range(2):
-        by_place = residuals(strip, state, fit, core)[3]
+        by_place = residuals(strip, state, fit, core).by_place
         middle = len(by_place) // 2
         left, weight = by_place[middle - SHADED_PX : middle + SHADED_PX + 1].T
         step = left / np.maximum(weight, 1e-3 * float(weight.max()) + 1e-12)
@@ -115,12 +115,7 @@ def _misfit_refitted(strip: Strip, state: EdgeState, frames: NDArray[np.int_], m
     fit = fit_edges(strip, replace(state, edge=edge))
     use = np.isfinite(fit[:, 0])
     edge[use] = fit[use, 0]
-    return residuals(strip, replace(state, edge=edge), fit, use, margin_px)[2]
-
-
-def _unshaded(state: EdgeState) -> EdgeState:
-    """The state without shading of the tip, which at constant speed looks like any error of the exposure."""
-    return replace(state, shading=np.zeros_like(state.shading))
+    return residuals(strip, replace(state, edge=edge), fit, use, margin_px).misfit
 
 
 def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
@@ -136,13 +131,10 @@ def find_exposure(strip: Strip, state: EdgeState, fit: Floats) -> float:
     -------
     exposure over frame period.
     """
-    core, state = core_frames(state, fit), _unshaded(state)
-    speed = blur_lengths(state.edge, 1.0)
-    fast = core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
+    speed, fast = _fast_frames(state, fit)
     if not fast.any():
         return ASSUMED_EXPOSURE
-    misfits = [residuals(strip, replace(state, lengths=speed * tau), fit, fast)[2] for tau in EXPOSURES]
-    return _least(EXPOSURES, np.array(misfits))
+    return _least(EXPOSURES, _misfits_of_exposures(strip, state, fit, speed, fast, EXPOSURES))
 
 
 def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: float) -> tuple[float, float]:
@@ -162,16 +154,31 @@ def seen_exposure(strip: Strip, state: EdgeState, fit: Floats, stated_frames: fl
     exposure over frame period, NaN where the stated one explains the blur as well (misfit within CONTRADICTED); and the
         median speed of the frames used, px a frame.
     """
-    core, state = core_frames(state, fit), _unshaded(state)
-    speed = blur_lengths(state.edge, 1.0)
-    fast = core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2) if core.any() else core
+    speed, fast = _fast_frames(state, fit)
     if fast.sum() < FEWEST_FAST:
         return np.nan, np.nan
-    tried = np.append(EXPOSURES, stated_frames)
-    misfits = np.array([residuals(strip, replace(state, lengths=speed * tau), fit, fast)[2] for tau in tried])
+    misfits = _misfits_of_exposures(strip, state, fit, speed, fast, np.append(EXPOSURES, stated_frames))
     contradicted = misfits[-1] > CONTRADICTED * misfits.min()
     seen = _least(EXPOSURES, misfits[:-1]) if contradicted else np.nan
     return seen, float(np.median(speed[fast]))
+
+
+def _fast_frames(state: EdgeState, fit: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Speed in every frame, px a frame, and the faster half of the core frames, of those that move 2 px."""
+    core = core_frames(state, fit)
+    speed = blur_lengths(state.edge, 1.0)
+    return speed, core & (speed >= np.quantile(speed[core], 0.5)) & (speed > 2)
+
+
+def _misfits_of_exposures(
+    strip: Strip, state: EdgeState, fit: Floats, speed: Floats, frames: NDArray[np.bool_], exposures: Floats
+) -> Floats:
+    """Misfit of some frames with each exposure, shape (n_exposures,).
+
+    Without shading of the tip, which at constant speed looks like any error of the exposure.
+    """
+    bare = replace(state, shading=np.zeros_like(state.shading))
+    return np.array([residuals(strip, replace(bare, lengths=speed * tau), fit, frames).misfit for tau in exposures])
 
 
 def _smooth_lag(lag: Floats, weight: Floats) -> tuple[Floats, float]:
