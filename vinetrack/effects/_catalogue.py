@@ -70,8 +70,9 @@ def _load_module(path: Path) -> ModuleType:
     except Exception as error:
         del sys.modules[name]
         raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
-    if before is not None:
-        sys.modules[name] = before
+    finally:
+        if before is not None:  # compiled forms look for the functions of the file that was there first
+            sys.modules[name] = before
     _MODULES[whole, name] = module
     return module
 
