@@ -17,8 +17,9 @@ demo: $(STAMP)  ## 24 recordings, made in the virtual laboratory on first use, t
 guide: demo  ## outputs and pictures of the docs, printed and drawn anew from the demonstration
 	$(BIN)/python benchmarks/guide_pages.py
 
+# Told to keep no compiled modules, each process that tests start would compile the package anew.
 test: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest -n $(CORES) --dist worksteal
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(CORES) --dist worksteal
 
 lint: $(STAMP)  ## style, types and the workflow's formatting
 	$(BIN)/ruff check .

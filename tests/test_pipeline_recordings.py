@@ -270,7 +270,8 @@ def test_a_falling_ball_gives_g_through_the_whole_chain(tmp_path: Path) -> None:
         "trial,video,diameter_mm,travel_ratio,mm_per_px,capture_fps\nball,freefall.mp4,20,1,0.27307,1000\n"
     )
     (folder / "experiment.yaml").write_text("candidates: [air_drag]\n")
-    done = snakemake(tmp_path, "--cores", "2", "--config", "experiment=fall")
+    small = ("figures={formats: [png]}", "overlays={of: none}")
+    done = snakemake(tmp_path, "--cores", "2", "--config", "experiment=fall", *small)
     assert done.returncode == 0, done.stdout + done.stderr
     row = read_rows(tmp_path / "results" / "fall" / "trials.csv")["ball"]
     assert row["status"] != "failed", row["reason"]

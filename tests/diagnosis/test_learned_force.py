@@ -10,8 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from grown import grown, hidden_force, pairs_of, sheet
+from scipy.interpolate import BSpline
 
 import vinetrack as vt
+from vinetrack.diagnosis.cubic_splines import splines
 from vinetrack.diagnosis.force_surface import ANY, CONSTANT, NOTHING, Domain, Surface, covariance_root, curves
 from vinetrack.diagnosis.learned_force import LEARNED_COLUMNS
 from vinetrack.diagnosis.learned_variables import following
@@ -68,6 +70,24 @@ def test_splines_add_up_to_one_and_are_constant_beyond_what_was_visited(domain: 
     beyond = [np.array([high, 2 * high]) for high in domain.high]
     at_end, further = domain.basis(beyond)
     assert at_end == pytest.approx(further)
+
+
+@pytest.mark.parametrize("knots", [np.linspace(0, 1, 18), np.array([0, 0.01, 0.05, 0.3, 0.5, 1.0])])
+def test_splines_are_those_of_scipy(knots: np.ndarray) -> None:
+    at = np.concatenate([np.random.default_rng(6).uniform(-0.2, 1.2, 300), knots])
+    ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
+    expected = BSpline.design_matrix(np.clip(at, 0, 1), ends, 3).toarray()
+    assert splines(at, knots) == pytest.approx(expected, abs=1e-14)
+
+
+def test_products_of_splines_are_summed_without_those_that_are_nothing() -> None:
+    draw = np.random.default_rng(7)
+    at = [draw.uniform(0, 0.3, 50), draw.uniform(0, 9, 50)]
+    coefficients = draw.standard_normal(BOTH.size)
+    assert BOTH.sum(at, coefficients) == pytest.approx(BOTH.basis(at) @ coefficients, abs=1e-13)
+    alone = [curves(part, count) for part, count in zip(BOTH.parts(at), BOTH.counts, strict=True)]
+    expected = np.einsum("na,nb->nab", *alone).reshape(50, -1)
+    assert BOTH.basis(at) == pytest.approx(expected, abs=1e-15)
 
 
 def test_speeds_are_taken_as_logarithms_beyond_what_is_usual() -> None:

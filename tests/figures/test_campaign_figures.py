@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -215,18 +216,18 @@ def test_the_overview_of_nothing_says_so() -> None:
     assert "No trial has positions" in words(draw_overview(campaign(1, 1)[0], {}))
 
 
-def every_figure() -> list[tuple[str, Figure]]:
-    return [
-        ("law", draw_damping_law(points(4), damping(4))),
-        ("law of 20 vines", draw_damping_law(points(20), damping(20))),
-        ("exponents", draw_exponents(damping(4), {"n": 0.37, "B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"})),
-        ("scaling", draw_scaling(scaling(), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"})),
-        ("overview", draw_overview(*campaign(40, 1))),
-    ]
+EVERY_FIGURE: dict[str, Callable[[], Figure]] = {
+    "law": lambda: draw_damping_law(points(4), damping(4)),
+    "law of 20 vines": lambda: draw_damping_law(points(20), damping(20)),
+    "exponents": lambda: draw_exponents(damping(4), {"n": 0.37, "B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"}),
+    "scaling": lambda: draw_scaling(scaling(), {"B": {"vine0": 1.0}, "source": "Alvarez et al. 2025"}),
+    "overview": lambda: draw_overview(*campaign(40, 1)),
+}
 
 
-@pytest.mark.parametrize(("name", "figure"), every_figure(), ids=lambda value: value if isinstance(value, str) else "")
-def test_no_text_is_cut_off_and_no_legend_covers_the_axes(name: str, figure: Figure) -> None:
+@pytest.mark.parametrize("name", EVERY_FIGURE)
+def test_no_text_is_cut_off_and_no_legend_covers_the_axes(name: str) -> None:
+    figure = EVERY_FIGURE[name]()
     with look():
         figure.draw_without_rendering()
         drawn, edge = figure.get_tightbbox(), figure.bbox_inches.padded(0.02)
@@ -243,6 +244,17 @@ def test_no_text_is_cut_off_and_no_legend_covers_the_axes(name: str, figure: Fig
 def test_the_same_figure_gives_the_same_bytes() -> None:
     first, second = (render(draw_damping_law(points(), damping())) for _ in range(2))
     assert first == second
+
+
+def test_a_figure_laid_out_once_for_all_formats_is_the_one_saved_by_itself() -> None:
+    from io import BytesIO
+
+    drawn, saved, file = draw_damping_law(points(), damping()), draw_damping_law(points(), damping()), BytesIO()
+    with look():
+        saved.savefig(file, format="png", dpi=150, facecolor="white", metadata={"Software": None})
+    engine = drawn.get_layout_engine()
+    assert render(drawn, ("png",))["png"] == file.getvalue()
+    assert drawn.get_layout_engine() is engine
 
 
 def test_a_png_is_white_and_an_svg_transparent() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -159,20 +160,20 @@ def test_without_families_the_figures_say_why() -> None:
     assert "one place" in words(draw_efficiency({}))
 
 
-def every_figure() -> list[tuple[str, Figure]]:
-    families = [speed_family([6.0, 12.0, 18.0, 24.0]), speed_family([6.0, 12.0], 30.0)]
-    note = "Alvarez et al. (2025): a sentence that is set below"
-    return [
-        ("speed", draw_speed_scaling({"steady_speed": families}, note)),
-        ("efficiency", draw_efficiency({"efficiency": [efficiency_family()]}, note)),
-        ("efficiency of one diameter", draw_efficiency({"efficiency": [efficiency_family(1)]})),
-        ("payload", draw_payload_speed(conditions(), conditions(), note)),
-        ("payload of five vines", draw_payload_speed(conditions(5), conditions(5))),
-    ]
+FAMILIES = [speed_family([6.0, 12.0, 18.0, 24.0]), speed_family([6.0, 12.0], 30.0)]
+NOTE = "Alvarez et al. (2025): a sentence that is set below"
+EVERY_FIGURE: dict[str, Callable[[], Figure]] = {
+    "speed": lambda: draw_speed_scaling({"steady_speed": FAMILIES}, NOTE),
+    "efficiency": lambda: draw_efficiency({"efficiency": [efficiency_family()]}, NOTE),
+    "efficiency of one diameter": lambda: draw_efficiency({"efficiency": [efficiency_family(1)]}),
+    "payload": lambda: draw_payload_speed(conditions(), conditions(), NOTE),
+    "payload of five vines": lambda: draw_payload_speed(conditions(5), conditions(5)),
+}
 
 
-@pytest.mark.parametrize(("name", "figure"), every_figure(), ids=lambda value: value if isinstance(value, str) else "")
-def test_nothing_is_cut_off_and_no_legend_covers_the_axes(name: str, figure: Figure) -> None:
+@pytest.mark.parametrize("name", EVERY_FIGURE)
+def test_nothing_is_cut_off_and_no_legend_covers_the_axes(name: str) -> None:
+    figure = EVERY_FIGURE[name]()
     with look():
         figure.draw_without_rendering()
         drawn, edge = figure.get_tightbbox(), figure.bbox_inches.padded(0.02)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lsoda_vine import grown_position, vine_trial
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import run_stage
@@ -94,17 +95,18 @@ def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path: Path)
 
 
 def write_campaign(folder: Path) -> None:
-    """Three pressures of a vine of 12 mm that settles within 10 ms at the speed of F = B·ẋⁿ, to 0.1 mm."""
+    """Three pressures of a horizontal vine of 12 mm as scipy grows it, seen to 0.1 mm."""
     folder.mkdir()
     rows, draw = [], np.random.default_rng(5)
     for kPa in (20, 30, 40):
-        lead = 0.5 * ((kPa - 3) * 1e3 * np.pi * 0.012**2 / 4 / 1.83) ** (1 / 0.37)
-        time = np.arange(0, 0.02 + 0.25 / lead, 0.001)
-        since = np.clip(time - 0.02, 0, None)
-        position = lead * (since - 0.01 * (1 - np.exp(-since / 0.01))) + draw.normal(0, 1e-4, len(time))
+        trial = vine_trial("", kPa, 12.0, length_m=0.3, growth_angle_rad=np.pi / 2)
+        time = np.arange(0, 0.2, 0.001)
+        position = grown_position(trial, time - 0.02, 1.83, 0.37)
+        time, position = time[np.isfinite(position)], position[np.isfinite(position)]
+        position = position + draw.normal(0, 1e-4, len(time))
         lines = [f"{t:.4f},{y:.6f}" for t, y in zip(time, position, strict=True)]
         (folder / f"p{kPa}.csv").write_text("\n".join(["time_s,position_m", *lines, ""]))
-        rows.append(f"p{kPa},p{kPa}.csv,12,100,300,{kPa},3,0\n")
+        rows.append(f"p{kPa},p{kPa}.csv,12,100,300,{kPa},3,90\n")
     (folder / "trials.csv").write_text(SHEET + "".join(rows))
     (folder / "experiment.yaml").write_text("candidates: [tail_friction]\n")
 

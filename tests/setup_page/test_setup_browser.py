@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ from served import Served
 from vinetrack.core.tables import read_table
 from vinetrack.core.yaml_document import read_yaml
 from vinetrack.experiment.settings import read_experiment_settings
+from vinetrack.setup_page.page_server import start_server
 
 pytestmark = pytest.mark.skipif(find_chrome() is None, reason="needs a browser: apt install chromium")
 
@@ -53,12 +56,32 @@ class Person:
         return str(self.chrome.run(f"document.querySelector({element!r}).textContent"))
 
 
+@contextmanager
+def at_the_page(address: str, folder: Path) -> Iterator[Person]:
+    with Chrome(folder / "chrome") as chrome:
+        yield Person(chrome, address)
+        assert [text for text in chrome.complaints if "422" not in text] == []
+
+
 @pytest.fixture
 def person(clips: Path, tmp_path: Path) -> Iterator[Person]:
-    with Served(clips, "--port", "0", command="setup") as served, Chrome(tmp_path / "chrome") as chrome:
-        made = Person(chrome, served.address)
+    """At a page served by this process: it need not start once more for every test."""
+    server = start_server(clips, 0)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
+    thread.start()
+    try:
+        with at_the_page(server.address, tmp_path) as made:
+            yield made
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join(10)
+
+
+@pytest.fixture
+def person_who_typed_the_command(clips: Path, tmp_path: Path) -> Iterator[Person]:
+    with Served(clips, "--port", "0", command="setup") as served, at_the_page(served.address, tmp_path) as made:
         yield made
-        assert [text for text in chrome.complaints if "422" not in text] == []
 
 
 def _fill_in(person: Person, length_mm: str) -> None:
@@ -86,8 +109,9 @@ def test_a_ruler_wrong_by_two_is_said_once_and_not_before_the_recordings_are_loo
     assert "or correct" in person.text("#headline")  # saving takes back nothing of what was found
 
 
-def test_a_folder_of_clips_becomes_an_experiment(person: Person, clips: Path) -> None:
+def test_a_folder_of_clips_becomes_an_experiment(person_who_typed_the_command: Person, clips: Path) -> None:
     """The whole way: four shared values, two ruler marks, one length, a check, a track, and a save."""
+    person = person_who_typed_the_command
     _fill_in(person, "168.75")
     person.press("#check")
     person.chrome.wait("document.querySelector('#headline').textContent.includes('ready to run')", "the check", 60)

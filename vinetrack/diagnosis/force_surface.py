@@ -25,10 +25,12 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from vinetrack.core.records import Floats
+from vinetrack.diagnosis.cubic_splines import ACTING, acting_splines, splines
 from vinetrack.diagnosis.force_sensitivities import FittedMotion
 
 VARIABLES = {
@@ -80,23 +82,9 @@ MARGIN = 0.03
 force that is constant there has a bend at what was set. Chosen: three times what single trials err by."""
 
 
-def splines(at: Floats, knots: Floats) -> Floats:
-    """Cubic B-splines on these knots, constant beyond the ends, shape (n, n_knots + 2).
-
-    Parameters
-    ----------
-    at : array, shape (n,)
-    knots : array, shape (n_knots,)
-        From 0 to 1.
-
-    Returns
-    -------
-    array, shape (n, n_knots + 2)
-    """
-    from scipy.interpolate import BSpline
-
-    ends = np.concatenate([[0.0] * 3, knots, [1.0] * 3])
-    return np.asarray(BSpline.design_matrix(np.clip(at, 0.0, 1.0), ends, 3).toarray())
+@lru_cache
+def _even_knots(count: int) -> tuple[float, ...]:
+    return tuple(np.linspace(0.0, 1.0, count - 2).tolist())
 
 
 def curves(at: Floats, count: int) -> Floats:
@@ -113,7 +101,7 @@ def curves(at: Floats, count: int) -> Floats:
     -------
     array, shape (n, count)
     """
-    return splines(at, np.linspace(0.0, 1.0, count - 2))
+    return splines(at, np.array(_even_knots(count)))
 
 
 def standard_error(basis: Floats, covariance: Floats) -> Floats:
@@ -132,6 +120,7 @@ def standard_error(basis: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.sqrt(np.einsum("nk,kl,nl->n", basis, covariance, basis)))
 
 
+@lru_cache(maxsize=256)
 def covariance_root(count: int, length: float, *, from_nothing: bool = False) -> tuple[Floats, Floats]:
     """Directions and variances of a process of unit size and this length, at the places of so many splines.
 
@@ -156,7 +145,11 @@ def covariance_root(count: int, length: float, *, from_nothing: bool = False) ->
     if from_nothing:
         covariance = covariance - np.outer(covariance[:, 0], covariance[0])
     variances, directions = np.linalg.eigh(covariance)
-    return directions, np.maximum(variances, 0.0)
+    variances = np.maximum(variances, 0.0)
+    # The same few are asked for thousands of times: kept, and so not to be written to.
+    for array in (directions, variances):
+        array.flags.writeable = False
+    return directions, variances
 
 
 @dataclass(frozen=True)
@@ -226,11 +219,36 @@ class Domain:
         -------
         array, shape (n, size)
         """
-        product = np.ones((len(values[0]), 1))
+        which, weights = self._acting(values)
+        whole = np.zeros((len(which), self.size))
+        np.put_along_axis(whole, which, weights, axis=1)
+        return whole
+
+    def sum(self, values: Sequence[Floats], coefficients: Floats) -> Floats:
+        """The splines, each times its coefficient, summed at these values, shape (n,).
+
+        Parameters
+        ----------
+        values : sequence of arrays, shape (n,), SI
+            One a variable.
+        coefficients : array, shape (size,)
+
+        Returns
+        -------
+        array, shape (n,)
+        """
+        which, weights = self._acting(values)
+        return np.asarray(np.einsum("ns,ns->n", weights, coefficients[which]))
+
+    def _acting(self, values: Sequence[Floats]) -> tuple[np.ndarray, Floats]:
+        """Which products of splines act at these values, and how much of each, shape (n, 4^n_variables)."""
+        which, weights = np.zeros((len(values[0]), 1), dtype=int), np.ones((len(values[0]), 1))
         for part, count in zip(self.parts(values), self.counts, strict=True):
-            columns = curves(part, count)
-            product = (product[:, :, None] * columns[:, None, :]).reshape(len(part), -1)
-        return product
+            first, more = acting_splines(part, _even_knots(count))
+            here = first[:, None] + np.arange(ACTING)
+            which = (which[:, :, None] * count + here[:, None, :]).reshape(len(part), -1)
+            weights = (weights[:, :, None] * more[:, None, :]).reshape(len(part), -1)
+        return which, weights
 
     @property
     def course(self) -> int:
@@ -277,12 +295,15 @@ class Domain:
 
 def _product(roots: Sequence[tuple[Floats, Floats]], kept: float) -> Floats:
     """Directions of a product of processes, each by its root, shape (n_splines, n_directions that stay)."""
-    directions: Floats = np.ones((1, 1))
     variances: Floats = np.ones(1)
-    for more, strength in roots:
-        directions, variances = np.asarray(np.kron(directions, more)), np.asarray(np.kron(variances, strength))
-    stays = variances > kept * variances.max()
-    return np.asarray(directions[:, stays] * np.sqrt(variances[stays]))
+    for _, strength in roots:
+        variances = np.asarray(np.kron(variances, strength))
+    stays = np.flatnonzero(variances > kept * variances.max())
+    directions: Floats = np.ones((1, stays.size))
+    parts = np.unravel_index(stays, [strength.size for _, strength in roots])
+    for (more, _), part in zip(roots, parts, strict=True):
+        directions = (directions[:, None, :] * more[None, :, part]).reshape(-1, stays.size)
+    return np.asarray(directions * np.sqrt(variances[stays]))
 
 
 @dataclass(frozen=True)
@@ -369,7 +390,7 @@ class Surface:
         -------
         array, shape (n_times,), N
         """
-        return np.asarray(self.domain.basis(self.domain.of_motion(motion)) @ (self.mix @ amplitude))
+        return self.domain.sum(self.domain.of_motion(motion), self.mix @ amplitude)
 
     def along(self, motion: FittedMotion) -> Floats:
         """The force of amplitude 1 along a motion, N, shape (n_times, n_columns).

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.core.records import Floats
+from vinetrack.diagnosis.cubic_splines import splines
 from vinetrack.diagnosis.force_inversion import ForceFit, Gain
 from vinetrack.diagnosis.force_sensitivities import FittedMotion, force_sensitivities, motions_of
-from vinetrack.diagnosis.force_surface import splines
 from vinetrack.diagnosis.per_trial_estimates import lay
 from vinetrack.diagnosis.stretches import courses_of, replicate_scatter
 from vinetrack.dynamics.simulate import SimulationError

@@ -165,9 +165,26 @@ def render(fig: Figure, formats: Iterable[str] = ("png", "svg"), dpi: float = 15
         "pdf": {"metadata": {"CreationDate": None}},
     }
     files = {}
-    with look():
+    with look(), _laid_out(fig, dpi):
         for form in formats:
             file = io.BytesIO()
             fig.savefig(file, format=form, dpi=dpi, **details[form])
             files[form] = file.getvalue()
     return files
+
+
+@contextmanager
+def _laid_out(fig: Figure, dpi: float) -> Iterator[None]:
+    """Room for its labels found once: each format would find it again, and draw the figure once more to do so."""
+    engine, before = fig.get_layout_engine(), fig.dpi
+    if engine is None:
+        yield
+        return
+    fig.dpi = dpi
+    engine.execute(fig)
+    fig.dpi = before
+    fig.set_layout_engine(None)  # "none" would have the figure drawn twice still
+    try:
+        yield
+    finally:
+        fig.set_layout_engine(engine)
