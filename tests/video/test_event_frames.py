@@ -17,7 +17,7 @@ from vinetrack.video.event_frames import MARGIN_FRAMES, event_range, read_event
 from vinetrack.video.frames import inspect_recording, read_frames
 from vinetrack.video.track import track_recording
 
-BEFORE, AFTER = 500, 300
+BEFORE, AFTER = 300, 180
 """Frames of rest beyond those of the scene."""
 
 
