@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Generator
 from itertools import count
 from pathlib import Path
 
@@ -12,14 +13,15 @@ FOLDERS = count()
 """Numbers the folders of one process."""
 
 
-# Thousands of tests and all modules of the package are gathered, of which nothing is garbage: looking for some takes a
-# third of the time, and later each time anew.
-gc.disable()
-
-
-def pytest_collection_finish() -> None:
-    gc.freeze()
-    gc.enable()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Thousands of tests and all modules are gathered, none of it garbage: to look for some takes half of the time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
