@@ -18,7 +18,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import FitError, refit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.solving import is_poor_fit
+from vinetrack.inference.solving import POOR_FIT, is_poor_fit
 
 Report = Callable[[str], None]
 """Told in a few words what is being done."""
@@ -77,9 +77,17 @@ SURELY = 6.0
 errors half as large as they should be."""
 
 
+Asked = tuple[str, float, str, str]
+"""A hypothesis and its ln L, one of its effects, and the simpler form of that which was asked for."""
+
+
 @dataclass
 class CandidateFits:
-    """Hypotheses tried so far from one fit. Climbs and fits are made once each."""
+    """Hypotheses tried so far from one fit. Climbs and fits are made once each.
+
+    `begun` are the starts of fits (effects, values, whether with nothing taken over) and whether each was led on;
+    `simpler` the hypotheses that came of larger ones, `asked` what simpler forms were fitted.
+    """
 
     questions: MisfitTests
     report: Report
@@ -87,7 +95,10 @@ class CandidateFits:
     fitted: dict[str, LikelihoodRatio] = field(default_factory=dict)
     silent: set[str] = field(default_factory=set)
     same_end: set[str] = field(default_factory=set)
+    begun: dict[tuple[tuple[str, ...], str, bool], bool] = field(default_factory=dict)
     simplified: list[Fit] = field(default_factory=list)
+    simpler: set[str] = field(default_factory=set)
+    asked: set[Asked] = field(default_factory=set)
     tested: list[tuple[Fit, MisfitTests]] = field(default_factory=list)
     most_fitted: int = MOST_FITTED
 
@@ -207,8 +218,9 @@ class CandidateFits:
             if behind or any(known is fitted_one.fit for known in self.simplified):
                 continue
             self.simplified.append(fitted_one.fit)
-            for both, fit in simpler_forms(base_fit, fitted_one, self.questions.effects):
+            for both, fit in simpler_forms(base_fit, fitted_one, self.questions.effects, self.asked):
                 simpler = likelihood_ratio(base_fit, both, fit)
+                self.simpler.add(simpler.label)
                 known = self.fitted.get(simpler.label)
                 if known is None or simpler.delta_chi2 > max(known.delta_chi2, WORSE):
                     self.fitted[simpler.label] = simpler
@@ -293,6 +305,8 @@ class CandidateFits:
         self.report(f"fitting {name}")
         best = max((fitted_one.fit.log_likelihood for fitted_one in self.fitted.values()), default=-math.inf)
         led = math.isfinite(climb.deviance) or not self.explained
+        if not self._is_new(climb, led=led):
+            return
         hypothesis = self._from_climb(climb, best, led=led)
         promised = max(self.base - climb.deviance, 0.0) if math.isfinite(climb.deviance) else 0.0
         if hypothesis is not None and hypothesis.delta_chi2 < (PART_KEPT * promised or -_same_place(hypothesis.fit)):
@@ -317,6 +331,10 @@ class CandidateFits:
         starts = [(smallest, False), (climb, True)] if smallest.values != climb.values else [(climb, True)]
         ends = [hypothesis]
         for start, afresh in starts:
+            if not self._is_new(start, afresh=afresh, led=led):
+                if start is climb:
+                    self.same_end.add(name)
+                continue
             other = self._from_climb(start, best, afresh=afresh, led=led)
             if other is not None:
                 ends.append(other)
@@ -324,6 +342,14 @@ class CandidateFits:
                     self.same_end.add(name)
                     break
         return max(ends, key=lambda hypothesis: hypothesis.delta_chi2)
+
+    def _is_new(self, climb: SubsetFit, *, led: bool, afresh: bool = False) -> bool:
+        """Whether no fit was begun there yet; a model far off takes nothing over, see `refit`."""
+        key = climb.names, repr(sorted(climb.values.items())), afresh or self.questions.fit.chi2_per_dof > POOR_FIT
+        if key in self.begun and (self.begun[key] or not led):
+            return False
+        self.begun[key] = led
+        return True
 
     def _from_climb(self, climb: SubsetFit, best: float, *, led: bool, afresh: bool = False) -> LikelihoodRatio | None:
         fit = full_fit(self.questions.fit, climb, best, afresh=afresh, led=led)
@@ -338,7 +364,7 @@ def _same_place(*fits: Fit) -> float:
 
 
 def simpler_forms(
-    before: Fit, pair: LikelihoodRatio, effects: Sequence[Effect]
+    before: Fit, pair: LikelihoodRatio, effects: Sequence[Effect], asked: set[Asked]
 ) -> Iterator[tuple[tuple[Effect, ...], Fit]]:
     """Give a hypothesis with one of its effects in the simpler form that it contains, fitted from where it ended.
 
@@ -348,6 +374,8 @@ def simpler_forms(
     pair : the hypothesis, of one effect or several.
     effects : sequence of Effect
         All candidates.
+    asked : set
+        What was fitted already, and is not again; added to.
 
     Yields
     ------
@@ -358,6 +386,10 @@ def simpler_forms(
         for simpler in effects:
             if simpler.name not in held.replaces or simpler.name in pair.names or _needs_more(pair.fit, held, simpler):
                 continue
+            key = "+".join(sorted(pair.names)), pair.fit.log_likelihood, held.name, simpler.name
+            if key in asked:
+                continue
+            asked.add(key)
             both = tuple(simpler if effect is held else effect for effect in pair.effects)
             model = before.model
             for effect in both:

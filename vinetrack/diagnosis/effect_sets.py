@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vinetrack.diagnosis.candidate_fits import CandidateFits, Report, simpler_forms
+from vinetrack.diagnosis.candidate_fits import Asked, CandidateFits, Report, simpler_forms
 from vinetrack.diagnosis.held_fits import let_go, with_curves
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import SUSPECT_SIGMAS
@@ -51,6 +51,7 @@ class EffectSets:
         for single in singles:
             self._keep(single)
         self.grown: set[Names] = set()
+        self.asked: set[Asked] = set()
 
     def of_size(self, size: int) -> list[LikelihoodRatio]:
         """Known sets of so many effects, most likely first.
@@ -86,11 +87,12 @@ class EffectSets:
             self.grown.add(names)
             search = CandidateFits(self.search.after(first.fit), self.report, most_fitted=partners)
             search.singles()
+            self.asked |= {("+".join(sorted((*first.names, name))), *others) for name, *others in search.asked}
             ranked = sorted(search.fitted.values(), key=lambda further: -further.fit.log_likelihood)
-            for further in ranked[:partners]:
+            for further in (*ranked[:partners], *(other for other in ranked[partners:] if other.label in search.simpler)):
                 self._keep(likelihood_ratio(self.before, (*first.effects, *further.effects), further.fit))
         for hypothesis in self.of_size(size)[:partners]:
-            for effects, fit in simpler_forms(self.before, hypothesis, self.effects):
+            for effects, fit in simpler_forms(self.before, hypothesis, self.effects, self.asked):
                 self._keep(likelihood_ratio(self.before, effects, fit))
         return self.of_size(size)
 

@@ -312,10 +312,11 @@ def _tried(
     theta = np.clip(state.theta + step, problem.lower, problem.upper)
     try:
         there = replace(state, theta=theta, trial_effects=limited(predictor, state.trial_effects, own_change))
-        there, costs = follow_trial_effects(predictor, problem, there)
+        most = now - shared_penalty(problem, there)
+        there, costs = follow_trial_effects(predictor, problem, there, most)
     except SimulationError:
         return None
-    return there if float(np.sum(costs)) + shared_penalty(problem, there) < now else None
+    return there if float(np.sum(costs)) < most else None
 
 
 def cost(

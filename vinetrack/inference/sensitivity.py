@@ -57,7 +57,10 @@ class Predictor:
 
     `feels_pressure` and `feels_damping`, shape (n_trials,), tell which trials have a pressure that may deviate (it was
     set, or measured by a gauge with noise) and a B. `host` is a larger model whose compiled form serves this one.
+    `divisible` tells whether a predictor of some of its trials answers as this one.
     """
+
+    divisible = True
 
     def __init__(self, layout: ParameterMap, data: Sequence[FitTrial], host: Model | None = None) -> None:
         self.layout, self.data, self.host = layout, data, host
@@ -235,8 +238,26 @@ class Predictor:
         -------
         list of arrays, shape (n_points,)
         """
-        motions = self._simulated(self.layout.model, self.together(theta, trial_effects))
-        return self.by_trial(self._left(motions.rows(0, len(self.data))[:, OBSERVED], trial_effects))
+        return self.residuals_of_ways(theta, [trial_effects])[0]
+
+    def residuals_of_ways(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
+        """`residuals` for several sets of the trials' own numbers, simulated in one call.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        ways : sequence of arrays, shape (n_trials, 4)
+
+        Returns
+        -------
+        list of lists of arrays, shape (n_points,)
+            One list a way.
+        """
+        count = len(self.data)
+        motions = self._simulated(self.layout.model, Jobs.joined([self.together(theta, way) for way in ways]))
+        observed_m = [motions.rows(k * count, (k + 1) * count)[:, OBSERVED] for k in range(len(ways))]
+        return [self.by_trial(self._left(left_m, way)) for left_m, way in zip(observed_m, ways, strict=True)]
 
     def _left(self, observed_m: Floats, trial_effects: Floats) -> Floats:
         """Measured minus predicted positions of all trials, end to end."""

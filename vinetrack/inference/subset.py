@@ -12,17 +12,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, solve
-from vinetrack.inference.parameters import ParameterMap
-from vinetrack.inference.sensitivity import Predictor
-
-Indices = NDArray[np.int_]
+from vinetrack.inference.part_of_trials import Indices, numbers_felt, subset_frame, subset_predictor, subset_state
 
 
 def fit_subset(
@@ -58,10 +53,10 @@ def fit_subset(
         If no trial is kept, one is unknown, or the model cannot be followed.
     """
     rows = _rows(fit, keep)
-    places = _numbers_felt(fit.predictor.layout, rows)
-    predictor = _subset_predictor(fit.predictor, rows, places)
-    state = _subset_state(fit.state, rows, places)
-    problem = _subset_frame(fit.solution.problem, predictor.layout, rows, places)
+    places = numbers_felt(fit.predictor.layout, rows)
+    predictor = subset_predictor(fit.predictor, rows, places)
+    state = subset_state(fit.state, rows, places)
+    problem = subset_frame(fit.solution.problem, predictor.layout, rows, places)
     names = set(held)
     free = [not names & {number.name, number.key} for number in predictor.layout.free]
     problem = replace(problem, free=problem.free & np.array(free, dtype=bool))
@@ -99,71 +94,6 @@ def _rows(fit: Fit, keep: Iterable[str] | Sequence[bool] | NDArray[np.bool_]) ->
     if not rows.size:
         raise FitError("No trial is left to fit: keep one at least.")
     return rows
-
-
-def _numbers_felt(layout: ParameterMap, rows: Indices) -> Indices:
-    """Places of the free numbers that some of these trials feel, in their order."""
-    felt = np.unique(layout.index[rows])
-    return np.asarray(felt[felt >= 0])
-
-
-def _subset_layout(layout: ParameterMap, rows: Indices, places: Indices) -> ParameterMap:
-    """The layout of these trials with these numbers; names, scales and priors stay."""
-    moved = np.full(len(layout.free) + 1, -1)
-    moved[places] = np.arange(places.size)
-    index = moved[layout.index[rows]]
-    columns = np.flatnonzero((index >= 0).any(axis=0))
-    return replace(
-        layout,
-        free=tuple(layout.free[place] for place in places),
-        keys=tuple(layout.keys[column] for column in columns),
-        index=index[:, columns].astype(int),
-        base=layout.base[rows],
-        between=tuple(
-            replace(term, groups=tuple(term.groups[row] for row in rows), regressor=term.regressor[rows])
-            for term in layout.between
-        ),
-    )
-
-
-def _subset_predictor(predictor: Predictor, rows: Indices, places: Indices) -> Predictor:
-    """A predictor of these trials, with the steps that the other has found for its differences."""
-    layout = _subset_layout(predictor.layout, rows, places)
-    smaller = Predictor(layout, [predictor.data[row] for row in rows], predictor.host)
-    smaller.pressure_step = predictor.pressure_step[rows].copy()
-    smaller.steps = np.array([predictor.steps[predictor.layout.keys.index(key)] for key in layout.keys])
-    return smaller
-
-
-def _subset_state(state: FitState, rows: Indices, places: Indices) -> FitState:
-    """The state of these trials and numbers."""
-    return replace(
-        state, theta=state.theta[places], trial_effects=state.trial_effects[rows], variance=state.variance[rows]
-    )
-
-
-def _subset_frame(problem: MixedProblem, layout: ParameterMap, rows: Indices, places: Indices) -> MixedProblem:
-    """The frame of these trials and numbers; `layout` is theirs already."""
-
-    def numbers(values: Floats) -> Floats:
-        return values[places]
-
-    return replace(
-        problem,
-        index=layout.index,
-        feels=problem.feels[rows],
-        gauge_error=problem.gauge_error[rows],
-        own_centre=problem.own_centre[rows],
-        own_precision=problem.own_precision[rows],
-        prior_mean=numbers(problem.prior_mean),
-        prior_precision=numbers(problem.prior_precision),
-        lower=numbers(problem.lower),
-        upper=numbers(problem.upper),
-        free=problem.free[places],
-        points=problem.points[rows],
-        stretches=problem.stretches[rows],
-        random=None if problem.random is None else problem.random[places],
-    )
 
 
 def _told(fit: Fit, rows: Indices) -> FixedTerms:

@@ -8,6 +8,7 @@ every release.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from vinetrack.inference.mixed_effects import (
     trial_effect_prior,
     trial_effect_step,
 )
+from vinetrack.inference.part_of_trials import numbers_felt, subset_frame, subset_predictor, subset_state
 from vinetrack.inference.release_kernels import products_at_releases
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -46,7 +48,9 @@ LARGEST_RELEASE_STEP_FRAMES = 2.0
 """Chosen with the two above as a trust region; at half releases take more steps, at twice they overshoot."""
 
 
-def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: FitState) -> tuple[FitState, Floats]:
+def follow_trial_effects(
+    predictor: Predictor, problem: MixedProblem, state: FitState, most: float = math.inf
+) -> tuple[FitState, Floats]:
     """The trials' own numbers brought to their best for the others, and the costs there.
 
     They are known so well that a step of the shared numbers leaves the valley by its curvature alone. Every trial
@@ -57,6 +61,8 @@ def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: Fit
     predictor : of the trials to fit.
     problem : what does not change during the fit.
     state : where the fit stands.
+    most : float
+        Sum of the costs that is of use: where linear answers promise no less, no better place is looked for.
 
     Returns
     -------
@@ -65,23 +71,24 @@ def follow_trial_effects(predictor: Predictor, problem: MixedProblem, state: Fit
     """
     columns = predictor.linearise(state.theta, state.trial_effects, own_only=True)
     grams = predictor.products(columns)
-    ways = [
-        state,
-        *(
-            replace(
-                state,
-                trial_effects=limited(
-                    predictor, state.trial_effects, trial_effect_step(grams, problem, state, pinned=pinned)
-                ),
-            )
-            for pinned in (False, True)
-        ),
-    ]
+    steps = [trial_effect_step(grams, problem, state, pinned=pinned) for pinned in (False, True)]
     here = trial_costs(predictor, problem, state, residuals_in(columns))
-    costs = np.array([here, *(trial_costs(predictor, problem, way) for way in ways[1:])])
+    if float(np.sum(here - _promised(grams, problem, state, steps[0]))) >= most:
+        return state, here
+    moved = [limited(predictor, state.trial_effects, step) for step in steps]
+    ways = [state, *(replace(state, trial_effects=trial_effects) for trial_effects in moved)]
+    there = zip(ways[1:], predictor.residuals_of_ways(state.theta, moved), strict=True)
+    costs = np.array([here, *(trial_costs(predictor, problem, way, left_m) for way, left_m in there)])
     best = np.argmin(costs, axis=0)
     trial_effects = np.array([ways[way].trial_effects[i] for i, way in enumerate(best)])
     return replace(state, trial_effects=trial_effects), np.min(costs, axis=0)
+
+
+def _promised(grams: Floats, problem: MixedProblem, state: FitState, step: Floats) -> Floats:
+    """By how much a step of each trial's own numbers to their linear best lowers its cost, shape (n_trials,)."""
+    centre, precision = trial_effect_prior(problem, state)
+    told = at_correlation(grams[:, :, :OWN, -1:], state.rho)[:, :, 0] / state.variance[:, None]
+    return np.asarray(np.sum(step * (told - precision * (state.trial_effects - centre)), axis=1))
 
 
 def limited(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats:
@@ -241,15 +248,28 @@ class ReleaseSearch:
         return replace(state, trial_effects=trial_effects) if claimed else None
 
     def _borne_out(self, state: FitState, tried: FitState) -> FitState:
-        """Of both the own numbers that fit a trial better, once those tried have settled: lines are not straight."""
-        predictor, problem = self.predictor, self.problem
+        """Of both the own numbers that fit a trial better, once those tried have settled: lines are not straight.
+
+        Trials that are not tried elsewhere stay as they are.
+        """
+        rows = np.flatnonzero((tried.trial_effects != state.trial_effects).any(axis=1))
+        predictor, problem, before = self.predictor, self.problem, state
+        if rows.size < len(predictor.data) and predictor.divisible:
+            places = numbers_felt(predictor.layout, rows)
+            predictor = subset_predictor(predictor, rows, places)
+            problem = subset_frame(problem, predictor.layout, rows, places)
+            before, tried = (subset_state(each, rows, places) for each in (state, tried))
+        else:
+            rows = np.arange(len(predictor.data))
         for _ in range(IMPROVED):
             tried = follow_trial_effects(predictor, problem, tried)[0]
-        better = _levels(predictor, problem, tried) < _levels(predictor, problem, state) - WORTH_MOVING
-        if self.led_back.any():
-            lower = trial_costs(predictor, problem, tried) < trial_costs(predictor, problem, state)
-            better &= lower | ~self.led_back
-        return replace(state, trial_effects=np.where(better[:, None], tried.trial_effects, state.trial_effects))
+        better = _levels(predictor, problem, tried) < _levels(predictor, problem, before) - WORTH_MOVING
+        if self.led_back[rows].any():
+            lower = trial_costs(predictor, problem, tried) < trial_costs(predictor, problem, before)
+            better &= lower | ~self.led_back[rows]
+        trial_effects = state.trial_effects.copy()
+        trial_effects[rows[better]] = tried.trial_effects[better]
+        return replace(state, trial_effects=trial_effects)
 
 
 def _levels(predictor: Predictor, problem: MixedProblem, state: FitState) -> Floats:

@@ -45,6 +45,8 @@ one draw in thousands leaves the range where a linear answer holds."""
 class PartlyLinear(Predictor):
     """Simulates new trials; the old ones answer by the sensitivities that their fit ended with."""
 
+    divisible = False
+
     def __init__(self, layout: ParameterMap, old: Predictor, solution: Solution, new: Sequence[FitTrial]) -> None:
         super().__init__(layout, [*old.data, *new], old.host)
         self.old, self.at, self.known = len(old.data), solution.state, solution.columns
@@ -92,6 +94,22 @@ class PartlyLinear(Predictor):
         list of arrays, shape (n_points,)
         """
         return self.residuals_of_old(theta, trial_effects) + self.new.residuals(theta, trial_effects[self.old :])
+
+    def residuals_of_ways(self, theta: Floats, ways: Sequence[Floats]) -> list[list[Floats]]:
+        """`residuals` for several sets of the trials' own numbers.
+
+        Parameters
+        ----------
+        theta : array, shape (n_free,)
+            Free numbers, scaled.
+        ways : sequence of arrays, shape (n_trials, OWN)
+
+        Returns
+        -------
+        list of lists of arrays, shape (n_points,)
+            One list a way.
+        """
+        return [self.residuals(theta, way) for way in ways]
 
     def residuals_of_old(self, theta: Floats, trial_effects: Floats) -> list[Floats]:
         """Measured minus predicted position of the old trials, m, as far as they answer linearly.
