@@ -15,7 +15,7 @@ from vinetrack.diagnosis.initial_fit import candidates_of, initial_fit
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, likelihood_ratio
 from vinetrack.effects import find_effect
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.solving import missed_fraction
+from vinetrack.inference.optimiser import missed_fraction
 
 
 @pytest.fixture(scope="module")

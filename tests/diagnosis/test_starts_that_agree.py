@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -35,7 +35,8 @@ def search(
 ) -> tuple[CandidateFits, list[float]]:
     """A search whose fits end at these Δχ² in turn, and the sizes of the leak that they begin from."""
     tried = object.__new__(CandidateFits)
-    tried.same_end, begun = set(), []
+    tried.same_end, tried.begun, begun = set(), {}, []
+    tried.questions = cast("Any", SimpleNamespace(fit=SimpleNamespace(chi2_per_dof=100.0 if far_off else 1.0)))
 
     def from_climb(_: Any, climb: SubsetFit, *best: float, afresh: bool = False, **led: bool) -> Any:  # noqa: ARG001
         begun.append(math.inf if afresh else climb.values["leak.rate"])
@@ -82,3 +83,23 @@ def test_far_off_the_tracks_fits_that_miss_by_as_much_are_in_the_same_place(
     assert tried._begun_again(LEAK, ended(-6.5), 0.0, led=True).delta_chi2 == (second if same else 1000.0)
     assert len(begun) == (1 if same else 2)
     assert bool(tried.same_end) == same
+
+
+def test_of_a_model_far_off_which_takes_nothing_over_a_start_is_not_made_afresh_once_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tried, begun = search(monkeypatch, [40.0], far_off=True)
+    assert tried._is_new(LEAK, led=True)
+    assert tried._begun_again(LEAK, ended(-6.5), 0.0, led=True).delta_chi2 == 40.0
+    assert begun == [1e-3]
+    assert tried.same_end == {"leak"}
+
+
+def test_a_start_is_made_again_only_to_be_led_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, _ = search(monkeypatch, [])
+    assert tried._is_new(LEAK, led=False)
+    assert not tried._is_new(LEAK, led=False)
+    assert tried._is_new(LEAK, led=True)
+    assert not tried._is_new(LEAK, led=True)
+    assert not tried._is_new(LEAK, led=False)
+    assert tried._is_new(LEAK, led=True, afresh=True)

@@ -18,7 +18,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import FitError, refit
 from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.solving import POOR_FIT, is_poor_fit
+from vinetrack.inference.optimiser import POOR_FIT, is_poor_fit
 
 Report = Callable[[str], None]
 """Told in a few words what is being done."""

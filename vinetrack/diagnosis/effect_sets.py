@@ -18,6 +18,7 @@ from vinetrack.diagnosis.candidate_fits import Asked, CandidateFits, Report, sim
 from vinetrack.diagnosis.held_fits import let_go, with_curves
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import SUSPECT_SIGMAS
+from vinetrack.diagnosis.multi_start import SHARE_OF_BEST
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
 from vinetrack.inference.fit import refit
@@ -27,9 +28,9 @@ from vinetrack.inference.fit_result import Fit
 MOST_EFFECTS = 5
 """Effects of a set at most. Chosen: with six and more the sets outnumber what 48 trials can tell apart."""
 
-FIRSTS, PARTNERS, SHARE_OF_BEST = 3, 4, 0.3
-"""Pairs are built on the three best effects alone, if they explain this part of what the best explains, with the four
-that promise most beside each. Chosen for time."""
+FIRSTS, PARTNERS = 3, 4
+"""Pairs are built on the three best effects alone, if they explain SHARE_OF_BEST of what the best explains, with the
+four that promise most beside each. Chosen for time."""
 
 FURTHER_FIRSTS, FURTHER_PARTNERS = 2, 3
 """Larger sets are built on the two best and the best credible one of those a size smaller. Chosen for time."""
@@ -87,9 +88,11 @@ class EffectSets:
             self.grown.add(names)
             search = CandidateFits(self.search.after(first.fit), self.report, most_fitted=partners)
             search.singles()
-            self.asked |= {("+".join(sorted((*first.names, name))), *others) for name, *others in search.asked}
+            for name, likely, held, simpler in search.asked:
+                self.asked.add(("+".join(sorted((*first.names, name))), likely, held, simpler))
             ranked = sorted(search.fitted.values(), key=lambda further: -further.fit.log_likelihood)
-            for further in (*ranked[:partners], *(other for other in ranked[partners:] if other.label in search.simpler)):
+            kept = [other for k, other in enumerate(ranked) if k < partners or other.label in search.simpler]
+            for further in kept:
                 self._keep(likelihood_ratio(self.before, (*first.effects, *further.effects), further.fit))
         for hypothesis in self.of_size(size)[:partners]:
             for effects, fit in simpler_forms(self.before, hypothesis, self.effects, self.asked):

@@ -20,7 +20,7 @@ from vinetrack.diagnosis.trial_effect_tests import conditions_apart, noisier_in_
 from vinetrack.effects import Effect
 from vinetrack.inference.fit_problem import track_correlation
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.solving import is_poor_fit, missed_fraction
+from vinetrack.inference.optimiser import is_poor_fit, missed_fraction
 from vinetrack.inference.systematics import systematics_of
 
 FIRST_LEVEL, LATER_LEVEL = 3e-3, 1e-4

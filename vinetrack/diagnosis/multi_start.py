@@ -23,10 +23,10 @@ from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_problem import first_state, make_problem, track_correlation
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import deviance, marginal
-from vinetrack.inference.optimiser import FixedTerms, solve
+from vinetrack.inference.optimiser import CREEPING, FixedTerms, is_poor_fit, solve
 from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMap, make_layout
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
-from vinetrack.inference.solving import SLOW_NOISE, is_poor_fit
+from vinetrack.inference.solving import SLOW_NOISE
 from vinetrack.inference.starts import align, one_of_each_condition
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]
@@ -47,6 +47,11 @@ FIRST_OF_FIT, MORE_OF_FIT, FAR_BEHIND = 14, 40, 50.0
 """Iterations of a full fit at first and in all, and how far behind the best in −2 ln L it is given up. Chosen for
 time."""
 
+SHARE_OF_BEST = 0.3
+"""Part of what the best hypothesis explains that another must explain for larger sets to be built on it. So a fit far
+off that cannot come to it need not be led to its end. Chosen for time: effects that share a misfit evenly explain a
+third of it each; at half weaker ones are built on too (time), at twice two that explain half each may not be."""
+
 LOWER, LOWER_PER_POINT = 1.0, 0.02
 """By how much −2 ln L of a climb must end lower for its start to be worth a fit. Chosen: unsettled iterations differ
 by as much."""
@@ -64,11 +69,12 @@ for time."""
 
 @dataclass(frozen=True)
 class SubsetFit:
-    """Where a climb ended: −2 ln L on its trials and the values to begin a full fit from."""
+    """Where a climb ended: −2 ln L on its trials, the values to begin a full fit from, and whether it is far off."""
 
     effects: tuple[Effect, ...]
     deviance: float
     values: Mapping[str, Value]
+    far_off: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,12 +137,15 @@ class SubsetFitter:
                 trial_effects, _ = align(self.data, predictor, theta, trial_effects)
             problem = make_problem(predictor, trial_effects)
             state = first_state(self.data, theta, trial_effects)
-            solution = solve(predictor, problem, state, held, warm=True, most_iterations=iterations)
+            solution = solve(predictor, problem, state, held, warm=True, most_iterations=iterations, search=True)
             part = marginal(solution.grams, solution.problem, solution.state)
         except (SimulationError, FitError, np.linalg.LinAlgError):
             return None
         level = deviance(part, solution.problem, solution.state, CLIMB_SPREADS, restricted=False)
-        return SubsetFit(tuple(effects), level, _values(layout, solution.state.theta)) if math.isfinite(level) else None
+        if not math.isfinite(level):
+            return None
+        values, far_off = _values(layout, solution.state.theta), is_poor_fit(predictor, solution)
+        return SubsetFit(tuple(effects), level, values, far_off)
 
     def here(self) -> float:
         """−2 ln L where a few steps from the fit itself end; infinite where it cannot be followed."""
@@ -231,9 +240,13 @@ def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -
         return best
     for _ in range(3):
         again = slope.climb(best.effects, best.values, iterations=MORE_ITERATIONS)
-        if again is None or again.deviance > best.deviance - 0.1:
+        if again is None:
             break
-        best = again
+        least = CREEPING * points if again.far_off else 0.1
+        creeps = again.deviance > best.deviance - least
+        best = min((best, again), key=lambda subset_fit: subset_fit.deviance)
+        if creeps:
+            break
     return best
 
 
@@ -267,7 +280,14 @@ def full_fit(
         model = model + effect
     try:
         fit = refit(
-            before, model, start=climb.values, most_iterations=FIRST_OF_FIT, thorough=False, afresh=afresh, led=led
+            before,
+            model,
+            start=climb.values,
+            most_iterations=FIRST_OF_FIT,
+            thorough=False,
+            afresh=afresh,
+            led=led,
+            goal=before.log_likelihood + SHARE_OF_BEST * (best - before.log_likelihood),
         )
         if fit.noise_correlation > SLOW_NOISE and is_poor_fit(fit.predictor, fit.solution):
             # Noise that wanders as it likes makes anything likely.

@@ -25,11 +25,11 @@ from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_trials, prepared_pairs
-from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch
+from vinetrack.inference.optimiser import MOST_ITERATIONS, POOR_FIT, FixedTerms, Solution, Watch
 from vinetrack.inference.parameters import BetweenTerm, make_layout
 from vinetrack.inference.prediction_band import with_bands
 from vinetrack.inference.sensitivity import Predictor
-from vinetrack.inference.solving import POOR_FIT, solve_again, solve_from, solve_from_scratch, solve_onward
+from vinetrack.inference.solving import solve_again, solve_from, solve_from_scratch, solve_onward
 from vinetrack.inference.starts import align, initial_trial_effects
 
 if TYPE_CHECKING:
@@ -165,6 +165,7 @@ def refit(
     thorough: bool = True,
     afresh: bool = False,
     led: bool = True,
+    goal: float = -math.inf,
     watch: Watch | None = None,
 ) -> Fit:
     """Fit another model, or other numbers of the same, to the same data, from where a fit ended.
@@ -196,6 +197,8 @@ def refit(
     led : bool
         Whether a fit that ends far off is begun again, led by what it misses; where another model explains the tracks
         already, what stays far off is out of the running.
+    goal : float
+        ln L that a fit far off must be able to reach to be led on to the end.
     watch : callable, optional
         Called with each step of the iterations; what it raises ends the fit.
 
@@ -241,15 +244,29 @@ def refit(
     try:
         if afresh or before.chi2_per_dof > POOR_FIT:
             trial_effects, _ = align(data, predictor, theta, initial_trial_effects(data))
-            solution = solve_from(predictor, theta, trial_effects, held, most_iterations=most_iterations, watch=watch)
+            solution = solve_from(
+                predictor,
+                theta,
+                trial_effects,
+                held,
+                most_iterations=most_iterations,
+                watch=watch,
+                search=not thorough,
+            )
         else:
             solution = solve_onward(
-                predictor, before.solution, theta, held, most_iterations=most_iterations, watch=watch
+                predictor,
+                before.solution,
+                theta,
+                held,
+                most_iterations=most_iterations,
+                watch=watch,
+                search=not thorough,
             )
     except SimulationError as error:
         raise FitError(f"The model cannot be followed from this start: {error}") from error
     if led:
-        solution = solve_again(predictor, solution, held, watch, thorough=thorough)
+        solution = solve_again(predictor, solution, held, watch, thorough=thorough, goal=goal)
     fitted = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
     return replace(fitted, pairs=before.pairs)
 

@@ -51,6 +51,21 @@ releases, after which −2 ln L may rise for a step or two; at half such a rise 
 steps is saved instead of more than half. The likelihood of a vine that sticks has corners where more steps stand still,
 so a fit that is asked for by itself is not ended."""
 
+CREEPING = 2e-3
+"""Fall of −2 ln L per point in PROGRESS_STEPS steps below which a fit far off, one of a search, ends. Derived: −2 ln L
+of n points with noise s is n ln s², so what the model misses then changes by less than a thousandth: such a candidate
+is far off, and which of those far off is a little less so decides nothing. At half and at twice it ends a step or two
+later or earlier."""
+
+LOST = 3e-3
+"""Part of its growth by which the median trial is missed where a model is far off. Chosen: several times what a
+tracker errs by slowly along the way; it decides whether further starts are tried, so half costs time and twice may
+keep a local minimum."""
+
+POOR_FIT = 3.0
+"""χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried. Chosen: half would
+try further starts for most fits (time), twice would keep local minima."""
+
 SHORTER, MOST_DAMPED = (1.0, 0.4, 0.15), 11
 """Parts of a step that are tried, and how often it is damped further if none of them helps. Chosen: a line search in
 factors of about 0.4, then damping in factors of ten."""
@@ -98,6 +113,9 @@ class Step:
 Watch = Callable[[Step], None]
 """Told of every step; what it raises ends the fit."""
 
+Behind = Callable[[Floats, MixedProblem, FitState, float], float]
+"""How far −2 ln L of a fit is behind where it has to get, from its products, problem, state and sum of squares."""
+
 
 def solve(
     predictor: Predictor,
@@ -110,7 +128,8 @@ def solve(
     watch: Watch | None = None,
     columns: Sequence[Floats] | None = None,
     least_decrease: float = SETTLED_DECREASE,
-    least_progress: float = 0.0,
+    search: bool = False,
+    behind: Behind | None = None,
 ) -> Solution:
     """Iterate to the end. `warm` says that the state is near it already.
 
@@ -134,8 +153,11 @@ def solve(
         Sensitivities at the state, as `Predictor.linearise` has them, where they are known.
     least_decrease : float
         Decrease of −2 ln L, promised by a step, below which the fit has settled.
-    least_progress : float
-        Fall of −2 ln L per point in PROGRESS_STEPS steps below which the fit ends, unsettled; 0: it goes on.
+    search : bool
+        Whether the fit is one of many that are held against each other: far off, it ends where it only creeps.
+    behind : callable, optional
+        A fit ends, unsettled, where it would stay behind even if each step that is left brought all that this one
+        promises.
 
     Returns
     -------
@@ -182,9 +204,15 @@ def solve(
             converged = True
             break
         now = cost(predictor, problem, state, residuals_in(columns))
-        levels.append(now + float(np.sum(problem.points * np.log(state.variance))))
-        if least_progress and _creeps(levels, least_progress * float(np.sum(problem.points))):
-            break
+        levels.append(_level(problem, state, now, held))
+        if search and _creeps(levels, CREEPING * float(np.sum(problem.points))):
+            there = Solution(state, problem, grams, tuple(columns), can, converged, iteration)
+            if is_poor_fit(predictor, there):
+                break
+        if behind is not None and iteration > EARLY_ITERATIONS:
+            lacking = behind(grams, problem, state, now)
+            if lacking > (most_iterations - iteration + 1) * _most_gained(problem, now, promised):
+                break
         taken, damping = _take_step(predictor, problem, grams, state, step, own_change, damping, now)
         if taken is None:
             # No step helps: a corner of the cost, where a frame meets the end of growth. It is as low as it gets.
@@ -199,6 +227,22 @@ def solve(
             break
         state = taken
     return Solution(state, problem, grams, tuple(columns), can, converged, iteration)
+
+
+def _level(problem: MixedProblem, state: FitState, now: float, held: FixedTerms) -> float:
+    """−2 ln L but for a constant: where the noise is held, as if it were as large as what is missed."""
+    if held.noise is not None:
+        return float(np.sum(problem.points)) * math.log(max(now, 1e-300))
+    return now + float(np.sum(problem.points * np.log(state.variance)))
+
+
+def _most_gained(problem: MixedProblem, now: float, promised: float) -> float:
+    """Fall of −2 ln L if a step keeps its promise and the noise is taken for as much less.
+
+    Of n points with noise s it is n ln s²; a step near the end promises all but the noise itself.
+    """
+    left = 1 - promised / max(now, 1e-300)
+    return -float(np.sum(problem.points)) * math.log(left) if left > 0 else math.inf
 
 
 def _creeps(levels: Sequence[float], least: float) -> bool:
@@ -238,6 +282,43 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     left = at_correlation(solution.grams, rho)[:, -1, -1]
     taken = np.count_nonzero(solution.problem.free) / left.size + 2 + solution.problem.feels.any(axis=1)
     return float(np.sum(left / noise) / np.sum(np.maximum(solution.problem.points - taken, 1.0)))
+
+
+def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
+    """Whether a solution is far from the tracks: beyond their noise, and by a visible part of the growth.
+
+    A tracker whose frames agree to a hundredth of a millimetre may err by a few tenths along the way: far beyond their
+    noise, and no reason to begin elsewhere.
+
+    Parameters
+    ----------
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
+
+    Returns
+    -------
+    bool
+    """
+    return bool(chi2_per_dof(predictor, solution) > POOR_FIT and missed_fraction(predictor, solution) > LOST)
+
+
+def missed_fraction(predictor: Predictor, solution: Solution) -> float:
+    """Root mean square of what is missed, as part of the growth that was seen; of the median trial.
+
+    Parameters
+    ----------
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
+
+    Returns
+    -------
+    float
+    """
+    parts = [
+        math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
+        for columns, trial_data in zip(solution.columns, predictor.data, strict=True)
+    ]
+    return float(np.median(parts))
 
 
 def _update_variances(

@@ -18,19 +18,21 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_problem import first_state, make_problem, track_correlation
 from vinetrack.inference.marginal_likelihood import deviance, marginal
 from vinetrack.inference.mixed_effects import FitState, MixedProblem
-from vinetrack.inference.optimiser import MOST_ITERATIONS, FixedTerms, Solution, Watch, chi2_per_dof, cost, solve
+from vinetrack.inference.optimiser import (
+    MOST_ITERATIONS,
+    POOR_FIT,
+    Behind,
+    FixedTerms,
+    Solution,
+    Watch,
+    chi2_per_dof,
+    cost,
+    is_poor_fit,
+    solve,
+)
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.starts import align, candidates, initial_trial_effects
 from vinetrack.inference.trial_effects import trial_costs
-
-LOST = 3e-3
-"""Part of its growth by which the median trial is missed where a model is far off. Chosen: several times what a
-tracker errs by slowly along the way; it decides whether further starts are tried, so half costs time and twice may
-keep a local minimum."""
-
-POOR_FIT = 3.0
-"""χ² per degree of freedom above which a fit may be a local minimum, and other starts are tried. Chosen: half would
-try further starts for most fits (time), twice would keep local minima."""
 
 MOST_STARTS = 3
 """Starts and iterations at most. Chosen for time: fits that need more are taken up again by the search for a better
@@ -39,12 +41,6 @@ minimum."""
 ITERATIONS_ONCE_MORE, GUIDED_ITERATIONS = 25, 40
 """Steps of a solution that is taken up again, and of one that is guided. Chosen for time: most settle in half of them;
 at half some stay unsettled and say so, at twice hopeless starts cost twice the time."""
-
-CREEPING = 2e-3
-"""Fall of −2 ln L per point in a few steps below which a guided fit of a search ends. Derived: −2 ln L of n points with
-noise s is n ln s², so what the model misses then changes by less than a thousandth: such a candidate is far off, and
-which of those far off is a little less so decides nothing. At half and at twice it ends a step or two later or
-earlier."""
 
 BAD_START = 1.5
 """χ² per point from which a start misses by more than the noise of the fit it came from. Chosen: below it the
@@ -141,43 +137,6 @@ def _with_noise_anew(predictor: Predictor, best: Solution, held: FixedTerms, wat
     return best if other is None else min((best, other), key=_deviance)
 
 
-def is_poor_fit(predictor: Predictor, solution: Solution) -> bool:
-    """Whether a solution is far from the tracks: beyond their noise, and by a visible part of the growth.
-
-    A tracker whose frames agree to a hundredth of a millimetre may err by a few tenths along the way: far beyond their
-    noise, and no reason to begin elsewhere.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    bool
-    """
-    return bool(chi2_per_dof(predictor, solution) > POOR_FIT and missed_fraction(predictor, solution) > LOST)
-
-
-def missed_fraction(predictor: Predictor, solution: Solution) -> float:
-    """Root mean square of what is missed, as part of the growth that was seen; of the median trial.
-
-    Parameters
-    ----------
-    predictor : of the trials that were fitted.
-    solution : where the iterations ended.
-
-    Returns
-    -------
-    float
-    """
-    parts = [
-        math.sqrt(float(np.mean(columns[:, -1] ** 2))) / max(float(np.ptp(trial_data.lead_position_m)), 1e-9)
-        for columns, trial_data in zip(solution.columns, predictor.data, strict=True)
-    ]
-    return float(np.median(parts))
-
-
 def _sane(predictor: Predictor, free: Solution, guided: list[Solution]) -> Solution:
     """The best of solutions of which the first may have taken for slow noise what the others had to fit.
 
@@ -196,11 +155,13 @@ def _guided(
     watch: Watch | None,
     *,
     freed: bool = True,
+    goal: float = -math.inf,
 ) -> Solution | None:
     """A solution led by what is missed: the noise is as correlated as in the tracks until the numbers have settled.
 
     All trials share their B and pressure as good as exactly: what is missed by much more than noise would else bend
-    each trial's own until n means nothing. So it stays where the model turns out to be far off all the same.
+    each trial's own until n means nothing. So it stays where the model turns out to be far off all the same. `goal` is
+    the ln L that it must be able to reach.
     """
     if held.noise is not None:
         return None
@@ -215,7 +176,8 @@ def _guided(
             warm=True,
             most_iterations=GUIDED_ITERATIONS,
             watch=watch,
-            least_progress=0.0 if freed else CREEPING,
+            search=not freed,
+            behind=_behind(goal) if math.isfinite(goal) else None,
         )
         if not freed:
             return first
@@ -228,19 +190,52 @@ def _guided(
         return None
 
 
+def _behind(goal: float) -> Behind:
+    """How far the −2 ln L of a solution, its shared numbers at their best, lies above that of `goal`."""
+
+    def lacking(grams: Floats, problem: MixedProblem, state: FitState, _: float) -> float:
+        reached = deviance(marginal(grams, problem, state), problem, state, state.spread, restricted=False)
+        return reached + 2 * goal
+
+    return lacking
+
+
+def _above_hopeless(_: Floats, problem: MixedProblem, __: FitState, now: float) -> float:
+    """By how much −2 ln L has to fall until χ² per point is no longer HOPELESS; its noise is what is missed."""
+    points = float(np.sum(problem.points))
+    return points * math.log(max(now, 1e-300) / (HOPELESS * points))
+
+
 def _strictly(
-    predictor: Predictor, theta: Floats, trial_effects: Floats, held: FixedTerms, watch: Watch | None
+    predictor: Predictor,
+    theta: Floats,
+    trial_effects: Floats,
+    held: FixedTerms,
+    watch: Watch | None,
+    *,
+    search: bool = False,
 ) -> Solution | None:
     """A solution led by the noise of the tracks, which nothing missed can enlarge, from numbers that are nearly right.
 
-    Trials whose own pressure or B is far from what was set would else be taken for noise altogether.
+    Trials whose own pressure or B is far from what was set would else be taken for noise altogether. A `search` gives
+    up what its steps can no longer bring near.
     """
     if held.noise is not None:
         return None
     state, problem = first_state(predictor.data, theta, trial_effects), make_problem(predictor, trial_effects)
     noise = FixedTerms(spread=held.spread or STRICT_SPREADS, noise=(state.rho, state.variance))
     try:
-        first = solve(predictor, problem, state, noise, warm=True, most_iterations=STRICT_ITERATIONS, watch=watch)
+        first = solve(
+            predictor,
+            problem,
+            state,
+            noise,
+            warm=True,
+            most_iterations=STRICT_ITERATIONS,
+            watch=watch,
+            search=search,
+            behind=_above_hopeless if search else None,
+        )
         if chi2_per_dof(predictor, first) > HOPELESS:
             return None
         if not first.converged:
@@ -264,6 +259,7 @@ def solve_from(
     *,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
+    search: bool = False,
 ) -> Solution:
     """Solve with the noise and the spreads that are assumed before anything is fitted.
 
@@ -279,15 +275,16 @@ def solve_from(
         Steps at most.
     watch : callable, optional
         Called with each step.
+    search : bool
+        Whether the fit is one of many, see `solve`.
 
     Returns
     -------
     Solution
     """
     state = first_state(predictor.data, theta, trial_effects)
-    return solve(
-        predictor, make_problem(predictor, trial_effects), state, held, most_iterations=most_iterations, watch=watch
-    )
+    problem = make_problem(predictor, trial_effects)
+    return solve(predictor, problem, state, held, most_iterations=most_iterations, watch=watch, search=search)
 
 
 def solve_onward(
@@ -298,6 +295,7 @@ def solve_onward(
     *,
     most_iterations: int = MOST_ITERATIONS,
     watch: Watch | None = None,
+    search: bool = False,
 ) -> Solution:
     """Solve from other numbers with the trial effects, spreads and noise of a solution.
 
@@ -312,6 +310,8 @@ def solve_onward(
         Steps at most.
     watch : callable, optional
         Called with each step.
+    search : bool
+        Whether the fit is one of many, see `solve`.
 
     Returns
     -------
@@ -323,12 +323,20 @@ def solve_onward(
         If the model cannot be followed.
     """
     problem = replace(make_problem(predictor, before.state.trial_effects), own_centre=before.problem.own_centre)
-    state = led_back(predictor, problem, replace(before.state, theta=theta), held)
-    return solve(predictor, problem, state, held, warm=True, most_iterations=most_iterations, watch=watch)
+    state = led_back(predictor, problem, replace(before.state, theta=theta), held, search=search)
+    return solve(
+        predictor, problem, state, held, warm=True, most_iterations=most_iterations, watch=watch, search=search
+    )
 
 
 def solve_again(
-    predictor: Predictor, solution: Solution, held: FixedTerms, watch: Watch | None, *, thorough: bool
+    predictor: Predictor,
+    solution: Solution,
+    held: FixedTerms,
+    watch: Watch | None,
+    *,
+    thorough: bool,
+    goal: float = -math.inf,
 ) -> Solution:
     """A solution, or, where it is lost, the one led from its numbers by what is missed.
 
@@ -341,6 +349,8 @@ def solve_again(
         Called with each step.
     thorough : bool
         Whether a guided solution is freed again.
+    goal : float
+        ln L that a guided solution must be able to reach, or it ends early.
 
     Returns
     -------
@@ -353,10 +363,10 @@ def solve_again(
         trial_effects, _ = align(predictor.data, predictor, theta, initial_trial_effects(predictor.data))
     except SimulationError:
         return solution
-    strict = _strictly(predictor, theta, trial_effects, held, watch)
+    strict = _strictly(predictor, theta, trial_effects, held, watch, search=not thorough)
     if strict is not None and not is_poor_fit(predictor, strict):
         return strict
-    guided = _guided(predictor, theta, trial_effects, held, watch, freed=thorough)
+    guided = _guided(predictor, theta, trial_effects, held, watch, freed=thorough, goal=goal)
     return solution if guided is None else _sane(predictor, solution, [guided])
 
 
@@ -365,7 +375,9 @@ def _deviance(solution: Solution) -> float:
     return deviance(part, solution.problem, solution.state, solution.state.spread)
 
 
-def led_back(predictor: Predictor, problem: MixedProblem, state: FitState, held: FixedTerms) -> FitState:
+def led_back(
+    predictor: Predictor, problem: MixedProblem, state: FitState, held: FixedTerms, *, search: bool = False
+) -> FitState:
     """The state, or, where its numbers miss by far more than its noise, the one that this noise leads to.
 
     With the noise to be found as well, all that a bad start misses would pass for noise, and hold the fit there.
@@ -376,6 +388,8 @@ def led_back(predictor: Predictor, problem: MixedProblem, state: FitState, held:
     problem : what does not change during the fit.
     state : where a warm start would begin.
     held : spreads and noise that are not estimated.
+    search : bool
+        Whether the fit is one of many, see `solve`.
 
     Returns
     -------
@@ -389,4 +403,4 @@ def led_back(predictor: Predictor, problem: MixedProblem, state: FitState, held:
     best = np.argmin([trial_costs(predictor, problem, way) for way in ways], axis=0)
     state = replace(state, trial_effects=np.array([ways[way].trial_effects[i] for i, way in enumerate(best)]))
     noise = FixedTerms(held.spread or state.spread, (state.rho, state.variance))
-    return solve(predictor, problem, state, noise, warm=True, most_iterations=GUIDED_ITERATIONS).state
+    return solve(predictor, problem, state, noise, warm=True, most_iterations=GUIDED_ITERATIONS, search=search).state
