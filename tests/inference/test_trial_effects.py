@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState
 from vinetrack.inference.optimiser import FixedTerms, _creeps, solve
 from vinetrack.inference.release_kernels import products_at_releases
-from vinetrack.inference.trial_effects import residuals_in
+from vinetrack.inference.trial_effects import follow_trial_effects, residuals_in, trial_costs
 from vinetrack.inference.whitening import whiten
 
 
@@ -110,3 +111,62 @@ def test_a_release_that_steps_led_back_from_is_taken_again_only_where_less_is_mi
 )
 def test_a_fit_that_only_creeps_may_end(levels: list[float], *, ends: bool) -> None:
     assert _creeps(levels, 1.0) == ends
+
+
+def test_residuals_of_several_ways_are_those_of_each(only_in_motion: Fit) -> None:
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    there = solution.state.trial_effects.copy()
+    there[:, 0] -= 0.004
+    ways = [solution.state.trial_effects, there]
+    together = predictor.residuals_of_ways(solution.state.theta, ways)
+    for way, left_m in zip(ways, together, strict=True):
+        alone = predictor.residuals(solution.state.theta, way)
+        assert all(np.array_equal(a, b) for a, b in zip(left_m, alone, strict=True))
+
+
+def test_a_place_that_no_linear_answer_brings_low_enough_is_given_up_at_once(only_in_motion: Fit) -> None:
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    off = solution.state.trial_effects.copy()
+    off[:, 1] += 1e-3
+    state = replace(solution.state, trial_effects=off)
+    better, costs = follow_trial_effects(predictor, solution.problem, state)
+    best = float(np.sum(trial_costs(predictor, solution.problem, solution.state)))
+    assert float(np.sum(costs)) < best + 1.0
+    kept, _ = follow_trial_effects(predictor, solution.problem, state, 0.5 * best)
+    assert kept is state
+    followed, _ = follow_trial_effects(predictor, solution.problem, state, 1.1 * best)
+    assert np.array_equal(followed.trial_effects, better.trial_effects)
+
+
+def test_where_releases_are_looked_for_the_other_trials_stay(only_in_motion: Fit) -> None:
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    off = solution.state.trial_effects.copy()
+    off[[2, 5], 0] -= 0.02
+    off[:, 1] += 2e-4
+    state = replace(solution.state, trial_effects=off)
+    tried = off.copy()
+    tried[[2, 5]] = solution.state.trial_effects[[2, 5]]
+    search = trial_effects.ReleaseSearch(predictor, solution.problem)
+    kept = search._borne_out(state, replace(state, trial_effects=tried)).trial_effects
+    others = np.delete(np.arange(len(off)), [2, 5])
+    assert np.array_equal(kept[others], off[others])
+    assert np.allclose(kept[[2, 5], 0], solution.state.trial_effects[[2, 5], 0], atol=1e-4)
+
+
+def test_a_fit_ends_where_the_steps_that_are_left_cannot_bring_it_far_enough(only_in_motion: Fit) -> None:
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    theta = solution.state.theta.copy()
+    theta[0] += 0.3
+    start = replace(solution.state, theta=theta)
+    led = solve(predictor, solution.problem, start, FixedTerms(), warm=True, behind=lambda *_: 0.0)
+    assert led.converged
+    assert log_likelihood(led) == pytest.approx(log_likelihood(solution), abs=0.5)
+    given_up = solve(predictor, solution.problem, start, FixedTerms(), warm=True, behind=lambda *_: math.inf)
+    assert not given_up.converged
+    assert given_up.iterations < led.iterations
+
+
+def test_a_search_goes_on_to_the_end_where_the_model_is_near_the_tracks(only_in_motion: Fit) -> None:
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4, search=True)
+    assert found.converged
