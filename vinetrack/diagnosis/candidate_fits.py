@@ -248,7 +248,7 @@ class CandidateFits:
             places = self.questions.of(name)[:STARTS_EACH]
             sizes = self.questions.gains[1]
             starts = starts_of((self.questions.answers.shapes[i], float(sizes[i])) for i in places)
-            climb = best_subset_fit(self.slope, starts, self.goal)
+            climb = best_subset_fit(self.slope, starts, self.goal, search=True)
             if climb is None:
                 self.silent.add(name)
                 continue

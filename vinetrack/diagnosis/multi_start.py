@@ -102,7 +102,13 @@ class SubsetFitter:
         self.correlation = track_correlation(self.data)
 
     def climb(
-        self, effects: Sequence[Effect], start: Mapping[str, Value], *, iterations: int, align_first: bool = True
+        self,
+        effects: Sequence[Effect],
+        start: Mapping[str, Value],
+        *,
+        iterations: int,
+        align_first: bool = True,
+        search: bool = False,
     ) -> SubsetFit | None:
         """Fit with these effects added from `start`; None where the start cannot be followed.
 
@@ -116,6 +122,8 @@ class SubsetFitter:
             Steps at most.
         align_first : bool
             Whether releases are looked for first.
+        search : bool
+            Whether it is one of many, see `optimiser.solve`.
 
         Returns
         -------
@@ -137,7 +145,7 @@ class SubsetFitter:
                 trial_effects, _ = align(self.data, predictor, theta, trial_effects)
             problem = make_problem(predictor, trial_effects)
             state = first_state(self.data, theta, trial_effects)
-            solution = solve(predictor, problem, state, held, warm=True, most_iterations=iterations, search=True)
+            solution = solve(predictor, problem, state, held, warm=True, most_iterations=iterations, search=search)
             part = marginal(solution.grams, solution.problem, solution.state)
         except (SimulationError, FitError, np.linalg.LinAlgError):
             return None
@@ -209,7 +217,9 @@ def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
     return {f"{effect.name}.{known.name}": value for known, value in zip(effect.parameters, values, strict=True)}
 
 
-def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -> SubsetFit | None:
+def best_subset_fit(
+    slope: SubsetFitter, starts: Sequence[Start], goal: float, *, search: bool = False
+) -> SubsetFit | None:
     """The best of several starts of one hypothesis: each a few steps, the best of them on to the end.
 
     One that stays far above `goal`, the best deviance of any hypothesis so far, is not followed further.
@@ -222,6 +232,8 @@ def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -
         Of one hypothesis.
     goal : float
         Best deviance of any hypothesis so far.
+    search : bool
+        Whether the hypothesis is one of many: far off, it is not followed where it only creeps.
 
     Returns
     -------
@@ -239,10 +251,10 @@ def best_subset_fit(slope: SubsetFitter, starts: Sequence[Start], goal: float) -
     if best.deviance - goal > HOPELESS * points:
         return best
     for _ in range(3):
-        again = slope.climb(best.effects, best.values, iterations=MORE_ITERATIONS)
+        again = slope.climb(best.effects, best.values, iterations=MORE_ITERATIONS, search=search)
         if again is None:
             break
-        least = CREEPING * points if again.far_off else 0.1
+        least = CREEPING * points if search and again.far_off else 0.1
         creeps = again.deviance > best.deviance - least
         best = min((best, again), key=lambda subset_fit: subset_fit.deviance)
         if creeps:
@@ -278,6 +290,7 @@ def full_fit(
     model = before.model
     for effect in climb.effects:
         model = model + effect
+    goal = before.log_likelihood + SHARE_OF_BEST * (best - before.log_likelihood) if climb.effects else -math.inf
     try:
         fit = refit(
             before,
@@ -287,7 +300,7 @@ def full_fit(
             thorough=False,
             afresh=afresh,
             led=led,
-            goal=before.log_likelihood + SHARE_OF_BEST * (best - before.log_likelihood),
+            goal=goal,
         )
         if fit.noise_correlation > SLOW_NOISE and is_poor_fit(fit.predictor, fit.solution):
             # Noise that wanders as it likes makes anything likely.

@@ -156,8 +156,8 @@ def solve(
     search : bool
         Whether the fit is one of many that are held against each other: far off, it ends where it only creeps.
     behind : callable, optional
-        A fit ends, unsettled, where it would stay behind even if each step that is left brought all that this one
-        promises.
+        A fit ends, unsettled, where it would stay behind even if this step brought all that it promises, and each that
+        is left as much as the last ones.
 
     Returns
     -------
@@ -210,8 +210,8 @@ def solve(
             if is_poor_fit(predictor, there):
                 break
         if behind is not None and iteration > EARLY_ITERATIONS:
-            lacking = behind(grams, problem, state, now)
-            if lacking > (most_iterations - iteration + 1) * _most_gained(problem, now, promised):
+            further = (most_iterations - iteration) * _fall_per_step(levels)
+            if behind(grams, problem, state, now) > _most_gained(problem, now, promised) + further:
                 break
         taken, damping = _take_step(predictor, problem, grams, state, step, own_change, damping, now)
         if taken is None:
@@ -243,6 +243,15 @@ def _most_gained(problem: MixedProblem, now: float, promised: float) -> float:
     """
     left = 1 - promised / max(now, 1e-300)
     return -float(np.sum(problem.points)) * math.log(left) if left > 0 else math.inf
+
+
+def _fall_per_step(levels: Sequence[float]) -> float:
+    """By how much each of the last steps lowered the least −2 ln L; infinite where there are too few of them to tell.
+
+    Its levels may go up and down in turns, noise and numbers being found in turns.
+    """
+    before = levels[:-PROGRESS_STEPS]
+    return (min(before) - min(levels)) / PROGRESS_STEPS if before else math.inf
 
 
 def _creeps(levels: Sequence[float], least: float) -> bool:
@@ -374,7 +383,7 @@ def _take_step(
     the sum of squares with what the priors add where the state stands.
     """
     for part in SHORTER:
-        tried = _tried(predictor, problem, state, part * step, part * own_change, now)
+        tried = _tried(predictor, problem, state, part * step, part * own_change, now, at_once=True)
         if tried is not None:
             return tried, damping * 0.1 if damping > 1e-6 else 0.0
     for _ in range(MOST_DAMPED):
@@ -387,14 +396,25 @@ def _take_step(
 
 
 def _tried(
-    predictor: Predictor, problem: MixedProblem, state: FitState, step: Floats, own_change: Floats, now: float
+    predictor: Predictor,
+    problem: MixedProblem,
+    state: FitState,
+    step: Floats,
+    own_change: Floats,
+    now: float,
+    *,
+    at_once: bool = False,
 ) -> FitState | None:
-    """The state after a step, if that lowers the sum of squares."""
+    """The state after a step, if that lowers the sum of squares.
+
+    One is refused `at_once` where the trials' own numbers cannot make up for it by their linear answer, which is wrong
+    where a release meets a frame: so never the last that are tried.
+    """
     theta = np.clip(state.theta + step, problem.lower, problem.upper)
     try:
         there = replace(state, theta=theta, trial_effects=limited(predictor, state.trial_effects, own_change))
         most = now - shared_penalty(problem, there)
-        there, costs = follow_trial_effects(predictor, problem, there, most)
+        there, costs = follow_trial_effects(predictor, problem, there, most if at_once else math.inf)
     except SimulationError:
         return None
     return there if float(np.sum(costs)) < most else None
