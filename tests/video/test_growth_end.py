@@ -49,6 +49,12 @@ def test_a_payload_that_flies_on_ends_growth(flight):
     assert abs(growth_end(strip, path, (20, int(path[-1]))) - END_PX) <= 3
 
 
+def test_a_payload_that_flies_on_over_lengths_of_the_tube_ends_growth():
+    strip, path = grown(flies=True, columns=1000, n=120)
+    assert path[-1] > 900
+    assert abs(growth_end(strip, path, (20, int(path[-1]))) - END_PX) <= 3
+
+
 def test_film_that_stays_ends_where_the_path_does():
     strip, path = grown(flies=False)
     assert growth_end(strip, path, (20, END_PX)) == END_PX

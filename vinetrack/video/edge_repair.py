@@ -292,6 +292,10 @@ faint film counts as bare."""
 SHORTEST_PX = 10
 """Columns that must show background again: more than any blur or ringing of the coder. Chosen. By reasoning: at half
 ringing of the coder counts as bare; at twice payloads that leave late are followed."""
+FILM_PARTS = (0.7, 0.35, 0.175)
+"""Parts of the columns passed, from the first, of which at least one is film by more than half. Derived: it is so where
+film is from a tenth to all of what is passed; a payload flies on over several lengths of a short tube. By reasoning: of
+half of the least a door's columns make half, at twice a tube that is a fifth of the way counts as bare."""
 RUNS_AWAY = 1.35
 """A payload leaves at the speed of the tail, twice the edge's; less than this is growth. Chosen between 1 and 2. By
 reasoning: nearer 1 growth that speeds up counts as flight; nearer 2 a payload slowed by drag does not."""
@@ -318,7 +322,7 @@ def growth_end(strip: Strip, path: Floats, passed: tuple[int, int]) -> int:
         return passed[1]
     arrival = np.clip(np.searchsorted(path, columns + 0.5), 0, frames - 1)
     stays = _difference(strip, columns, arrival)
-    usual = float(np.median(stays[: int(0.7 * len(stays))]))
+    usual = max(float(np.median(stays[: int(part * len(stays))])) for part in FILM_PARTS)
     back = stays < RETURNED * usual
     i = _first_bare(back, strip.values.shape[1])
     if i < 3 * SHORTEST_PX or back[i - 2 * SHORTEST_PX : i].mean() > 0.3:
