@@ -5,22 +5,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
-from vinetrack.video.axis import Axis, find_axis
+from vinetrack.video.axis import Axis
 from vinetrack.video.calibration import CalibrationError, PlaneCalibration, calibrate
 from vinetrack.video.capture_clock import capture_rate
-from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis, axis_through
-from vinetrack.video.curved_strip import curve_found
 from vinetrack.video.event_frames import read_event
-from vinetrack.video.frames import Frames, Recording, RecordingError, inspect_recording
-from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.sound_frames import sound_stretch
+from vinetrack.video.frames import Recording, RecordingError, inspect_recording
 from vinetrack.video.track import Tracking, track_frames
 
 if TYPE_CHECKING:
@@ -78,24 +73,16 @@ def measure_recording(trial: Trial, settings: ExperimentSettings, folder: Path) 
             f"{trial.name}: there is no scale; give `calibration` in experiment.yaml, or mm_per_px in the sheet"
         )
     frames = read_event(recording, trial.frames_used)
-    m_per_px, rel_sigma, position_m = trial.m_per_px, math.nan, None
-    axis = given_axis(trial, settings, m_per_px if calibration is None else calibration.m_per_px)
-    is_given = axis is not None
-    if calibration is not None:
-        axis = axis or _found_axis(_sound_luma(frames), trial)
-        along = calibration.along_path(axis)
-        m_per_px, rel_sigma, position_m = along.m_per_px, along.scale_rel_sigma, along.position_m
+    m_per_px = trial.m_per_px if calibration is None else calibration.m_per_px
+    axis = given_axis(trial, settings, m_per_px)
     along_path = None if calibration is None else calibration.along_path
-    tracking = track_frames(
-        frames, trial, capture_fps, axis, m_per_px=m_per_px, position_m=position_m, along_path=along_path
-    )
-    if calibration is not None and isinstance(tracking.axis, CurvedAxis):
-        off_px = tracking.tube_width_sigma_px / 2 if math.isfinite(tracking.tube_width_sigma_px) else 0.0
-        along = calibration.along_path(tracking.axis, off_px)
+    tracking = track_frames(frames, trial, capture_fps, axis, m_per_px=m_per_px, along_path=along_path)
+    rel_sigma = math.nan
+    if calibration is not None:
+        bent = isinstance(tracking.axis, CurvedAxis) and math.isfinite(tracking.tube_width_sigma_px)
+        along = calibration.along_path(tracking.axis, tracking.tube_width_sigma_px / 2 if bent else 0.0)
         m_per_px, rel_sigma = along.m_per_px, along.scale_rel_sigma
     notes = [*tracking.track.notes]
-    if calibration is not None and not is_given and isinstance(tracking.axis, CurvedAxis):
-        notes.append(f"{recording.path.name}: {curve_found(tracking.axis)}")
     # What is to be said of a scale that was merely given belongs to the experiment, not to each of its trials.
     if calibration is not None and math.isfinite(calibration.reprojection_px):
         notes += calibration.notes
@@ -151,16 +138,3 @@ def given_axis(trial: Trial, settings: ExperimentSettings, m_per_px: float) -> A
     shared = settings.axis
     width_px = shared.width_mm / 1e3 / m_per_px if shared.width_mm is not None else math.nan
     return axis_through((shared.from_px, *(shared.via_px or ()), shared.to_px), width_px)
-
-
-def _sound_luma(frames: Frames) -> NDArray[Any]:
-    """Pictures that are not damaged, of the stretch that will be tracked."""
-    sound = sound_stretch(frames, np.ones(len(frames), dtype=bool))
-    return frames.luma if sound.all() else frames.luma[sound]
-
-
-def _found_axis(luma: NDArray[Any], trial: Trial) -> Axis:
-    try:
-        return find_growth_axis(SmallPictures(luma), luma) if trial.travel_ratio == 2 else find_axis(luma)
-    except RecordingError as error:
-        raise RecordingError(f"{trial.video.name if trial.video else trial.name}: {error}") from error

@@ -188,7 +188,8 @@ def track_frames(
     frames : decoded, with their capture periods.
     trial, axis, m_per_px, position_m : as in `track_recording`.
     capture_fps : frames a second.
-    along_path : the calibration's scale along a curve, which takes the place of `position_m` where the axis is one.
+    along_path : a calibration's scale along an axis, which takes the place of `m_per_px` and `position_m`; until there
+        is an axis, `m_per_px` is the calibration's mean.
 
     Returns
     -------
@@ -204,8 +205,7 @@ def track_frames(
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
     rejected = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
-    first, last = trial.frames_used or (0, frames.n_recorded - 1)
-    number = frames.first + np.arange(len(frames))
+    number, (first, last) = frames.first + np.arange(len(frames)), trial.frames_used or (0, frames.n_recorded - 1)
     used = (number >= first) & (number <= last)
     if used.sum() < FEWEST_FRAMES:
         raise RecordingError(f"{name}: frames_used leaves {int(used.sum())} of {len(frames)} frames; widen it")
@@ -223,7 +223,7 @@ def track_frames(
     largest = LARGEST_BODY_FACTOR if trial.travel_ratio == 1 else LARGEST_FACTOR
     known = np.isfinite(edge_fit.edge_px)
     noise = calibrated_sigma(edge_fit.edge_px, edge_fit.sigma_px, moving & known, largest=largest)
-    # Roughness and the bands' disagreement tell of the same noise; the larger one also of what the other is blind to.
+    # Roughness and the bands' disagreement tell of the same noise; the larger also of what the other is blind to.
     sigma = np.maximum(np.hypot(noise, FLOOR_PX), np.hypot(edge_fit.apart_sigma_px, FLOOR_PX))
     sigma = np.hypot(sigma, STEADIED_PX if strip.steadied else 0.0)
     end_px = strip.axis.length_px - edge_fit.reach_px
@@ -244,6 +244,9 @@ def track_frames(
             )
         raise RecordingError(f"{name}: nothing moves along the axis; check the recording, or give the axis")
     scale = trial.m_per_px if m_per_px is None else m_per_px
+    if along_path is not None:
+        along = along_path(strip.axis)
+        scale, position_m = along.m_per_px, along.position_m
     notes = [*frames.notes, *verdict.notes]
     if edge_fit.end is not None:
         notes.append(f"{name}: {end_of_body(edge_fit.end, number[kept])}")
@@ -269,9 +272,7 @@ def track_frames(
         notes.append(f"{name}: {int(rejected.sum())} frames are unlike all others and rejected, first frame {first}")
     track = _assemble(frames, kept, edge_fit, (noise, slow), verdict, capture_fps, exposure_s, notes)
     track = corrected_by_hand(track, trial.corrections)
-    if isinstance(strip.axis, CurvedAxis) and along_path is not None:
-        position_m = along_path(strip.axis).position_m
-    track = in_metres(track, strip.axis, trial.m_per_px if m_per_px is None else m_per_px, position_m)
+    track = in_metres(track, strip.axis, scale, position_m)
     chosen = [verdict.first_moving, (verdict.first_moving + verdict.last_moving) // 2, verdict.last_moving]
     pictures = tuple((int(number[kept[i]]), luma[i].copy()) for i in chosen)
     shake_px = np.zeros(frames.n_recorded)
@@ -302,7 +303,7 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     small = SmallPictures(luma)
     if axis is None and trial.travel_ratio == 2:
         axis = find_growth_axis(small, luma)
-    axis = axis if axis is not None else find_axis(small)
+    axis = axis if axis is not None else find_axis(small, grows=False)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
     if isinstance(axis, CurvedAxis):
         return axis, True
