@@ -17,7 +17,7 @@ from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import LEAST_AXIS_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import fan_gains, passing_times
-from vinetrack.video.small_pictures import SmallPictures, changed_pixels
+from vinetrack.video.small_pictures import Pixels, SmallPictures, changed_pixels, order_tolerance
 
 ORDERLY = 0.45
 """Share of all change that one front explains where nothing else of weight goes on. Chosen: a swinging door takes a
@@ -98,12 +98,13 @@ class Axis:
         return Axis((a[0] + dx_px, a[1] + dy_px), (b[0] + dx_px, b[1] + dy_px), self.width_px)
 
 
-def find_axis(luma: NDArray[Any] | SmallPictures) -> Axis:
+def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
     """Find the axis of growth from the motion itself.
 
     Parameters
     ----------
     luma : brightness, shape (n_frames, height, width), or the small pictures made from it.
+    grows : whether it is a tube that stays where it has grown, and not a body that passes.
 
     Returns
     -------
@@ -118,11 +119,15 @@ def find_axis(luma: NDArray[Any] | SmallPictures) -> Axis:
     small = seen.frames
     if len(small) < 3:
         raise RecordingError("fewer than 3 frames: no motion can be seen")
-    best = _line_of(small, seen.changed)
+    best = _line_of(small, seen.grown) if grows else _NO_LINE
+    if best.collected <= 0:
+        best = _line_of(small, seen.changed, insist=True)
     if best.order < ORDERLY:
         # It meets a wall, bends, sweeps: the longest beginning that is orderly tells the axis.
+        stays = grows and seen.grown is not seen.changed
         for part in PREFIXES:
-            shorter = _line_of(small, changed_pixels(small, max(3, int(part * len(small)))), patient=True)
+            count = max(3, int(part * len(small)))
+            shorter = _line_of(small, _until(part, seen.grown) if stays else changed_pixels(small, count), patient=True)
             worth = shorter.order * shorter.collected
             if shorter.order >= ORDERLY and (best.order < ORDERLY or worth > best.order * best.collected):
                 best = shorter
@@ -225,14 +230,21 @@ def _shrunk(axis: Axis, factor: float) -> Axis:
     return Axis(ends[0], ends[1], axis.width_px / factor)
 
 
-def _line_of(
-    small: NDArray[np.float32], changed: tuple[Floats, Floats, Floats, Floats, int], patient: bool = False
-) -> _Line:
-    """The best line through pixels that change."""
+def _until(part: float, pixels: Pixels) -> Pixels:
+    """Those of some pixels that change in a part of the time, from its beginning."""
+    x, y, time, weight, n_times = pixels
+    early = time < part * n_times
+    return x[early], y[early], time[early], weight[early], n_times
+
+
+_NO_LINE = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
+
+
+def _line_of(small: NDArray[np.float32], changed: Pixels, patient: bool = False, insist: bool = False) -> _Line:
+    """The best line through pixels that change; where none is, an empty one, or an error where one is insisted on."""
     x, y, time, weight, n_times = changed
-    nothing = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
     if len(x) < 12:
-        return nothing
+        return _NO_LINE
     diagonal = float(np.hypot(*small.shape[1:]))
     band = max(3.0, 0.03 * diagonal)
     # Of a vine that bends and sweeps what comes first counts most; else a door, which swings first, would count too.
@@ -243,9 +255,9 @@ def _line_of(
             angle, middle, half, ends, collected = _refine(x, y, time, weight, n_times, angle, middle, band)
             band = float(np.clip(1.2 * half, 2.0, 0.2 * diagonal))
     except RecordingError:
-        if patient:
-            return nothing
-        raise
+        if insist:
+            raise
+        return _NO_LINE
     return _Line(angle, middle, half, ends, collected, collected / float(weight.sum()))
 
 
@@ -331,7 +343,7 @@ def agreeing(
     table = np.zeros((n_times, int(place.max()) + 1))
     np.add.at(table, (time[near].astype(int), place[near]), weight[near])
     passed = passing_times(table)
-    agree = near & (np.abs(time - passed[place]) <= max(2.0, 0.03 * n_times))
+    agree = near & (np.abs(time - passed[place]) <= order_tolerance(n_times))
     return agree, along, across
 
 

@@ -21,13 +21,13 @@ from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 
 BETTER = 1.35
-"""A curve that explains so many times the change that the straight line explains is taken. Measured: 1.6 to 1.7 along a
-quarter of a circle and a sharp bend, at most 1.14 along 38 straight vines with doors and payloads. At 1.1 such bend the
-axis of straight vines, at 2 a bend half-way is missed."""
+"""A curve that explains so many times the change that the straight line explains is taken. Measured: 1.6 to 1.8 along a
+quarter of a circle and a sharp bend, at most 1.02 along 42 straight vines with doors and payloads. By reasoning: at 1.1
+such as have longer doors are bent, at 2 a bend half-way is missed."""
 WIDER = 1.25
-"""So is one that explains no less, where the straight line needs a band so many times wider. Measured: 1.35 along a
-bend of 25 degrees, 1.8 along an S, at most 1.13 along those straight vines. At 1.1 they would be taken for bent, at 1.5
-a bend of 25 degrees for straight."""
+"""So is one that explains no less, where the straight line needs a band so many times wider. Measured: 1.34 along a
+bend of 25 degrees, 1.8 along an S, at most 1.24 along those straight vines but for a contrast that reverses (1.31, and
+the curve explains less). At 1.1 some would be taken for bent, at 1.5 a bend of 25 degrees for straight."""
 LEAST_LENGTH = 3.0
 """Length of the band in its widths from which it has a path. Chosen: a shorter one is a blot; half or twice changes
 only what is hardly grown."""
@@ -77,7 +77,7 @@ def find_growth_axis(small: SmallPictures, luma: NDArray[Any]) -> Axis:
 
 
 def share_in_order(seen: SmallPictures, axis: Axis) -> float:
-    """Share of all change in the picture that is a front passing once along an axis, straight or curved.
+    """Share of all growth in the picture that is a front passing once along an axis, straight or curved.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def share_in_order(seen: SmallPictures, axis: Axis) -> float:
     -------
     0 to 1.
     """
-    x, y, time, weight, n_times = seen.changed
+    x, y, time, weight, n_times = seen.grown
     if len(x) < 12:
         return 0.0
     places = (np.column_stack([x, y]) + 0.5) * seen.factor - 0.5
@@ -152,7 +152,7 @@ def _band(small: SmallPictures) -> Band | None:
     """The largest connected region that changed; None where hardly anything does."""
     from scipy.ndimage import distance_transform_edt
 
-    x, y, time, _, _ = small.changed
+    x, y, time, _, _ = small.grown
     if len(x) < 12:
         return None
     when = np.full(small.frames.shape[1:], np.nan)
