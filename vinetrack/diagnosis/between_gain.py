@@ -20,7 +20,7 @@ from vinetrack.inference.marginal_likelihood import (
     marginal,
     normal_equations,
 )
-from vinetrack.inference.mixed_effects import FitState, MixedProblem, key_places
+from vinetrack.inference.mixed_effects import FitState, MixedProblem
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import BetweenTerm, ParameterMap, make_layout
 from vinetrack.inference.position_errors import with_shapes
@@ -180,7 +180,7 @@ def gains_from_each(
     information, slope, square, log_det = normal_equations(part, problem, state, spread)
     constant = square + log_det + part.log_constant
     blocks, _ = left_to_keys(part, problem, spread)
-    places, shapes = key_places(problem), base.problem.index.shape[1] - len(fit.predictor.layout.keys)
+    places, shapes = problem.places, base.problem.index.shape[1] - len(fit.predictor.layout.keys)
     last = places.shape[1] - shapes
     of_term = np.zeros(places.shape[1], dtype=bool)
     of_term[last - len(difference.terms) : last] = True

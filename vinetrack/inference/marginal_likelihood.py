@@ -18,7 +18,6 @@ from vinetrack.inference.mixed_effects import (
     FitState,
     MixedProblem,
     bounded_solve,
-    key_places,
     put_back,
     solve_each,
     spreads,
@@ -133,9 +132,9 @@ def normal_equations(
     """
     root = spreads(problem, spread) * problem.feels
     size = problem.prior_mean.size
-    information, slope, square, log_det = sums_without_deviations(part.blocks, key_places(problem), root, size)
+    information, slope, square, log_det = sums_without_deviations(part.blocks, problem.places, root, size)
     away = state.theta - problem.prior_mean
-    information[np.diag_indices(size)] += problem.prior_precision
+    information.flat[:: size + 1] += problem.prior_precision
     slope -= problem.prior_precision * away
     return information, slope, square + float(np.sum(problem.prior_precision * away**2)), log_det
 
@@ -245,12 +244,13 @@ def estimate_spreads(
     which = [k for k in range(2) if estimable[k]]
     if not which:
         return state.spread
+    least, largest = math.log(LEAST_SPREAD), [math.log(most) for most in LARGEST_SPREAD]
 
     def at(logs: Floats) -> tuple[float, float]:
         spread = list(state.spread)
-        for k, value in zip(which, logs, strict=True):
+        for k, value in zip(which, logs.tolist(), strict=True):
             # Clipped before the exponential: on a flat likelihood the simplex walks as far as it likes.
-            spread[k] = math.exp(float(np.clip(value, math.log(LEAST_SPREAD), math.log(LARGEST_SPREAD[k]))))
+            spread[k] = math.exp(min(max(value, least), largest[k]))
         return spread[0], spread[1]
 
     def cost(logs: Floats) -> float:

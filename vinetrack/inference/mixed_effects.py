@@ -37,6 +37,7 @@ About the current θ and u_i the residuals are linear in both, r_i = X_i Δθ + 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,11 @@ class MixedProblem:
     stretches: Floats
     random: NDArray[np.bool_] | None = None
 
+    @cached_property
+    def places(self) -> NDArray[np.int_]:
+        """`index` with the place behind all numbers for keys that a trial does not feel."""
+        return np.where(self.index < 0, self.prior_mean.size, self.index)
+
 
 def trial_effect_prior(problem: MixedProblem, state: FitState) -> tuple[Floats, Floats]:
     """Centre and precision of each trial's own numbers, shape (n_trials, 4) each.
@@ -128,8 +134,9 @@ def spreads(problem: MixedProblem, spread: tuple[float, float]) -> Floats:
     -------
     array, shape (n_trials, 2)
     """
-    each = np.tile(spread, (problem.gauge_error.size, 1))
-    each[:, 0] = np.where(problem.gauge_error > 0, problem.gauge_error, each[:, 0])
+    each = np.empty((problem.gauge_error.size, 2))
+    each[:, 0] = np.where(problem.gauge_error > 0, problem.gauge_error, spread[0])
+    each[:, 1] = spread[1]
     return each
 
 
@@ -177,7 +184,7 @@ def cross_products(blocks: Floats, problem: MixedProblem) -> Floats:
     array, shape (n_free, n_free)
     """
     p = problem.prior_mean.size
-    among = key_places(problem)
+    among = problem.places
     flat = among[:, :, None] * (p + 1) + among[:, None, :]
     total = np.bincount(flat.ravel(), weights=blocks.ravel(), minlength=(p + 1) ** 2)
     return np.asarray(total.reshape(p + 1, p + 1)[:p, :p])
@@ -196,21 +203,7 @@ def cross_products_vector(blocks: Floats, problem: MixedProblem) -> Floats:
     array, shape (n_free,)
     """
     p = problem.prior_mean.size
-    return np.asarray(np.bincount(key_places(problem).ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
-
-
-def key_places(problem: MixedProblem) -> NDArray[np.int_]:
-    """`index` with the place behind all numbers for keys that a trial does not feel.
-
-    Parameters
-    ----------
-    problem : what does not change during the fit.
-
-    Returns
-    -------
-    array of int, shape (n_trials, n_keys)
-    """
-    return np.where(problem.index < 0, problem.prior_mean.size, problem.index)
+    return np.asarray(np.bincount(problem.places.ravel(), weights=blocks.ravel(), minlength=p + 1)[:p])
 
 
 def newton_step(grams: Floats, problem: MixedProblem, state: FitState, damping: float) -> tuple[Floats, Floats, float]:
