@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.diagnosis.effect_sensitivities import EffectSensitivities
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState, MixedProblem, trial_effects_eliminated
@@ -113,7 +114,11 @@ def fit_columns(fit: Fit) -> list[Floats]:
         As `Predictor.linearise`, past the end of growth.
     """
     state = fit.solution.state
-    return fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
+    try:
+        return fit.predictor.linearise(state.theta, state.trial_effects, past_end=True)
+    except SimulationError:
+        # A vine that sticks may not be followed a step of another size away: then those that the fit itself ended with.
+        return list(fit.solution.columns)
 
 
 def products_of(
