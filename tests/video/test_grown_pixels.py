@@ -75,6 +75,17 @@ def test_neither_where_the_door_stood_nor_where_it_passed_is_growth() -> None:
     assert near["film", "grown"] >= 0.9 * near["film", "changed"] > 10
 
 
+def test_the_middle_of_a_dark_tube_far_from_any_ground_counts_as_growth() -> None:
+    rng = np.random.default_rng(46)
+    frames = rng.normal(150, 2, (40, 200, 240))
+    for t in range(40):
+        frames[t, 35:165, : 20 + 5 * t] -= 110
+    small = SmallPictures(np.clip(frames, 0, 255).astype(np.uint8))
+    _, y, *_ = small.grown
+    assert (np.abs(y - 100) < 5).sum() >= 0.9 * 9 * 190
+    assert abs(slope_deg(find_axis(small))) < 1
+
+
 def test_a_body_that_passes_is_sought_in_all_that_changes() -> None:
     rng = np.random.default_rng(43)
     frames = rng.normal(60, 2, (40, 120, 320))

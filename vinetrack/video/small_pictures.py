@@ -172,11 +172,17 @@ def _standing_out(
 
     still = np.ones(frames.shape[1:], np.float32)
     still[rows, columns] = 0.0
-    weight = np.maximum(cv2.GaussianBlur(still, (0, 0), AROUND_PX), 1e-3)
+
+    def around(picture: NDArray[np.float32]) -> NDArray[np.float32]:
+        # Within a tube much wider than AROUND_PX ground further off stands in.
+        near, wide, widest = (cv2.GaussianBlur(picture, (0, 0), k * AROUND_PX) for k in (1, 4, 16))
+        return np.asarray(near + 1e-2 * wide + 1e-4 * widest)
+
+    weight = np.maximum(around(still), 1e-9)
     power = []
     count = max(2, len(frames) // ENDS)
     for picture in (np.median(frames[:count], axis=0), np.median(frames[-count:], axis=0)):
-        ground = cv2.GaussianBlur(picture * still, (0, 0), AROUND_PX) / weight
+        ground = around(picture * still) / weight
         power.append(cv2.blur((picture - ground) ** 2, (3, 3))[rows, columns])
     return np.asarray(power[1] / (power[0] + power[1] + 2 * noise_power), dtype=float)
 
