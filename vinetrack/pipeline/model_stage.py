@@ -114,9 +114,11 @@ def measured(experiment: Experiment, results: Results) -> tuple[list[tuple[Trial
         If a trial has not been analysed.
     """
     pairs, kinematics = [], {}
+    gathered = read_result(results.trials) if results.trials.exists() else None
+    failed = set() if gathered is None else set(gathered.loc[gathered["status"] == "failed", "trial"])
     for trial in experiment.trials:
         table = read_result(results.track(trial.name))
-        if len(table):
+        if len(table) and trial.name not in failed:
             pairs.append((trial, read_back(trial, table)))
             kinematics[trial.name] = _kinematics(read_result(results.kinematics(trial.name)), trial.travel_ratio)
     return pairs, kinematics

@@ -164,6 +164,7 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
 
     results = Results(folder)
     analysed = {name: read_json(results.analysed(name)) for name in experiment.names if name not in experiment.left_out}
+    analysed |= _taken_for_the_tube(experiment, analysed)
     rows = {name: content["row"] for name, content in analysed.items()}
     rows |= {name: _bare_row(name, "left_out", reason) for name, reason in experiment.left_out.items()}
     table = _frame([rows[name] for name in experiment.names], TRIALS_COLUMNS)
@@ -178,6 +179,30 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
     for row in table.itertuples():
         log.info("%s: %s %s", row.trial, row.status, row.reason)
     return table
+
+
+def _taken_for_the_tube(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Trials whose axis was found askew to that of most others that grow as they do, as ones that failed."""
+    from vinetrack.video.axis_agreement import askew, slope_deg
+
+    failed: dict[str, dict[str, Any]] = {}
+    if experiment.settings.axis is not None:
+        return failed
+    slopes: dict[float, dict[str, float]] = {}
+    for trial in experiment.trials:
+        axis = analysed[trial.name].get("axis") if trial.axis is None and trial.travel_ratio == 2 else None
+        if axis is not None and analysed[trial.name]["row"]["status"] != "failed":
+            slope = slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis)
+            slopes.setdefault(trial.growth_angle_rad, {})[trial.name] = slope
+    for of_angle in slopes.values():
+        names, agreed = askew(of_angle)
+        for name in names:
+            reason = (
+                f"its growth axis was found askew to that of {agreed} other recordings: something else that moves, "
+                "such as a door, was taken for the tube; give its axis (column `axis`), even where the camera turned"
+            )
+            failed[name] = {"row": failed_row(experiment.trial(name), reason), "windows": [], "point": None}
+    return failed
 
 
 def _frame(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> pd.DataFrame:

@@ -18,6 +18,7 @@ from vinetrack.core.problems import Problem
 from vinetrack.core.records import Trial
 from vinetrack.core.terminal import table
 from vinetrack.video.axis import Axis
+from vinetrack.video.axis_agreement import askew, slope_deg
 from vinetrack.video.curved_axis import CurvedAxis, axis_entry
 from vinetrack.video.measure import Measurement
 from vinetrack.video.track import Tracking
@@ -43,13 +44,6 @@ SAME_FACTOR = 0.1
 """Width and growth that are off by factors within a tenth of each other are off by one factor: the scale. Chosen:
 widths and growths are seen to some per cent. At half true errors of scale are told as two faults, at twice two faults
 as one of scale."""
-ASKEW_DEG = 10.0
-"""Angle between a recording's axis and that of most others from which it is named. Chosen: axes that are found err by a
-degree or two, and a door that swings before a tip turns them by 30 or more. At half axes of short growth are named; at
-twice one that leads past the tube's far end is not."""
-FEWEST_ALIKE = 3
-"""Recordings whose axes agree, from which the others are judged. Chosen: two may agree by chance. By reasoning: with
-two a pair of wrong ones accuses a right one, with six small campaigns are never judged."""
 STEEP = 60.0
 """Degrees between growth in the picture and its rows from which it runs up or down, and to its columns from which it
 runs level. Chosen: a camera is held askew by some degrees; at 45 a tilted rig would be told, at 75 a camera askew by 20
@@ -251,27 +245,15 @@ def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
     for fact, trial in zip(facts, trials, strict=True):
         if fact.axis is None or trial.axis is not None or trial.travel_ratio == 1:
             continue
-        # A curve where others are straight is askew as well.
-        right, down = (b - a for a, b in zip(fact.axis.from_px, fact.axis.to_px, strict=True))
-        bent = isinstance(fact.axis, CurvedAxis)
-        slopes_deg[trial.name] = math.nan if bent else math.degrees(math.atan2(down, right))
-    straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
-    agreeing = [sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight) for slope in straight]
-    usual = straight[int(np.argmax(agreeing))] if straight else 0.0
-    askew = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, usual) < ASKEW_DEG]
-    agreed = len(slopes_deg) - len(askew)
-    if not askew or agreed < FEWEST_ALIKE or agreed <= len(askew):
+        slopes_deg[trial.name] = slope_deg(fact.axis.from_px, fact.axis.to_px, bends=isinstance(fact.axis, CurvedAxis))
+    names, agreed = askew(slopes_deg)
+    if not names:
         return []
     return [
-        f"a growth axis other than that of {agreed} recordings was found ({_some(askew)}): where one camera filmed "
+        f"a growth axis other than that of {agreed} recordings was found ({_some(names)}): where one camera filmed "
         "them all, something else that moves (a door, a hand) was taken for the tube; give the axis of those (column "
         "`axis`)"
     ]
-
-
-def _apart_deg(slope_deg: float, other_deg: float) -> float:
-    """Angle between two lines, whichever way they run, 0 to 90 degrees."""
-    return abs((slope_deg - other_deg + 90.0) % 180.0 - 90.0)
 
 
 def _some(names: list[str]) -> str:

@@ -1,0 +1,55 @@
+"""Whether the growth axes of recordings agree: what one camera films grows along one line of its picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+ASKEW_DEG = 10.0
+"""Angle between a recording's axis and that of most others from which it is named. Chosen: axes that are found err by a
+degree or two, and a door that swings before a tip turns them by 30 or more. At half axes of short growth are named; at
+twice one that leads past the tube's far end is not."""
+FEWEST_ALIKE = 3
+"""Recordings whose axes agree, from which the others are judged. Chosen: two may agree by chance. By reasoning: with
+two a pair of wrong ones accuses a right one, with six small campaigns are never judged."""
+
+
+def slope_deg(from_px: Sequence[float], to_px: Sequence[float], *, bends: bool) -> float:
+    """Direction of an axis in the picture, degrees from +x towards +y; NaN for a curve, which agrees with no line.
+
+    Parameters
+    ----------
+    from_px, to_px : its ends (x, y), px.
+    bends : whether it is a curve.
+
+    Returns
+    -------
+    degrees.
+    """
+    return math.nan if bends else math.degrees(math.atan2(to_px[1] - from_px[1], to_px[0] - from_px[0]))
+
+
+def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
+    """Recordings whose axis is not that of most others, where most agree.
+
+    Parameters
+    ----------
+    slopes_deg : direction of each recording's axis by its name, as `slope_deg` gives it.
+
+    Returns
+    -------
+    their names, and how many recordings agree; no names where fewer than FEWEST_ALIKE, or not most, do.
+    """
+    straight = [slope for slope in slopes_deg.values() if math.isfinite(slope)]
+    agreeing = [sum(_apart_deg(slope, other) < ASKEW_DEG for other in straight) for slope in straight]
+    usual = straight[int(np.argmax(agreeing))] if straight else 0.0
+    names = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, usual) < ASKEW_DEG]
+    agreed = len(slopes_deg) - len(names)
+    return (names, agreed) if FEWEST_ALIKE <= agreed > len(names) else ([], agreed)
+
+
+def _apart_deg(slope: float, other: float) -> float:
+    """Angle between two lines, whichever way they run, 0 to 90 degrees."""
+    return abs((slope - other + 90.0) % 180.0 - 90.0)
