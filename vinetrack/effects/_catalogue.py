@@ -60,13 +60,14 @@ def _load_module(path: Path) -> ModuleType:
     if (whole, name) in _MODULES:
         return _MODULES[whole, name]
     spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    if spec is None:
         raise EffectError(f"{path}: an effect is a Python file whose name ends in .py.")
     module = importlib.util.module_from_spec(spec)
     before = sys.modules.get(name)
     sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
+        # The text itself is run: bytecode kept beside a file is that of an older one saved within the same second.
+        exec(compile(text, str(path), "exec", dont_inherit=True), module.__dict__)
     except Exception as error:
         del sys.modules[name]
         raise EffectError(f"{path}: this effect cannot be read ({type(error).__name__}: {error}).") from error
