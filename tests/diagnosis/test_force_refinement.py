@@ -38,7 +38,7 @@ def test_a_law_of_the_pressure_changes_with_the_pressure_of_its_trial(slowed: tu
     motions = on_tracks(linear.fit, effects, linear.motions)
     place = Place(fit.solution.state.theta, effects, Surface(domain, np.eye(domain.size)), force, motions)
     settled = place
-    for _ in range(4):
+    for _ in range(12):  # where a place far off the tracks is settled depends on where it begins
         settled = _as_driven(fit, settled)
     trial = 0
     mine = place.theta.size + domain.size + trial * OWN + PRESSURE
