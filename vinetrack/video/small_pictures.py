@@ -24,7 +24,8 @@ MAX_FRAMES = 150
 GROWN = 0.4
 """Part of a pixel's change that lasts, times the part by which it stands out at the end, from which growth may have
 brought it. Measured on 40 short tubes beside long doors (`benchmarks/long_doors.py`, seeds 71001-71040) and 40 drawn by
-other code, axes more than 5 degrees off: 6 and 2 at 0.4 and at 0.2, 7 and 6 at 0.6; 15 and 24 with all that changes."""
+other code, axes more than 5 degrees off: 8 and 2 at 0.4, 7 and none at 0.2, 6 and 4 at 0.6; 15 and 24 with all that
+changes."""
 LEAST_GROWN = 0.16
 """Part of all change that must be such, or all that changes is asked: a vine that sweeps leaves what it has covered.
 Chosen between 0.08 of a real vine that sweeps and 0.32, the least of those 40; at half that vine counts as one that
