@@ -223,6 +223,9 @@ class _Line:
     order: float
 
 
+_NO_LINE = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
+
+
 def _shrunk(axis: Axis, factor: float) -> Axis:
     """The axis in a picture that is smaller by a factor."""
     (a, b), (c, d) = axis.from_px, axis.to_px
@@ -235,9 +238,6 @@ def _until(part: float, pixels: Pixels) -> Pixels:
     x, y, time, weight, n_times = pixels
     early = time < part * n_times
     return x[early], y[early], time[early], weight[early], n_times
-
-
-_NO_LINE = _Line(0.0, np.zeros(2), 1.0, (0.0, 0.0), 0.0, 0.0)
 
 
 def _line_of(small: NDArray[np.float32], changed: Pixels, patient: bool = False, insist: bool = False) -> _Line:

@@ -59,21 +59,26 @@ class SmallPictures:
         self.shape = luma.shape[1:]
 
     @cached_property
+    def _busy(self) -> tuple[NDArray[np.float32], float]:
+        """The frames that are looked at, and the variance of their noise."""
+        return _looked_at(self.frames)
+
+    @cached_property
     def changed(self) -> Pixels:
         """All pixels that change."""
-        return changed_pixels(self.frames, len(self.frames))
+        return _changed(*self._busy)
 
     @cached_property
     def grown(self) -> Pixels:
         """Pixels that change as where a tube grows: what comes stays, and stands out where nothing did.
 
-        Their worth is less where many change at once, as where a door comes to rest.
+        Their worth is less where many change at once, as where a door comes to rest. It is `changed` itself where
+        hardly any of it stays (LEAST_GROWN).
         """
         x, y, time, worth, n_times = self.changed
         if not len(x):
             return self.changed
-        frames = self.frames[_busy_frames(self.frames)]
-        noise = _noise_power(frames)
+        frames, noise = self._busy
         rows, columns = y.astype(int), x.astype(int)
         lasting = _lasting_part(frames[:, rows, columns].astype(float), time.astype(int), noise)
         kept = lasting * _standing_out(frames, rows, columns, noise) > GROWN
@@ -95,11 +100,20 @@ def changed_pixels(small: NDArray[np.float32], count: int) -> Pixels:
     -------
     the pixels.
     """
-    picked = _busy_frames(small[:count])
-    when, worth = _changes(small[picked])
+    return _changed(*_looked_at(small[:count]))
+
+
+def _looked_at(small: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+    """Frames in which something changes, and the variance of their noise."""
+    busy = small[_busy_frames(small)]
+    return busy, _noise_power(busy)
+
+
+def _changed(busy: NDArray[np.float32], noise_power: float) -> Pixels:
+    when, worth = _changes(busy, noise_power)
     rows, columns = np.nonzero(worth > 0)
     time = when[rows, columns].astype(float)
-    return columns.astype(float), rows.astype(float), time, worth[rows, columns].astype(float), len(picked)
+    return columns.astype(float), rows.astype(float), time, worth[rows, columns].astype(float), len(busy)
 
 
 def _small_frames(luma: NDArray[Any]) -> tuple[NDArray[np.float32], float]:
@@ -132,14 +146,13 @@ def _busy_frames(small: NDArray[np.float32]) -> NDArray[np.int_]:
     return np.unique(np.searchsorted(total, np.linspace(0, total[-1], MAX_FRAMES)).clip(0, n - 1))
 
 
-def _changes(frames: NDArray[np.float32]) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
+def _changes(frames: NDArray[np.float32], noise_power: float) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
     """Frame at which each pixel changes most and for good, and what that change is worth; shapes (height, width)."""
     n = len(frames)
     window = int(np.clip(n // 6, 2, 8))
     when, best = (x.reshape(frames.shape[1:]) for x in largest_steps(frames.reshape(n, -1), window))
-    unit = _noise_power(frames)
-    floor = max(30.0 * unit, 0.02 * float(np.quantile(best, 0.995)))
-    return when, np.where(best > floor, np.log(np.maximum(best, unit) / unit), 0.0).astype(np.float32)
+    floor = max(30.0 * noise_power, 0.02 * float(np.quantile(best, 0.995)))
+    return when, np.where(best > floor, np.log(np.maximum(best, noise_power) / noise_power), 0.0).astype(np.float32)
 
 
 def _noise_power(frames: NDArray[np.float32]) -> float:

@@ -188,8 +188,7 @@ def track_frames(
     frames : decoded, with their capture periods.
     trial, axis, m_per_px, position_m : as in `track_recording`.
     capture_fps : frames a second.
-    along_path : a calibration's scale along an axis, which takes the place of `m_per_px` and `position_m`; until there
-        is an axis, `m_per_px` is the calibration's mean.
+    along_path : a calibration's scale along the axis, in place of `position_m` and of `m_per_px`, then its mean scale.
 
     Returns
     -------
@@ -205,7 +204,8 @@ def track_frames(
     if len(frames) < FEWEST_FRAMES:
         raise RecordingError(f"{name}: only {len(frames)} frames can be decoded; at least {FEWEST_FRAMES} are needed")
     rejected = odd_frames(frames.luma) if frames.first == 0 else np.zeros(len(frames), dtype=bool)
-    number, (first, last) = frames.first + np.arange(len(frames)), trial.frames_used or (0, frames.n_recorded - 1)
+    first, last = trial.frames_used or (0, frames.n_recorded - 1)
+    number = frames.first + np.arange(len(frames))
     used = (number >= first) & (number <= last)
     if used.sum() < FEWEST_FRAMES:
         raise RecordingError(f"{name}: frames_used leaves {int(used.sum())} of {len(frames)} frames; widen it")
