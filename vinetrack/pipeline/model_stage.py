@@ -114,8 +114,10 @@ def measured(experiment: Experiment, results: Results) -> tuple[list[tuple[Trial
         If a trial has not been analysed.
     """
     pairs, kinematics = [], {}
-    gathered = read_result(results.trials) if results.trials.exists() else None
-    failed = set() if gathered is None else set(gathered.loc[gathered["status"] == "failed", "trial"])
+    failed: set[str] = set()
+    if results.trials.exists():
+        gathered = read_result(results.trials)
+        failed = set(gathered.loc[gathered["status"] == "failed", "trial"])
     for trial in experiment.trials:
         table = read_result(results.track(trial.name))
         if len(table) and trial.name not in failed:
