@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import gc
+import os
 from collections.abc import Generator
 from itertools import count
 from pathlib import Path
 
 import pytest
+
+# A worker for every core already: threads of the linear algebra would wait for one another, and the last digits of a
+# sum would depend on how many cores a machine has. Asked for before NumPy is loaded, here and in what tests start.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 FOLDERS = count()
 """Numbers the folders of one process."""
