@@ -107,32 +107,37 @@ def bent_scene(plan: BentPlan) -> BentScene:
     n = int(np.argmax(travel(np.arange(5000.0)) >= end)) + plan.end_frames
     h, w = plan.height, plan.width
     yy, xx = np.mgrid[0:h, 0:w].astype(np.float32)
-    away, nearest = cKDTree(curve).query(np.column_stack([xx.ravel(), yy.ravel()]))
+    pixels = np.column_stack([xx.ravel(), yy.ravel()])
+    away, nearest = cKDTree(curve).query(pixels, distance_upper_bound=plan.radius + 8)
+    near = np.flatnonzero(np.isfinite(away))
     tangent = np.gradient(curve, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    offset = np.column_stack([xx.ravel(), yy.ravel()]) - curve[nearest]
-    unit = tangent[nearest]
-    along = (arc[nearest] + np.sum(offset * unit, axis=1)).reshape(h, w)
-    across = (unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]).reshape(h, w)
+    offset, unit = pixels[near] - curve[nearest[near]], tangent[nearest[near]]
+    along = arc[nearest[near]] + np.sum(offset * unit, axis=1)
+    across = unit[:, 0] * offset[:, 1] - unit[:, 1] * offset[:, 0]
     back = plan.background + texture(rng, (h, w), 2.0, plan.background_sd)
     wall, tail = texture(rng, (h, w), 2.5, plan.wall_sd), texture(rng, (64, 4096), 3.0, plan.tail_sd)
     # Only the tube's own pixels are drawn anew in each of the parts of an exposure.
-    tube = np.nonzero((away.reshape(h, w) < plan.radius + 8) & (np.abs(across) < plan.radius + 0.5))
-    off, s = across[tube], along[tube]
+    drawn = np.abs(across) < plan.radius + 0.5
+    tube, off, s = np.unravel_index(near[drawn], (h, w)), across[drawn], along[drawn]
     inside = np.clip(plan.radius - np.abs(off) + 0.5, 0, 1)
     bulge = plan.tip_depth * (1 - np.sqrt(np.clip(1 - (off / plan.radius) ** 2, 0, 1)))
     shade = 1 - 0.25 * np.clip(off / plan.radius, -1, 1) ** 2
     film = plan.opacity * (plan.film * shade + wall[tube]) + (1 - plan.opacity) * back[tube]
-    rows = np.clip(off + 32, 0, 63).astype(np.int32)
+    rows, within = np.clip(off + 32, 0, 63).astype(np.int32), np.abs(off) < 0.6 * plan.radius
     phase = rng.uniform(0, 2 * np.pi, 2)
     frames = np.empty((n, h, w), np.uint8)
     for i in range(n):
-        cover, inner = np.zeros(len(s)), np.zeros(len(s))
-        for now in travel(i + plan.exposure * (np.arange(12) + 0.5) / 12):
-            cover += np.clip(now - bulge - s + 0.5, 0, 1) / 12
-            inner += tail[rows, np.mod((s - 2 * now).astype(np.int32), 4096)] * (np.abs(off) < 0.6 * plan.radius) / 12
+        places = travel(i + plan.exposure * (np.arange(12) + 0.5) / 12)
+        shown = np.flatnonzero(s < places[-1] + 0.5)
+        bulge_here, s_here, rows_here, within_here = (part[shown] for part in (bulge, s, rows, within))
+        cover, inner = np.zeros(len(shown)), np.zeros(len(shown))
+        for now in places:
+            cover += np.clip(now - bulge_here - s_here + 0.5, 0, 1) / 12
+            inner += tail[rows_here, np.mod((s_here - 2 * now).astype(np.int32), 4096)] * within_here / 12
         picture = back.copy()
-        picture[tube] += cover * inside * (film + inner - back[tube])
+        here = tube[0][shown], tube[1][shown]
+        picture[here] += cover * inside[shown] * (film[shown] + inner - back[here])
         picture = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), plan.psf)
         if plan.shake:
             dx, dy = plan.shake * np.sin(0.55 * i + phase[0]), plan.shake * np.sin(0.37 * i + phase[1])
