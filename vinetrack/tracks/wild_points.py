@@ -113,24 +113,27 @@ def local_fit(time_s: Floats, position_m: Floats, noise_m: float) -> LocalFit:
     places = places[places != np.arange(n)[:, None]].reshape(n, -1)
     since = time_s[places] - time_s[:, None]
     width = np.abs(since).max(axis=1)
-    basis = (since / width[:, None])[:, :, None] ** np.arange(4)
+    away = since / width[:, None]
+    powers = np.ones((*away.shape, 7))
+    for power in range(1, 7):
+        powers[..., power] = powers[..., power - 1] * away
     y = position_m[places] - position_m[:, None]
     least = np.maximum(noise_m, 1e-9 * np.ptp(position_m))
     weight = np.ones_like(y)
     for turn in range(10):
-        coefficients = _weighted(basis, y, weight)
-        left = np.abs(y - np.einsum("npk,nk->np", basis, coefficients))
+        coefficients = _solved(_sums(powers, weight), _sums(powers[..., :4], weight * y))
+        left = np.abs(y - _cubic(away, coefficients))
         if turn < 6:
             weight = 1 / np.maximum(left, 0.1 * least)
         else:
             # The scale of a window is that of its better half; of 12 residuals about 4 numbers the median is 0.55 sd.
-            scale = np.maximum(np.median(left, axis=1) / 0.55, least)
+            scale = np.maximum(np.sort(left, axis=1)[:, HALF_WIDTH - 1 : HALF_WIDTH + 1].mean(axis=1) / 0.55, least)
             weight = np.maximum(1 - (left / (BIWEIGHT * scale[:, None])) ** 2, 0.0) ** 2 + 1e-9
     on = weight > 0.1
     used = np.maximum(on.sum(axis=1), 5)
-    inverse = _inverse(basis, weight)
+    # The point itself lies at 0, where the cubic is its first coefficient.
+    levers = weight * _cubic(away, _solved(_sums(powers, weight), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))))
     nearest = np.argsort(np.abs(since), axis=1, kind="stable")[:, :NEAREST]
-    levers = np.einsum("nk,npk,np->np", inverse[:, 0], basis, weight)
     return LocalFit(
         residual_m=-coefficients[:, 0],
         gain=np.sqrt(1 + np.sum(levers**2, axis=1)),
@@ -267,13 +270,37 @@ def _far_off(time_s: Floats, position_m: Floats, limit: float) -> NDArray[np.boo
     return np.asarray((size > limit * fit.gain * sigma_m + room_m) & alone & (sigma_m > 0))
 
 
-def _inverse(basis: Floats, weight: Floats) -> Floats:
-    square = np.einsum("npk,np,npl->nkl", basis, weight, basis)
-    scale = 1 / np.sqrt(np.einsum("nkk->nk", square))
-    even = square * scale[:, :, None] * scale[:, None, :] + 1e-10 * np.eye(square.shape[1])
-    return np.asarray(np.linalg.inv(even) * scale[:, :, None] * scale[:, None, :])
+def _sums(powers: Floats, weight: Floats) -> Floats:
+    """Sums over each window of a weight times powers, shape (n_windows, n_powers)."""
+    return np.asarray(np.matmul(weight[:, None, :], powers)[:, 0])
 
 
-def _weighted(basis: Floats, y: Floats, weight: Floats) -> Floats:
-    """Coefficients of the weighted least-squares fits, shape (n_windows, 4)."""
-    return np.einsum("nkl,npl,np,np->nk", _inverse(basis, weight), basis, weight, y)
+def _cubic(away: Floats, coefficients: Floats) -> Floats:
+    """The cubic of each window at its places, shape (n_windows, n_places)."""
+    c0, c1, c2, c3 = (coefficients[:, k, None] for k in range(4))
+    return np.asarray(c0 + away * (c1 + away * (c2 + away * c3)))
+
+
+def _solved(sums: Floats, right: Floats) -> Floats:
+    """Coefficients, shape (n_windows, 4), whose normal equations have these sums of powers 0 to 6 and right sides.
+
+    The system is brought to a unit diagonal, a ridge of 1e-10 put on it, and factored as L D Lᵀ in all windows at once.
+    """
+    scale = 1 / np.sqrt(sums[:, ::2])
+    lower, pivots = np.empty((4, 4, len(sums))), np.empty((4, len(sums)))
+    solution = (right * scale).T.copy()
+    for u in range(4):
+        for v in range(u):
+            left = sums[:, u + v] * scale[:, u] * scale[:, v]
+            for w in range(v):
+                left = left - lower[u, w] * lower[v, w] * pivots[w]
+            lower[u, v] = left / pivots[v]
+        pivots[u] = 1 + 1e-10
+        for v in range(u):
+            pivots[u] -= lower[u, v] ** 2 * pivots[v]
+            solution[u] -= lower[u, v] * solution[v]
+    solution /= pivots
+    for u in range(2, -1, -1):
+        for v in range(u + 1, 4):
+            solution[u] -= lower[v, u] * solution[v]
+    return np.asarray(solution.T * scale)
