@@ -14,6 +14,10 @@ import pytest
 # sum would depend on how many cores a machine has. Asked for before NumPy is loaded, here and in what tests start.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Garbage is looked for after 50 000 new objects, not 700: among all that thousands of tests have imported, it took a
+# twentieth of their time.
+gc.set_threshold(50_000, 20, 50)
+
 FOLDERS = count()
 """Numbers the folders of one process."""
 

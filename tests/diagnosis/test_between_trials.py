@@ -123,7 +123,7 @@ def other_tube(trial: Trial) -> bool:
 def test_another_tube_for_high_pressures_is_named(trials: list[Trial]) -> None:
     pairs = made(trials, range(len(trials)), lambda trial, _: 1.1 if other_tube(trial) else 1.0, seed=3)
     known = [(replace(trial, specimen="b" if other_tube(trial) else "a"), track) for trial, track in pairs]
-    result = diagnosed(known)
+    result = diagnosed(known, PHYSICS)
     assert result.verdict in (ARTEFACT, AMBIGUOUS)
     assert "specimen" in result.answer_set
 
@@ -135,7 +135,7 @@ def test_exponents_that_differ_by_vine_are_named(trials: list[Trial]) -> None:
     for vine, exponent in zip(dict.fromkeys(trial.vine for trial in trials), (0.40, 0.46), strict=True):
         nature = Nature(effects=BASE, values={**values, n: exponent}, seed=4, damping_scatter=0.01)
         pairs += pairs_of(grow([trial for trial in trials if trial.vine == vine], nature))
-    result = diagnosed(pairs)
+    result = diagnosed(pairs, PHYSICS)
     assert (result.verdict, result.answer_set) == (ARTEFACT, ("n_by_vine",))
     row = next(row for row in result.rounds[0].ranking if row.effect == "n_by_vine")
     for number, exponent in zip(row.numbers, (0.40, 0.46), strict=True):

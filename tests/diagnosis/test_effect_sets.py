@@ -17,7 +17,7 @@ from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.narrative.diagnosis_text import diagnosis_text
 from vinetrack.narrative.verdict_summary import settled_rows
 
-CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak", "pressure_gain")
+CANDIDATES = ("reservoir_depletion", "tail_friction", "latch_release", "leak")
 TRUTH = {
     "reservoir_depletion.gamma": 1.3,
     "tail_friction.mu_w": 1.0,
