@@ -86,6 +86,31 @@ def test_the_middle_of_a_dark_tube_far_from_any_ground_counts_as_growth() -> Non
     assert abs(slope_deg(find_axis(small))) < 1
 
 
+@pytest.mark.parametrize("brighter", [-80.0, 80.0])
+@pytest.mark.parametrize("tube_px", [40, 100, 150])
+def test_a_tube_as_wide_as_most_of_the_picture_is_followed_along_itself(
+    tmp_path: Path, tube_px: int, brighter: float
+) -> None:
+    rng = np.random.default_rng(47)
+    ground = 120 + cv2.GaussianBlur(rng.normal(0, 30, (200, 240)), (0, 0), 5)
+    tip = np.minimum(20 + 4.3 * np.arange(46), 205)
+    frames = []
+    for place in tip:
+        picture = ground.copy()
+        rows = slice(100 - tube_px // 2, 100 + tube_px // 2)
+        picture[rows] += brighter * np.clip(place - np.arange(240) + 0.5, 0, 1)
+        frames.append(cv2.GaussianBlur(picture, (0, 0), 0.8) + rng.normal(0, 2, picture.shape))
+    video = write_images(tmp_path / "wide", np.clip(np.stack(frames), 0, 255).astype(np.uint8))
+    trial = Trial(name="wide", video=video, capture_fps=1000.0, exposure_s=1e-5, m_per_px=0.001, length_m=0.3)
+    tracking = track_recording(trial)
+    assert abs(slope_deg(tracking.axis)) < 1
+    assert tracking.axis.width_px == pytest.approx(tube_px, rel=0.05)
+    track = tracking.track
+    off = track.lead_position_m / 0.001 - np.interp(track.time_s, np.arange(46) / 1000, tip)
+    assert np.all(track.lead_position_sigma_m < 0.001)
+    np.testing.assert_allclose(off - np.median(off), 0.0, atol=0.4)
+
+
 def test_a_body_that_passes_is_sought_in_all_that_changes() -> None:
     rng = np.random.default_rng(43)
     frames = rng.normal(60, 2, (40, 120, 320))

@@ -111,12 +111,29 @@ def test_growth_that_looks_otherwise_than_stated_is_noted(
 def test_an_axis_that_most_recordings_do_not_have_is_named(slopes_deg: list[float], named: str) -> None:
     trials = [replace(VINE, name=name) for name in "abcdefgh"[: len(slopes_deg)]]
     ends = [(100 + 200 * np.cos(np.radians(s)), 100 + 200 * np.sin(np.radians(s))) for s in slopes_deg]
-    facts = [replace(FACTS, axis=Axis((100.0, 100.0), end)) for end in ends]
+    facts = [
+        replace(FACTS, trial=trial.name, axis=Axis((100.0, 100.0), end))
+        for trial, end in zip(trials, ends, strict=True)
+    ]
     notes = axis_notes(facts, trials)
     assert len(notes) == bool(named)
     assert all(f"recordings was found ({named}): where" in note for note in notes)
     given = [replace(trial, axis=Axis((100.0, 100.0), end)) for trial, end in zip(trials, ends, strict=True)]
     assert axis_notes(facts, given) == []
+
+
+def test_axes_are_compared_among_trials_that_grow_at_the_same_angle() -> None:
+    trials = [
+        replace(VINE, name=name, growth_angle_rad=angle)
+        for name, angle in zip("abcdefg", [0.0] * 4 + [1.5] * 3, strict=True)
+    ]
+    ends = [(300.0, 100.0)] * 3 + [(200.0, 260.0)] + [(100.0, 300.0)] * 3
+    facts = [
+        replace(FACTS, trial=trial.name, axis=Axis((100.0, 100.0), end))
+        for trial, end in zip(trials, ends, strict=True)
+    ]
+    (note,) = axis_notes(facts, trials)
+    assert "that of 3 recordings was found (d)" in note
 
 
 @pytest.fixture(scope="module")

@@ -183,19 +183,18 @@ def gather(experiment: Experiment, folder: Path, settings: RunSettings) -> pd.Da
 
 def _taken_for_the_tube(experiment: Experiment, analysed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Trials whose axis was found askew to that of most others that grow as they do, as ones that failed."""
-    from vinetrack.video.axis_agreement import askew, slope_deg
+    from vinetrack.video.axis_agreement import askew_trials, slope_deg
 
     failed: dict[str, dict[str, Any]] = {}
     if experiment.settings.axis is not None:
         return failed
-    slopes: dict[float, dict[str, float]] = {}
-    for trial in experiment.trials:
-        axis = analysed[trial.name].get("axis") if trial.axis is None and trial.travel_ratio == 2 else None
-        if axis is not None and analysed[trial.name]["row"]["status"] != "failed":
-            slope = slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis)
-            slopes.setdefault(trial.growth_angle_rad, {})[trial.name] = slope
-    for of_angle in slopes.values():
-        names, agreed = askew(of_angle)
+    tracked = [
+        (name, content.get("axis")) for name, content in analysed.items() if content["row"]["status"] != "failed"
+    ]
+    slopes_deg = {
+        name: slope_deg(axis["from_px"], axis["to_px"], bends="via_px" in axis) for name, axis in tracked if axis
+    }
+    for names, agreed in askew_trials(slopes_deg, experiment.trials):
         for name in names:
             reason = (
                 f"its growth axis was found askew to that of {agreed} other recordings: something else that moves, "

@@ -27,6 +27,13 @@ MOST_TURN_DEG = 8.0
 or two; with half of it an axis 5 degrees off stays off, with twice of it a wide strip lets in what crosses it."""
 PREFIXES = (0.12, 0.18, 0.25, 0.32, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Parts of a recording, from its beginning, that may be orderly. Chosen: steps of a quarter; more cost time alone."""
+LEAST_ROUNDS, MOST_ROUNDS = 3, 20
+"""Rounds in which a line is refined by the pixels that agree with it. Chosen: a line moves less than a pixel after the
+third; the band widens by a seventh each, from 3 % of the picture's diagonal to the fifth that it may be in 15. With at
+most half of them wide tubes are seen in part, with twice nothing changes."""
+WIDENS = 1.05
+"""Growth of that band in a round, from which another follows. Chosen: between none and the seventh by which it widens
+within a tube. By reasoning: at twice the growth wide tubes are seen in part, at half rounds are spent on noise."""
 
 
 @dataclass(frozen=True)
@@ -251,14 +258,11 @@ def _line_of(small: NDArray[np.float32], changed: Pixels, patient: bool = False,
     early = weight * (1 - 0.8 * time / n_times) if patient else weight
     try:
         angle, middle = _best_line(x, y, time, early, n_times, band, diagonal)
-        for _ in range(3):
-            angle, middle, half, ends, collected = _refine(x, y, time, weight, n_times, angle, middle, band)
-            band = float(np.clip(1.2 * half, 2.0, 0.2 * diagonal))
+        return _converged(changed, angle, middle, band, 0.2 * diagonal)
     except RecordingError:
         if insist:
             raise
         return _NO_LINE
-    return _Line(angle, middle, half, ends, collected, collected / float(weight.sum()))
 
 
 def _line_near(
@@ -288,14 +292,10 @@ def _line_near(
             best, angle, point = float(worth[i]), start + float(turn), middle + away[i] * side
     if best <= 0:
         return None
-    band, half, ends, collected = 2 * band, band, (0.0, 0.0), best
     try:
-        for _ in range(3):
-            angle, point, half, ends, collected = _refine(x, y, time, weight, n_times, angle, point, band)
-            band = float(np.clip(1.2 * half, 2.0, reach))
+        return _converged((x, y, time, weight, n_times), angle, point, 2 * band, reach)
     except RecordingError:
         return None
-    return _Line(angle, point, half, ends, collected, collected / float(weight.sum()))
 
 
 def _best_line(
@@ -345,6 +345,16 @@ def agreeing(
     passed = passing_times(table)
     agree = near & (np.abs(time - passed[place]) <= order_tolerance(n_times))
     return agree, along, across
+
+
+def _converged(pixels: Pixels, angle: float, middle: Floats, band: float, most_band: float) -> _Line:
+    """The line refined until its band, at most `most_band` wide to either side, no longer widens."""
+    for round_ in range(1, MOST_ROUNDS + 1):
+        angle, middle, half, ends, collected = _refine(*pixels, angle, middle, band)
+        narrower, band = band, float(np.clip(1.2 * half, 2.0, most_band))
+        if round_ >= LEAST_ROUNDS and band < WIDENS * narrower:
+            break
+    return _Line(angle, middle, half, ends, collected, collected / float(pixels[3].sum()))
 
 
 def _refine(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+
+from vinetrack.core.records import Trial
 
 ASKEW_DEG = 10.0
 """Angle between a recording's axis and that of most others from which it is named. Chosen: axes that are found err by a
@@ -48,6 +50,27 @@ def askew(slopes_deg: Mapping[str, float]) -> tuple[list[str], int]:
     names = [name for name, slope in slopes_deg.items() if not _apart_deg(slope, usual) < ASKEW_DEG]
     agreed = len(slopes_deg) - len(names)
     return (names, agreed) if FEWEST_ALIKE <= agreed > len(names) else ([], agreed)
+
+
+def askew_trials(slopes_deg: Mapping[str, float], trials: Iterable[Trial]) -> list[tuple[list[str], int]]:
+    """Trials whose axis was found askew to that of most others that grow at the same angle.
+
+    Bodies that fly free and trials whose axis was given are not compared.
+
+    Parameters
+    ----------
+    slopes_deg : direction of the axis by a trial's name, as `slope_deg` gives it, of those that have one.
+    trials : of the experiment.
+
+    Returns
+    -------
+    names, and how many agree against them, for every growth angle at which any is askew.
+    """
+    by_angle: dict[float, dict[str, float]] = {}
+    for trial in trials:
+        if trial.name in slopes_deg and trial.axis is None and trial.travel_ratio != 1:
+            by_angle.setdefault(trial.growth_angle_rad, {})[trial.name] = slopes_deg[trial.name]
+    return [named for slopes in by_angle.values() if (named := askew(slopes))[0]]
 
 
 def _apart_deg(slope: float, other: float) -> float:

@@ -18,7 +18,7 @@ from vinetrack.core.problems import Problem
 from vinetrack.core.records import Trial
 from vinetrack.core.terminal import table
 from vinetrack.video.axis import Axis
-from vinetrack.video.axis_agreement import askew, slope_deg
+from vinetrack.video.axis_agreement import askew_trials, slope_deg
 from vinetrack.video.curved_axis import CurvedAxis, axis_entry
 from vinetrack.video.measure import Measurement
 from vinetrack.video.track import Tracking
@@ -229,7 +229,7 @@ def direction_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial], bl
 
 
 def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list[str]:
-    """Name recordings whose axis was found askew to that of most others, which the same camera films.
+    """Name recordings whose axis was found askew to that of most others that grow at the same angle.
 
     Something else that moves, such as a door as long as the growth, is then taken for the tube.
 
@@ -239,20 +239,15 @@ def axis_notes(facts: Iterable[RecordingFacts], trials: Iterable[Trial]) -> list
 
     Returns
     -------
-    a sentence, or none.
+    sentences, one for every growth angle at which any is askew.
     """
-    slopes_deg: dict[str, float] = {}
-    for fact, trial in zip(facts, trials, strict=True):
-        if fact.axis is None or trial.axis is not None or trial.travel_ratio == 1:
-            continue
-        slopes_deg[trial.name] = slope_deg(fact.axis.from_px, fact.axis.to_px, bends=isinstance(fact.axis, CurvedAxis))
-    names, agreed = askew(slopes_deg)
-    if not names:
-        return []
+    axes = [(fact.trial, fact.axis) for fact in facts if fact.axis is not None]
+    slopes_deg = {name: slope_deg(axis.from_px, axis.to_px, bends=axis.bends) for name, axis in axes}
     return [
         f"a growth axis other than that of {agreed} recordings was found ({_some(names)}): where one camera filmed "
         "them all, something else that moves (a door, a hand) was taken for the tube; give the axis of those (column "
         "`axis`)"
+        for names, agreed in askew_trials(slopes_deg, trials)
     ]
 
 
