@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Bools, Floats
 from vinetrack.video import edge_kernels as kernels
 from vinetrack.video import kymograph as ky
-from vinetrack.video.edge_repair import ASTRAY_PX, disagreement, dwell_error_px, growth_end, mend_jumps
+from vinetrack.video.edge_repair import ASTRAY_PX, disagreement, dwell_error_px, mend_jumps
 from vinetrack.video.edge_state import (
     EdgeState,
     blur_lengths,
     core_frames,
+    first_state,
     fit_edges,
     frames_that_tell,
     held_at_rest,
@@ -29,6 +30,7 @@ from vinetrack.video.edge_state import (
     repicture,
     residuals,
 )
+from vinetrack.video.first_path import grown_path
 from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors, leap_error_px
 from vinetrack.video.slow_errors import noise_and_slow, slow_error_px
 from vinetrack.video.strip import Strip
@@ -68,19 +70,6 @@ SIDES_PX = 1.0
 FAINT, FAINT_PART = 25.0, 0.15
 """Grey levels of contrast below which the sides of a tube fade away, and the error of its width then, a part of it.
 Measured (benchmarks/seen_sizes.py, seeds 20900 and up): 0.76 of the width is seen at 16 levels, 0.96 and more at 70."""
-LEAST_CHANGE, STRONG_PART = 5.0, 0.3
-"""Score of a column that counts as changed, in units of its expectation under noise, and as a part of the usual score.
-Chosen: five standard deviations; half the usual contrast is 0.3 of its power. By reasoning: at half the path begins in
-what never changed; at twice faint starts are cut off."""
-RUN_PX, RUN_FILLED = 9, 0.6
-"""Columns in a row of which this part must have changed for a front to have passed. Chosen: blur alone spreads a change
-over half as many. By reasoning: at half a glint counts as growth; at twice short growth does not."""
-FALL_PART, FALL_PX = 0.1, 0.2
-"""Least fall of the steps in the run-up, as a part of the first difference seen and in px. Chosen: the run-up then
-ends. By reasoning: at half it reaches twice as far back, which the second path takes back."""
-LEAP, LEAP_OVER_PX = 3.0, 2.0
-"""A step so many times those that follow, taken as this much at least, is no growth. Chosen: from rest steps grow. By
-reasoning: at half vines that slow down at once lose their start; at twice a tail that jerks passes for growth."""
 LEAST_NOVELTY = 0.05
 """Weight of a frame that shows nothing new. Chosen: twenty frames of rest weigh as one of motion. At half or twice so
 many more or fewer do."""
@@ -139,10 +128,10 @@ def track_edge(strip: Strip, exposure_frames: float = np.nan, rounds: int = 4, s
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, passed = _grown_path(strip) if sides is None else (sides.path_px, sides.passed)
+    path, passed = grown_path(strip) if sides is None else (sides.path_px, sides.passed)
     path = np.minimum(path, passed[1])
     exposure = float(exposure_frames) if np.isfinite(exposure_frames) else ASSUMED_EXPOSURE
-    state = _first_state(strip, path, exposure)
+    state = first_state(strip, path, exposure)
     change = _frame_changes(strip)
     for turn in range(3):
         before, path = path, _second_path(strip, state, passed, change)
@@ -217,8 +206,8 @@ def outline(strip: Strip, parts: int = 12) -> Outline:
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, passed = _grown_path(strip)
-    pictures = _first_state(strip, np.minimum(path, passed[1]), ASSUMED_EXPOSURE).pictures
+    path, passed = grown_path(strip)
+    pictures = first_state(strip, np.minimum(path, passed[1]), ASSUMED_EXPOSURE).pictures
     power = (pictures[0] - pictures[1]).astype(float)[:, passed[0] : passed[1]] ** 2
     rows = np.arange(len(power)) - (len(power) - 1) / 2
     sides, places, contrasts = [], [], []
@@ -257,7 +246,7 @@ def rough_growth(strip: Strip) -> tuple[float, float]:
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, passed = _grown_path(strip)
+    path, passed = grown_path(strip)
     growth = float(passed[1] - passed[0])
     early, late = (int(np.searchsorted(path, passed[0] + part * growth)) for part in (0.2, 0.9))
     return growth, 0.7 * growth / max(late - early, 1)
@@ -287,86 +276,6 @@ def _robust_line(x: Floats, y: Floats) -> tuple[float, float]:
     i, j = np.triu_indices(len(x), 1)
     slope = float(np.median((y[j] - y[i]) / (x[j] - x[i]))) if len(i) else 0.0
     return slope, float(np.median(y - slope * x))
-
-
-def _first_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
-    """Front by frame from changes alone, and first and last column where whole runs of columns change along it."""
-    path, score = ky.first_path(strip.values, strip.scale, strip.offset, strip.noise)
-    columns = np.arange(strip.values.shape[2])
-    when = np.clip(np.searchsorted(path, columns + 0.5), 0, len(path) - 1)
-    got = np.max([score[np.clip(when + d, 0, len(path) - 1), columns] for d in (-1, 0, 1)], axis=0)
-    # Half the usual contrast: rather begin late (the neighbours then stand in for the background) than
-    # early, where a column that never changed would say nothing at all about the edge.
-    seen = got[got > LEAST_CHANGE]
-    strong = got > max(LEAST_CHANGE, STRONG_PART * float(np.median(seen)) if seen.size else LEAST_CHANGE)
-    run = np.convolve(strong, np.ones(RUN_PX) / RUN_PX, mode="same") > RUN_FILLED
-    if run.sum() < RUN_PX:
-        raise ValueError("nothing moves along the axis")
-    where = np.flatnonzero(run & strong)
-    passed = max(int(where[0]), after_jump(path)), int(where[-1]) + 1
-    if passed[0] >= passed[1]:
-        raise ValueError("what changes along the axis does so all at once: nothing grows")
-    return _run_up(np.clip(path, *passed)), passed
-
-
-def _grown_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
-    """Front by frame from changes alone, and the first and last column that it leaves changed for good."""
-    path, (begin, end) = _first_path(strip)
-    end = growth_end(strip, path, (begin, end))
-    if end <= begin:
-        raise ValueError("what changes along the axis does not stay changed: nothing grows")
-    return path, (begin, end)
-
-
-def _run_up(path: Floats) -> Floats:
-    """The path with its beginning replaced by a run-up of falling steps, as from rest.
-
-    Where growth is first seen something else may have stood before (a door), and the tip have come from further back.
-    If it did not, the columns between turn out to be film from the start, and the second path takes that back.
-    """
-    steps = np.diff(path)
-    onset = int(np.argmax(steps > 0)) if np.any(steps > 0) else 0
-    later = path[onset + 1 :]
-    if onset < 2 or len(later) < 5:
-        return path
-    fall = max(float(np.median(np.diff(later[:5], 2))), FALL_PART * float(later[1] - later[0]), FALL_PX)
-    out, step = path.copy(), float(np.median(np.diff(later[:4])))
-    for t in range(onset, -1, -1):
-        step = max(step - fall, 0.0)
-        out[t] = max(out[t + 1] - step, 0.0)
-    return out
-
-
-def after_jump(path: Floats) -> int:
-    """Column where growth begins in earnest: a path that leaps at its start and crawls on has not grown that far.
-
-    At release the tail jerks inside the film that already stands, and its columns change without any front. No front
-    is three times as fast in its first frames as in those that follow.
-
-    Parameters
-    ----------
-    path : column of the front by frame, shape (n_frames,), px.
-
-    Returns
-    -------
-    column; 0 where the path does not leap at its start.
-    """
-    steps = np.diff(path)
-    if not np.any(steps > 0):
-        return 0
-    onset = int(np.argmax(steps > 0))
-    begin = 0
-    for t in range(onset, min(onset + 4, len(steps) - 4)):
-        if steps[t] > LEAP * max(float(np.median(steps[t + 1 : t + 5])), LEAP_OVER_PX):
-            begin = int(path[t + 1])
-    return begin
-
-
-def _first_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
-    rows, columns = strip.values.shape[1:]
-    blank = np.zeros((4, rows, columns), np.float32)
-    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank, np.ones(3))
-    return repicture(strip, state, 0.0)
 
 
 def _second_path(strip: Strip, state: EdgeState, passed: tuple[int, int], change: Floats) -> Floats:

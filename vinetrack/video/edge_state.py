@@ -293,3 +293,22 @@ def residuals(
         margin_px, use, _shading_as_wide(state, margin_px),
     )  # fmt: skip
     return Residuals(*sums)
+
+
+def first_state(strip: Strip, path: Floats, exposure: float) -> EdgeState:
+    """Picture film and background from a first path of the front, with a tip that is even and a usual blur.
+
+    Parameters
+    ----------
+    strip : along the axis.
+    path : shape (n_frames,), px.
+    exposure : of a frame, over the frame period.
+
+    Returns
+    -------
+    the state to begin with.
+    """
+    rows, columns = strip.values.shape[1:]
+    blank = np.zeros((4, rows, columns), np.float32)
+    state = EdgeState(path, blur_lengths(path, exposure), np.zeros(rows), 2.0, blank, np.ones(3))
+    return repicture(strip, state, 0.0)

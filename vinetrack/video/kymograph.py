@@ -1,8 +1,10 @@
 """The front as a monotone path through space and time, by dynamic programming.
 
-Two passes. The first knows nothing of film or background: a column changes once, when the front passes it, and the
-path collects the change of every column. The second knows both, and asks of every pixel in every frame which of the
-two it resembles, with clipped distances, so that a door, a payload flying ahead or a reflection cannot steal the path.
+Two passes. The first (`first_path`) knows nothing of film or background: a column changes once, when the front passes
+it. `changing_path` collects the change of every column; `lasting_path` divides columns that look as they will at last
+from those that look as they did at first. The second pass knows both, and asks of every pixel in every frame which of
+the two it resembles, with clipped distances, so that a door, a payload flying ahead or a reflection cannot steal the
+path.
 
 `track_arrival` is for the tip of a vine that bends, sweeps or slides along walls. Such a vine leaves what it has
 covered, and no picture of its film holds for long; the tracker of a straight front would follow its sweeping. But a
@@ -12,6 +14,7 @@ from unchanged columns, good to about a pixel, not better.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.video.edge_cover import MATHS
 
 if TYPE_CHECKING:
     from vinetrack.video.strip import Strip
@@ -27,12 +31,22 @@ if TYPE_CHECKING:
 BUNCHED, MOST_BUNCHED = 12, 4
 """Groups of rows that a strip is divided into, and rows of a group at most. Chosen for time; at half noise averages out
 further and narrow vines fill one group, at twice the first path takes twice as long."""
+WINDOW = 10
+"""Frames before and after over which a change is judged. Chosen: noise averages out, and the slowest pass 10 px. By
+reasoning: at half faint film is lost, at twice what follows soon upon another change is."""
 LEAST_SCORE, SHARE, NEVER = 3.0, 0.15, 0.2
 """Score from which a column counts as changed; the part of its largest score that each frame must exceed to count; the
 cost of crossing a column that never changed. Chosen: three times what noise brings on average; a change seen in part,
 as by a blurred edge, still counts. By reasoning: at half noise draws the path on; at twice faint stretches end it."""
 FIRST_FRAMES = 5
-"""Frames whose median is what stands before the vine comes. Chosen: the median of five drops two odd ones."""
+"""Frames whose median is what stands before the vine comes, and of the last what it leaves. Chosen: the median of five
+drops two odd ones. By reasoning: at half a single glint counts; at twice the slowest are half-way grown."""
+DISTINCT = 4.0
+"""Difference of first and last look, in units of the noise, at which a pixel has half a vote. Chosen: two look alike
+within it. By reasoning: at half noise votes, at twice dark film on dark ground hardly does."""
+STRAY = 3.0
+"""Noise beyond which a value is as far from a picture as can be. Chosen: three standard deviations. By reasoning: at
+half noise counts like what is amiss; at twice a bright door counts more than the film it stands beside."""
 
 CHANGED_ROWS = 4
 """Rows of a column that must have changed for something to be there. Chosen: noise above the threshold never fills
@@ -43,6 +57,11 @@ in a pixel. By reasoning: at half noise counts as arrival, at twice dark film on
 SIGMA_PX = 0.8
 """Half a pixel of the path's own grid, and the ragged outline of a crumpled tip. Chosen; half or twice is the stated
 error of such tracks."""
+
+
+LEAP, LEAP_OVER_PX = 3.0, 2.0
+"""A step so many times those that follow, taken as this much at least, is no growth. Chosen: from rest steps grow. By
+reasoning: at half vines that slow down at once lose their start; at twice a tail that jerks passes for growth."""
 
 
 @njit(cache=True)
@@ -143,32 +162,145 @@ def evident_path(evidence: np.ndarray) -> np.ndarray:
     return path
 
 
-def first_path(
-    strip: NDArray, scale: NDArray[np.float64], offset: NDArray[np.float64], noise: float, window: int = 10
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Front by frame from changes alone, shape (n_frames,), and the scores it collected.
+def changing_path(strip: Strip) -> tuple[Floats, Floats]:
+    """Find the front by what changes most, and how much each column changes as it passes.
 
-    Within a column the score is linear in the change, so that the strongest change wins; between columns only its
-    logarithm counts, so that a bright glint in a few columns cannot outvote the rest.
+    Within a column the score is linear in the power of the change, so that the strongest change wins; between columns
+    only its logarithm counts, so that a bright glint in a few columns cannot outvote the rest.
+
+    Parameters
+    ----------
+    strip : along the axis, growth towards higher columns.
+
+    Returns
+    -------
+    column of the front, shape (n_frames,), px
+    logarithm of each column's change over that of noise, less SHARE of it; shape (n_along,)
+    """
+    score = _change_score(strip.values, strip.scale, strip.offset, WINDOW, _bunch(strip), strip.noise)
+    peak = score.max(axis=0)
+    worth = np.where(peak > LEAST_SCORE, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(np.float32)
+    score = score * worth[None, :]
+    score = np.where(worth[None, :] > 0, score - SHARE * score.max(axis=0, keepdims=True), -NEVER).astype(np.float32)
+    path, columns = _collect_path(score), np.arange(score.shape[1])
+    when = np.clip(np.searchsorted(path, columns + 0.5), 0, len(path) - 1)
+    return path, np.max([score[np.clip(when + d, 0, len(path) - 1), columns] for d in (-1, 0, 1)], axis=0)
+
+
+def lasting_path(strip: Strip) -> tuple[Floats, Floats]:
+    """Find the front by which of its first and last looks every pixel resembles, each having the same say.
+
+    A pixel's vote is the difference of its distances from both, over the distance between them: −1 where it looks as
+    it does at last, 1 where as at first. Few rows of something else, however bright, hardly move a column's sum.
+
+    Parameters
+    ----------
+    strip : along the axis, growth towards higher columns.
+
+    Returns
+    -------
+    column of the front, shape (n_frames,), px
+    change of each column from first to last, in the terms of `changing_path`; shape (n_along,)
+    """
+    first, last = _look(strip, slice(0, FIRST_FRAMES)), _look(strip, slice(-FIRST_FRAMES, None))
+    votes = _votes(strip.values, strip.scale, strip.offset, first, last, DISTINCT * strip.noise)
+    bunch, rows = _bunch(strip), len(first)
+    change = (last - first)[: rows // bunch * bunch].reshape(-1, bunch, first.shape[1]).mean(axis=1)
+    power = WINDOW / 2 * np.mean(change**2, axis=0) / (strip.noise**2 / bunch)
+    return evident_path(votes), (1 - SHARE) * np.log1p(power)
+
+
+def _bunch(strip: Strip) -> int:
+    """Rows of a strip that are judged together."""
+    return int(np.clip(strip.values.shape[1] // BUNCHED, 1, MOST_BUNCHED))
+
+
+def _look(strip: Strip, frames: slice) -> NDArray[np.float32]:
+    """Median brightness of every pixel over some frames, shape (n_across, n_along)."""
+    values = strip.values[frames] * strip.scale[frames, None, None].astype(np.float32)
+    return np.asarray(np.median(values + strip.offset[frames, None, None].astype(np.float32), axis=0), np.float32)
+
+
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+def _votes(
+    strip: np.ndarray, scale: np.ndarray, offset: np.ndarray, first: np.ndarray, last: np.ndarray, unit: float
+) -> np.ndarray:
+    """How much less like its last than its first look each column is in each frame, shape (n_frames, n_along)."""
+    n, rows, columns = strip.shape
+    out = np.zeros((n, columns), np.float32)
+    weight = np.float32(1.0) / (np.abs(last - first) + np.float32(unit))
+    for t in range(n):
+        gain, level = np.float32(scale[t]), np.float32(offset[t])
+        for u in range(rows):
+            for s in range(columns):
+                value = strip[t, u, s] * gain + level
+                out[t, s] += (abs(value - last[u, s]) - abs(value - first[u, s])) * weight[u, s]
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=MATHS, error_model="numpy")
+def unexplained(
+    strip: np.ndarray,
+    scale: np.ndarray,
+    offset: np.ndarray,
+    noise: float,
+    path: np.ndarray,
+    pictures: np.ndarray,
+    begin: int,
+    end: int,
+) -> float:
+    """Sum what film behind a path and background ahead of it do not explain.
 
     Parameters
     ----------
     strip : values as the camera wrote them, shape (n_frames, n_across, n_along).
     scale, offset : brightness = scale · value + offset, shape (n_frames,).
     noise : standard deviation of a value, grey levels.
-    window : frames before and after over which a change is judged.
+    path : column of the front by frame, shape (n_frames,), px.
+    pictures : brightness of film, then of background, shape (2 or more, n_across, n_along).
+    begin, end : columns over which to sum.
 
     Returns
     -------
-    column of the front, shape (n_frames,), px; scores, shape (n_frames, n_along).
+    squares in units of the noise, each STRAY² at most.
     """
-    bunch = int(np.clip(strip.shape[1] // BUNCHED, 1, MOST_BUNCHED))
-    score = _change_score(strip, scale, offset, window, bunch, noise)
-    peak = score.max(axis=0)
-    worth = np.where(peak > LEAST_SCORE, np.log1p(np.maximum(peak, 0)) / np.maximum(peak, 1e-6), 0.0).astype(np.float32)
-    score = score * worth[None, :]
-    score = np.where(worth[None, :] > 0, score - SHARE * score.max(axis=0, keepdims=True), -NEVER).astype(np.float32)
-    return _collect_path(score), score
+    n, rows, _ = strip.shape
+    unit, top, total = np.float32(1 / noise), np.float32(STRAY * STRAY), 0.0
+    for t in range(n):
+        gain, level = np.float32(scale[t]), np.float32(offset[t])
+        front = min(max(math.ceil(path[t]), begin), end)
+        for u in range(rows):
+            values = strip[t, u]
+            for k in range(2):
+                for s in range(begin if k == 0 else front, front if k == 0 else end):
+                    off = (values[s] * gain + level - pictures[k, u, s]) * unit
+                    total += min(off * off, top)
+    return total
+
+
+def after_jump(path: Floats) -> int:
+    """Column where growth begins in earnest: a path that leaps at its start and crawls on has not grown that far.
+
+    At release the tail jerks inside the film that already stands, and its columns change without any front. No front
+    is three times as fast in its first frames as in those that follow.
+
+    Parameters
+    ----------
+    path : column of the front by frame, shape (n_frames,), px.
+
+    Returns
+    -------
+    column; 0 where the path does not leap at its start.
+    """
+    steps = np.diff(path)
+    if not np.any(steps > 0):
+        return 0
+    onset = int(np.argmax(steps > 0))
+    begin = 0
+    for t in range(onset, min(onset + 4, len(steps) - 4)):
+        if steps[t] > LEAP * max(float(np.median(steps[t + 1 : t + 5])), LEAP_OVER_PX):
+            begin = int(path[t + 1])
+    return begin
 
 
 def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
@@ -187,8 +319,6 @@ def track_arrival(strip: Strip) -> tuple[Floats, Floats]:
     ValueError
         Where nothing new arrives anywhere.
     """
-    from vinetrack.video.edge import after_jump
-
     values = strip.values.astype(np.float32) * strip.scale[:, None, None].astype(np.float32)
     values += strip.offset[:, None, None].astype(np.float32)
     first = np.median(values[:FIRST_FRAMES], axis=0)
