@@ -144,7 +144,7 @@ def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
 
 
 def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
-    """Whether most of what changes along `axis` is a front that passes once, and what it brings stays.
+    """Whether most of what grows along `axis` is a front that passes once; where hardly any change stays, of all change.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
     scaled = _shrunk(axis, seen.factor)
     angle = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
     band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*seen.frames.shape[1:])))
-    x, y, time, weight, n_times = seen.changed
+    x, y, time, weight, n_times = seen.grown
     near = np.abs((np.column_stack([x, y]) - scaled.from_px) @ scaled.normal) < band
     if near.sum() < 12:
         raise RecordingError("nothing moves along the axis")

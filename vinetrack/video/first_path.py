@@ -70,8 +70,8 @@ def _likelier_path(strip: Strip) -> _Way:
     if len(ways) == 1:
         return ways[0]
     columns = min(passed[0] for _, passed in ways), max(passed[1] for _, passed in ways)
-    left = [_unexplained(strip, way, columns) for way in ways]
-    return ways[int(np.argmin(left))]
+    by_change, by_looks = (_unexplained(strip, way, columns) for way in ways)
+    return ways[1] if by_looks < by_change else ways[0]
 
 
 def _unexplained(strip: Strip, way: _Way, columns: tuple[int, int]) -> float:
