@@ -144,7 +144,9 @@ def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
 
 
 def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
-    """Whether most of what grows along `axis` is a front that passes once; where hardly any change stays, of all change.
+    """Whether most of what grows along `axis` is a front that passes once.
+
+    Where hardly any change stays, it is of all that changes.
 
     Parameters
     ----------
