@@ -12,7 +12,8 @@ from vinetrack.video import edge_kernels as kernels
 from vinetrack.video.axis import Axis
 from vinetrack.video.kymograph import fan_gains
 from vinetrack.video.order_kernels import median
-from vinetrack.video.strip import _pixels, _reference, sample
+from vinetrack.video.registration import _pixels, reference_pixels
+from vinetrack.video.resample import sample
 
 
 @pytest.mark.parametrize(("length", "blur"), [(0.0, 0.4), (0.02, 3.0), (4.3, 0.8), (17.0, 1.6)])
@@ -217,7 +218,7 @@ def test_single_pixels_of_a_strip_are_those_of_the_whole_strip(shake: np.ndarray
     axis, rows = Axis((10.0, 30.0), (125.0, 52.0)), [np.arange(-18, -10), np.arange(10, 18)]
     views = [sample(luma, axis, band, shake) for band in rows]
     means = [np.median(view, axis=0).astype(np.float32) for view in views]
-    reference = _reference(means, rows)
+    reference = reference_pixels(means, rows)
     whole = np.concatenate([view[:, 1:-1, 1:-1].reshape(3, -1) for view in views], axis=1).astype(int)
     apart = np.abs(_pixels(luma, axis, reference, shake).astype(int) - whole)
     assert apart.max() <= 6

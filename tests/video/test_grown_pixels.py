@@ -15,9 +15,11 @@ from vinetrack.core.records import Trial
 from vinetrack.experiment.settings import ExperimentSettings, MmPerPx
 from vinetrack.video.axis import Axis, find_axis
 from vinetrack.video.curve_search import find_growth_axis
+from vinetrack.video.first_path import grown_path
+from vinetrack.video.kymograph import changing_path
 from vinetrack.video.measure import measure_recording
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import cut_strip
+from vinetrack.video.strip import Strip, cut_strip
 from vinetrack.video.track import track_recording
 
 MOUTH = (60, 120)
@@ -141,3 +143,25 @@ def test_a_found_axis_is_as_narrow_with_a_calibration_as_without(tmp_path: Path)
         calibrated.tracking.track.lead_position_m, plain.track.lead_position_m, rtol=1e-9, equal_nan=True
     )
     assert calibrated.m_per_px == pytest.approx(5e-4)
+
+
+def test_a_door_that_rests_beside_the_tube_does_not_lead_its_first_path() -> None:
+    rng = np.random.default_rng(48)
+    ground, film = rng.uniform(60, 90, (40, 300)), rng.uniform(100, 130, (40, 300))
+    tip = np.clip(40 + 4 * (np.arange(80) - 14), 40, 290)
+    values = np.empty((80, 40, 300))
+    for t, place in enumerate(tip):
+        values[t] = np.where(np.arange(300) < place, film, ground)
+        if t >= 12:
+            values[t, 30:38, 60:180] = 250.0
+    values += rng.normal(0, 2, values.shape)
+    axis = Axis((0.0, 20.0), (299.0, 20.0), 40.0)
+    strip = Strip(
+        np.clip(values, 0, 255).astype(np.uint8), np.ones(80), np.zeros(80), np.zeros((80, 2)), 2.0, axis, False
+    )
+    by_change, _ = changing_path(strip)
+    assert np.abs(by_change - tip)[20:40].max() > 20
+    path, passed = grown_path(strip)
+    assert np.abs(path - tip)[18:60].max() <= 6
+    assert abs(passed[0] - 40) <= 8
+    assert abs(passed[1] - 290) <= 3

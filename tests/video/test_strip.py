@@ -8,7 +8,8 @@ from plain_scene import Plan, plain_scene
 
 from vinetrack.video.axis import Axis, find_axis, is_orderly
 from vinetrack.video.frames import RecordingError
-from vinetrack.video.strip import cut_strip, sample, squared
+from vinetrack.video.resample import sample
+from vinetrack.video.strip import cut_strip, squared
 
 
 def ramp(gx, gy, shape=(90, 140)):

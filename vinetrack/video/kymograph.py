@@ -202,12 +202,30 @@ def lasting_path(strip: Strip) -> tuple[Floats, Floats]:
     column of the front, shape (n_frames,), px
     change of each column from first to last, in the terms of `changing_path`; shape (n_along,)
     """
+    votes, _ = look_votes(strip)
+    change = _look(strip, slice(-FIRST_FRAMES, None)) - _look(strip, slice(0, FIRST_FRAMES))
+    bunch = _bunch(strip)
+    power = change[: len(change) // bunch * bunch].reshape(-1, bunch, change.shape[1]).mean(axis=1) ** 2
+    times_noise = WINDOW / 2 * power.mean(axis=0) / (strip.noise**2 / bunch)
+    return evident_path(votes), (1 - SHARE) * np.log1p(times_noise)
+
+
+def look_votes(strip: Strip) -> tuple[NDArray[np.float32], Floats]:
+    """Ask of every column in every frame whether it looks as at last or as at first.
+
+    Parameters
+    ----------
+    strip : along the axis, growth towards higher columns.
+
+    Returns
+    -------
+    sum of the votes of its pixels, shape (n_frames, n_along), negative where it looks as at last
+    what that would be if all agreed, shape (n_along,)
+    """
     first, last = _look(strip, slice(0, FIRST_FRAMES)), _look(strip, slice(-FIRST_FRAMES, None))
-    votes = _votes(strip.values, strip.scale, strip.offset, first, last, DISTINCT * strip.noise)
-    bunch, rows = _bunch(strip), len(first)
-    change = (last - first)[: rows // bunch * bunch].reshape(-1, bunch, first.shape[1]).mean(axis=1)
-    power = WINDOW / 2 * np.mean(change**2, axis=0) / (strip.noise**2 / bunch)
-    return evident_path(votes), (1 - SHARE) * np.log1p(power)
+    unit = DISTINCT * strip.noise
+    apart = np.abs(last - first)
+    return _votes(strip.values, strip.scale, strip.offset, first, last, unit), np.sum(apart / (apart + unit), axis=0)
 
 
 def _bunch(strip: Strip) -> int:

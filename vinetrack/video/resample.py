@@ -1,4 +1,4 @@
-"""Cutting sloped strips out of many pictures alike: bicubic interpolation on a straight grid, compiled.
+"""Cutting strips out of many pictures alike, exactly or by bicubic interpolation on a straight grid, compiled.
 
 Along an axis that lies nearly along the rows of a picture, neighbours of the strip are neighbours of the picture for
 hundreds of pixels, so that sixteen weights and sixteen loads of neighbouring pixels make one pixel, many at a time.
@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from vinetrack.core.records import Floats
+from vinetrack.video.axis import Axis
 from vinetrack.video.edge_cover import BORROWED
 
 SHARPNESS = np.float32(-0.75)
@@ -156,3 +158,65 @@ def _interpolate_one(
                     total += along[j] * neighbours[min(max(s + lead + j, 0), width - 1)]
                 value += across[k] * total
             made[place + s] = np.int32((min(max(value, nothing), most) + WHOLE) - WHOLE)
+
+
+def sample(luma: NDArray[Any], axis: Axis, rows_px: NDArray[np.int_], shift_px: Floats | None = None) -> NDArray[Any]:
+    """Values at whole pixels along the axis and at `rows_px` (consecutive) across; shape (n, n_rows, n_along).
+
+    An axis along the picture's own rows or columns is cut out without interpolation, moved by less than half a
+    pixel for it; `shift_px` (n, 2) moves every frame back by its own shift.
+
+    Parameters
+    ----------
+    luma : grey levels, shape (n_frames, height, width).
+    axis : in the picture, px.
+    rows_px : consecutive distances beside the axis, shape (n_rows,), px.
+    shift_px : shake of every frame along and across, shape (n_frames, 2), px.
+
+    Returns
+    -------
+    grey levels, shape (n_frames, n_rows, n_along).
+    """
+    import cv2
+
+    n_along = int(np.floor(axis.length_px)) + 1
+    along, across = axis.direction, axis.normal
+    start = axis.points(np.array(0.0), float(rows_px[0]))
+    if shift_px is None and max(abs(along)) > 1 - 1e-9:
+        return _slice(luma, start, along, across, len(rows_px), n_along)
+    if shift_px is None:
+        return warp_all(luma, _matrix(along, across, start), len(rows_px), n_along)
+    out = np.empty((len(luma), len(rows_px), n_along), luma.dtype)
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    for i, frame in enumerate(luma):
+        matrix = _matrix(along, across, start + shift_px[i, 0] * along + shift_px[i, 1] * across)
+        cv2.warpAffine(frame, matrix, (n_along, len(rows_px)), dst=out[i], flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return out
+
+
+def _matrix(along: Floats, across: Floats, origin: Floats) -> Floats:
+    """Matrix of places in the picture: matrix @ (along, row, 1), shape (2, 3)."""
+    return np.array([[along[0], across[0], origin[0]], [along[1], across[1], origin[1]]])
+
+
+def _slice(luma: NDArray[Any], start: Floats, along: Floats, across: Floats, n_rows: int, n_along: int) -> NDArray[Any]:
+    """Whole pixels of an axis that runs along rows or columns of the picture; outside it the border repeats."""
+    x = np.rint(
+        start[0] + np.arange(n_along) * along[0] if abs(along[0]) > 0.5 else start[0] + np.arange(n_rows) * across[0]
+    )
+    y = np.rint(
+        start[1] + np.arange(n_rows) * across[1] if abs(along[0]) > 0.5 else start[1] + np.arange(n_along) * along[1]
+    )
+    columns = np.clip(x, 0, luma.shape[2] - 1).astype(int)
+    rows = np.clip(y, 0, luma.shape[1] - 1).astype(int)
+    part = _take(_take(luma, rows, 1), columns, 2)
+    return np.ascontiguousarray(part if abs(along[0]) > 0.5 else part.transpose(0, 2, 1))
+
+
+def _take(luma: NDArray[Any], index: NDArray[np.int_], dim: int) -> NDArray[Any]:
+    """Consecutive indices as a view, others as a copy."""
+    steps = np.diff(index)
+    if len(steps) and np.all(steps == 1):
+        chosen = slice(int(index[0]), int(index[-1]) + 1)
+        return luma[:, chosen] if dim == 1 else luma[:, :, chosen]
+    return np.take(luma, index, axis=dim)

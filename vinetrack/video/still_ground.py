@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import Axis
 from vinetrack.video.curved_axis import CurvedAxis
-from vinetrack.video.strip import (
-    GAP_PX,
+from vinetrack.video.registration import (
     PIXELS,
     REFERENCE_FRAMES,
     SHAKE_FLOOR_PX,
@@ -25,7 +24,9 @@ from vinetrack.video.strip import (
     Reference,
     camera_unit,
     register,
+    shaken_alike,
 )
+from vinetrack.video.strip import GAP_PX
 
 BESIDE_PX = 120
 """Distance from the tube within which ground counts. Chosen: some thousand pixels lie there, of the plane in which the
@@ -61,11 +62,7 @@ def picture_shake(luma: NDArray[Any], axis: CurvedAxis, half_px: float) -> Float
     (first, first_sd), (second, second_sd) = (register(luma, level, half, None, unit) for half in halves)
     strength = float(np.median(np.abs(np.concatenate([first[:, 2:], second[:, 2:]]))))
     sd_sum = float(np.median(first_sd + second_sd))
-    apart = np.hypot(*(first - second)[:, 2:].T)
-    both = np.hypot(*(first + second)[:, 2:].T)
-    most = apart + both >= np.quantile(apart + both, 0.75)
-    disagree = apart[most].mean() > max(0.7 * both[most].mean(), 2 * sd_sum)
-    if not strength > max(SHAKE_FLOOR_PX, 1.25 * sd_sum) or disagree:
+    if not strength > max(SHAKE_FLOOR_PX, 1.25 * sd_sum) or not shaken_alike(luma, level, halves, unit):
         return None
     whole = _reference(picture, x, y)
     shift = np.zeros((len(luma), 2))
