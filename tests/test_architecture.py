@@ -47,6 +47,13 @@ HEAVY_AT_IMPORT = {
 """Rooms that compute: whoever imports them wants what they stand on. All others must start at once."""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _trees_are_let_go():
+    """The syntax trees of the whole package take 130 MB."""
+    yield
+    house_rules.parsed.cache_clear()
+
+
 def room(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
@@ -67,7 +74,7 @@ def imports(path: Path, at_import_only: bool = False) -> set[str]:
         for child in ast.iter_child_nodes(node):
             visit(child)
 
-    visit(ast.parse(path.read_text(encoding="utf-8")))
+    visit(house_rules.parsed(path))
     return found
 
 
@@ -120,7 +127,7 @@ def test_no_file_is_longer_than_450_lines() -> None:
 def test_importing_a_file_does_no_work(path: Path) -> None:
     """Loops, reading and writing at the top of a file would run in every process that imports it."""
     forbidden = []
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+    for node in house_rules.parsed(path).body:
         if isinstance(node, ast.For | ast.While | ast.With | ast.Try):
             forbidden.append(ast.unparse(node)[:60])
         calls = [ast.unparse(call.func) for call in ast.walk(node) if isinstance(call, ast.Call)]
@@ -147,7 +154,7 @@ def test_no_two_test_files_share_a_name() -> None:
 
 @pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
 def test_a_benchmark_finds_what_it_imports(path: Path) -> None:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(house_rules.parsed(path)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "vinetrack":
             room = importlib.import_module(str(node.module))
             for alias in node.names:

@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 VAGUE_NAMES = frozenset({"found", "one", "own", "item", "said", "rest", "thing", "doubts", "beliefs", "belief", "lost"})
@@ -39,10 +40,16 @@ def sources(package: Path) -> list[Path]:
     return sorted(path for path in package.rglob("*.py") if "__pycache__" not in path.parts)
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Syntax tree of a file, which many rules read."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def public_functions(package: Path) -> Iterator[tuple[Path, ast.FunctionDef, str]]:
     """Public module-level functions and public methods of public classes that take arguments, with their names."""
     for path in sources(package):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in parsed(path).body:
             if isinstance(node, ast.FunctionDef) and not node.name.startswith("_") and _arguments(node):
                 yield path, node, node.name
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
@@ -88,7 +95,7 @@ def module_numbers(package: Path) -> Iterator[tuple[Path, ast.stmt, str, bool]]:
     for path in sources(package):
         text = path.read_text(encoding="utf-8")
         lines = text.splitlines()
-        body = ast.parse(text).body
+        body = parsed(path).body
         for k, node in enumerate(body):
             target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
             value = getattr(node, "value", None)
@@ -136,7 +143,7 @@ def vague_names(package: Path) -> list[Place]:
     """Arguments, variables, attributes of classes, functions and classes with a name that says nothing."""
     places = []
     for path in sources(package):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             name = None
             if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
                 name = node.id
@@ -154,7 +161,7 @@ def private_imports(package: Path) -> list[Place]:
     places = []
     for path in sources(package):
         here = path.relative_to(package).parts[0]
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("vinetrack."):
                 continue
             if str(node.module).split(".")[1] == here:
@@ -179,7 +186,7 @@ def repeated_classes(package: Path) -> list[str]:
     names = Counter(
         node.name
         for path in sources(package)
-        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        for node in parsed(path).body
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     return sorted(name for name, times in names.items() if times > 1)

@@ -6,7 +6,7 @@ import ast
 import shutil
 import subprocess
 import sys
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import pytest
@@ -44,7 +44,7 @@ def changed_by_an_edit(path: Path, copy: Path) -> set[str]:
     return {stage for stage in STAGES if before[stage] != after[stage]}
 
 
-@lru_cache
+@cache
 def imports_by_syntax(path: Path) -> frozenset[str]:
     """What a file imports at run time, read from its syntax tree: the slow way, beyond doubt."""
     names: set[str] = set()
@@ -64,7 +64,7 @@ def imports_by_syntax(path: Path) -> frozenset[str]:
     return frozenset(name.removeprefix("vinetrack").lstrip(".") for name in names)
 
 
-@lru_cache
+@cache
 def modules_by_syntax(stage: str) -> set[Path]:
     """Modules that the imports of a stage reach; files that are read, not imported, are not among them."""
     waiting, reached = list(STAGE_MODULES[stage]), set()
