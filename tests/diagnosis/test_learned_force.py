@@ -125,7 +125,7 @@ def test_a_variable_that_follows_from_those_named_is_told_and_one_that_varies_fr
 @pytest.fixture(scope="module")
 def proposal(tmp_path_factory: pytest.TempPathFactory) -> Proposal:
     """Of vines that felt waves along the growth which become shorter: no formula of the list follows them."""
-    pairs = hidden_force(sheet((4,)), 131, "waves", -0.3, tmp_path_factory.mktemp("waves"))
+    pairs = hidden_force(sheet((4,), replicates=2), 131, "waves", -0.3, tmp_path_factory.mktemp("waves"))
     return propose(vt.base_model(), pairs, lambda _: None)
 
 
