@@ -192,7 +192,7 @@ def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:
     path.write_text(OWN_EFFECT)
     own = own_effects([path])
     pairs = _with_own(own["ratchet"], 0.25, seed=7003)
-    found = vt.diagnose(pairs, user_effects=own, ladder=False, advice=False)
+    found = vt.diagnose(pairs, user_effects=own, candidates=(*FEW, "ratchet"), ladder=False, advice=False)
     assert found.verdict == "missing"
     assert found.effects == ("ratchet",)
     size = found.fit["ratchet.F"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -106,6 +107,14 @@ def small_campaign(
     seed: int, damping: float = 0.03, pressure: float = 0.01, rho: float = 0.0, replicates: int = 2
 ) -> tuple[list[tuple[Trial, Track]], list[dict[str, float]]]:
     """Two vines, four pressures; sheet and tracks, and the truth of every trial."""
+    pairs, truth = _small_campaign(seed, damping, pressure, rho, replicates)
+    return list(pairs), list(truth)
+
+
+@lru_cache(maxsize=32)
+def _small_campaign(
+    seed: int, damping: float, pressure: float, rho: float, replicates: int
+) -> tuple[list[tuple[Trial, Track]], list[dict[str, float]]]:
     draw = np.random.default_rng(seed)
     trials = [
         vine_trial(f"D{D:g}_{P:g}_{k}".replace(".", "p"), P, D)

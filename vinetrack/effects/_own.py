@@ -154,7 +154,18 @@ def _worked_faults(effect: Effect, worked: Worked) -> Iterator[str]:
         yield f"{worked.hook} gives {value:.6g} where worked out by hand it is {worked.expected:.6g} ({worked.how})"
 
 
-def _compile_faults(effect: Effect, hook: str) -> Iterator[str]:
+_COMPILED: dict[tuple[bytes, str], tuple[str, ...]] = {}
+"""What became of functions that were compiled in this process, by the text of their file and their name."""
+
+
+def _compile_faults(effect: Effect, hook: str) -> tuple[str, ...]:
+    key = effect.path.read_bytes(), hook
+    if key not in _COMPILED:
+        _COMPILED[key] = tuple(_compiled_anew(effect, hook))
+    return _COMPILED[key]
+
+
+def _compiled_anew(effect: Effect, hook: str) -> Iterator[str]:
     from numba import njit
     from numba.core.errors import NumbaError
 
