@@ -28,7 +28,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """An experiment whose vines feel a force that grows with time, and its results; one candidate, which is not it."""
     place = tmp_path_factory.mktemp("lawful")
     values = {"hidden.a": -0.3, "hidden.kind": float(list(FORCES).index("growing"))}
-    virtual = grown(sheet((4,), replicates=2), 103, own=[effect_file(place)], values=values)
+    virtual = grown(sheet((4,), replicates=1), 103, own=[effect_file(place)], values=values)
     experiment, results = place / "bench", place / "results"
     write_experiment(virtual, experiment, "candidates: [air_drag]\n")
     for stage in (("tracks", experiment, results), ("gather", experiment, results), ("damping", results)):
@@ -53,7 +53,7 @@ def test_a_law_is_written_beside_the_experiment_and_added(
     assert "Proposed: a force that grows in proportion to time" in output
     path = experiment / "proposed_time.py"
     effect = own_effects([path])["proposed_time"]
-    assert "8 trials of bench" in effect.text
+    assert "4 trials of bench" in effect.text
     monkeypatch.setattr(search, "propose", lambda *_: proposals[0])  # the same once more, without the search
     code, output = run("propose", results)
     assert code == 1
