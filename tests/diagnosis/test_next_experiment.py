@@ -59,8 +59,20 @@ def one_tube(pressures_kPa: Sequence[float], replicates: int, **more: Any) -> li
 
 
 def fits_of(pairs: Pairs, *effects: str, noise: tuple[float, float] | None = None) -> list[Fit]:
-    base = vt.fit(vt.base_model(), pairs, profile=False, host=HOST, noise=noise)
+    base = base_fit(tuple(pairs), noise)
     return [vt.refit(base, base.model + getattr(vt.effects, name)) for name in effects]
+
+
+BASES: dict[tuple[int, ...], tuple[tuple[tuple[Trial, Track], ...], Fit]] = {}
+"""Fits that several tests begin from, with their trials, so that what tells these apart stays theirs."""
+
+
+def base_fit(pairs: tuple[tuple[Trial, Track], ...], noise: tuple[float, float] | None = None) -> Fit:
+    """The model without any effect fitted to these trials, once."""
+    key = (*map(id, pairs), hash(noise))
+    if key not in BASES:
+        BASES[key] = pairs, vt.fit(vt.base_model(), list(pairs), profile=False, host=HOST, noise=noise)
+    return BASES[key][1]
 
 
 def as_trials(found: NextExperiment, like: Trial) -> list[Trial]:
