@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from chrome import Chrome, find_chrome
 from served import Served
@@ -15,6 +16,7 @@ from vinetrack.core.tables import read_table
 from vinetrack.core.yaml_document import read_yaml
 from vinetrack.experiment.settings import read_experiment_settings
 from vinetrack.setup_page.page_server import start_server
+from vinetrack.video.curved_axis import CurvedAxis, axis_of_entry
 
 pytestmark = pytest.mark.skipif(find_chrome() is None, reason="needs a browser: apt install chromium")
 
@@ -147,6 +149,37 @@ def test_the_axis_is_dragged_and_moved_by_the_keyboard(person: Person, clips: Pa
     person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
     axis = read_yaml(clips / "experiment.yaml").content["axis"]
     assert axis["to_px"] == pytest.approx([440, 91], abs=1.0)
+
+
+def test_a_bend_is_added_dragged_and_taken_out_and_the_curve_is_the_one_tracked_along(
+    person: Person, clips: Path, tmp_path: Path
+) -> None:
+    person.press("#add-bend")
+    bend = "document.querySelector('[data-handle^=Bend]')"
+    assert person.chrome.run(f"document.activeElement === {bend}")
+    x, y = person.chrome.run(
+        f"(() => {{ const r = {bend}.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()"
+    )
+    person.chrome.mouse("move", x, y)
+    person.chrome.mouse("press", x, y)
+    target = person.at(250, 120)
+    person.chrome.mouse("move", *target, held=True)
+    person.chrome.mouse("release", *target)
+    person.press("#save")
+    person.chrome.wait("document.querySelector('#status').textContent.includes('Written')", "the save")
+    given = axis_of_entry(read_yaml(clips / "experiment.yaml").content["axis"])
+    assert isinstance(given, CurvedAxis)
+    assert given.via_px == (pytest.approx((250, 120), abs=1.0),)
+    drawn = str(person.chrome.run("document.querySelector('#over polyline.axis-line').getAttribute('points')"))
+    places = np.array([[float(v) for v in point.split(",")] for point in drawn.split()])
+    along, across = given.along_and_across(places)
+    assert np.abs(across).max() < 0.1
+    assert np.diff(along).min() > 0
+    person.chrome.picture(tmp_path / "bend.png")
+    person.chrome.run(f"{bend}.focus()")
+    person.key("Delete", 46)
+    assert person.chrome.run(f"{bend} === null")
+    assert person.chrome.run("document.querySelector('#over polyline.axis-line') === null")
 
 
 def test_a_frame_is_proofread_and_the_file_says_so(person: Person, clips: Path) -> None:

@@ -1,4 +1,5 @@
 // The picture: frames of the chosen recording, the growth axis dragged on it, and its scale.
+import {curveThrough, middleOfLongest} from "./curve.js";
 import {$, ask, changed, decimals, el, numberOf, round, state, url} from "./state.js";
 
 const view = {source: "", frame: 0, tool: "axis", image: null, width: 1, height: 1, board: "", words: "", edge: null};
@@ -108,10 +109,28 @@ function setAxis(axis, scope) {
   changed();
 }
 
-// Places along an axis in equal steps: those of a curve as the server laid it, else its points.
+const pointsOf = (axis) => [axis.from_px, ...(axis.via_px ?? []), axis.to_px];
+
+// Places along an axis, one after the other: those of a curve as the server laid it, else along the points.
 export function placesOf(axis) {
-  return axis.path_px ?? [axis.from_px, ...(axis.via_px ?? []), axis.to_px];
+  return axis.path_px ?? curveThrough(pointsOf(axis));
 }
+
+// The axis with other bends; it stays whose it was.
+function setBends(via_px) {
+  const now = currentAxis();
+  setAxis({...now, via_px}, now.given || scopeWanted());
+  drawOver();
+  drawTools();
+}
+
+function addBend() {
+  const now = currentAxis(), {index, point} = middleOfLongest(pointsOf(now));
+  setBends((now.via_px ?? []).toSpliced(index - 1, 0, point));
+  document.querySelector(`[data-handle="${bendWords(index - 1)}"]`)?.focus();
+}
+
+const bendWords = (i) => `Bend ${i + 1} of the growth axis`;
 
 function clearAxis() {
   if (row().axis) row().axis = "";
@@ -176,12 +195,18 @@ function drawAxis(over, axis, unit, handles) {
       drawTools();
     }));
   }
+  (axis.via_px ?? []).forEach((point, i) => {
+    const put = (place) => setBends(currentAxis().via_px.with(i, place));
+    const made = handle("circle", {cx: point[0], cy: point[1], r: 6 * unit, "stroke-width": 2 * unit, class: axis.given ? "handle given" : "handle"}, bendWords(i), () => currentAxis().via_px[i], put, "Delete takes it out");
+    made.addEventListener("keydown", (event) => { if (["Delete", "Backspace"].includes(event.key)) setBends(currentAxis().via_px.toSpliced(i, 1)); });
+    over.append(made);
+  });
 }
 
 const scopeWanted = () => document.querySelector("#axis-scope")?.value ?? "all";
 
-function handle(tag, given, words, where, put) {
-  const made = el(tag, {...given, tabindex: 0, role: "button", "aria-label": `${words}; arrow keys move it by a pixel, with Shift by ten, with Alt by a tenth`, "data-handle": words});
+function handle(tag, given, words, where, put, more = "") {
+  const made = el(tag, {...given, tabindex: 0, role: "button", "aria-label": `${words}; arrow keys move it by a pixel, with Shift by ten, with Alt by a tenth${more && `; ${more}`}`, "data-handle": words});
   made.addEventListener("pointerdown", (event) => { event.stopPropagation(); event.preventDefault(); drag(event, words, put); });
   made.addEventListener("keydown", (event) => {
     const step = event.shiftKey ? 10 : event.altKey ? 0.1 : 1;
@@ -346,6 +371,8 @@ function drawAxisTool() {
   const warning = moved ? el("p", {class: "hint", id: "moved-points", role: "note"}, `${moved === 1 ? "A point that was moved counts" : `${moved} points that were moved count`} along the axis as it was: after a change of it, move them again.`) : null;
   $("axis-tool").replaceChildren(...[said("axis"), el("p", {class: "hint"}, words), warning].filter(Boolean), el("div", {class: "row"},
     axis ? el("span", {class: "fact"}, el("b", {}, ends), " px") : el("button", {type: "button", onclick: place}, "Draw one"),
+    axis ? el("button", {type: "button", class: "plain", id: "add-bend", onclick: addBend, title: "A point in the middle of the longest part, to be dragged to where the vine bends; Delete takes one out"}, "Add a bend") : null,
+    axis?.via_px?.length ? el("button", {type: "button", class: "plain", id: "straighten", onclick: () => setBends([])}, "Make it straight") : null,
     el("label", {}, "A dragged axis holds for ", scope), axis?.given ? el("button", {type: "button", class: "plain", onclick: clearAxis}, "Take what the motion shows") : null));
 }
 

@@ -1,0 +1,49 @@
+// A smooth curve through points, the one that is tracked along: a natural cubic spline whose parameter grows by the
+// square root of the distance between points (video/curved_axis.py).
+const STEP_PX = 4;  // between places of it: drawn straight between them, a bend of 100 px radius is off by 0.02 px
+
+export function curveThrough(points) {
+  if (points.length < 3) return points;
+  const knots = [0];
+  for (let i = 1; i < points.length; i++) knots.push(knots[i - 1] + Math.sqrt(distance(points[i - 1], points[i])));
+  if (knots.some((knot, i) => i && knot === knots[i - 1])) return points;
+  const bends = [0, 1].map((k) => bendsOf(knots, points.map((point) => point[k])));
+  const places = [];
+  for (let i = 0; i + 1 < points.length; i++) {
+    const count = Math.max(1, Math.ceil(distance(points[i], points[i + 1]) / STEP_PX));
+    for (let j = 0; j < count; j++) places.push([0, 1].map((k) => valueAt(knots, points.map((point) => point[k]), bends[k], i, j / count)));
+  }
+  return [...places, points.at(-1)];
+}
+
+// Where a bend is added: the middle of the longest part between two points, and its place among them.
+export function middleOfLongest(points) {
+  const lengths = points.slice(1).map((point, i) => distance(points[i], point));
+  const i = lengths.indexOf(Math.max(...lengths));
+  const from = curveThrough(points), ends = [points[i], points[i + 1]].map((end) => nearest(from, end));
+  const middle = points.length < 3 ? points[0].map((v, k) => (v + points[1][k]) / 2) : from[Math.round((ends[0] + ends[1]) / 2)];
+  return {index: i + 1, point: middle};
+}
+
+const distance = ([x0, y0], [x1, y1]) => Math.hypot(x1 - x0, y1 - y0);
+
+const nearest = (places, point) => places.reduce((best, place, i) => (distance(place, point) < distance(places[best], point) ? i : best), 0);
+
+// Second derivatives at the knots, none at both ends: a tridiagonal system, by elimination.
+function bendsOf(knots, values) {
+  const n = values.length, bends = Array(n).fill(0), upper = Array(n).fill(0);
+  for (let i = 1; i < n - 1; i++) {
+    const before = knots[i] - knots[i - 1], after = knots[i + 1] - knots[i];
+    const slope = (values[i + 1] - values[i]) / after - (values[i] - values[i - 1]) / before;
+    const pivot = 2 * (before + after) - before * upper[i - 1];
+    upper[i] = after / pivot;
+    bends[i] = (6 * slope - before * bends[i - 1]) / pivot;
+  }
+  for (let i = n - 2; i > 0; i--) bends[i] -= upper[i] * bends[i + 1];
+  return bends;
+}
+
+function valueAt(knots, values, bends, i, part) {
+  const wide = knots[i + 1] - knots[i], left = 1 - part;
+  return left * values[i] + part * values[i + 1] + (wide * wide / 6) * ((left ** 3 - left) * bends[i] + (part ** 3 - part) * bends[i + 1]);
+}
