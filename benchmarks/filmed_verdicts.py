@@ -29,8 +29,10 @@ from hidden.filmed import film_campaign, filming_of
 import vinetrack as vt
 from vinetrack.core.records import Track, Trial
 from vinetrack.experiment.settings import ExperimentSettings
+from vinetrack.video.axis_agreement import askew_trials, slope_deg
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.measure import measure_recording
+from vinetrack.video.track import Tracking
 
 ONE_EACH = (
     "null:anything@953",
@@ -54,8 +56,14 @@ def ask(kind: str, seed: int, folder: Path, cores: int) -> None:
     begun = time.perf_counter()
     track = partial(measured, settings=experiment.settings, folder=experiment.folder)
     with ProcessPoolExecutor(cores) as pool:
-        seen = zip(experiment.trials, pool.map(track, experiment.trials), strict=True)
-        tracks = {trial.name: one for trial, one in seen if one is not None}
+        seen = list(zip(experiment.trials, pool.map(track, experiment.trials), strict=True))
+        trackings = {trial.name: tracking for trial, tracking in seen if tracking is not None}
+    axes = {name: tracking.axis for name, tracking in trackings.items()}
+    slopes_deg = {name: slope_deg(axis.from_px, axis.to_px, bends=axis.bends) for name, axis in axes.items()}
+    askew = {name for names, _ in askew_trials(slopes_deg, experiment.trials) for name in names}
+    for name in sorted(askew):
+        print(f"    left out: the growth axis of {name} is askew to the others'")
+    tracks = {name: tracking.track for name, tracking in trackings.items() if name not in askew}
     tracked_s = time.perf_counter() - begun
     begun = time.perf_counter()
     said = vt.diagnose(experiment, tracks=tracks, ladder=False, advice=False)
@@ -69,10 +77,10 @@ def ask(kind: str, seed: int, folder: Path, cores: int) -> None:
     print("    " + said.explanation[:500], flush=True)
 
 
-def measured(trial: Trial, settings: ExperimentSettings, folder: Path) -> Track | None:
-    """The track of one recording; None where it is refused, as the workflow leaves out such a trial alone."""
+def measured(trial: Trial, settings: ExperimentSettings, folder: Path) -> Tracking | None:
+    """What is tracked of one recording; None where it is refused, as the workflow leaves out such a trial alone."""
     try:
-        return measure_recording(trial, settings, folder).tracking.track
+        return measure_recording(trial, settings, folder).tracking
     except RecordingError as error:
         print(f"    left out: {error}")
         return None

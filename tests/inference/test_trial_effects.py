@@ -11,13 +11,14 @@ from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference import trial_effects
-from vinetrack.inference.assemble import log_likelihood
+from vinetrack.inference.assemble import _beside_smooth_errors, log_likelihood
 from vinetrack.inference.fit import fit
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.mixed_effects import FitState
 from vinetrack.inference.optimiser import FixedTerms, _creeps, solve
+from vinetrack.inference.position_errors import SmoothErrors
 from vinetrack.inference.release_kernels import products_at_releases
-from vinetrack.inference.trial_effects import follow_trial_effects, residuals_in, trial_costs
+from vinetrack.inference.trial_effects import LARGEST_DEVIATION, follow_trial_effects, residuals_in, trial_costs
 from vinetrack.inference.whitening import whiten
 
 
@@ -170,3 +171,18 @@ def test_a_search_goes_on_to_the_end_where_the_model_is_near_the_tracks(only_in_
     solution, predictor = only_in_motion.solution, only_in_motion.predictor
     found = solve(predictor, solution.problem, solution.state, FixedTerms(), least_decrease=1e-4, search=True)
     assert found.converged
+
+
+def test_deviations_that_a_straight_line_promises_without_end_are_stated_as_far_as_one_may_go(
+    only_in_motion: Fit,
+) -> None:
+    fitted = only_in_motion
+    effects = np.zeros_like(fitted.solution.state.trial_effects)
+    effects[0], effects[1] = 2000.0, -2000.0
+    there = replace(fitted.solution, state=replace(fitted.solution.state, trial_effects=effects))
+    smooth = SmoothErrors(there, 0.0, tuple(trial.whitened for trial in fitted.trials), ())
+    high, low, *others = _beside_smooth_errors(fitted.trials, smooth)
+    assert high.damping_deviation == pytest.approx(math.expm1(LARGEST_DEVIATION))
+    assert low.damping_deviation == pytest.approx(math.expm1(-LARGEST_DEVIATION))
+    assert (high.pressure_deviation, low.pressure_deviation) == (LARGEST_DEVIATION, -LARGEST_DEVIATION)
+    assert {trial.damping_deviation for trial in others} == {0.0}

@@ -24,6 +24,7 @@ from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import SmoothErrors, smooth_errors
 from vinetrack.inference.robust_covariance import few_trials, widened_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.trial_effects import LARGEST_DEVIATION
 from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation, whiten
 
@@ -129,8 +130,11 @@ def assemble(
 
 
 def _beside_smooth_errors(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
-    """Trials with deviations and residuals as they are beside smooth errors of position: a lens deviates no tube."""
-    effects = smooth.solution.state.trial_effects
+    """Trials with deviations and residuals as they are beside smooth errors of position: a lens deviates no tube.
+
+    A straight line promises deviations without end where a fit is far off; no further than it may go itself.
+    """
+    effects = np.clip(smooth.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     return tuple(
         replace(
             trial,

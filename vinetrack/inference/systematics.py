@@ -178,7 +178,8 @@ def _tracker(predictor: Predictor, trials: Sequence[TrialFit]) -> list[Floats]:
     if all(slow_m is None for slow_m in stated):
         return [np.zeros((trial.time_s.size, 0)) for trial in trials]
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
-    reach = max(float(np.max(growth_m)) for growth_m in grown)
+    # With hopeless parameters no trial moves; all parts of the growth are then zero.
+    reach = max(float(np.max(growth_m)) for growth_m in grown) or 1.0
     return [_slow_shapes(growth_m / reach, slow_m) for growth_m, slow_m in zip(grown, stated, strict=True)]
 
 
