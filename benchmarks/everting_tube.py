@@ -163,7 +163,7 @@ def main() -> None:
         if not given.no_diagnosis:
             diagnose("all trials", experiment)
             sticks = [one for one in recordings if len(one.events) > LEAST_EVENTS]
-            diagnose("those that stick", vt.read_experiment(write_folder(sticks, Path(scratch) / "sticks", own=True)))
+            diagnose("those that stick", vt.read_experiment(write_folder(sticks, Path(scratch) / "sticks")))
 
 
 if __name__ == "__main__":

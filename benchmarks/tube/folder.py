@@ -1,15 +1,13 @@
-"""The recordings as an experiment folder: sheet, settings, tracks with their pressure, and one effect of one's own."""
+"""The recordings as an experiment folder: sheet, settings, and tracks with their pressure."""
 
 from __future__ import annotations
 
 import csv
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from tube.recordings import DIAMETER_M, THICKNESS_M, Recording
 
-REEL = Path(__file__).with_name("reel_inertia.py")
 SETTINGS = """\
 # Low-density polyethylene; the tail comes off a reel; the tube grows level along a bench.
 tail_store: reel
@@ -25,8 +23,8 @@ COLUMNS = (
 )
 
 
-def write_folder(recordings: Sequence[Recording], folder: Path, *, own: bool = False) -> Path:
-    """Write the experiment; `own` names the reel's inertia among its effects.
+def write_folder(recordings: Sequence[Recording], folder: Path) -> Path:
+    """Write the experiment.
 
     The tubes are specimens, not replicates: each has a length of its own, the most its reel let out, and so a B and a
     yield pressure of its own. The pressure is the supply's; what reached the tube is the trace in the track.
@@ -47,11 +45,7 @@ def write_folder(recordings: Sequence[Recording], folder: Path, *, own: bool = F
             writer.writerow((one.name, f"tracks/{one.name}.csv", *row))
     for one in recordings:
         _write_track(one, folder / "tracks" / f"{one.name}.csv")
-    settings = SETTINGS
-    if own:
-        shutil.copy(REEL, folder / REEL.name)
-        settings += f"effects: [{REEL.name}]\n"
-    (folder / "experiment.yaml").write_text(settings, encoding="utf-8")
+    (folder / "experiment.yaml").write_text(SETTINGS, encoding="utf-8")
     return folder
 
 

@@ -24,7 +24,7 @@ pytestmark = [
     pytest.mark.skipif(not FOLDER, reason="VINETRACK_REAL_DATA is unset: no real recordings to try"),
 ]
 STICKS = "tube2_hi_2"
-MENDED = "+ static_yield + tail_friction + reel_inertia (own)"
+MENDED = "+ static_yield + tail_friction + reel_inertia"
 
 
 @cache
