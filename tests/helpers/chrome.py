@@ -8,8 +8,10 @@ from __future__ import annotations
 import asyncio
 import base64
 import json
+import os
 import shutil
 import subprocess
+import tempfile
 import time
 import urllib.request
 from collections.abc import Callable
@@ -55,10 +57,13 @@ class Chrome:
         self._count = 0
         self._answers: dict[int, dict[str, Any]] = {}
         profile = folder / "profile"
+        # The browser leaves folders where programs keep what passes; a socket in them wants a short path.
+        self._scratch = tempfile.TemporaryDirectory(prefix="browser", ignore_cleanup_errors=True)
         self._process = subprocess.Popen(
             [program, *FLAGS, f"--user-data-dir={profile}", f"--window-size={width},{height}", "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            env={**os.environ, "TMPDIR": self._scratch.name},
         )
         port_file = profile / "DevToolsActivePort"
         until(lambda: port_file.exists() and port_file.read_text().count("\n") >= 1, "the browser to start", 60)
@@ -90,6 +95,7 @@ class Chrome:
             self._process.kill()
             self._process.wait(20)
         self._loop.close()
+        self._scratch.cleanup()
 
     def send(self, method: str, **params: Any) -> dict[str, Any]:
         """One command and its answer."""
