@@ -180,6 +180,7 @@ def test_a_bend_is_added_dragged_and_taken_out_and_the_curve_is_the_one_tracked_
     person.key("Delete", 46)
     assert person.chrome.run(f"{bend} === null")
     assert person.chrome.run("document.querySelector('#over polyline.axis-line') === null")
+    assert person.chrome.run("document.activeElement.dataset.handle") == "Start of the growth axis"
 
 
 def test_a_frame_is_proofread_and_the_file_says_so(person: Person, clips: Path) -> None:

@@ -101,3 +101,13 @@ def test_nothing_moves_is_said():
 def test_an_axis_needs_length():
     with pytest.raises(RecordingError, match="shorter than 10"):
         Axis((5.0, 5.0), (9.0, 5.0))
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_black_ground_beside_the_tube_tells_of_no_light(kind: type) -> None:
+    luma = np.zeros((12, 120, 200), kind)
+    luma[:, 55:65] = 180
+    strip = cut_strip(luma, Axis((5.0, 60.0), (195.0, 60.0)), 8)
+    assert np.ptp(strip.scale) == 0
+    assert not strip.offset.any()
+    assert not strip.steadied

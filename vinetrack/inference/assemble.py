@@ -132,7 +132,8 @@ def assemble(
 def _beside_smooth_errors(trials: Sequence[TrialFit], smooth: SmoothErrors) -> tuple[TrialFit, ...]:
     """Trials with deviations and residuals as they are beside smooth errors of position: a lens deviates no tube.
 
-    A straight line promises deviations without end where a fit is far off; no further than it may go itself.
+    The deviations come from one linear step, which is unbounded where a fit is far off: they are limited as the fit's
+    own are (LARGEST_DEVIATION). The residuals are those of the step itself.
     """
     effects = np.clip(smooth.solution.state.trial_effects, -LARGEST_DEVIATION, LARGEST_DEVIATION)
     return tuple(

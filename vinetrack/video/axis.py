@@ -17,7 +17,7 @@ from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import LEAST_AXIS_PX
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.kymograph import fan_gains, passing_times
-from vinetrack.video.small_pictures import Pixels, SmallPictures, changed_pixels, order_tolerance
+from vinetrack.video.small_pictures import LEAST_GROWN, Pixels, SmallPictures, changed_pixels, order_tolerance
 
 ORDERLY = 0.45
 """Share of all change that one front explains where nothing else of weight goes on. Chosen: a swinging door takes a
@@ -146,7 +146,7 @@ def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
 def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
     """Whether most of what grows along `axis` is a front that passes once.
 
-    Where hardly any change stays, it is of all that changes.
+    Where hardly any of what changes along it stays (LEAST_GROWN), all that changes there is asked instead.
 
     Parameters
     ----------
@@ -166,13 +166,21 @@ def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
     scaled = _shrunk(axis, seen.factor)
     angle = float(np.arctan2(scaled.direction[1], scaled.direction[0]))
     band = float(np.clip(0.6 * scaled.width_px, 2.0, 0.2 * np.hypot(*seen.frames.shape[1:])))
-    x, y, time, weight, n_times = seen.grown
-    near = np.abs((np.column_stack([x, y]) - scaled.from_px) @ scaled.normal) < band
-    if near.sum() < 12:
+    line, grown = _beside(seen.changed, scaled, band), _beside(seen.grown, scaled, band)
+    n_times = seen.changed[-1]
+    if len(line[0]) < 12:
         raise RecordingError("nothing moves along the axis")
-    line = x[near], y[near], time[near], weight[near]
+    if len(grown[0]) >= max(12, LEAST_GROWN * len(line[0])):
+        line = grown
     agree, _, _ = agreeing(*line, n_times, angle, np.array(scaled.from_px), band)
     return bool(line[3][agree].sum() >= ORDERLY * line[3].sum())
+
+
+def _beside(pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Place, time and worth of those pixels that lie nearer to an axis than `band`."""
+    x, y, time, weight, _ = pixels
+    near = np.abs((np.column_stack([x, y]) - axis.from_px) @ axis.normal) < band
+    return x[near], y[near], time[near], weight[near]
 
 
 def centred_on_motion(luma: NDArray[Any] | SmallPictures, given: Axis) -> Axis:

@@ -3,7 +3,9 @@
 There are two ways to it, and each fails where the other does not. What changes most tells nothing of what it was: a
 bright door that comes to rest beside the tube outdoes it. What every pixel looks like, as in the first or as in the
 last frames, is a vote in which each has the same say, and a door has few rows; but what has flown on by then, or stood
-in front at first, has no vote. The path is taken whose pictures of film and background leave less unexplained.
+in front at first, has no vote, and what grows while the first and the last looks are taken is left out: the path begins
+and ends up to three frames late and early. The path is taken whose pictures of film and background leave less
+unexplained.
 """
 
 from __future__ import annotations
@@ -17,10 +19,10 @@ from vinetrack.video.edge_state import first_state
 from vinetrack.video.strip import Strip
 from vinetrack.video.tip_shape import ASSUMED_EXPOSURE
 
-LEAST_CHANGE, STRONG_PART = 5.0, 0.3
-"""Change of a column, as `kymograph.changing_path` states it, from which it counts as changed, and that as a part of
-the usual change. Chosen: some hundred times the power of noise. By reasoning: at half the path begins in what never
-changed; at twice faint starts are cut off."""
+LEAST_CHANGE = 5.0
+"""Change of a column, as `kymograph.changing_path` states it, from which it counts as changed. Chosen: about 360 times
+what noise brings to the score, e^(5/0.85). By reasoning: at half the path begins in what never changed; at twice faint
+starts are cut off."""
 RUN_PX, RUN_FILLED = 9, 0.6
 """Columns in a row of which this part must have changed for a front to have passed. Chosen: blur alone spreads a change
 over half as many. By reasoning: at half a glint counts as growth; at twice short growth does not."""
@@ -76,19 +78,18 @@ def _likelier_path(strip: Strip) -> _Way:
 
 def _unexplained(strip: Strip, way: _Way, columns: tuple[int, int]) -> float:
     """What a path leaves unexplained of some columns, with the pictures that follow from it."""
-    path, passed = way
-    pictures = first_state(strip, np.minimum(path, passed[1]), ASSUMED_EXPOSURE).pictures
+    path, _ = way
+    pictures = first_state(strip, path, ASSUMED_EXPOSURE).pictures
     return float(ky.unexplained(strip.values, strip.scale, strip.offset, strip.noise, path, pictures, *columns))
 
 
 def _in_earnest(path: Floats, change: Floats) -> _Way:
     """A path over the columns of which whole runs change, and the first and last of these.
 
-    Half the usual contrast counts: rather begin late (the neighbours then stand in for the background) than early,
-    where a column that never changed would say nothing at all about the edge.
+    Rather begin late (the neighbours then stand in for the background) than early, where a column that never changed
+    would say nothing at all about the edge.
     """
-    seen = change[change > LEAST_CHANGE]
-    strong = change > max(LEAST_CHANGE, STRONG_PART * float(np.median(seen)) if seen.size else LEAST_CHANGE)
+    strong = change > LEAST_CHANGE
     run = np.convolve(strong, np.ones(RUN_PX) / RUN_PX, mode="same") > RUN_FILLED
     if run.sum() < RUN_PX:
         raise ValueError("nothing moves along the axis")

@@ -39,8 +39,9 @@ LEAST_SCORE, SHARE, NEVER = 3.0, 0.15, 0.2
 cost of crossing a column that never changed. Chosen: three times what noise brings on average; a change seen in part,
 as by a blurred edge, still counts. By reasoning: at half noise draws the path on; at twice faint stretches end it."""
 FIRST_FRAMES = 5
-"""Frames whose median is what stands before the vine comes, and of the last what it leaves. Chosen: the median of five
-drops two odd ones. By reasoning: at half a single glint counts; at twice the slowest are half-way grown."""
+"""The median of the first so many frames is what stands before the vine comes, that of the last so many what it leaves.
+Chosen: the median of five drops two odd ones. By reasoning: at half a single glint counts; at twice the fastest have
+grown by a third."""
 DISTINCT = 4.0
 """Difference of first and last look, in units of the noise, at which a pixel has half a vote. Chosen: two look alike
 within it. By reasoning: at half noise votes, at twice dark film on dark ground hardly does."""
@@ -190,8 +191,9 @@ def changing_path(strip: Strip) -> tuple[Floats, Floats]:
 def lasting_path(strip: Strip) -> tuple[Floats, Floats]:
     """Find the front by which of its first and last looks every pixel resembles, each having the same say.
 
-    A pixel's vote is the difference of its distances from both, over the distance between them: −1 where it looks as
-    it does at last, 1 where as at first. Few rows of something else, however bright, hardly move a column's sum.
+    A pixel's vote is the difference of its distances from both, over the distance between them and DISTINCT times the
+    noise: towards −1 where it looks as at last, towards 1 where as at first. Few rows of something else, however
+    bright, hardly move a column's sum.
 
     Parameters
     ----------
@@ -202,30 +204,12 @@ def lasting_path(strip: Strip) -> tuple[Floats, Floats]:
     column of the front, shape (n_frames,), px
     change of each column from first to last, in the terms of `changing_path`; shape (n_along,)
     """
-    votes, _ = look_votes(strip)
-    change = _look(strip, slice(-FIRST_FRAMES, None)) - _look(strip, slice(0, FIRST_FRAMES))
+    first, last = _look(strip, slice(0, FIRST_FRAMES)), _look(strip, slice(-FIRST_FRAMES, None))
+    votes = _votes(strip.values, strip.scale, strip.offset, first, last, DISTINCT * strip.noise)
     bunch = _bunch(strip)
-    power = change[: len(change) // bunch * bunch].reshape(-1, bunch, change.shape[1]).mean(axis=1) ** 2
+    power = (last - first)[: len(first) // bunch * bunch].reshape(-1, bunch, first.shape[1]).mean(axis=1) ** 2
     times_noise = WINDOW / 2 * power.mean(axis=0) / (strip.noise**2 / bunch)
     return evident_path(votes), (1 - SHARE) * np.log1p(times_noise)
-
-
-def look_votes(strip: Strip) -> tuple[NDArray[np.float32], Floats]:
-    """Ask of every column in every frame whether it looks as at last or as at first.
-
-    Parameters
-    ----------
-    strip : along the axis, growth towards higher columns.
-
-    Returns
-    -------
-    sum of the votes of its pixels, shape (n_frames, n_along), negative where it looks as at last
-    what that would be if all agreed, shape (n_along,)
-    """
-    first, last = _look(strip, slice(0, FIRST_FRAMES)), _look(strip, slice(-FIRST_FRAMES, None))
-    unit = DISTINCT * strip.noise
-    apart = np.abs(last - first)
-    return _votes(strip.values, strip.scale, strip.offset, first, last, unit), np.sum(apart / (apart + unit), axis=0)
 
 
 def _bunch(strip: Strip) -> int:

@@ -19,7 +19,8 @@ from vinetrack.video.order_kernels import BINS_A_LEVEL, median
 from vinetrack.video.resample import sample
 
 REFERENCE_FRAMES = 15
-"""Frames whose mean is what all are compared with. Chosen: its noise is then a quarter of a frame's."""
+"""Frames whose median is what all are compared with. Derived: its noise is then a third of a frame's, √(π/2)/√15. By
+reasoning: at half it is nearly a half, at twice a quarter."""
 
 PIXELS = 9000
 """Pixels of the bands that are used, evenly spread: enough for a shift of 0.01 px. Derived for slopes of 5 grey levels
@@ -38,9 +39,10 @@ SHAKE_SETTLED_PX = 0.02
 """Shift of a round below which it is the last. Chosen: a fifth of the error of a shake that was taken off, and half of
 SHAKE_FLOOR_PX. At half another round is made, at twice up to that floor is left."""
 HALVES_APART = 0.7
-"""Shift between both halves of the bands, over their sum, below which a camera shook. Measured on clips of seeds 1 to 6
+"""Difference of the shifts that both halves of what stands still tell, over their sum, below which a camera shook.
+Measured on clips of seeds 1 to 6
 of `benchmarks/tracking_accuracy.py`: 0.03 to 0.36 where it did, 0.89 to 1.02 where film and doors move one half alone.
-At half a shake is left in; at twice film shakes the strip."""
+The ground beside a curve is judged alike. At half a shake is left in; at twice film shakes the strip."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,8 @@ def steady(
     picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
     means = _mean_pictures(luma, axis, bands, picks, None)
     reference = reference_pixels(means, bands)
+    if not reference.basis[0].any():  # black all over: it tells of no light and of no shift
+        return np.full(n, unit), np.zeros(n), shift, False
     for turn in range(SHAKE_ROUNDS):
         fit, sd = register(luma, axis, reference, shift if turn else None, unit)
         if turn == 0:
@@ -142,6 +146,8 @@ def shaken_alike(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], un
         for turn in range(SHAKE_ROUNDS):
             fit, sd = register(luma, axis, half, shift if turn else None, unit)
             shift = shift + np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
+            if float(np.abs(fit[:, 2:]).max()) < SHAKE_SETTLED_PX:
+                break
         shifts.append(shift)
         errors.append(sd)
     first, second = shifts

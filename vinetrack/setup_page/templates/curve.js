@@ -1,12 +1,10 @@
 // A smooth curve through points, the one that is tracked along: a natural cubic spline whose parameter grows by the
 // square root of the distance between points (video/curved_axis.py).
-const STEP_PX = 4;  // between places of it: drawn straight between them, a bend of 100 px radius is off by 0.02 px
+const STEP_PX = 4;  // about, between places of it: drawn straight, a bend of 100 px radius is off by less than 0.05 px
 
 export function curveThrough(points) {
-  if (points.length < 3) return points;
-  const knots = [0];
-  for (let i = 1; i < points.length; i++) knots.push(knots[i - 1] + Math.sqrt(distance(points[i - 1], points[i])));
-  if (knots.some((knot, i) => i && knot === knots[i - 1])) return points;
+  const knots = knotsOf(points);
+  if (points.length < 3 || !knots) return points;
   const bends = [0, 1].map((k) => bendsOf(knots, points.map((point) => point[k])));
   const places = [];
   for (let i = 0; i + 1 < points.length; i++) {
@@ -19,15 +17,20 @@ export function curveThrough(points) {
 // Where a bend is added: the middle of the longest part between two points, and its place among them.
 export function middleOfLongest(points) {
   const lengths = points.slice(1).map((point, i) => distance(points[i], point));
-  const i = lengths.indexOf(Math.max(...lengths));
-  const from = curveThrough(points), ends = [points[i], points[i + 1]].map((end) => nearest(from, end));
-  const middle = points.length < 3 ? points[0].map((v, k) => (v + points[1][k]) / 2) : from[Math.round((ends[0] + ends[1]) / 2)];
-  return {index: i + 1, point: middle};
+  const i = lengths.indexOf(Math.max(...lengths)), knots = knotsOf(points);
+  if (!knots) return {index: i + 1, point: points[i].map((v, k) => (v + points[i + 1][k]) / 2)};
+  const column = (k) => points.map((point) => point[k]);
+  return {index: i + 1, point: [0, 1].map((k) => valueAt(knots, column(k), bendsOf(knots, column(k)), i, 0.5))};
+}
+
+// Parameter at each point; none where two points coincide, through which no curve goes.
+function knotsOf(points) {
+  const knots = [0];
+  for (let i = 1; i < points.length; i++) knots.push(knots[i - 1] + Math.sqrt(distance(points[i - 1], points[i])));
+  return knots.some((knot, i) => i && knot === knots[i - 1]) ? null : knots;
 }
 
 const distance = ([x0, y0], [x1, y1]) => Math.hypot(x1 - x0, y1 - y0);
-
-const nearest = (places, point) => places.reduce((best, place, i) => (distance(place, point) < distance(places[best], point) ? i : best), 0);
 
 // Second derivatives at the knots, none at both ends: a tridiagonal system, by elimination.
 function bendsOf(knots, values) {

@@ -130,6 +130,12 @@ function addBend() {
   document.querySelector(`[data-handle="${bendWords(index - 1)}"]`)?.focus();
 }
 
+function removeBend(i) {
+  setBends(currentAxis().via_px.toSpliced(i, 1));
+  const next = currentAxis().via_px?.length ? bendWords(Math.max(i - 1, 0)) : "Start of the growth axis";
+  document.querySelector(`[data-handle="${next}"]`)?.focus();
+}
+
 const bendWords = (i) => `Bend ${i + 1} of the growth axis`;
 
 function clearAxis() {
@@ -178,7 +184,7 @@ function drawAxis(over, axis, unit, handles) {
   const [[x0, y0], [x1, y1]] = places.slice(-2);
   if (places.length > 2) over.append(el("polyline", {class: kind, fill: "none", points: places.slice(0, -1).join(" "), "stroke-width": 2 * unit}));
   const line = (cls, dx, dy, width) => el("line", {class: cls, x1: x0 + dx, y1: y0 + dy, x2: x1 + dx, y2: y1 + dy, "stroke-width": width * unit});
-  const length = Math.hypot(x1 - x0, y1 - y0);
+  const length = Math.hypot(x1 - x0, y1 - y0) || 1;
   const half = (axis.width_px ?? 0) / 2;
   if (half && places.length === 2) for (const side of [-half, half]) over.append(line(`${kind} side`, (-side * (y1 - y0)) / length, (side * (x1 - x0)) / length, 1));
   over.append(line(kind, 0, 0, 2));
@@ -198,7 +204,7 @@ function drawAxis(over, axis, unit, handles) {
   (axis.via_px ?? []).forEach((point, i) => {
     const put = (place) => setBends(currentAxis().via_px.with(i, place));
     const made = handle("circle", {cx: point[0], cy: point[1], r: 6 * unit, "stroke-width": 2 * unit, class: axis.given ? "handle given" : "handle"}, bendWords(i), () => currentAxis().via_px[i], put, "Delete takes it out");
-    made.addEventListener("keydown", (event) => { if (["Delete", "Backspace"].includes(event.key)) setBends(currentAxis().via_px.toSpliced(i, 1)); });
+    made.addEventListener("keydown", (event) => { if (["Delete", "Backspace"].includes(event.key)) { event.preventDefault(); removeBend(i); } });
     over.append(made);
   });
 }
