@@ -23,7 +23,8 @@ from vinetrack.video.small_pictures import SmallPictures
 BETTER = 1.35
 """A curve that explains so many times the change that the straight line explains is taken. Measured on the clips
 below: 1.7 to 1.8 along a sharp bend, 1.2 to 1.7 along a quarter of a circle (WIDER takes those below), at most 1.04
-along straight vines with doors and payloads. By reasoning: at 1.1 such as have longer doors are bent, at 2 a bend half-way is missed."""
+along straight vines with doors and payloads. By reasoning: at 1.1 such as have longer doors are bent, at 2 a bend
+half-way is missed."""
 WIDER, AS_MUCH = 1.25, 0.98
 """So is one that explains hardly less, where the straight line needs a band so many times wider. Measured, clips of
 seeds 3 and 4 (straight) and 1 to 4 (bent) of `benchmarks/tracking_accuracy.py`: 1.29 to 1.37 along bends of 25 degrees,
