@@ -131,15 +131,16 @@ def _best(
     """
     vines = {trial.name: trial.vine for trial, _ in pairs}
     shared = {key: how for key, how in PER_TUBE.items() if key in model.parameter_names}
-    found: list[Fit] = []
+    followed: list[tuple[Fit, tuple[TrialFit, ...]]] = []
     for start in starts(model, [one for one in recordings if one.name in vines], vines):
         try:
-            found.append(vt.fit(model, pairs, shared=shared, start=start, profile=False))
+            fit = vt.fit(model, pairs, shared=shared, start=start, profile=False)
+            followed.append((fit, in_sample(fit).trials))
         except vt.FitError as error:
             print(f"{name}, {', '.join(vines)}: a start was given up. {error}")
-    if not found:
+    if not followed:
         raise vt.FitError(f"{name}: no start could be followed.")
-    return min(((fit, in_sample(fit).trials) for fit in found), key=lambda pair: rms_m(pair[1]))
+    return min(followed, key=lambda pair: rms_m(pair[1]))
 
 
 def rms_m(trials: Sequence[TrialFit]) -> float:
