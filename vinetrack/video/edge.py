@@ -30,7 +30,7 @@ from vinetrack.video.edge_state import (
     repicture,
     residuals,
 )
-from vinetrack.video.first_path import grown_path
+from vinetrack.video.first_path import grown_by_change, grown_path
 from vinetrack.video.hidden_tip import GUESSED_PX, NO_EDGE_PX, disturbed_start, find_mouth, hidden_errors, leap_error_px
 from vinetrack.video.slow_errors import noise_and_slow, slow_error_px
 from vinetrack.video.strip import Strip
@@ -246,7 +246,7 @@ def rough_growth(strip: Strip) -> tuple[float, float]:
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, passed = grown_path(strip)
+    path, passed = grown_by_change(strip)
     growth = float(passed[1] - passed[0])
     early, late = (int(np.searchsorted(path, passed[0] + part * growth)) for part in (0.2, 0.9))
     return growth, 0.7 * growth / max(late - early, 1)

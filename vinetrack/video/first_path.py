@@ -51,7 +51,33 @@ def grown_path(strip: Strip) -> tuple[Floats, tuple[int, int]]:
     ValueError
         Where nothing in the strip changes as a passing front does.
     """
-    path, (begin, end) = _likelier_path(strip)
+    return _of_growth(strip, _likelier_path(strip))
+
+
+def grown_by_change(strip: Strip) -> tuple[Floats, tuple[int, int]]:
+    """Find a path of the front by what changes most alone, and the columns that it leaves changed for good.
+
+    Where it begins and ends is told better than by looks, of which several frames are taken.
+
+    Parameters
+    ----------
+    strip : along the axis, growth towards higher columns.
+
+    Returns
+    -------
+    as `grown_path`.
+
+    Raises
+    ------
+    ValueError
+        Where nothing in the strip changes as a passing front does.
+    """
+    return _of_growth(strip, _in_earnest(*ky.changing_path(strip)))
+
+
+def _of_growth(strip: Strip, way: _Way) -> _Way:
+    """A path over what film covers, without what a payload flies on over."""
+    path, (begin, end) = way
     end = growth_end(strip, path, (begin, end))
     if end <= begin:
         raise ValueError("what changes along the axis does not stay changed: nothing grows")
