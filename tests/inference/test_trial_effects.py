@@ -19,7 +19,7 @@ from vinetrack.inference.optimiser import FixedTerms, _creeps, solve
 from vinetrack.inference.position_errors import SmoothErrors
 from vinetrack.inference.release_kernels import products_at_releases
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION, follow_trial_effects, residuals_in, trial_costs
-from vinetrack.inference.whitening import whiten
+from vinetrack.inference.whitening import products, whiten
 
 
 @pytest.fixture(scope="module")
@@ -186,3 +186,10 @@ def test_deviations_that_a_straight_line_promises_without_end_are_stated_as_far_
     assert low.damping_deviation == pytest.approx(math.expm1(-LARGEST_DEVIATION))
     assert (high.pressure_deviation, low.pressure_deviation) == (LARGEST_DEVIATION, -LARGEST_DEVIATION)
     assert {trial.damping_deviation for trial in others} == {0.0}
+
+
+def test_a_trajectory_beyond_what_numbers_hold_costs_without_end_and_says_nothing(only_in_motion: Fit) -> None:
+    solution, predictor = only_in_motion.solution, only_in_motion.predictor
+    far = [np.full(trial.time_s.size, 1e200) for trial in predictor.data]
+    assert not np.isfinite(trial_costs(predictor, solution.problem, solution.state, far)).any()
+    assert not np.isfinite(products(np.full((5, 2), 1e200), np.arange(5) == 0)).all()

@@ -114,6 +114,7 @@ def limited(predictor: Predictor, trial_effects: Floats, step: Floats) -> Floats
     return moved
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a step far off: see `whitening`
 def trial_costs(
     predictor: Predictor, problem: MixedProblem, state: FitState, residuals: Sequence[Floats] | None = None
 ) -> Floats:

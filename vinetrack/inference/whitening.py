@@ -7,6 +7,9 @@ With noise e_k = ρ e_{k−1} + s ε_k, the columns c_k enter every quantity of 
 so three small matrices a trial stand for all its points, whatever ρ turns out to be. `first` are the points that begin
 a stretch without gaps; the noise of stretches is independent. Where noise varies from point to point, columns are
 divided by each point's relative standard deviation first: what is left is AR(1) of one variance.
+
+A step far off may take a trajectory beyond what numbers hold. Its sums are then infinite, or no numbers, and the step
+is refused: nothing is said of it.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def products(columns: Floats, first: NDArray[np.bool_], relative_sd: Floats | None = None) -> Floats:
     """G₀, G₁, G₂ of one trial, shape (3, k, k), for columns of shape (n_points, k).
 
@@ -73,6 +77,7 @@ def all_products(
     return np.stack([products(c, f, sd) for c, f, sd in zip(columns, first, relative, strict=True)])
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def at_correlation(grams: Floats, rho: float) -> Floats:
     """Sums of whitened products at one correlation, shape (n_trials, k, k), in units of the innovations' variance 1.
 
