@@ -42,7 +42,7 @@ SETS = (
     ("tail_friction", "falling_friction", "reel_inertia"),
     ("quadratic_length_friction", "falling_friction", "reel_inertia"),
 )
-"""Effects that are added to the base model, the smallest sets first."""
+"""Sets of effects that are added to the base model."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
-"""How far a camera shook and its light flickered, told by what stands still: each frame against the mean picture.
+"""How far a camera shook and its light flickered, told by what stands still: each frame against the median picture.
 
-Robust least squares on the mean picture and its slopes. What moves there (a door, a hand) strays and is left out.
+Robust least squares on the median picture and its slopes. What moves there (a door, a hand) strays and is left out.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ The ground beside a curve is judged alike. At half a shake is left in; at twice 
 class Reference:
     """Pixels of the bands with which frames are compared: where they lie, and what they show on average.
 
-    `along_px` and `across_px`, shape (n_pixels,), whole numbers; `basis`, shape (4, n_pixels): mean picture, one, and
+    `along_px` and `across_px`, shape (n_pixels,), whole numbers; `basis`, shape (4, n_pixels): median picture, one, and
     its slopes along and across.
     """
 
@@ -78,7 +78,7 @@ def camera_unit(luma: NDArray[Any]) -> float:
 def steady(
     luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], unit: float, still: bool
 ) -> tuple[Floats, Floats, Floats, bool]:
-    """Level and steady every frame against the mean picture of its bands.
+    """Level and steady every frame against the median picture of its bands.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ def steady(
     shift = np.zeros((n, 2))
     fit, steadied = np.zeros((n, 4)), False
     picks = np.unique(np.linspace(0, n - 1, REFERENCE_FRAMES).astype(int))
-    means = _mean_pictures(luma, axis, bands, picks, None)
-    reference = reference_pixels(means, bands)
+    medians = _median_pictures(luma, axis, bands, picks, None)
+    reference = reference_pixels(medians, bands)
     if not reference.basis[0].any():  # black all over: it tells of no light and of no shift
         return np.full(n, unit), np.zeros(n), shift, False
     for turn in range(SHAKE_ROUNDS):
@@ -108,14 +108,14 @@ def steady(
             strength = float(np.median(np.abs(fit[:, 2:]))), float(np.median(sd))
             if still or not np.isfinite(strength[1]) or strength[0] < max(SHAKE_FLOOR_PX, 2.5 * strength[1]):
                 break
-            middle, end = means[0].shape[1] // 2, means[0].shape[1]
-            halves = [reference_pixels(means, bands, part) for part in ((0, middle), (middle, end))]
+            middle, end = medians[0].shape[1] // 2, medians[0].shape[1]
+            halves = [reference_pixels(medians, bands, part) for part in ((0, middle), (middle, end))]
             if not shaken_alike(luma, axis, halves, unit):
                 break
             steadied = True
         shift = shift + np.clip(fit[:, 2:], -SHAKE_STEP_PX, SHAKE_STEP_PX)
         if turn == 1:
-            reference = reference_pixels(_mean_pictures(luma, axis, bands, picks, shift), bands)
+            reference = reference_pixels(_median_pictures(luma, axis, bands, picks, shift), bands)
         if turn > 1 and float(np.abs(fit[:, 2:]).max()) < SHAKE_SETTLED_PX:
             break
     gain = np.clip(fit[:, 0], 0.2, 5.0)
@@ -157,7 +157,7 @@ def shaken_alike(luma: NDArray[Any], axis: Axis, halves: Sequence[Reference], un
     return float(np.mean(apart[most])) < max(HALVES_APART * float(np.mean(both[most])), 2 * sd_sum)
 
 
-def _mean_pictures(
+def _median_pictures(
     luma: NDArray[Any], axis: Axis, bands: list[NDArray[np.int_]], picks: NDArray[np.int_], shift_px: Floats | None
 ) -> list[NDArray[np.float32]]:
     """Median of some frames in each band, shape (n_rows, n_along)."""
@@ -167,13 +167,13 @@ def _mean_pictures(
 
 
 def reference_pixels(
-    means: list[NDArray[np.float32]], bands: list[NDArray[np.int_]], columns: tuple[int, int] | None = None
+    medians: list[NDArray[np.float32]], bands: list[NDArray[np.int_]], columns: tuple[int, int] | None = None
 ) -> Reference:
-    """Choose about PIXELS pixels of some bands, with what they show on average.
+    """Choose about PIXELS pixels of some bands, with their median brightness and its slopes.
 
     Parameters
     ----------
-    means : picture of each band, shape (n_rows, n_along).
+    medians : median picture of each band, shape (n_rows, n_along).
     bands : their rows, px across.
     columns : the first, and the one behind the last; all where None.
 
@@ -181,9 +181,9 @@ def reference_pixels(
     -------
     the pixels.
     """
-    low, high = columns or (0, means[0].shape[1])
+    low, high = columns or (0, medians[0].shape[1])
     parts, along, across = [], [], []
-    for picture, rows in zip(means, bands, strict=True):
+    for picture, rows in zip(medians, bands, strict=True):
         part = (slice(1, -1), slice(low + 1, high - 1))
         slopes = -np.gradient(picture, axis=1)[part], -np.gradient(picture, axis=0)[part]
         parts.append(np.stack([x.ravel() for x in (picture[part], np.ones_like(picture[part]), *slopes)]))
