@@ -17,6 +17,7 @@ import numpy as np
 
 from vinetrack.core.records import Floats, Track
 from vinetrack.core.tables import Table
+from vinetrack.tracks.rounded_times import without_rounding
 from vinetrack.tracks.track_checks import LARGEST_NUMBER, TrackError, check_times, new_track
 
 if TYPE_CHECKING:
@@ -254,7 +255,7 @@ def read_export(table: Table) -> Track:
         columns.setdefault(name, (column, unit))
     if "t" not in columns or not {"x", "y"} & columns.keys():
         raise TrackError("has no columns t and x or y: export them from Tracker with one separator throughout")
-    time_s = table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS)
+    time_s, rounded = without_rounding(table.numbers(columns["t"][0]) * _factor(columns["t"], SECONDS))
     check_times(time_s, table.lines)
     axes = [
         table.numbers(columns[name][0], blank_is_nan=True) * _factor(columns[name], METRES)
@@ -263,7 +264,9 @@ def read_export(table: Table) -> Track:
     ]
     position_m, note = _project_on_axis(np.column_stack(axes))
     missing = int(np.sum(~np.isfinite(position_m)))
-    notes = [f"{missing} rows have no position."] if missing else []
+    notes = [rounded] if rounded else []
+    if missing:
+        notes.append(f"{missing} rows have no position.")
     if not columns["t"][1] and not any(columns[name][1] for name in ("x", "y") if name in columns):
         notes.append("The export names no units; seconds and metres are assumed.")
     return new_track(time_s, position_m, notes=[*notes, note] if note else notes)
