@@ -134,7 +134,7 @@ def gather(tasks: list[Task], path: Path | None, jobs: int) -> list[Line]:
 
 def summary(lines: list[Line]) -> pd.DataFrame:
     """A line a row: how often right, how often a wrong name alone, what was said, how long it took."""
-    table = pd.DataFrame(lines, columns=list(COLUMNS)).fillna("")
+    table = pd.DataFrame(lines, columns=list(COLUMNS), dtype=object).fillna("")
     for name in ("right", "wrong_name"):
         table[name] = table[name].astype(str) == "True"
     for name in ("seconds", "covered", "intervals"):

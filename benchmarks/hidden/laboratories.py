@@ -244,6 +244,29 @@ def trace_off(low_ms: float, high_ms: float) -> Fault:
     return apply
 
 
+def slow_gauge(low_Hz: float, high_Hz: float, sigma_Pa: float) -> Fault:
+    """The pressure is read so many times a second, fewer than there are frames, with noise."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        rate = float(draw.uniform(low_Hz, high_Hz))
+        camera = replace(laboratory.camera, trace_late_s=0.0, trace_sigma_Pa=sigma_Pa, gauge_Hz=rate)
+        return replace(laboratory, camera=camera).known(gauge_Hz=rate)
+
+    return apply
+
+
+def filtered_gauge(low_Hz: float, high_Hz: float, sigma_Pa: float) -> Fault:
+    """The noise of the gauge went through a filter of so many hertz, and so lasts for several frames."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        band = float(draw.uniform(low_Hz, high_Hz))
+        rho = math.exp(-2 * math.pi * band / laboratory.shots[0].setting.capture_hz)
+        camera = replace(laboratory.camera, trace_late_s=0.0, trace_sigma_Pa=sigma_Pa, gauge_rho=rho)
+        return replace(laboratory, camera=camera).known(gauge_band_Hz=band)
+
+    return apply
+
+
 def _longest(laboratory: Laboratory) -> float:
     return max(shot.tube.length for shot in laboratory.shots)
 

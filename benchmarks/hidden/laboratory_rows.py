@@ -193,6 +193,15 @@ def _camera_rows() -> list[Row]:
             Wants(payload=False, chamber=True),
             least_sigma=CLEAR,
         ),
+        Row("gauge_slow", "gauge_slow", ADEQUATE, (faults.slow_gauge(40, 150, 100.0),)),
+        Row(
+            "gauge_slow_depletion",
+            "gauge_slow_depletion",
+            ADEQUATE,
+            (faults.physics(gamma=1.3), faults.slow_gauge(100, 200, 50.0)),
+            Wants(payload=False, chamber=True),
+        ),
+        Row("gauge_filtered", "gauge_filtered", ADEQUATE, (faults.filtered_gauge(30, 100, 100.0),)),
     ]
 
 

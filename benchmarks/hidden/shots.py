@@ -52,7 +52,9 @@ class Camera:
     edge. `wild_share` of the points are off by `wild_m`, evenly drawn. The lens adds k₃ u³ + k₅ u⁵, u from
     `lens_centre_m`; a camera that is tilted shows y (1 + `bow_per_m` y). The rows of the picture are read
     `row_delay_s_m` later by the metre; `scale` and `clock` are relative errors. `trace_late_s`: by how much the clock
-    of a recorded pressure is ahead (NaN: none is recorded).
+    of a recorded pressure is ahead (NaN: none is recorded); its gauge has noise `trace_sigma_Pa`, of correlation
+    `gauge_rho` from frame to frame, and is read `gauge_Hz` times a second, the file joined by lines in between (NaN: at
+    every frame).
     """
 
     noise_m: float
@@ -69,6 +71,8 @@ class Camera:
     clock: float = 0.0
     trace_late_s: float = math.nan
     trace_sigma_Pa: float = 50.0
+    gauge_Hz: float = math.nan
+    gauge_rho: float = 0.0
     sees_end: bool = False
 
 
@@ -217,9 +221,20 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
     position[wild] += draw.choice([-1, 1], int(wild.sum())) * draw.uniform(*camera.wild_m, int(wild.sum()))
     trace = None
     if math.isfinite(camera.trace_late_s):
-        trace = gauge(times, gauge_Pa, camera.trace_late_s)[:stop]
-        trace = (trace + camera.trace_sigma_Pa * draw.standard_normal(stop)) / 1e3
+        trace = _recorded(times[:stop], gauge(times, gauge_Pa, camera.trace_late_s)[:stop], camera, draw) / 1e3
     return times[:stop], position, trace
+
+
+def _recorded(times: Floats, pressure_Pa: Floats, camera: Camera, draw: Draw) -> Floats:
+    """Pressure, Pa, as the file has it at every frame."""
+    if math.isfinite(camera.gauge_Hz):
+        read = np.arange(
+            times[0] - float(draw.uniform()) / camera.gauge_Hz, times[-1] + 1 / camera.gauge_Hz, 1 / camera.gauge_Hz
+        )
+        readings_Pa = np.interp(read, times, pressure_Pa) + camera.trace_sigma_Pa * draw.standard_normal(read.size)
+        return np.interp(times, read, readings_Pa)
+    noise = _correlated(draw, camera.gauge_rho, times.size) if camera.gauge_rho else draw.standard_normal(times.size)
+    return pressure_Pa + camera.trace_sigma_Pa * noise
 
 
 def imaged(y: Floats, camera: Camera) -> Floats:

@@ -319,6 +319,18 @@ def test_a_trial_that_moves_below_its_yield_pressure_is_left_out_and_named(campa
     assert "1.5 kPa, lies below the yield pressure, 3 kPa" in fit.left_out["odd"]
 
 
+@pytest.mark.parametrize(("moving", "left_out"), [(3, True), (4, False)])
+def test_a_trial_of_which_hardly_any_motion_is_usable_is_left_out_and_named(
+    campaign: Campaign, moving: int, left_out: bool
+) -> None:
+    at_rest = 1e-5 * np.random.default_rng(2).standard_normal(40)
+    y = np.concatenate([at_rest, 2e-3 * np.arange(1, moving + 1)])
+    seen = as_track(np.arange(y.size) / FPS, y)
+    fit = vt.fit(vt.base_model(), [*campaign[1], (vine_trial("hid", 20), seen)], profile=False)
+    assert ("hid" in fit.left_out) == left_out
+    assert not left_out or f"{moving} usable points in motion, at least 4 are needed" in fit.left_out["hid"]
+
+
 def test_an_experiment_without_a_usable_trial_is_refused() -> None:
     short = as_track(np.arange(3) / FPS, np.arange(3.0))
     with pytest.raises(vt.FitError, match="No trial can be fitted: a: 3 usable points"):

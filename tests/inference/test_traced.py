@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lsoda_vine import N_TRUE, as_track, small_campaign
 
 import vinetrack as vt
 from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.sensitivity import PRESSURE, Predictor
+from vinetrack.inference.systematics import systematics_of
 
 GAUGE_NOISE_PA = 100.0
 
@@ -34,3 +38,29 @@ def test_the_gauge_is_believed_as_far_as_its_noise_lets_it(traced: Fit) -> None:
         samples = np.count_nonzero(item.time_s >= trial.release_s)
         assert item.gauge_error == pytest.approx(GAUGE_NOISE_PA / np.sqrt(samples) / trial.trial.pressure_Pa, rel=0.4)
         assert abs(trial.pressure_deviation) < 4 * item.gauge_error
+
+
+def test_what_the_gauge_leaves_wrong_in_a_pressure_bends_its_own_trial_alone(traced: Fit) -> None:
+    """The tip of a light vine follows the pressure at once: what a ramp adds is the integral of what a step adds."""
+    predictor = traced.predictor
+    trace = predictor.data[3].trace
+    assert trace is not None
+    ramp = np.linspace(-100.0, 100.0, trace[0].size)
+    data = [replace(trial_data, trace_errors_Pa=None) for trial_data in predictor.data]
+    data[3] = replace(data[3], trace_errors_Pa=ramp[:, None])
+    errors = systematics_of(Predictor(predictor.layout, data, predictor.host), traced.solution, traced.trials)
+    without = systematics_of(
+        Predictor(
+            predictor.layout,
+            [replace(data[3], trace_errors_Pa=None) if i == 3 else each for i, each in enumerate(data)],
+            predictor.host,
+        ),
+        traced.solution,
+        traced.trials,
+    )
+    assert errors.count == without.count + 1
+    moved = [columns[:, :1] for columns in errors.columns]
+    assert all(not columns.any() for i, columns in enumerate(moved) if i != 3)
+    part = np.interp(data[3].time_s, trace[0], ramp) / np.interp(data[3].time_s, *trace)
+    expected = np.cumsum(np.diff(traced.solution.columns[3][:, PRESSURE], prepend=0.0) * part)
+    assert moved[3][:, 0] == pytest.approx(expected, abs=0.05 * np.ptp(expected))

@@ -51,6 +51,32 @@ def test_the_same_likelihood_is_reached_wherever_the_releases_begin(only_in_moti
     assert np.isfinite(found["n"].sigma)
 
 
+@pytest.fixture(scope="module")
+def gauged_in_motion() -> Fit:
+    """The same with a gauge on each chamber, whose pressures stand still."""
+    pairs, truth = small_campaign(seed=7, replicates=1)
+    gauged = []
+    for (trial, track), true in zip(pairs, truth, strict=True):
+        time_s, position_m = (values[track.time_s > 0.03] for values in (track.time_s, track.lead_position_m))
+        gauged.append((trial, as_track(time_s, position_m, np.full(time_s.size, trial.pressure_Pa * true["pressure"]))))
+    return fit(vt.base_model(), gauged, profile=False)
+
+
+@pytest.mark.parametrize("early_frames", [5, 45])
+def test_nor_does_it_matter_where_they_begin_with_a_gauge_on_the_chamber(
+    gauged_in_motion: Fit, early_frames: int
+) -> None:
+    solution, predictor = gauged_in_motion.solution, gauged_in_motion.predictor
+    assert all(trial_data.trace is not None and not trial_data.shows_rest for trial_data in predictor.data)
+    away = solution.state.trial_effects.copy()
+    away[2, 0] = predictor.data[2].time_s[0] - early_frames * predictor.data[2].frame_s
+    begin = replace(solution.state, trial_effects=away)
+    elsewhere = solve(predictor, solution.problem, begin, FixedTerms(), warm=True)
+    # Each trial stays where another release would lower its −2 ln L by less than WORTH_MOVING.
+    within = 0.5 * trial_effects.WORTH_MOVING * len(predictor.data)
+    assert log_likelihood(elsewhere) == pytest.approx(log_likelihood(solution), abs=within)
+
+
 @pytest.mark.parametrize("rho", [0.0, 0.6])
 def test_products_at_a_release_are_those_of_the_shifted_and_whitened_columns(rho: float) -> None:
     draw = np.random.default_rng(5)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
-from vinetrack.inference.gauge_noise import noise_of, without_noise
+from vinetrack.inference.gauge_noise import QuietTrace, quiet_traces
 from vinetrack.tracks.noise_shape import correlated_gain, noise_shape
 from vinetrack.tracks.position_noise import position_noise, rest_points, rough_noise
 
@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 FEWEST_POINTS = 5
 """A trial with fewer points is refused. Derived: release, origin, speed and curvature take four."""
+
+FEWEST_MOVING = 4
+"""A trial with fewer points in motion is refused. Derived: release, speed and curvature take three; with them alone any
+motion is explained, and what a door did in two frames passes for one."""
 
 GAP_FRAMES = 1.5
 """A point later than this many frames after the one before begins a new stretch of noise, independent of the last.
@@ -85,7 +89,8 @@ class FitTrial:
     `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0
     where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
     `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
-    pressure, Pa; `gauge_error` is by what part of it the noise of the gauge leaves it wrong along the whole motion.
+    pressure, Pa; `gauge_error` is by what part of it the noise of the gauge leaves it wrong along the whole motion, and
+    the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are a standard deviation each of what varies of it.
     `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
     changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
     the noise over speed that it follows from, 0 where it follows `stated_m`, the file's own standard deviations.
@@ -102,6 +107,7 @@ class FitTrial:
     correlation: float
     trace: tuple[Floats, Floats] | None = None
     gauge_error: float = 0.0
+    trace_errors_Pa: Floats | None = None
     vague_rest: VagueRest | None = None
     position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
     stated_m: Floats | None = None
@@ -166,9 +172,10 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
         Reason by name of trial.
     """
     data, left_out = [], {}
-    for trial, track in pairs:
+    pairs = list(pairs)
+    for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
         try:
-            data.append(prepare_trial(trial, track))
+            data.append(prepare_trial(trial, track, quiet))
         except FitError as error:
             left_out[trial.name] = str(error)
     return _with_noise_shape(data) if weighted else data, left_out
@@ -201,13 +208,15 @@ def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:
     return weighted
 
 
-def prepare_trial(trial: Trial, track: Track) -> FitTrial:
+def prepare_trial(trial: Trial, track: Track, quiet: QuietTrace | None = None) -> FitTrial:
     """The usable points of a track, rest included, with what they say of their own noise.
 
     Parameters
     ----------
     trial : row of the sheet.
     track : its positions.
+    quiet : QuietTrace, optional
+        Its recorded pressure without noise, from `quiet_traces`, where traces of other trials tell of it too.
 
     Returns
     -------
@@ -216,8 +225,8 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     Raises
     ------
     FitError
-        Fewer than five usable points, times that do not increase, a leading edge that never moves, or one that moves
-        although its pressure cannot do it.
+        Fewer than five usable points, or four in motion; times that do not increase; a leading edge that never moves,
+        or one that moves although its pressure cannot do it.
     """
     usable = track.usable & ~_nearing_end(trial, track)
     vague, vague_rest = _vague(track, usable)
@@ -240,7 +249,13 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
     if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
         raise FitError("its leading edge never moves forward beyond its noise")
     n_rest = rest_points(position_m)
-    trace, gauge_error = _trace(track, time_s[max(n_rest - 1, 0) :])
+    moving = time_s.size - n_rest
+    if 0 < moving < FEWEST_MOVING:
+        raise FitError(
+            f"{moving} usable point{'s' * (moving != 1)} in motion, at least {FEWEST_MOVING} are needed: film faster,"
+            " or see in its overlay what hides the edge"
+        )
+    quiet = quiet or quiet_traces([track])[0]
     stated_m = track.lead_position_sigma_m[usable]
     filmed = trial.video is not None
     return FitTrial(
@@ -251,8 +266,9 @@ def prepare_trial(trial: Trial, track: Track) -> FitTrial:
         n_rest=n_rest if n_rest < position_m.size else 0,
         noise_m=noise_m,
         correlation=correlation,
-        trace=trace,
-        gauge_error=gauge_error,
+        trace=None if quiet is None else (quiet.time_s, quiet.pressure_Pa),
+        gauge_error=0.0 if quiet is None else _gauge_error(quiet, time_s[max(n_rest - 1, 0) :]),
+        trace_errors_Pa=None if quiet is None or not quiet.errors_Pa.size else quiet.errors_Pa,
         vague_rest=vague_rest,
         position_systematic_m=_position_systematic_m(trial),
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
@@ -279,28 +295,14 @@ def _position_systematic_m(trial: Trial) -> float:
     return POSITION_SYSTEMATIC_M if trial.video is None else 0.0
 
 
-def _trace(track: Track, moving_s: Floats) -> tuple[tuple[Floats, Floats] | None, float]:
-    """Times and pressures of a trace freed of noise, and by what part of the pressure it is wrong all the same."""
-    if track.pressure_Pa is None:
-        return None, 0.0
-    known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
-    if np.count_nonzero(known) < 2:
-        return None, 0.0
-    clock_s, pressure_Pa = (values[known].astype(float) for values in (track.time_s, track.pressure_Pa))
-    told = (clock_s >= moving_s[0]) & (clock_s <= moving_s[-1])
-    typical_Pa = abs(float(np.median(pressure_Pa[told]))) if told.any() else math.nan
-    smooth_Pa = without_noise(pressure_Pa, _growth(track, known))
-    if not typical_Pa > 0 or smooth_Pa is pressure_Pa:
-        return (clock_s, smooth_Pa), 0.0
-    return (clock_s, smooth_Pa), noise_of(pressure_Pa) / math.sqrt(np.count_nonzero(told)) / typical_Pa
-
-
-def _growth(track: Track, known: NDArray[np.bool_]) -> Floats | None:
-    """The leading edge at the samples of a trace, m, between the frames in which it was seen."""
-    seen = track.usable & np.isfinite(track.lead_position_m) & np.isfinite(track.time_s)
-    if np.count_nonzero(seen) < 2:
-        return None
-    return np.interp(track.time_s[known], track.time_s[seen], track.lead_position_m[seen])
+def _gauge_error(quiet: QuietTrace, moving_s: Floats) -> float:
+    """By what part of the pressure a trace freed of noise is wrong all along the motion."""
+    told = (quiet.time_s >= moving_s[0]) & (quiet.time_s <= moving_s[-1])
+    typical_Pa = abs(float(np.median(quiet.pressure_Pa[told]))) if told.any() else math.nan
+    if not typical_Pa > 0:
+        return 0.0
+    # Noise averages out over what is seen of the motion alone.
+    return quiet.mean_error_Pa * math.sqrt(told.size / np.count_nonzero(told)) / typical_Pa
 
 
 def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], VagueRest | None]:

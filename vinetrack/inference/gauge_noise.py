@@ -5,18 +5,34 @@ that it never moved; and a noisy pressure passes a threshold early, in every tri
 
 Where a few numbers explain a trace, they are fitted: a polynomial in time, or, since the pressure falls as the tube
 fills and has its corner where the growth begins, a polynomial in time and in the growth that is seen. Gauge and camera
-may differ in their clocks, so the growth may be shifted. Of the curves that leave only noise that with the least AIC
-(Akaike, IEEE Trans. Autom. Control 19, 716, 1974) is taken. Where there is none,
-around every sample straight lines are laid through ever more neighbours, for as long as what is left beside them looks
-like noise and each agrees with all narrower ones: wide where the pressure runs straight, narrow at a corner (the
+may differ in their clocks, so the growth may be shifted, by any of so many samples alike. Of the curves that leave only
+noise that with the least BIC (Schwarz, Ann. Stat. 6, 461, 1978) is taken: a term too many bends the speed all
+through a trial, at 0.1 kPa of noise by more than its positions err. How often each kind of curve occurs in a campaign
+is estimated along (empirical Bayes: Robbins, Proc. 3rd Berkeley Symp. 1, 157, 1956). Where no curve will do, straight
+lines are laid around every sample through ever more neighbours, for as long as what is left beside them looks like
+noise and each agrees with all narrower ones: wide where the pressure runs straight, narrow at a corner (the
 intersection of confidence intervals: Goldenshluger & Nemirovski, Math. Methods Stat. 6, 135, 1997).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
 import numpy as np
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Floats, Track
+from vinetrack.inference.gauge_readings import (
+    FEWEST,
+    GaugeNoise,
+    gauge_readings,
+    noise_correlation,
+    noise_of,
+    noises_of,
+    whitened,
+)
 
 HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 27, 40, 60, 90, 135, 200, 300, 450, 680, 1000)
 """Half widths of the smoothing lines, samples. Chosen: each half as wide again as the one before, so that the best
@@ -30,16 +46,11 @@ CHANCE = 1e-5
 """At which noise leaves more beside a line than is let pass. Chosen: one false alarm in 1e5 traces; its square root at
 half the number of standard deviations."""
 
-QUIET = 1e-4
-"""Noise below this part of the median pressure is rounding, and left as it is. Chosen: a tenth of the last digit that
-pressure gauges print."""
-
-FEWEST = 9
-"""Samples below which a trace is left as it is. Derived: twice the degrees of freedom of a cubic and one more."""
-
-MOST_BENT, LOOKED_BEYOND, SLOW_SIGMAS = 6, 12, 3.3
+MOST_BENT, LOOKED_BEYOND, SLOW_SIGMAS = 6, 12, 4.0
 """Degree of a curve at most; of so many degrees beyond its own none may show by so many standard deviations. Chosen:
-sixth degree follows any filling and draining seen; 3.3 standard deviations are a chance of 1e-3."""
+sixth degree follows any filling and draining seen. Derived: 4 standard deviations are a chance of 1e-3 among the
+nineteen that are asked of a trace; at half two traces in three would be refused their curve, at twice a slow part of
+eight standard errors stays."""
 
 LOCAL_SIGMAS = 5.0
 """Standard deviations by which a sum of neighbouring residuals may stand out. Chosen: of a thousand samples in sixteen
@@ -58,6 +69,85 @@ ALONG_GROWTH = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
 growth to 1e-4 of its pressure, a supply that refills it is slow in time."""
 
 
+EXPECTATIONS = 30
+"""Rounds in which it is estimated how often each kind of curve occurs. Derived: shares settle to 1e-3 in ten."""
+
+
+@dataclass(frozen=True)
+class QuietTrace:
+    """A recorded pressure without its noise, s and Pa, shape (n,).
+
+    `mean_error_Pa` is the standard deviation of its mean, 0 where the trace was left as it is. The columns of
+    `errors_Pa`, shape (n, n_errors), are one standard deviation each of what else the curve may be wrong by.
+    """
+
+    time_s: Floats
+    pressure_Pa: Floats
+    mean_error_Pa: float
+    errors_Pa: Floats
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """A trace with noise to be taken out: samples, Pa, their noise, and the growth at each, m.
+
+    `growth_m` is shifted to where it explains the pressure best; None where nothing is known to grow.
+    """
+
+    pressure_Pa: Floats
+    noise: GaugeNoise
+    growth_m: Floats | None
+
+    def basis(self, kind: int) -> Floats:
+        """Orthonormal columns of a kind of curve, the first of them the mean."""
+        if kind <= MOST_BENT:
+            return _polynomials(self.pressure_Pa.size, kind)
+        assert self.growth_m is not None
+        return np.asarray(np.linalg.qr(_along(self.growth_m, *ALONG_GROWTH[kind - MOST_BENT - 1]))[0])
+
+    def criteria(self) -> list[float]:
+        """BIC of every kind of curve, infinite where it leaves more than noise."""
+        rho, y = self.noise.rho, whitened(self.pressure_Pa, self.noise.rho)
+        slow = _polynomials(y.size, min(MOST_BENT + LOOKED_BEYOND, y.size // 3))
+        kinds = [kind + 1 if kind < slow.shape[1] - 1 else 0 for kind in range(MOST_BENT + 1)]
+        along = [sum(degrees) + 2 for degrees in ALONG_GROWTH]
+        kinds += [numbers if self.growth_m is not None and 3 * numbers <= y.size else 0 for numbers in along]
+        values = []
+        for kind, numbers in enumerate(kinds):
+            values.append(math.inf)
+            if numbers:
+                basis = np.linalg.qr(whitened(self.basis(kind), rho))[0]
+                left = y - basis @ (basis.T @ y)
+                if _is_noise(left, self.noise, numbers, slow):
+                    # The shift of the growth is one of so many, each as likely as the others.
+                    fitted, shifts = (numbers, 1) if kind <= MOST_BENT else (numbers - 1, 2 * _reach(y.size) + 1)
+                    penalty = math.log(y.size) * fitted + 2 * math.log(shifts)
+                    values[-1] = float(left @ left) / self.noise.sigma_Pa**2 + penalty
+        return values
+
+    def curve(self, kind: int | None) -> tuple[Floats, float, Floats]:
+        """The curve of a kind, Pa, how well its mean is known, Pa, and a standard deviation each of what else is wrong.
+
+        Without a kind it is made of straight lines.
+        """
+        noise = self.noise
+        if kind is None:
+            # Of a pressure that moves a correlation may be told that is none of its noise.
+            white_Pa = noise_of(self.pressure_Pa) if self.pressure_Pa.size >= FEWEST else noise.sigma_Pa
+            noise = replace(noise, sigma_Pa=white_Pa, rho=0.0)
+            # What straight lines leave wrong is slow where they are long: as wrong as a curve of so many degrees.
+            basis = _polynomials(self.pressure_Pa.size, min(MOST_BENT, self.pressure_Pa.size - 2))
+            smooth = _lines(self.pressure_Pa, noise)
+        else:
+            basis = self.basis(kind)
+        q, r = np.linalg.qr(whitened(basis, noise.rho))
+        per_error = noise.sigma_Pa * np.linalg.solve(r.T, basis.T).T
+        if kind is not None:
+            smooth = basis @ np.linalg.solve(r, q.T @ whitened(self.pressure_Pa, noise.rho))
+        means = np.mean(per_error, axis=0)
+        return smooth, float(np.linalg.norm(means)), (per_error - means)[:, 1:]
+
+
 def without_noise(pressure_Pa: Floats, growth_m: Floats | None = None) -> Floats:
     """Pressure, shape (n,), of samples about evenly spaced, with white noise taken out.
 
@@ -74,29 +164,89 @@ def without_noise(pressure_Pa: Floats, growth_m: Floats | None = None) -> Floats
     -------
     array, shape (n,), Pa
     """
-    if pressure_Pa.size < FEWEST:
-        return pressure_Pa
-    sigma = noise_of(pressure_Pa)
-    if not sigma > QUIET * abs(float(np.median(pressure_Pa))):
-        return pressure_Pa
-    curve = _curve(pressure_Pa, growth_m, sigma)
-    return _lines(pressure_Pa, sigma) if curve is None else curve
+    return _quieted([(pressure_Pa, growth_m)])[0][0]
 
 
-def _curve(pressure_Pa: Floats, growth_m: Floats | None, sigma: float) -> Floats | None:
-    """The curve of least AIC beside which only noise is left; None where there is none."""
-    slow = _polynomials(pressure_Pa.size, min(MOST_BENT + LOOKED_BEYOND, pressure_Pa.size // 3))
-    bases = [slow[:, : degree + 1] for degree in range(min(MOST_BENT, slow.shape[1] - 2) + 1)]
-    if growth_m is not None and np.ptp(growth_m) > 0:
-        bases += _growth_bases(pressure_Pa, growth_m)
-    best, least = None, np.inf
-    for basis in bases:
-        curve = basis @ (basis.T @ pressure_Pa)
-        numbers = basis.shape[1]
-        criterion = float(np.sum((pressure_Pa - curve) ** 2)) / sigma**2 + 2 * numbers
-        if criterion < least and _is_noise(pressure_Pa - curve, sigma, numbers, slow):
-            best, least = curve, criterion
-    return best
+def quiet_traces(tracks: Sequence[Track]) -> list[QuietTrace | None]:
+    """Recorded pressures of the trials of a campaign without the noise of their gauge; None where there are none.
+
+    How often each kind of curve occurs among them is estimated along, and weighs in: where all pressures stand still, a
+    bend that a single trace shows by chance is noise.
+
+    Parameters
+    ----------
+    tracks : sequence of Track
+
+    Returns
+    -------
+    list of QuietTrace or None
+        At the samples that are known.
+    """
+    times: dict[int, Floats] = {}
+    recorded = []
+    for i, track in enumerate(tracks):
+        if track.pressure_Pa is None:
+            continue
+        known = np.isfinite(track.pressure_Pa) & np.isfinite(track.time_s)
+        if np.count_nonzero(known) < 2:
+            continue
+        times[i] = track.time_s[known].astype(float)
+        seen = track.usable & np.isfinite(track.lead_position_m) & np.isfinite(track.time_s)
+        grows = np.count_nonzero(seen) > 1
+        growth_m = np.interp(times[i], track.time_s[seen], track.lead_position_m[seen]) if grows else None
+        recorded.append((track.pressure_Pa[known].astype(float), growth_m))
+    quiet = dict(zip(times, _quieted(recorded), strict=True))
+    return [QuietTrace(times[i], *quiet[i]) if i in times else None for i in range(len(tracks))]
+
+
+def _quieted(traces: Sequence[tuple[Floats, Floats | None]]) -> list[tuple[Floats, float, Floats]]:
+    """Of traces with the growth in each the pressure without noise, how wrong its mean is, and what else is, Pa."""
+    read = [gauge_readings(y) or (np.arange(float(y.size)), y) for y, _ in traces]
+    rho = noise_correlation([readings_Pa for _, readings_Pa in read])
+    noises = noises_of([readings_Pa for _, readings_Pa in read], rho)
+    noisy: dict[int, _Recorded] = {}
+    for i, ((_, growth_m), (read_at, readings_Pa), noise) in enumerate(zip(traces, read, noises, strict=True)):
+        if noise.sigma_Pa > 0:
+            there_m = None if growth_m is None else np.interp(read_at, np.arange(growth_m.size), growth_m)
+            grows = there_m is not None and np.ptp(there_m) > 0
+            shifted_m = _shifted(readings_Pa, there_m) if there_m is not None and grows else None
+            noisy[i] = _Recorded(readings_Pa, noise, shifted_m)
+    criteria = np.array([recorded.criteria() for recorded in noisy.values()])
+    best = dict(zip(noisy, _kinds(criteria), strict=True)) if noisy else {}
+    quiet = []
+    for i, ((pressure_Pa, _), (read_at, _)) in enumerate(zip(traces, read, strict=True)):
+        if i not in noisy:
+            quiet.append((pressure_Pa, 0.0, np.zeros((pressure_Pa.size, 0))))
+            continue
+        smooth_Pa, of_mean_Pa, errors_Pa = noisy[i].curve(best[i])
+        curves = np.column_stack([smooth_Pa, errors_Pa])
+        if read_at.size < pressure_Pa.size:
+            frames = np.arange(pressure_Pa.size)
+            curves = np.column_stack([np.interp(frames, read_at, curve) for curve in curves.T])
+        quiet.append((curves[:, 0], of_mean_Pa, curves[:, 1:]))
+    return quiet
+
+
+def _kinds(criteria: Floats) -> list[int | None]:
+    """The likeliest kind of curve of every trace, of criteria of shape (n_traces, n_kinds); None where none will do."""
+    least = np.argmin(criteria + _prior(criteria), axis=1)
+    return [int(kind) if np.isfinite(of_trace[kind]) else None for kind, of_trace in zip(least, criteria, strict=True)]
+
+
+def _prior(criteria: Floats) -> Floats:
+    """−2 ln of how often each kind of curve occurs, shape (n_kinds,), by expectation and maximisation.
+
+    `criteria` has shape (n_traces, n_kinds). With one trace counted beside them that is of every kind alike, so that
+    none is ruled out.
+    """
+    told = criteria[np.isfinite(criteria).any(axis=1)]
+    n_kinds = criteria.shape[1]
+    often = np.full(n_kinds, 1 / n_kinds)
+    for _ in range(EXPECTATIONS if len(told) > 1 else 0):
+        likely = np.exp(-0.5 * (told - told.min(axis=1, keepdims=True))) * often
+        belongs = likely / likely.sum(axis=1, keepdims=True)
+        often = (belongs.sum(axis=0) + 1 / n_kinds) / (len(told) + 1)
+    return np.asarray(-2 * np.log(often))
 
 
 def _polynomials(count: int, degree: int) -> Floats:
@@ -106,74 +256,77 @@ def _polynomials(count: int, degree: int) -> Floats:
     return np.asarray(np.linalg.qr(legvander(np.linspace(-1, 1, count), degree))[0])
 
 
-def _growth_bases(pressure_Pa: Floats, growth_m: Floats) -> list[Floats]:
-    """Orthonormal bases of polynomials in time and growth, each with the growth shifted to where it fits best."""
-    reach = min(pressure_Pa.size // 4, MOST_SHIFTED)
-    coarse = range(-reach, reach + 1, COARSE)
+def _along(growth_m: Floats, bent: int, along: int) -> Floats:
+    """Powers of time and of growth, shape (n, bent + along + 1)."""
+    t, g = np.linspace(-1, 1, growth_m.size), (growth_m - growth_m[0]) / np.ptp(growth_m)
+    return np.column_stack([t**k for k in range(bent + 1)] + [g**k for k in range(1, along + 1)])
 
+
+def _reach(count: int) -> int:
+    """Samples by which the growth may be shifted, either way, of so many."""
+    return min(count // 4, MOST_SHIFTED)
+
+
+def _shifted(pressure_Pa: Floats, growth_m: Floats) -> Floats:
+    """The growth moved by as many samples as explain the pressure best."""
+    reach = _reach(pressure_Pa.size)
     every = max(growth_m.size // ENOUGH, 1)
 
-    def columns(shift: int, bent: int, along: int) -> Floats:
-        place = np.clip(np.arange(growth_m.size) + shift, 0, growth_m.size - 1)
-        t, g = np.linspace(-1, 1, growth_m.size), (growth_m[place] - growth_m[0]) / np.ptp(growth_m)
-        return np.column_stack([t**k for k in range(bent + 1)] + [g**k for k in range(1, along + 1)])
+    def moved(shift: int) -> Floats:
+        return growth_m[np.clip(np.arange(growth_m.size) + shift, 0, growth_m.size - 1)]
 
     def explained(shift: int) -> float:
-        few = np.linalg.qr(columns(shift, 1, 2)[::every])[0]
+        there_m = moved(shift)
+        if not np.ptp(there_m) > 0:
+            return -math.inf
+        few = np.linalg.qr(_along(there_m, 1, 2)[::every])[0]
         return float(np.sum((few.T @ pressure_Pa[::every]) ** 2))
 
-    best = max(coarse, key=explained)
-    best = max(range(best - COARSE, best + COARSE + 1), key=explained)
-    return [np.linalg.qr(columns(best, bent, along))[0] for bent, along in ALONG_GROWTH]
+    best = max(range(-reach, reach + 1, COARSE), key=explained)
+    return moved(max(range(best - COARSE, best + COARSE + 1), key=explained))
 
 
-def _is_noise(residual_Pa: Floats, sigma: float, fitted: int, slow: Floats) -> bool:
+def _is_noise(residual_Pa: Floats, noise: GaugeNoise, fitted: int, slow: Floats) -> bool:
     """Whether what a curve of so many fitted numbers leaves has neither a slow part nor more than the noise."""
-    from scipy.stats import chi2
-
-    if np.any(np.abs(slow.T @ residual_Pa) > SLOW_SIGMAS * sigma):
+    if np.any(np.abs(slow.T @ residual_Pa) > _reach_Pa(SLOW_SIGMAS, noise)):
         return False
     # A corner that is cut stands out over the samples about it and nowhere else.
     total = np.concatenate([[0.0], np.cumsum(residual_Pa)])
+    local = _reach_Pa(LOCAL_SIGMAS, noise)
     for width in (2 * half + 1 for half in HALF_WIDTHS if 2 * half < residual_Pa.size):
-        if np.max(np.abs(total[width:] - total[:-width])) > LOCAL_SIGMAS * sigma * np.sqrt(width):
+        if np.max(np.abs(total[width:] - total[:-width])) > local * np.sqrt(width):
             return False
-    return bool(residual_Pa @ residual_Pa <= sigma**2 * chi2.isf(CHANCE, residual_Pa.size - fitted))
+    return bool(residual_Pa @ residual_Pa <= _most_left(noise, residual_Pa.size - fitted))
 
 
-def _lines(pressure_Pa: Floats, sigma: float) -> Floats:
+def _reach_Pa(sigmas: float, noise: GaugeNoise) -> float:
+    """How far chance reaches, Pa, that of normal noise would reach so many standard deviations, were they known."""
+    from scipy.stats import norm, t
+
+    return noise.sigma_Pa * float(t.isf(norm.sf(sigmas), noise.degrees))
+
+
+def _most_left(noise: GaugeNoise, degrees: Floats | int) -> Any:
+    """Sum of squares of noise of so many degrees of freedom at most, Pa²."""
+    from scipy.stats import f
+
+    return noise.sigma_Pa**2 * degrees * f.isf(CHANCE, degrees, noise.degrees)
+
+
+def _lines(pressure_Pa: Floats, noise: GaugeNoise) -> Floats:
     """A line through as many neighbours of every sample as agree with it."""
-    from scipy.stats import chi2
-
     smooth = pressure_Pa.copy()
     low, high = np.full(smooth.size, -np.inf), np.full(smooth.size, np.inf)
     agrees = np.ones(smooth.size, dtype=bool)
     for half in HALF_WIDTHS:
         value, part, left, degrees = _line(pressure_Pa, half)
-        reach = AGREE_SIGMAS * sigma * part
+        reach = AGREE_SIGMAS * noise.sigma_Pa * part
         low, high = np.maximum(low, value - reach), np.minimum(high, value + reach)
-        agrees &= (low <= high) & (left < sigma**2 * chi2.isf(CHANCE, degrees))
+        agrees &= (low <= high) & (left < _most_left(noise, degrees))
         if not agrees.any():
             break
         smooth[agrees] = value[agrees]
     return smooth
-
-
-def noise_of(pressure_Pa: Floats) -> float:
-    """Standard deviation of white noise on a smooth course, from third differences; their variance is 20 σ².
-
-    Parameters
-    ----------
-    pressure_Pa : array, shape (n,), Pa
-        Samples of a trace.
-
-    Returns
-    -------
-    float
-        Pa
-    """
-    third = np.diff(pressure_Pa, 3)
-    return float(1.4826 * np.median(np.abs(third)) / np.sqrt(20))
 
 
 def _line(y: Floats, half: int) -> tuple[Floats, Floats, Floats, Floats]:

@@ -14,6 +14,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.assemble import trial_fit
 from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, prepare_trial
+from vinetrack.inference.gauge_noise import quiet_traces
 from vinetrack.inference.parameters import YIELD_PRESSURE, ParameterMap
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
@@ -207,10 +208,10 @@ def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
     FitError
         If a trial cannot be used; the message names it.
     """
-    data = []
-    for trial, track in pairs:
+    data, pairs = [], list(pairs)
+    for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
         try:
-            data.append(prepare_trial(trial, track))
+            data.append(prepare_trial(trial, track, quiet))
         except FitError as error:
             raise FitError(f"Trial {trial.name}: {error}.") from error
     return data

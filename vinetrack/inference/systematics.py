@@ -1,19 +1,21 @@
-"""What is never known exactly and shared by trials: a payload's mass, a set pressure, the place a camera gives an edge.
+"""What is never known exactly: a payload's mass, a set pressure, the place a camera gives an edge, a noisy gauge.
 
-Errors of that kind do not average out over trials, so that the scatter of trials does not tell of them; left out, they
-pass for a small effect as soon as pressures and B scatter little.
+Most of it is shared by trials and does not average out over them, so that their scatter does not tell of it; left out,
+it passes for a small effect as soon as pressures and B scatter little. What the noise of a gauge leaves of a recorded
+pressure is each trial's alone, and bends its motion all along.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.fit_result import TrialFit
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.position_change import position_change
@@ -93,7 +95,7 @@ class Systematics:
 def systematics_of(
     predictor: Predictor, solution: Solution, trials: Sequence[TrialFit], *, positions: bool = True
 ) -> Systematics:
-    """What trials err by together: payloads, set pressures, the tracker's slow errors, smooth errors of position.
+    """What trials err by: payloads, set and recorded pressures, the tracker's slow errors, smooth errors of position.
 
     Parameters
     ----------
@@ -114,6 +116,7 @@ def systematics_of(
     parts = [
         _payloads(predictor, solution, trials),
         _set_pressures(predictor, solution),
+        _recorded_pressures(predictor, solution),
         *(_felt_by_all(columns) for columns in dense),
     ]
     columns = [np.empty((size, sum(part.n_felt for part in parts))) for size in points]
@@ -164,6 +167,39 @@ def _set_pressures(predictor: Predictor, solution: Solution) -> Systematics:
         if felt:
             column[:, 0] = PRESSURE_ERROR_PA / trial.pressure_Pa * sensitivities[:, PRESSURE]
     return _one_each(columns, [trial.condition if felt else None for trial, felt in zip(data, feels, strict=True)])
+
+
+def _recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics:
+    """What the noise of the gauge leaves wrong in each recorded pressure beside its mean, which the fit has."""
+    data = predictor.data
+    counts = [0 if trial_data.trace_errors_Pa is None else trial_data.trace_errors_Pa.shape[1] for trial_data in data]
+    felt = max(counts)
+    nothing = Systematics.none([trial_data.time_s.size for trial_data in data])
+    if not felt:
+        return nothing
+    columns = [np.zeros((trial_data.time_s.size, felt)) for trial_data in data]
+    places = np.full((len(data), felt), sum(counts))
+    jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
+    try:
+        plain = predictor.run(jobs)
+        for k in range(felt):
+            rows = [i for i, count in enumerate(counts) if count > k]
+            other = Predictor(predictor.layout, [_with_trace_error(each, k) for each in data], predictor.host)
+            for i, moved in zip(rows, other.run([jobs[i] for i in rows]), strict=True):
+                columns[i][:, k] = position_change(plain[i], moved)
+                places[i, k] = sum(counts[:i]) + k
+    except SimulationError:
+        return nothing
+    return Systematics(columns, places, sum(counts))
+
+
+def _with_trace_error(trial_data: FitTrial, k: int) -> FitTrial:
+    """A trial whose recorded pressure has its k-th error, a standard deviation of it; as it is where it has fewer."""
+    errors_Pa = trial_data.trace_errors_Pa
+    if trial_data.trace is None or errors_Pa is None or errors_Pa.shape[1] <= k:
+        return trial_data
+    clock_s, pressure_Pa = trial_data.trace
+    return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa[:, k]))
 
 
 def _one_each(columns: list[Floats], names: Sequence[Hashable | None]) -> Systematics:

@@ -202,8 +202,8 @@ class ReleaseSearch:
     def look(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
         """The state with likelier releases; None if none is.
 
-        Trials whose pressure was recorded are left alone, and those seen at rest that are missed by far more than
-        noise: another release would make up for something else.
+        Trials into which the pressure was let while it was recorded are left alone, since the trace tells when, and
+        those seen at rest that are missed by far more than noise: another release would make up for something else.
 
         Parameters
         ----------
@@ -230,7 +230,7 @@ class ReleaseSearch:
         places = [
             i
             for i, trial_data in enumerate(predictor.data)
-            if trial_data.trace is None
+            if not trial_data.let_in
             and (not trial_data.shows_rest or missed[i] < HARDLY_MISSED * trial_data.noise_m**2)
         ]
         if not places:
@@ -332,28 +332,30 @@ def _answers(
 ) -> list[tuple[Floats, Floats, Floats]]:
     """Of every trial other instants since release, shape (n,), positions there, and how they answer to its own numbers.
 
-    Answers have shape (4, n), zero where it does not feel one.
+    Answers have shape (4, n), zero where it does not feel one. A recorded pressure is moved along with the release, as
+    if it had been recorded that much later: a settled trace hardly differs, and what is taken is simulated as it was.
     """
     jobs: list[Job] = []
     moves: list[tuple[int, float]] = []
     grids: list[Floats] = []
     for job, tried_s in zip(plain, releases, strict=True):
-        i, released = job.trial, job._replace(release_s=0.0)
-        ways = [((-1, 0.0), released)]
+        i = job.trial
+        ways = [((-1, 0.0), job)]
         if predictor.feels_pressure[i]:
             deviation = job.pressure_deviation + PRESSURE_STEP
-            ways.append(((PRESSURE, PRESSURE_STEP), released._replace(pressure_deviation=deviation)))
+            ways.append(((PRESSURE, PRESSURE_STEP), job._replace(pressure_deviation=deviation)))
         if predictor.feels_damping[i]:
             row = job.row.copy()
             row[predictor.damping_column] *= np.exp(DAMPING_STEP)
-            ways.append(((DAMPING_DEVIATION, DAMPING_STEP), released._replace(row=row)))
+            ways.append(((DAMPING_DEVIATION, DAMPING_STEP), job._replace(row=row)))
         longest_s = float(predictor.data[i].time_s[-1] - tried_s.min())
         for move, varied in ways:
             moves.append(move)
             jobs.append(varied)
             grids.append(longest_s * np.linspace(0.0, 1.0, GRID_POINTS) ** 1.5)
     answers_found: list[tuple[Floats, Floats, Floats]] = []
-    for (place, step), times, moved in zip(moves, grids, predictor.run(jobs, times_s=grids), strict=True):
+    instants = [job.release_s + times for job, times in zip(jobs, grids, strict=True)]
+    for (place, step), times, moved in zip(moves, grids, predictor.run(jobs, times_s=instants), strict=True):
         y = moved.observed_position_m
         if place < 0:
             answers = np.zeros((OWN, times.size))
