@@ -112,7 +112,7 @@ def gather(tasks: list[Task], path: Path | None) -> pd.DataFrame:
             if path is not None:
                 with path.open("a", newline="", encoding="utf-8") as stream:
                     csv.DictWriter(stream, COLUMNS).writerow(rows[-1])
-    return pd.DataFrame(rows, columns=list(COLUMNS)).fillna("")
+    return pd.DataFrame(rows, columns=list(COLUMNS), dtype=object).fillna("")
 
 
 def differs(answers: pd.DataFrame) -> pd.Series:

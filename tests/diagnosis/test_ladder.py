@@ -28,8 +28,9 @@ from vinetrack.diagnosis.ladder import (
 )
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.experiment.naming import with_names
-from vinetrack.inference.fit_result import Fit
-from vinetrack.inference.left_out import predict_trials
+from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.fit_result import Fit, TrialFit
+from vinetrack.inference.left_out import predict_prepared, predict_trials
 from vinetrack.laboratory.tracks import BASE, Nature, grow
 from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
@@ -168,6 +169,24 @@ def test_a_vine_of_one_condition_cannot_be_predicted_and_that_is_said(pairs: Pai
     # The reader sees an error in sample of all trials beside one without them: a diagnosis says so.
     told = diagnose._with_ladder(Diagnosis(rounds=(), effects=(), explanation="", fits=(found,)), lambda _: None)
     assert told.notes == tuple(table.attrs["notes"])
+
+
+def test_a_trial_that_cannot_be_followed_costs_its_own_prediction_and_no_other(
+    fits: tuple[Fit, Fit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on real tubes that stick, where the numbers of the other trials leave one at a corner of its motion."""
+    stuck = fits[0].trials[4].name
+
+    def predicted(fit: Fit, data: Sequence[FitTrial], **told: bool) -> list[TrialFit]:
+        if any(trial_data.trial.name == stuck for trial_data in data):
+            raise vt.FitError("The model cannot be followed: it ends at 1.4 s")
+        return predict_prepared(fit, data, **told)
+
+    monkeypatch.setattr(ladder_module, "predict_prepared", predicted)
+    for errors in (in_sample(fits[0]), left_out(fits[0])):
+        assert errors.not_predicted == {stuck: "The model cannot be followed: it ends at 1.4 s"}
+        assert len(errors.trials) == len(fits[0].trials) - 1
+        assert math.isfinite(errors.rms_m)
 
 
 def test_of_a_single_condition_nothing_can_be_left_out(pairs: Pairs) -> None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinetrack.diagnosis.replicates import align_replicates, first_that_counts
-from vinetrack.inference.fit_data import FitError
+from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_prepared
 from vinetrack.inference.subset import fit_subset
@@ -162,7 +162,7 @@ def in_sample(fit: Fit) -> Errors:
     -------
     Errors
     """
-    return Errors(tuple(predict_prepared(fit, fit.predictor.data, from_rest=True)), {})
+    return _predicted(fit, fit.predictor.data)
 
 
 def left_out(fit: Fit) -> Errors:
@@ -225,8 +225,19 @@ def _without(fit: Fit, gone: Sequence[bool]) -> Errors:
         for trial_data in data
         if trial_data.trial.vine in alone
     }
-    predicted = predict_prepared(others, known, from_rest=True) if known else []
-    return Errors(tuple(predicted), left)
+    return _together([_predicted(others, known), Errors((), left)])
+
+
+def _predicted(fit: Fit, data: Sequence[FitTrial]) -> Errors:
+    """Predictions of trials; those that the model cannot be followed for are left without one, by their reason."""
+    if not data:
+        return Errors((), {})
+    try:
+        return Errors(tuple(predict_prepared(fit, data, from_rest=True)), {})
+    except FitError as error:
+        if len(data) == 1:
+            return Errors((), {data[0].trial.name: str(error)})
+        return _together([_predicted(fit, [trial_data]) for trial_data in data])
 
 
 def _has_numbers_of_its_own(fit: Fit, vine: str) -> bool:
