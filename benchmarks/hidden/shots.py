@@ -233,8 +233,7 @@ def _recorded(times: Floats, pressure_Pa: Floats, camera: Camera, draw: Draw) ->
         )
         readings_Pa = np.interp(read, times, pressure_Pa) + camera.trace_sigma_Pa * draw.standard_normal(read.size)
         return np.interp(times, read, readings_Pa)
-    noise = _correlated(draw, camera.gauge_rho, times.size) if camera.gauge_rho else draw.standard_normal(times.size)
-    return pressure_Pa + camera.trace_sigma_Pa * noise
+    return pressure_Pa + camera.trace_sigma_Pa * _correlated(draw, camera.gauge_rho, times.size)
 
 
 def imaged(y: Floats, camera: Camera) -> Floats:

@@ -49,7 +49,7 @@ half the number of standard deviations."""
 MOST_BENT, LOOKED_BEYOND, SLOW_SIGMAS = 6, 12, 4.0
 """Degree of a curve at most; of so many degrees beyond its own none may show by so many standard deviations. Chosen:
 sixth degree follows any filling and draining seen. Derived: 4 standard deviations are a chance of 1e-3 among the
-nineteen that are asked of a trace; at half two traces in three would be refused their curve, at twice a slow part of
+nineteen that are asked of a trace; at half three traces in five would be refused their curve, at twice a slow part of
 eight standard errors stays."""
 
 LOCAL_SIGMAS = 5.0
@@ -70,7 +70,8 @@ growth to 1e-4 of its pressure, a supply that refills it is slow in time."""
 
 
 EXPECTATIONS = 30
-"""Rounds in which it is estimated how often each kind of curve occurs. Derived: shares settle to 1e-3 in ten."""
+"""Rounds in which it is estimated how often each kind of curve occurs. Measured: after ten, shares in twelve
+campaigns (kind null:trace of the hidden effects, seeds 20600 to 20611) change by 5e-5 at most."""
 
 
 @dataclass(frozen=True)
@@ -109,20 +110,21 @@ class _Recorded:
         """BIC of every kind of curve, infinite where it leaves more than noise."""
         rho, y = self.noise.rho, whitened(self.pressure_Pa, self.noise.rho)
         slow = _polynomials(y.size, min(MOST_BENT + LOOKED_BEYOND, y.size // 3))
-        kinds = [kind + 1 if kind < slow.shape[1] - 1 else 0 for kind in range(MOST_BENT + 1)]
-        along = [sum(degrees) + 2 for degrees in ALONG_GROWTH]
-        kinds += [numbers if self.growth_m is not None and 3 * numbers <= y.size else 0 for numbers in along]
+        bent = [(kind + 1 < slow.shape[1], False) for kind in range(MOST_BENT + 1)]
+        most = y.size // 3 - 2 if self.growth_m is not None else -1
+        along = [(sum(degrees) <= most, True) for degrees in ALONG_GROWTH]
+        # The shift of the growth is one of so many, each as likely as the others.
+        shift_cost = 2 * math.log(2 * _reach(y.size) + 1)
         values = []
-        for kind, numbers in enumerate(kinds):
+        for kind, (possible, shifted) in enumerate(bent + along):
             values.append(math.inf)
-            if numbers:
-                basis = np.linalg.qr(whitened(self.basis(kind), rho))[0]
-                left = y - basis @ (basis.T @ y)
-                if _is_noise(left, self.noise, numbers, slow):
-                    # The shift of the growth is one of so many, each as likely as the others.
-                    fitted, shifts = (numbers, 1) if kind <= MOST_BENT else (numbers - 1, 2 * _reach(y.size) + 1)
-                    penalty = math.log(y.size) * fitted + 2 * math.log(shifts)
-                    values[-1] = float(left @ left) / self.noise.sigma_Pa**2 + penalty
+            if not possible:
+                continue
+            basis = np.linalg.qr(whitened(self.basis(kind), rho))[0]
+            left, numbers = y - basis @ (basis.T @ y), basis.shape[1]
+            if _is_noise(left, self.noise, numbers + shifted, slow):
+                penalty = math.log(y.size) * numbers + shifted * shift_cost
+                values[-1] = float(left @ left) / self.noise.sigma_Pa**2 + penalty
         return values
 
     def curve(self, kind: int | None) -> tuple[Floats, float, Floats]:

@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
+from vinetrack.inference.whitening import whiten
+from vinetrack.tracks.position_noise import rough_noise
 
 STRAIGHT = 1e-9
 """Part of the largest pressure by which neighbours may be off a straight line that was drawn between readings. Derived:
-rounding of double precision is a million times less; a millionth of a kilopascal at a kilopascal is more."""
+a million times the rounding of double precision, and as much as six decimals of a kilopascal leave of one."""
 
 FILLED = 0.25
 """Part of the samples that lie straight between their neighbours from which a trace is taken for filled up. Chosen: of
@@ -37,8 +39,8 @@ FEWEST_WITH_OTHERS = 3
 
 CLIPPED, KEPT, CLIPPED_ROUNDS = 3.0, 0.9950, 3
 """Standard deviations at which differences are clipped for the noise, what that leaves of the variance of normal noise
-(derived: 0.9707 + 9 · 0.0027), and rounds, of which the last changes it by 1e-3. Chosen: at 2 it errs a fifth more, at
-4 a corner of ten standard deviations weighs twice as much."""
+(derived: 0.9707 + 9 · 0.0027), and rounds, of which the last changes it by 1e-4. Chosen: on 2,000 traces of 300
+samples it errs by 6.2 %, at 2 by 6.4 %; a corner of ten standard deviations raises it by 1.2 %, at 4 by 1.7 %."""
 
 NOISE_DEGREES = 2 / 4.62
 """Degrees of freedom of the variance of the noise per sample. Derived: neighbouring third differences are correlated by
@@ -47,7 +49,7 @@ NOISE_DEGREES = 2 / 4.62
 ALIKE = 20.0
 """Degrees of freedom that the other traces of a campaign add to what a trace tells of its noise. Chosen: one gauge
 reads them all; as much as 46 readings of its own. At half the noise of short traces is what it is by chance, at twice a
-gauge whose noise grows with the pressure is misjudged by a few per cent more."""
+gauge whose noise grows with the pressure is misjudged more."""
 
 APART, SURELY_CORRELATED, MOST_CORRELATED = 4, 3.0, 0.97
 """How many readings apart noise is held against that of neighbours, from how many standard deviations it is taken for
@@ -136,7 +138,7 @@ def noise_of(pressure_Pa: Floats) -> float:
         Pa
     """
     third = np.diff(pressure_Pa, 3) / math.sqrt(20)
-    sigma = 1.4826 * float(np.median(np.abs(third)))
+    sigma = rough_noise(pressure_Pa)
     for _ in range(CLIPPED_ROUNDS):
         sigma = math.sqrt(float(np.mean(np.minimum(third**2, (CLIPPED * sigma) ** 2))) / KEPT)
     return sigma
@@ -221,6 +223,4 @@ def whitened(values: Floats, rho: float) -> Floats:
     -------
     array, of the same shape
     """
-    if rho == 0:
-        return values
-    return np.concatenate([values[:1] * math.sqrt(1 - rho**2), values[1:] - rho * values[:-1]])
+    return whiten(values, np.arange(len(values)) == 0, rho)

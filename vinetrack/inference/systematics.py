@@ -179,6 +179,7 @@ def _recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics
         return nothing
     columns = [np.zeros((trial_data.time_s.size, felt)) for trial_data in data]
     places = np.full((len(data), felt), sum(counts))
+    begins = np.cumsum([0, *counts])
     jobs = predictor.jobs(solution.state.theta, solution.state.trial_effects)
     try:
         plain = predictor.run(jobs)
@@ -187,7 +188,7 @@ def _recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics
             other = Predictor(predictor.layout, [_with_trace_error(each, k) for each in data], predictor.host)
             for i, moved in zip(rows, other.run([jobs[i] for i in rows]), strict=True):
                 columns[i][:, k] = position_change(plain[i], moved)
-                places[i, k] = sum(counts[:i]) + k
+                places[i, k] = begins[i] + k
     except SimulationError:
         return nothing
     return Systematics(columns, places, sum(counts))

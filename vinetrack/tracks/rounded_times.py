@@ -12,8 +12,9 @@ import numpy as np
 from vinetrack.core.records import Floats
 
 FEWEST = 8
-"""Times from which an even series is told from its rounding. Derived: two numbers are fitted to them, and six agree by
-chance within three quarters of a digit once in a hundred at most."""
+"""Times from which an even series is told from its rounding. Measured: of 3,000 series whose steps are one digit or two
+at random 83 % are taken for even with 8 times, 7 % with 20, 0.03 % with 40; none of them is then moved by more than
+three quarters of a digit. Chosen: a short film of few digits is mended, at the price of such as these."""
 
 WITHIN_DIGITS = 0.75
 """Last digits by which a time may be off the series. Derived: half a digit by rounding, and as much as half of that by
@@ -25,7 +26,7 @@ WORTH_MENDING = 0.01
 nothing is gained below that, at twice 0.6 mm stay."""
 
 MOST_DIGITS = 7
-"""Decimals beyond which a time is not taken for rounded. Chosen: a tenth of a microsecond, 6 µm at 60 m/s."""
+"""Decimals from which a time is not taken for rounded. Chosen: a tenth of a microsecond, 6 µm at 60 m/s."""
 
 
 def without_rounding(time_s: Floats) -> tuple[Floats, str]:
@@ -54,7 +55,7 @@ def without_rounding(time_s: Floats) -> tuple[Floats, str]:
     step_s, first_s = np.polyfit(place, time_s, 1)
     even_s = first_s + step_s * place
     off_s = float(np.max(np.abs(time_s - even_s)))
-    if not step_s > 0 or off_s > WITHIN_DIGITS * digit_s or max(off_s, 1e-3 * digit_s) < 0.5 * WORTH_MENDING * step_s:
+    if not step_s > 0 or off_s > WITHIN_DIGITS * digit_s or off_s < 0.5 * WORTH_MENDING * step_s:
         return time_s, ""
     rounded, spacing = f"{1e3 * digit_s:g} ms", f"{1e3 * step_s:.3g} ms"
     return even_s, f"Times are rounded to {rounded}; evenly spaced ones, {spacing} apart, are taken instead."
