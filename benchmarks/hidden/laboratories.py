@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -244,13 +245,24 @@ def trace_off(low_ms: float, high_ms: float) -> Fault:
     return apply
 
 
-def slow_gauge(low_Hz: float, high_Hz: float, sigma_Pa: float) -> Fault:
-    """The pressure is read so many times a second, fewer than there are frames, with noise."""
+def slow_gauge(low_Hz: float, high_Hz: float, sigma_Pa: float, **how: Any) -> Fault:
+    """The pressure is read so many times a second, fewer than there are frames, with noise; `how` as of `Camera`."""
 
     def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
         rate = float(draw.uniform(low_Hz, high_Hz))
-        camera = replace(laboratory.camera, trace_late_s=0.0, trace_sigma_Pa=sigma_Pa, gauge_Hz=rate)
+        camera = replace(laboratory.camera, trace_late_s=0.0, trace_sigma_Pa=sigma_Pa, gauge_Hz=rate, **how)
         return replace(laboratory, camera=camera).known(gauge_Hz=rate)
+
+    return apply
+
+
+def coarse_gauge(digit_Pa: float, low_sigmas: float, high_sigmas: float) -> Fault:
+    """The pressure is read at every frame in steps of a digit, with noise of so many digits."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        sigma_Pa = digit_Pa * float(draw.uniform(low_sigmas, high_sigmas))
+        camera = replace(laboratory.camera, trace_late_s=0.0, trace_sigma_Pa=sigma_Pa, gauge_digit_Pa=digit_Pa)
+        return replace(laboratory, camera=camera).known(gauge_sigma_Pa=sigma_Pa)
 
     return apply
 

@@ -201,6 +201,23 @@ def _camera_rows() -> list[Row]:
             (faults.physics(gamma=1.3), faults.slow_gauge(100, 200, 50.0)),
             Wants(payload=False, chamber=True),
         ),
+        Row("gauge_rounded", "gauge_rounded", ADEQUATE, (faults.slow_gauge(40, 150, 100.0, trace_digit_Pa=10.0),)),
+        Row(
+            "gauge_held",
+            "gauge_held",
+            ADEQUATE,
+            (faults.slow_gauge(40, 150, 60.0, gauge_digit_Pa=100.0, gauge_holds=True),),
+        ),
+        Row("gauge_steps", "gauge_steps", ADEQUATE, (faults.slow_gauge(40, 150, 60.0, gauge_digit_Pa=100.0),)),
+        Row("gauge_coarse", "gauge_coarse", ADEQUATE, (faults.coarse_gauge(100.0, 0.4, 1.0),)),
+        Row("gauge_coarse_quiet", "gauge_coarse_quiet", ADEQUATE, (faults.coarse_gauge(100.0, 0.05, 0.3),)),
+        Row(
+            "gauge_coarse_depletion",
+            "gauge_coarse_depletion",
+            ADEQUATE,
+            (faults.physics(gamma=1.3), faults.coarse_gauge(50.0, 0.05, 0.5)),
+            Wants(payload=False, chamber=True),
+        ),
         Row("gauge_filtered", "gauge_filtered", ADEQUATE, (faults.filtered_gauge(30, 100, 100.0),)),
     ]
 

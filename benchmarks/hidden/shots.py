@@ -53,8 +53,9 @@ class Camera:
     `lens_centre_m`; a camera that is tilted shows y (1 + `bow_per_m` y). The rows of the picture are read
     `row_delay_s_m` later by the metre; `scale` and `clock` are relative errors. `trace_late_s`: by how much the clock
     of a recorded pressure is ahead (NaN: none is recorded); its gauge has noise `trace_sigma_Pa`, of correlation
-    `gauge_rho` from frame to frame, and is read `gauge_Hz` times a second, the file joined by lines in between (NaN: at
-    every frame).
+    `gauge_rho` from frame to frame, is read `gauge_Hz` times a second (NaN: at every frame) in multiples of
+    `gauge_digit_Pa`, and the file joined by lines in between or, where it `gauge_holds`, repeated. The file has
+    multiples of `trace_digit_Pa`.
     """
 
     noise_m: float
@@ -73,6 +74,9 @@ class Camera:
     trace_sigma_Pa: float = 50.0
     gauge_Hz: float = math.nan
     gauge_rho: float = 0.0
+    gauge_digit_Pa: float = 0.0
+    gauge_holds: bool = False
+    trace_digit_Pa: float = 0.0
     sees_end: bool = False
 
 
@@ -227,13 +231,22 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
 
 def _recorded(times: Floats, pressure_Pa: Floats, camera: Camera, draw: Draw) -> Floats:
     """Pressure, Pa, as the file has it at every frame."""
-    if math.isfinite(camera.gauge_Hz):
-        read = np.arange(
-            times[0] - float(draw.uniform()) / camera.gauge_Hz, times[-1] + 1 / camera.gauge_Hz, 1 / camera.gauge_Hz
-        )
-        readings_Pa = np.interp(read, times, pressure_Pa) + camera.trace_sigma_Pa * draw.standard_normal(read.size)
-        return np.interp(times, read, readings_Pa)
-    return pressure_Pa + camera.trace_sigma_Pa * _correlated(draw, camera.gauge_rho, times.size)
+    if not math.isfinite(camera.gauge_Hz):
+        noise = camera.trace_sigma_Pa * _correlated(draw, camera.gauge_rho, times.size)
+        return _rounded(_rounded(pressure_Pa + noise, camera.gauge_digit_Pa), camera.trace_digit_Pa)
+    read = np.arange(
+        times[0] - float(draw.uniform()) / camera.gauge_Hz, times[-1] + 1 / camera.gauge_Hz, 1 / camera.gauge_Hz
+    )
+    readings_Pa = np.interp(read, times, pressure_Pa) + camera.trace_sigma_Pa * draw.standard_normal(read.size)
+    readings_Pa = _rounded(readings_Pa, camera.gauge_digit_Pa)
+    if camera.gauge_holds:
+        return _rounded(readings_Pa[np.searchsorted(read, times, side="right") - 1], camera.trace_digit_Pa)
+    return _rounded(np.interp(times, read, readings_Pa), camera.trace_digit_Pa)
+
+
+def _rounded(values: Floats, digit: float) -> Floats:
+    """Values as multiples of a digit; as they are where it is 0."""
+    return np.asarray(digit * np.round(values / digit)) if digit > 0 else values
 
 
 def imaged(y: Floats, camera: Camera) -> Floats:

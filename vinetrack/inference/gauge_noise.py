@@ -8,10 +8,11 @@ fills and has its corner where the growth begins, a polynomial in time and in th
 may differ in their clocks, so the growth may be shifted, by any of so many samples alike. Of the curves that leave only
 noise that with the least BIC (Schwarz, Ann. Stat. 6, 461, 1978) is taken: a term too many bends the speed all
 through a trial, at 0.1 kPa of noise by more than its positions err. How often each kind of curve occurs in a campaign
-is estimated along (empirical Bayes: Robbins, Proc. 3rd Berkeley Symp. 1, 157, 1956). Where no curve will do, straight
-lines are laid around every sample through ever more neighbours, for as long as what is left beside them looks like
-noise and each agrees with all narrower ones: wide where the pressure runs straight, narrow at a corner (the
-intersection of confidence intervals: Goldenshluger & Nemirovski, Math. Methods Stat. 6, 135, 1997).
+is estimated along (empirical Bayes: Robbins, Proc. 3rd Berkeley Symp. 1, 157, 1956). Where a second kind is not much
+less likely, the curve is the mean of both, and what they differ by an error. Where no curve will do, straight lines
+are laid around every sample through ever more neighbours, for as long as what is left beside them looks like noise and
+each agrees with all narrower ones: wide where the pressure runs straight, narrow at a corner (the intersection of
+confidence intervals: Goldenshluger & Nemirovski, Math. Methods Stat. 6, 135, 1997).
 """
 
 from __future__ import annotations
@@ -71,7 +72,12 @@ growth to 1e-4 of its pressure, a supply that refills it is slow in time."""
 
 EXPECTATIONS = 30
 """Rounds in which it is estimated how often each kind of curve occurs. Measured: after ten, shares in twelve
-campaigns (kind null:trace of the hidden effects, seeds 20600 to 20611) change by 5e-5 at most."""
+campaigns (kind null:trace of the hidden effects, seeds 20600 to 20611) change by 1e-5 at most."""
+
+
+LEAST_WEIGHT = 0.01
+"""Probability beside the likeliest from which a kind of curve counts. Chosen: a tenth of what such a kind differs by is
+an error then; at half and at twice 0.07 and 0.14 of it are left out."""
 
 
 @dataclass(frozen=True)
@@ -92,12 +98,14 @@ class QuietTrace:
 class _Recorded:
     """A trace with noise to be taken out: samples, Pa, their noise, and the growth at each, m.
 
-    `growth_m` is shifted to where it explains the pressure best; None where nothing is known to grow.
+    `growth_m` is shifted to where it explains the pressure best, of so many `shifts`; None where nothing is known to
+    grow.
     """
 
     pressure_Pa: Floats
     noise: GaugeNoise
     growth_m: Floats | None
+    shifts: int
 
     def basis(self, kind: int) -> Floats:
         """Orthonormal columns of a kind of curve, the first of them the mean."""
@@ -114,7 +122,7 @@ class _Recorded:
         most = y.size // 3 - 2 if self.growth_m is not None else -1
         along = [(sum(degrees) <= most, True) for degrees in ALONG_GROWTH]
         # The shift of the growth is one of so many, each as likely as the others.
-        shift_cost = 2 * math.log(2 * _reach(y.size) + 1)
+        shift_cost = 2 * math.log(self.shifts)
         values = []
         for kind, (possible, shifted) in enumerate(bent + along):
             values.append(math.inf)
@@ -124,8 +132,28 @@ class _Recorded:
             left, numbers = y - basis @ (basis.T @ y), basis.shape[1]
             if _is_noise(left, self.noise, numbers + shifted, slow):
                 penalty = math.log(y.size) * numbers + shifted * shift_cost
-                values[-1] = float(left @ left) / self.noise.sigma_Pa**2 + penalty
+                # Where the noise itself is known from few differences, what is left weighs as Student's t has it.
+                degrees = self.noise.degrees
+                spread = float(left @ left) / (degrees * self.noise.sigma_Pa**2)
+                values[-1] = (degrees + y.size) * math.log1p(spread) + penalty
         return values
+
+    def averaged(self, weights: Floats) -> tuple[Floats, float, Floats]:
+        """As `curve`, of kinds of these weights: what they differ by is an error of their mean as well.
+
+        Bayesian model averaging (Hoeting et al., Stat. Sci. 14, 382, 1999).
+        """
+        kinds = np.flatnonzero(weights)
+        if not kinds.size:
+            return self.curve(None)
+        smooth_Pa, of_mean_Pa, errors_Pa = self.curve(int(np.argmax(weights)))
+        if kinds.size == 1:
+            return smooth_Pa, of_mean_Pa, errors_Pa
+        shares = weights[kinds] / weights[kinds].sum()
+        curves_Pa = np.column_stack([self.curve(int(kind))[0] for kind in kinds])
+        mean_Pa = curves_Pa @ shares
+        between_Pa = (curves_Pa - mean_Pa[:, None]) * np.sqrt(shares)
+        return mean_Pa, of_mean_Pa, np.column_stack([errors_Pa, between_Pa - np.mean(between_Pa, axis=0)])
 
     def curve(self, kind: int | None) -> tuple[Floats, float, Floats]:
         """The curve of a kind, Pa, how well its mean is known, Pa, and a standard deviation each of what else is wrong.
@@ -203,52 +231,73 @@ def quiet_traces(tracks: Sequence[Track]) -> list[QuietTrace | None]:
 
 def _quieted(traces: Sequence[tuple[Floats, Floats | None]]) -> list[tuple[Floats, float, Floats]]:
     """Of traces with the growth in each the pressure without noise, how wrong its mean is, and what else is, Pa."""
-    read = [gauge_readings(y) or (np.arange(float(y.size)), y) for y, _ in traces]
-    rho = noise_correlation([readings_Pa for _, readings_Pa in read])
-    noises = noises_of([readings_Pa for _, readings_Pa in read], rho)
+    read = gauge_readings([pressure_Pa for pressure_Pa, _ in traces])
+    rho = noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])
     noisy: dict[int, _Recorded] = {}
-    for i, ((_, growth_m), (read_at, readings_Pa), noise) in enumerate(zip(traces, read, noises, strict=True)):
+    for i, ((_, growth_m), readings, noise) in enumerate(zip(traces, read, noises_of(read, rho), strict=True)):
         if noise.sigma_Pa > 0:
-            there_m = None if growth_m is None else np.interp(read_at, np.arange(growth_m.size), growth_m)
-            grows = there_m is not None and np.ptp(there_m) > 0
-            shifted_m = _shifted(readings_Pa, there_m) if there_m is not None and grows else None
-            noisy[i] = _Recorded(readings_Pa, noise, shifted_m)
+            grows = growth_m is not None and np.ptp(growth_m) > 0
+            shifted_m = (
+                _shifted(readings.values_Pa, readings.places, growth_m) if growth_m is not None and grows else None
+            )
+            shifts = 2 * _reach(growth_m.size) + 1 if growth_m is not None else 1
+            noisy[i] = _Recorded(readings.values_Pa, noise, shifted_m, shifts)
     criteria = np.array([recorded.criteria() for recorded in noisy.values()])
-    best = dict(zip(noisy, _kinds(criteria), strict=True)) if noisy else {}
+    weights = dict(zip(noisy, _weights(criteria), strict=True)) if noisy else {}
     quiet = []
-    for i, ((pressure_Pa, _), (read_at, _)) in enumerate(zip(traces, read, strict=True)):
+    for i, ((pressure_Pa, _), readings) in enumerate(zip(traces, read, strict=True)):
         if i not in noisy:
             quiet.append((pressure_Pa, 0.0, np.zeros((pressure_Pa.size, 0))))
             continue
-        smooth_Pa, of_mean_Pa, errors_Pa = noisy[i].curve(best[i])
-        curves = np.column_stack([smooth_Pa, errors_Pa])
-        if read_at.size < pressure_Pa.size:
-            frames = np.arange(pressure_Pa.size)
-            curves = np.column_stack([np.interp(frames, read_at, curve) for curve in curves.T])
+        smooth_Pa, of_mean_Pa, errors_Pa = noisy[i].averaged(weights[i])
+        curves = _at_samples(np.column_stack([smooth_Pa, errors_Pa]), readings.places, pressure_Pa.size)
         quiet.append((curves[:, 0], of_mean_Pa, curves[:, 1:]))
     return quiet
 
 
-def _kinds(criteria: Floats) -> list[int | None]:
-    """The likeliest kind of curve of every trace, of criteria of shape (n_traces, n_kinds); None where none will do."""
-    least = np.argmin(criteria + _prior(criteria), axis=1)
-    return [int(kind) if np.isfinite(of_trace[kind]) else None for kind, of_trace in zip(least, criteria, strict=True)]
+def _at_samples(curves: Floats, places: Floats, count: int) -> Floats:
+    """Columns at so many samples, of their values at places among them; they go on straight beyond the outermost."""
+    samples = np.arange(count)
+    if places.size == count:
+        return curves
+    inside = np.column_stack([np.interp(samples, places, curve) for curve in curves.T])
+    for end, beyond in (([0, 1], samples < places[0]), ([-1, -2], samples > places[-1])):
+        near, next_to = end
+        slope = (curves[near] - curves[next_to]) / (places[near] - places[next_to])
+        inside[beyond] = curves[near] + np.outer(samples[beyond] - places[near], slope)
+    return inside
 
 
-def _prior(criteria: Floats) -> Floats:
-    """−2 ln of how often each kind of curve occurs, shape (n_kinds,), by expectation and maximisation.
+def _weights(criteria: Floats) -> Floats:
+    """How likely each kind of curve is beside the likeliest, of the shape of `criteria`, (n_traces, n_kinds).
 
-    `criteria` has shape (n_traces, n_kinds). With one trace counted beside them that is of every kind alike, so that
-    none is ruled out.
+    0 where it is not likely enough to matter, and for all kinds of a trace of which none will do.
     """
-    told = criteria[np.isfinite(criteria).any(axis=1)]
+    totals = criteria - 2 * np.log(_often(criteria))
+    possible = np.asarray(np.isfinite(criteria).any(axis=1))
+    least = np.where(possible, totals.min(axis=1), 0.0)
+    weights = np.where(possible[:, None], np.exp(-0.5 * (totals - least[:, None])), 0.0)
+    return np.where(weights >= LEAST_WEIGHT, weights, 0.0)
+
+
+def _often(criteria: Floats) -> Floats:
+    """How often each kind of curve occurs among the other traces, of the shape of `criteria`, (n_traces, n_kinds).
+
+    By expectation and maximisation, with one trace counted beside them that is of every kind alike, so that none is
+    ruled out. A trace tells nothing of how often its own kind occurs, or one bend by chance would make itself likely
+    (the collapsed variational rule: Asuncion et al., Proc. 25th UAI, 27, 2009).
+    """
+    told = np.asarray(np.isfinite(criteria).any(axis=1))
     n_kinds = criteria.shape[1]
-    often = np.full(n_kinds, 1 / n_kinds)
-    for _ in range(EXPECTATIONS if len(told) > 1 else 0):
-        likely = np.exp(-0.5 * (told - told.min(axis=1, keepdims=True))) * often
-        belongs = likely / likely.sum(axis=1, keepdims=True)
-        often = (belongs.sum(axis=0) + 1 / n_kinds) / (len(told) + 1)
-    return np.asarray(-2 * np.log(often))
+    least = np.where(told, criteria.min(axis=1), 0.0)
+    likely = np.where(told[:, None], np.exp(-0.5 * (criteria - least[:, None])), 0.0)
+    often: Floats = np.full(criteria.shape, 1 / n_kinds)
+    for _ in range(EXPECTATIONS if np.count_nonzero(told) > 1 else 0):
+        belongs = likely * often
+        belongs = belongs / np.where(told, belongs.sum(axis=1), 1.0)[:, None]
+        others = belongs.sum(axis=0) - belongs
+        often = (others + 1 / n_kinds) / (others.sum(axis=1, keepdims=True) + 1)
+    return often
 
 
 def _polynomials(count: int, degree: int) -> Floats:
@@ -269,13 +318,17 @@ def _reach(count: int) -> int:
     return min(count // 4, MOST_SHIFTED)
 
 
-def _shifted(pressure_Pa: Floats, growth_m: Floats) -> Floats:
-    """The growth moved by as many samples as explain the pressure best."""
-    reach = _reach(pressure_Pa.size)
-    every = max(growth_m.size // ENOUGH, 1)
+def _shifted(pressure_Pa: Floats, places: Floats, growth_m: Floats) -> Floats:
+    """The growth at readings, of shape (n,), moved by as many samples as explain their pressure best.
+
+    `growth_m`, shape (n_samples,), is that of all samples.
+    """
+    reach = _reach(growth_m.size)
+    samples = np.arange(growth_m.size)
+    every = max(places.size // ENOUGH, 1)
 
     def moved(shift: int) -> Floats:
-        return growth_m[np.clip(np.arange(growth_m.size) + shift, 0, growth_m.size - 1)]
+        return np.interp(places + shift, samples, growth_m)
 
     def explained(shift: int) -> float:
         there_m = moved(shift)
