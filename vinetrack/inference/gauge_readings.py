@@ -192,9 +192,9 @@ def _last_digit(values: Floats, exact: float) -> float:
     left = left[left > exact]
     while left.size > 1:
         least = left[0]
-        rest = np.mod(left, least)
-        rest = np.unique(np.minimum(rest, least - rest))
-        left = np.concatenate([rest[rest > exact], [least]])
+        remainder = np.mod(left, least)
+        remainder = np.unique(np.minimum(remainder, least - remainder))
+        left = np.concatenate([remainder[remainder > exact], [least]])
     return float(left[0]) if left.size and left[0] > 2 * exact else 0.0
 
 
