@@ -80,6 +80,11 @@ LEAST_WEIGHT = 0.01
 an error then; at half and at twice 0.07 and 0.14 of it are left out."""
 
 
+SMALL_ERROR = 1e-3
+"""Part of the variance of all errors of a curve below which a direction of them is left out. Chosen: 3 % of their
+standard deviation, at half 2 and at twice 4 %; each costs a simulation of its trial."""
+
+
 @dataclass(frozen=True)
 class QuietTrace:
     """A recorded pressure without its noise, s and Pa, shape (n,).
@@ -153,7 +158,11 @@ class _Recorded:
         curves_Pa = np.column_stack([self.curve(int(kind))[0] for kind in kinds])
         mean_Pa = curves_Pa @ shares
         between_Pa = (curves_Pa - mean_Pa[:, None]) * np.sqrt(shares)
-        return mean_Pa, of_mean_Pa, np.column_stack([errors_Pa, between_Pa - np.mean(between_Pa, axis=0)])
+        every_Pa = np.column_stack([errors_Pa, between_Pa - np.mean(between_Pa, axis=0)])
+        # The same covariance in as few columns as it takes: kinds that are alike differ in the same way.
+        along, sizes_Pa, _ = np.linalg.svd(every_Pa, full_matrices=False)
+        tells = sizes_Pa**2 > SMALL_ERROR * np.sum(sizes_Pa**2)
+        return mean_Pa, of_mean_Pa, (along * sizes_Pa)[:, tells]
 
     def curve(self, kind: int | None) -> tuple[Floats, float, Floats]:
         """The curve of a kind, Pa, how well its mean is known, Pa, and a standard deviation each of what else is wrong.
