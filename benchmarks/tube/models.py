@@ -135,7 +135,12 @@ def _best(
     for start in starts(model, [one for one in recordings if one.name in vines], vines):
         try:
             fit = vt.fit(model, pairs, shared=shared, start=start, profile=False)
-            followed.append((fit, in_sample(fit).trials))
+            predicted = in_sample(fit).trials
+            # A trial that the fit cannot be integrated through would make it look better than one that can.
+            if len(predicted) < len(pairs):
+                print(f"{name}, {', '.join(vines)}: a start was given up. Its fit cannot be followed to the end.")
+                continue
+            followed.append((fit, predicted))
         except vt.FitError as error:
             print(f"{name}, {', '.join(vines)}: a start was given up. {error}")
     if not followed:

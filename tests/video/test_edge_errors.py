@@ -134,6 +134,23 @@ def test_an_edge_that_stops_within_an_exposure_is_no_surer_than_its_dwell_allows
     assert sigma[16 : last - 4].max() < 0.5
 
 
+@pytest.mark.parametrize("door_grey", [30, 60, 90])
+def test_an_edge_behind_something_that_moves_is_lost(door_grey: int) -> None:
+    """A striped door slides by in front of the first 80 px of growth; the tip comes out from behind it and is seen."""
+    frames, columns = np.arange(80.0), np.arange(COLUMNS)
+    true = grown_px(frames)
+    luma = step_frames(true[:, None]).astype(float)
+    noise = np.random.default_rng(336).normal(0, 2, luma.shape)
+    stripes = np.sin(2 * np.pi * (columns + 6 * np.minimum(frames, 40)[:, None]) / 30)
+    luma[:, :, :140] = (door_grey + 40 * stripes[:, None, :] + noise)[:, :, :140]
+    tracking = tracked(np.rint(np.clip(luma, 0, 255)).astype(np.uint8), 0.05, Axis((20.0, 59.5), (440.0, 59.5), 40.0))
+    usable = tracking.track.usable
+    assert not usable[(frames > 12) & (true < 138)].any()
+    assert usable[true > 150].all()
+    error = tracking.track.edge_px + tracking.axis.from_px[0] - true
+    assert np.abs(error[usable]).max() < 0.1
+
+
 @pytest.mark.parametrize("exposure", [0.9, 0.5, 0.1])
 @pytest.mark.parametrize("stop", [-0.2, 0.0, 0.04, 0.3])
 @pytest.mark.parametrize("sense", [1, -1])
