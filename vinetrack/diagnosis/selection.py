@@ -111,7 +111,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     if not questions.something and not questions.suspect and not differ:
         return [SelectionStep(ADEQUATE, questions)]
     slack = _slack(questions, effects, report) if questions.something else None
-    if slack is not None and not _leaves_room(slack[0].kept):
+    if slack is not None and not _leaves_room(slack[0].kept) and not slack[-1].questions.suspect:
         return slack
     search = CandidateFits(questions, report)
     search.singles()

@@ -89,8 +89,9 @@ class FitTrial:
     `first` marks the points that begin a stretch without gaps. `n_rest` counts the points at rest before the motion, 0
     where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
     `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
-    pressure, Pa; `gauge_error` is by what part of it the noise of the gauge leaves it wrong along the whole motion, and
-    the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are a standard deviation each of what varies of it.
+    pressure, Pa, the last sample extrapolated; `gauge_error` is by what part of it the noise of the gauge leaves it
+    wrong along the whole motion, and the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are a standard
+    deviation each of what varies of it.
     `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
     changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
     the noise over speed that it follows from, 0 where it follows `stated_m`, the file's own standard deviations.
@@ -256,6 +257,7 @@ def prepare_trial(trial: Trial, track: Track, quiet: QuietTrace | None = None) -
             " or see in its overlay what hides the edge"
         )
     quiet = quiet or quiet_traces([track])[0]
+    extended = None if quiet is None else quiet.extended()
     stated_m = track.lead_position_sigma_m[usable]
     filmed = trial.video is not None
     return FitTrial(
@@ -266,9 +268,9 @@ def prepare_trial(trial: Trial, track: Track, quiet: QuietTrace | None = None) -
         n_rest=n_rest if n_rest < position_m.size else 0,
         noise_m=noise_m,
         correlation=correlation,
-        trace=None if quiet is None else (quiet.time_s, quiet.pressure_Pa),
+        trace=None if extended is None else (extended.time_s, extended.pressure_Pa),
         gauge_error=0.0 if quiet is None else _gauge_error(quiet, time_s[max(n_rest - 1, 0) :]),
-        trace_errors_Pa=None if quiet is None or not quiet.errors_Pa.size else quiet.errors_Pa,
+        trace_errors_Pa=None if extended is None or not extended.errors_Pa.size else extended.errors_Pa,
         vague_rest=vague_rest,
         position_systematic_m=_position_systematic_m(trial),
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
