@@ -154,6 +154,22 @@ def test_the_restricted_likelihood_adds_the_information() -> None:
     assert more == pytest.approx(-np.linalg.slogdet(covariance_of_numbers.covariance)[1], rel=1e-8)
 
 
+@pytest.mark.parametrize("restricted", [True, False])
+@pytest.mark.parametrize("bound", [np.inf, 1e-3])
+def test_the_likelihood_is_the_same_by_the_compiled_step_and_by_the_one_for_numbers_hardly_told_apart(
+    monkeypatch: pytest.MonkeyPatch, bound: float, *, restricted: bool
+) -> None:
+    columns = columns_of(4, 20, 2, seed=3)
+    frame = replace(frame_of(4, 20, 2), lower=np.full(2, -bound), upper=np.full(2, bound))
+    state = state_of(4, 2, 0.5)
+    part = marginal(all_products(columns, [np.arange(20) == 0] * 4), frame, state)
+    compiled = deviance(part, frame, state, state.spread, restricted=restricted)
+    monkeypatch.setattr(
+        "vinetrack.inference.marginal_likelihood.decrease_within_bounds", lambda *_: (False, np.nan, np.nan)
+    )
+    assert deviance(part, frame, state, state.spread, restricted=restricted) == pytest.approx(compiled, rel=1e-9)
+
+
 def balanced(n_trials: int, count: int, spread: float, seed: int) -> tuple[list[np.ndarray], np.ndarray]:
     """A level of its own for every trial about a common one: the textbook's one-way layout, white noise of 0.01."""
     draw = np.random.default_rng(seed)

@@ -96,33 +96,12 @@ def solve_from_scratch(predictor: Predictor, held: FixedTerms, watch: Watch | No
         raise FitError(f"The model cannot be followed from any start: {reason or 'no trajectory could be simulated'}")
     best = min(solutions, key=_deviance)
     if not is_poor_fit(predictor, best):
-        best = _with_sizes_anew(predictor, best, held, watch) if thorough else best
         return _with_noise_anew(predictor, best, held, watch)
     guided = [
         _guided(predictor, theta, trial_effects, held, watch)
         for _, theta, trial_effects in (starts if thorough else starts[:1])
     ]
     return _sane(predictor, best, [solution for solution in guided if solution is not None])
-
-
-def _with_sizes_anew(predictor: Predictor, best: Solution, held: FixedTerms, watch: Watch | None) -> Solution:
-    """The better of a solution and of the one led from it with further effects at the sizes they begin at.
-
-    While B and n are still far off, an effect may come to nothing, and what it should explain is taken for deviations
-    of the trials; from there no small step leads back where single frames resist it.
-    """
-    layout = predictor.layout
-    base = {effect.name for effect in layout.model if effect.kind == "base"}
-    further = [k for k, number in enumerate(layout.free) if number.key.split(".")[0] not in base]
-    if not further:
-        return best
-    theta = best.state.theta.copy()
-    theta[further] = layout.start[further]
-    try:
-        other = solve_onward(predictor, best, theta, held, most_iterations=ITERATIONS_ONCE_MORE, watch=watch)
-    except SimulationError:
-        return best
-    return min((best, other), key=_deviance) if not is_poor_fit(predictor, other) else best
 
 
 def _with_noise_anew(predictor: Predictor, best: Solution, held: FixedTerms, watch: Watch | None) -> Solution:
