@@ -113,6 +113,17 @@ def test_a_rolling_shutter_sees_the_edge_where_it_is_when_its_row_is_read(
     assert np.max(np.abs(got - np.interp(times, fine, y))) > 0.6 * abs(delay)
 
 
+@pytest.mark.parametrize("delay", [1.5e-3, -1.5e-3])
+def test_a_rolling_shutter_reads_what_the_lens_bends(delay: float) -> None:
+    lens = {"lens.k3": -0.7, "lens.y_c": 0.1}
+    fine = np.linspace(-0.01, 0.1, 200_001)
+    bent = simulated(LOADED, lens, fine).observed_position_m
+    times = np.arange(-0.005, 0.08, 2e-3)
+    got = simulated(LOADED, {"rolling_shutter.delay": delay, **lens}, times).observed_position_m
+    # Between frames the lens is followed by straight lines: f'' (Δy)² / 8 = 4.2 · 0.1 m⁻¹ · (4 mm)² / 8.
+    np.testing.assert_allclose(got, np.interp(times, fine - delay * bent, bent), rtol=0, atol=1.5e-6)
+
+
 def test_a_rolling_shutter_of_no_size_does_nothing_where_the_vine_sets_off() -> None:
     times = np.arange(-0.005, 0.02, 5e-4) + 2.1e-4
     at_rest = times < 0

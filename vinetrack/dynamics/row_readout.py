@@ -2,8 +2,8 @@
 
 What is stamped t shows the edge at t + s·y, with y the position at which it is seen then and s the delay by the metre.
 Between the times asked for the motion is the Hermite polynomial of degree 5 through position, speed and acceleration at
-either side; from where the vine sets off and up to the end of growth, where the acceleration jumps, that of degree 4
-without the one at the jump.
+either side; up to the end of growth, where the acceleration jumps, that of degree 4 without the one at the jump. Where
+the vine sets off it jumps as well, but there rows are read at their stamps, since s·y is next to nothing.
 """
 
 from vinetrack.dynamics.equations import Point, compiled, inlined
@@ -74,29 +74,11 @@ def _motion_at(times, out, ratio, end, i, read):
         x = before.x + since * (before.v + 0.5 * since * before.acceleration)
         return max(x, 0.0), before.v + since * before.acceleration, offset
     after = _point(times, out, k + 1)
-    if before.v == 0 and after.v > 0:
-        x, v = _from_rest(before, after, read)
-        return x, v, offset
     if after.time >= end.time:
         x, v = _without_far_acceleration(before, end, read)
         return min(x, end.x), v, offset
     x, v, _a = quintic((read - before.time) / (after.time - before.time), after.time - before.time, before, after)
     return x, v, offset
-
-
-@inlined
-def _from_rest(before, after, read):
-    """Position, m, and speed, m/s, of a tail that sets off between two instants, not before its release.
-
-    A motion from rest takes at most three times its way over its speed, unless its drive rises faster than in
-    proportion to the time; before that the tail lies where it lay.
-    """
-    set_off = max(before.time, 0.0, after.time - 3.0 * (after.x - before.x) / after.v)
-    if read <= set_off:
-        return before.x, 0.0
-    resting = Point(set_off, before.x, 0.0, 0.0, 0.0)
-    x, v = _without_far_acceleration(after, resting, read)
-    return max(x, before.x), max(v, 0.0)
 
 
 @inlined
