@@ -134,6 +134,28 @@ def test_an_edge_that_stops_within_an_exposure_is_no_surer_than_its_dwell_allows
     assert sigma[16 : last - 4].max() < 0.5
 
 
+def test_a_picture_unlike_the_others_has_an_error_of_its_own() -> None:
+    """Every fourth picture has five times the noise, as where a coder spares bits."""
+    frames = np.arange(95.0)
+    true = grown_px(frames)
+    moves = (frames > 20) & (frames < 92)
+    noisy = moves & (frames % 4 == 0)
+    errors, stated, chosen = [], [], []
+    for seed in (342, 343, 344, 345):
+        luma = step_frames(true[:, None], seed=seed).astype(float)
+        luma[noisy] += np.random.default_rng(seed).normal(0, 10, luma[noisy].shape)
+        tracking = tracked(
+            np.rint(np.clip(luma, 0, 255)).astype(np.uint8), 0.05, Axis((20.0, 59.5), (440.0, 59.5), 40.0)
+        )
+        use = moves & tracking.track.usable
+        errors.append((tracking.track.edge_px + tracking.axis.from_px[0] - true)[use])
+        stated.append(tracking.track.lead_position_sigma_m[use] * 1e4)
+        chosen.append(noisy[use])
+    error, sigma, which = map(np.concatenate, (errors, stated, chosen))
+    assert 0.7 < np.sqrt(np.mean(sigma[which] ** 2) / np.mean(error[which] ** 2)) < 2.0
+    assert 0.8 < np.sqrt(np.mean(sigma[~which] ** 2) / np.mean(error[~which] ** 2)) < 1.25
+
+
 @pytest.mark.parametrize("door_grey", [30, 60, 90])
 def test_an_edge_behind_something_that_moves_is_lost(door_grey: int) -> None:
     """A striped door slides by in front of the first 80 px of growth; the tip comes out from behind it and is seen."""
