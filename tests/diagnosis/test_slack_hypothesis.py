@@ -5,10 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hidden_truth import Pairs, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis.slack_hypothesis import pushes, slack_fit
+from vinetrack.diagnosis import candidates as hypotheses
+from vinetrack.diagnosis.initial_fit import candidates_of
+from vinetrack.diagnosis.likelihood_ratio import likelihood_ratio
+from vinetrack.diagnosis.misfit_tests import FIRST_LEVEL, MisfitTests, misfit_tests
+from vinetrack.diagnosis.selection import SelectionStep, select_effects
+from vinetrack.diagnosis.slack_hypothesis import TAIL_SLACK, pushes, slack_fit
 from vinetrack.inference.fit import fit
 from vinetrack.laboratory.tracks import BASE, Nature, grow
 from vinetrack.laboratory.vine_campaigns import damping_values
@@ -47,3 +53,26 @@ def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_push
     slack = slack_fit(bent)
     assert slack is not None
     assert slack.sigma > 5
+
+
+@pytest.mark.parametrize("suspect", [False, True])
+def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_better(
+    monkeypatch: pytest.MonkeyPatch, *, suspect: bool
+) -> None:
+    truth = {"tail_friction.mu_w": 0.04}
+    trials = [replace(one, growth_angle_rad=np.pi / 2) for one in sheet()]
+    nature = Nature(effects=[*BASE, "tail_friction"], values=damping_values(trials) | truth, noise_m=5e-5, seed=6)
+    found = fit(vt.base_model(), [(one.stated, one.track) for one in grow(trials, nature)], profile=False)
+    effects, _ = hypotheses.testable(candidates_of(found.model, ["tail_friction"], None), found.predictor.data)
+    questions = misfit_tests(found, effects, FIRST_LEVEL)
+    assert questions.something
+    assert not questions.far_off
+    slack = likelihood_ratio(found, (TAIL_SLACK,), found)
+    monkeypatch.setattr(MisfitTests, "suspect", suspect)
+    steps = [
+        SelectionStep("missing", questions, (slack,), (slack,), (), slack.names),
+        SelectionStep("adequate", questions),
+    ]
+    monkeypatch.setattr("vinetrack.diagnosis.selection._slack", lambda *_: steps)
+    named = select_effects(found, effects, lambda _: None)[0].answer
+    assert named == (("tail_friction",) if suspect else ("tail_slack",))

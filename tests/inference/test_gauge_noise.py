@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from hidden.laboratory_folder import write_experiment
+from hidden.laboratory_rows import campaign
 from lsoda_vine import as_track
 
-from vinetrack.inference.gauge_noise import quiet_traces, without_noise
+import vinetrack as vt
+from vinetrack.inference.gauge_noise import QuietTrace, quiet_traces, without_noise
 from vinetrack.inference.gauge_readings import gauge_readings, noise_correlation, noise_of, noises_of
 
 TIMES_S = np.arange(0.0, 0.6, 1e-3)
@@ -250,3 +255,30 @@ def test_of_steady_pressures_hardly_any_course_is_left(per_reading: int):
     assert sum(float(np.ptp(each)) > 20.0 for each in off) <= 1
     stated = [trace.mean_error_Pa for trace in quiet_traces(tracks) if trace is not None]
     assert 0.7 < np.sqrt(np.mean((np.array([each.mean() for each in off]) / stated) ** 2)) < 1.4
+
+
+def test_a_pressure_goes_on_beyond_its_end_along_its_last_line_but_not_below_that_of_the_air():
+    times_s = np.linspace(0.0, 0.2, 201)
+    falls = np.where(times_s < 0.1, 30e3, 30e3 - 50e3 * (times_s - 0.1))
+    errors = np.column_stack([np.full(201, 20.0), 100 * times_s])
+    longer = QuietTrace(times_s, falls, 5.0, errors).extended()
+    assert longer.time_s[:-1] == pytest.approx(times_s)
+    assert longer.time_s[-1] == pytest.approx(0.24)
+    assert longer.pressure_Pa[-1] == pytest.approx(25e3 - 50e3 * 0.04)
+    assert longer.errors_Pa[-1] == pytest.approx([20.0, 24.0])
+    assert longer.mean_error_Pa == 5.0
+    let_out = QuietTrace(times_s, np.maximum(20e3 - 1e5 * times_s, 0.0), 0.0, np.zeros((201, 0))).extended()
+    assert let_out.pressure_Pa[-1] == 0.0
+    level = QuietTrace(times_s, np.full(201, 2e4), 0.0, np.zeros((201, 0))).extended()
+    assert level.pressure_Pa[-1] == pytest.approx(2e4)
+
+
+def test_the_clock_of_a_gauge_that_is_late_is_found_though_the_last_pressures_were_not_recorded(tmp_path: Path):
+    """Held at its last value the pressure, which falls by 40 Pa a millisecond, gave 9 ms with an error of 1."""
+    shot = campaign("trace_clock", 20611, (16, 16), weighed=False)
+    write_experiment(shot, tmp_path / "laboratory")
+    fit = vt.fit(vt.base_model() + "trace_clock", tmp_path / "laboratory", profile=False)
+    (offset,) = (number for number in fit.numbers if number.key == "trace_clock.delta")
+    truth_s = shot.truth["truths"]["trace_late_s"]  # type: ignore[index]
+    assert truth_s < -0.01
+    assert abs(offset.value - truth_s) < min(2.5 * offset.sigma, 3e-3)
