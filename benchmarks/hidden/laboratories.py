@@ -235,6 +235,18 @@ def rolling(laboratory: Laboratory, draw: Draw) -> Laboratory:
     return replace(laboratory, camera=camera).known(row_delay_s_m=delay)
 
 
+def smoothed(frames: tuple[int, ...], degree: int = 0) -> Fault:
+    """Positions are smoothed over one of these odd numbers of frames, by polynomials."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        chosen = int(draw.choice(frames))
+        camera = replace(laboratory.camera, smoothed=chosen, smoothed_degree=degree)
+        hz = laboratory.shots[0].setting.capture_hz
+        return replace(laboratory, camera=camera).known(**{"moving_average.T2": (chosen**2 - 1) / hz**2})
+
+    return apply
+
+
 def trace_off(low_ms: float, high_ms: float) -> Fault:
     """The pressure is recorded along, by a clock that is off by so much, either way."""
 

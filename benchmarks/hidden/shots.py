@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import savgol_coeffs
 
 from hidden.designs import Setting, Wants, design
 from hidden.motion import Floats, Physics, Tube, follow
@@ -55,7 +56,8 @@ class Camera:
     of a recorded pressure is ahead (NaN: none is recorded); its gauge has noise `trace_sigma_Pa`, of correlation
     `gauge_rho` from frame to frame, is read `gauge_Hz` times a second (NaN: at every frame) in multiples of
     `gauge_digit_Pa`, and the file joined by lines in between or, where it `gauge_holds`, repeated. The file has
-    multiples of `trace_digit_Pa`.
+    multiples of `trace_digit_Pa`. Positions are `smoothed` over so many frames by polynomials of `smoothed_degree`, 0 a
+    moving average, and those at either end that have no full window are left out.
     """
 
     noise_m: float
@@ -78,6 +80,8 @@ class Camera:
     gauge_holds: bool = False
     trace_digit_Pa: float = 0.0
     sees_end: bool = False
+    smoothed: int = 0
+    smoothed_degree: int = 0
 
 
 @dataclass(frozen=True)
@@ -226,7 +230,20 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
     trace = None
     if math.isfinite(camera.trace_late_s):
         trace = _recorded(times[:stop], gauge(times, gauge_Pa, camera.trace_late_s)[:stop], camera, draw) / 1e3
-    return times[:stop], position, trace
+    return _smoothed(times[:stop], position, trace, camera)
+
+
+def _smoothed(
+    times: Floats, position: Floats, trace: Floats | None, camera: Camera
+) -> tuple[Floats, Floats, Floats | None] | None:
+    """Positions as somebody hands them in who smoothed them first; None where nothing is left."""
+    if camera.smoothed < 2:
+        return times, position, trace
+    if position.size < camera.smoothed + FEWEST_MOVING:
+        return None
+    kernel = savgol_coeffs(camera.smoothed, camera.smoothed_degree, use="dot")
+    whole = slice(camera.smoothed // 2, -(camera.smoothed // 2))
+    return times[whole], np.correlate(position, kernel, "valid"), None if trace is None else trace[whole]
 
 
 def _recorded(times: Floats, pressure_Pa: Floats, camera: Camera, draw: Draw) -> Floats:

@@ -87,6 +87,7 @@ NEUTRAL = {
     "rest_force": 0.0,
     "observed_position": STATE.observed,
     "row_delay": 0.0,
+    "averaged_over": 0.0,
 }
 """What a hook returns that changes nothing. A chamber's rate has no such number: it takes the place of another law."""
 
@@ -130,7 +131,7 @@ def test_the_kind_agrees_with_the_hooks_and_with_being_base(effect: Effect) -> N
     assert (effect.kind == "base") == (effect.name in BASE_EFFECTS)
     if effect.kind == "measurement":
         read_off = {"true_time", "trace_time", "observed_position", "row_delay", "gauge", "yield_gauge", "area"}
-        read_off |= {"film_gain"}
+        read_off |= {"film_gain", "averaged_over"}
         weight = {"tail_force"} if effect.name == "growth_angle" else set()  # it turns a force that is there
         assert set(effect.functions) <= read_off | weight
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from by_hand import BARE, LEVEL, LOADED, G, N, Vine, assert_same_motion, followed, simulated
+from scipy.integrate import cumulative_trapezoid
 
 TIMES = np.linspace(0, 0.15, 50)
 FAST = Vine(D=30e-3, t=100e-6, L=0.36, P=61e3, P_y=4.5e3, B=3.6)
@@ -129,6 +130,28 @@ def test_a_rolling_shutter_of_no_size_does_nothing_where_the_vine_sets_off() -> 
     at_rest = times < 0
     got = simulated(FAST, {"rolling_shutter.delay": 1e-6}, times).observed_position_m
     np.testing.assert_array_equal(got[at_rest], simulated(FAST, {}, times).observed_position_m[at_rest])
+
+
+@pytest.mark.parametrize("phase_s", [0.0, 2.1e-4])
+@pytest.mark.parametrize("over_s", [5e-4, 4.8e-3])
+@pytest.mark.parametrize("vine", [LOADED, FAST], ids=["2 m/s", "60 m/s"])
+def test_a_moving_average_reports_the_mean_about_every_instant(vine: Vine, over_s: float, phase_s: float) -> None:
+    fine = np.linspace(-0.02, 0.3, 640_001)
+    y = simulated(vine, {}, fine).lead_position_m
+    area = cumulative_trapezoid(y, fine, initial=0.0)
+    ended = simulated(vine, {}, fine)
+    times = np.arange(-0.005, ended.end_time_s + 0.005, 5e-4) + phase_s
+    got = simulated(vine, {"moving_average.T2": over_s**2}, times).observed_position_m
+    after, before = (np.interp(times + side * over_s / 2, fine, area) for side in (1, -1))
+    np.testing.assert_allclose(got, (after - before) / over_s, rtol=0, atol=1e-5)
+    assert np.max(np.abs(got - np.interp(times, fine, y))) > 20 * over_s**2  # a ÿ of 500 m/s², or the release
+
+
+def test_a_moving_average_of_no_length_does_nothing() -> None:
+    np.testing.assert_array_equal(
+        simulated(FAST, {"moving_average.T2": 0.0}, TIMES).observed_position_m,
+        simulated(FAST, {}, TIMES).lead_position_m,
+    )
 
 
 def test_a_supply_that_rises_starts_the_vine_once_it_overcomes_the_yield_pressure() -> None:

@@ -25,7 +25,7 @@ from vinetrack.effects import catalogue
 from vinetrack.inference.fit_data import pairs_of
 
 B, N = 6.44, 0.37
-WRITTEN_OUT = ("growth_angle", "lens", "rolling_shutter", "supply_rise", "trace_clock")
+WRITTEN_OUT = ("growth_angle", "lens", "moving_average", "rolling_shutter", "supply_rise", "trace_clock")
 """Effects that are held against a vine written out by hand instead (`test_measurement_effects`)."""
 
 TIMES = FRAME_S * np.arange(-3, 1200)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.integrate import cumulative_trapezoid
 
 from vinetrack.core.records import Floats, Kinematics, Trial
 from vinetrack.dynamics.batch import Trace
@@ -196,7 +197,7 @@ def _neglected_row(model: Model, effect: Effect, motion: AuditedMotion, without:
         terms = _along(model + effect, motion)
     except EffectError as error:
         return {**row, "note": str(error)}
-    if not set(effect.functions) - {"observed_position", "row_delay"}:
+    if not set(effect.functions) - {"observed_position", "row_delay", "averaged_over"}:
         return {**row, **_shift(effect, motion, without)}
     if not set(effect.functions) - {"rest_force"}:
         return {**row, "note": "acts on a vine at rest only"}
@@ -220,10 +221,23 @@ def _shift(effect: Effect, motion: AuditedMotion, terms: Terms) -> dict[str, flo
     if "row_delay" in effect.functions:
         late_s = effect.functions["row_delay"](state, rig, *sizes) * motion.lead_position_m
         shift = np.interp(motion.time_s + late_s, motion.time_s, motion.lead_position_m) - motion.lead_position_m
+    elif "averaged_over" in effect.functions:
+        shift = _averaged(motion, math.sqrt(effect.functions["averaged_over"](state, rig, *sizes)))
+        shift -= motion.lead_position_m
     else:
         shift = np.asarray(effect.functions["observed_position"](state, rig, *sizes), float) - motion.lead_position_m
     i = int(np.argmax(np.abs(shift)))
     return {"shift_m": float(shift[i]), **_place(motion, i)}
+
+
+def _averaged(motion: AuditedMotion, over_s: float) -> Floats:
+    """Positions as means over a time, m; the edge rests before the first and stands behind the last."""
+    area = cumulative_trapezoid(motion.lead_position_m, motion.time_s, initial=0.0)
+    time_s = np.concatenate([[motion.time_s[0] - over_s], motion.time_s, [motion.time_s[-1] + over_s]])
+    ends = over_s * motion.lead_position_m[[0, -1]]
+    area = np.concatenate([[-ends[0]], area, [area[-1] + ends[1]]])
+    halves = [np.interp(motion.time_s + side * over_s / 2, time_s, area) for side in (1, -1)]
+    return np.asarray((halves[0] - halves[1]) / over_s)
 
 
 def _tension_row(motion: AuditedMotion, terms: Terms) -> dict[str, Any]:

@@ -106,6 +106,7 @@ class Batch:
             out,
             ends[a:b],
             np.empty((7, 4)),
+            np.empty(int(np.diff(self.starts[a : b + 1]).max(initial=0))),
         )
 
 

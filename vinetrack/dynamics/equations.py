@@ -59,6 +59,7 @@ class Equations:
     first_chamber: Callable  #: pressure of the chamber at release, of (trial) alone
     has_chamber: Callable  #: whether an effect gives the chamber an equation of its own, of no argument
     row_delay: Callable  #: how much later rows are read by the metre, s/m, of (trial) alone
+    averaged_over: Callable  #: square of the time that positions are averaged over, s², of (trial) alone
     tip_tension: Callable  #: tension that the tip leaves for the tail, N, and rate of the chamber; one more argument
     free_fall: Callable  #: acceleration of a slack tail, m/s², at (time, y, ẏ, x, v, chamber, trial)
     slack_fraction: Callable  #: `vinetrack.dynamics.slack_tail.slack_fraction`
@@ -205,6 +206,21 @@ def yes():
 def no():
     """False, as a function that the compiler sees through."""
     return False
+
+
+@compiled
+def not_averaged(trial):  # noqa: ARG001
+    """Stands for `averaged_over` where a position is that of one instant.
+
+    Parameters
+    ----------
+    trial : unused.
+
+    Returns
+    -------
+    0 s².
+    """
+    return 0.0
 
 
 @compiled

@@ -31,6 +31,7 @@ from vinetrack.dynamics.equations import (
 )
 from vinetrack.dynamics.radau import NO_STAGES, first_stages, quintic, radau_step
 from vinetrack.dynamics.row_readout import read_by_rows
+from vinetrack.dynamics.time_average import average_over
 from vinetrack.effects import TrialInputs
 
 TRAVEL_RATIO = TrialInputs._fields.index("travel_ratio")
@@ -48,6 +49,7 @@ less often, at twice more of such steps are refused."""
 BATCH = (
     "starts", "times", "on", "inputs", "thetas", "trace_starts", "trace_time", "trace_pressure", "bend_starts", "bends",
     "breakpoints", "stops", "rtol", "out", "ends", "work",
+    "means",
 )  # fmt: skip
 """Arguments of `integrate_trials` behind the equations, in their order."""
 
@@ -188,6 +190,7 @@ def integrate_trials(
     out,
     ends,
     work,
+    means,
 ):
     """`_integrate` for many trials.
 
@@ -204,6 +207,7 @@ def integrate_trials(
     out, ends : filled, shapes (n_times, 4) and (n_trials, 5): the latter status, end time, end speed, number of steps,
         time of slack.
     work : array (7, 4), overwritten.
+    means : array, overwritten, as long as the longest trial.
     """
     for i in range(starts.size - 1):
         trace = slice(trace_starts[i], trace_starts[i + 1])
@@ -219,10 +223,13 @@ def integrate_trials(
         status, end_time, end_speed, n_steps, slack_time = _integrate(
             equations, trial, times[rows], breakpoints[i], stops[i], rtol, out[rows], work
         )
+        end = Point(end_time if status == ENDED else np.inf, stops[i], end_speed, 0.0, 0.0)
         delay = equations.row_delay(trial)
         if delay != 0:
-            end = Point(end_time if status == ENDED else np.inf, stops[i], end_speed, 0.0, 0.0)
             read_by_rows(times[rows], out[rows], inputs[i, TRAVEL_RATIO], end, delay)
+        square = equations.averaged_over(trial)
+        if square > 0:
+            average_over(times[rows], out[rows], means, inputs[i, TRAVEL_RATIO], end, square)
         ends[i, 0] = status
         ends[i, 1] = end_time
         ends[i, 2] = end_speed

@@ -23,7 +23,10 @@ from vinetrack.core import constants
 from vinetrack.dynamics.integrator import BATCH
 from vinetrack.effects import Effect, TrialInputs
 
-PARTS = ("equations.py", "radau.py", "slack_tail.py", "row_readout.py", "integrator.py")
+PARTS = (
+    *("equations.py", "radau.py", "slack_tail.py", "between_frames.py", "row_readout.py", "time_average.py"),
+    "integrator.py",
+)
 """Files of the integrator, which the compiled form of a model holds too: an edit of one must compile anew."""
 
 _HEAD = '''"""Machine-made: the effects {names} summed, for the integrator of vinetrack.dynamics."""
@@ -32,7 +35,7 @@ from numba import njit
 
 from vinetrack.dynamics.equations import (
     Equations, angle_passed, compiled, never_slack, no, no_free_fall, no_row_delay, no_slack_phase, no_tip_tension,
-    not_slack_at_rest, trace_at, yes,
+    not_averaged, not_slack_at_rest, trace_at, yes,
 )
 from vinetrack.dynamics.integrator import integrate_trials
 from vinetrack.dynamics.slack_tail import follow_slack, slack_at_rest, slack_fraction
@@ -205,6 +208,9 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     if write.has("row_delay"):
         delays = ["delay = 0.0", *write.calls("row_delay", "delay += {call}"), "return delay"]
         functions += [write.function("row_delay", "trial", _AT_RELEASE, delays)]
+    if write.has("averaged_over"):
+        squares = ["square = 0.0", *write.calls("averaged_over", "square += {call}"), "return square"]
+        functions += [write.function("averaged_over", "trial", _AT_RELEASE, squares)]
     if tail_free:
         resting = ["if resting:", *[f"    {line}" for line in holding or ["pass"]]]
         functions += [
@@ -219,6 +225,7 @@ def sum_source(effects: Sequence[Effect], tail_free: bool = False) -> str:
     names = ", ".join(effect.name for effect in effects)
     fields = ["rates", "rest_acceleration", "observed", "first_chamber", "yes" if write.has("chamber_rate") else "no"]
     fields += ["row_delay" if write.has("row_delay") else "no_row_delay"]
+    fields += ["averaged_over" if write.has("averaged_over") else "not_averaged"]
     fields += _TAIL_FREE if tail_free else _TAIL_TAUT
     foot = _FOOT.format(fields=", ".join(fields), batch=", ".join(BATCH))
     return "\n".join((_HEAD.format(names=names), *write.loads.values(), *functions, foot))

@@ -32,6 +32,7 @@ HOOKS = (
     "rest_force",
     "observed_position",
     "row_delay",
+    "averaged_over",
 )
 """What an effect may change, in the order in which the model asks: see `Effect`."""
 
@@ -153,6 +154,7 @@ class Effect:
     rest_force          force at the tip that holds a vine at rest and is gone once it moves, N, negative
     observed_position   position of the leading edge that the camera reports, m
     row_delay           how much later the camera reads it by the metre of that position, s/m; asked at release
+    averaged_over       square of the time over which positions are averaged, s²; asked at release
 
     Effects of one hook are asked by rising `order`, then as they stand in the model, and each sees what the ones before
     left. In the chain of pressures 1 is the chamber, 2 a leak, 3 losses on the way (as everywhere if not said); what

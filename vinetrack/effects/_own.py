@@ -67,6 +67,7 @@ UNCHANGED = {
     "rest_force": 0.0,
     "observed_position": _STATE.observed,
     "row_delay": 0.0,
+    "averaged_over": 0.0,
 }
 """What a function must leave behind, in the state above, where its effect has no size."""
 

@@ -82,7 +82,7 @@ class Predictor:
         self.rigs = np.array([trial_inputs(trial_data.trial) for trial_data in data], dtype=float)
         self.bends = [bends_of(trial_data.trial) for trial_data in data]
         measured_otherwise = any(
-            {"true_time", "observed_position", "row_delay"} & set(effect.functions) for effect in model
+            {"true_time", "observed_position", "row_delay", "averaged_over"} & set(effect.functions) for effect in model
         )
         self.plain_release = np.array([trial_data.trace is None and not measured_otherwise for trial_data in data])
         self.twins = _twins(data, self.rigs, self.bends)

@@ -1,0 +1,59 @@
+"""Positions that are means over a stretch of time: what is reported at t is averaged from t − T/2 to t + T/2."""
+
+import math
+
+from vinetrack.dynamics.between_frames import motion_at
+from vinetrack.dynamics.equations import compiled
+
+NODE, WEIGHT, MIDDLE_WEIGHT = math.sqrt(0.6), 5 / 18, 4 / 9
+"""Gauss and Legendre's three places in an interval, and their weights. Derived: exact for polynomials of degree 5, as
+the motion between two frames is."""
+
+
+@compiled
+def average_over(times, out, means, ratio, end, square):
+    """Replace what is seen at an instant by its mean over the time about it.
+
+    Parameters
+    ----------
+    times : array (n_times,), s since release, increasing.
+    out : array (n_times, 4): x, v, a of the tail and the reported position of the leading edge, m, which is replaced.
+    means : array (n_times,), overwritten.
+    ratio : travel ratio r, x = r·y.
+    end : the `Point` at which growth ends; its time is infinite where it does not.
+    square : T², s², above 0.
+    """
+    half = 0.5 * math.sqrt(square)
+    for i in range(times.size):
+        first, last = times[i] - half, times[i] + half
+        k = i
+        while k > 0 and times[k] > first:
+            k -= 1
+        area, at = 0.0, first
+        while at < last:
+            # What lies before the first instant, and beyond the last, is one piece each.
+            until = last
+            if at < times[0]:
+                until = min(last, times[0])
+            elif k < times.size - 1:
+                until = min(last, times[k + 1])
+            if at < end.time < until:
+                until = end.time
+            area += _integral(times, out, ratio, end, k, at, until)
+            at = until
+            while k < times.size - 1 and times[k + 1] <= at:
+                k += 1
+        means[i] = area / (2 * half)
+    for i in range(times.size):
+        out[i, 3] = means[i]
+
+
+@compiled
+def _integral(times, out, ratio, end, k, low, high):
+    """Of the reported position, m s, over a piece of time in which the motion is one polynomial."""
+    middle, reach = 0.5 * (low + high), 0.5 * NODE * (high - low)
+    total = 0.0
+    for place in range(3):
+        x, _v, offset = motion_at(times, out, ratio, end, k, middle + (place - 1) * reach)
+        total += (MIDDLE_WEIGHT if place == 1 else WEIGHT) * (x / ratio + offset)
+    return total * (high - low)
