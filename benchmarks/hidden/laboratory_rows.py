@@ -185,7 +185,12 @@ def _camera_rows() -> list[Row]:
             least_sigma=CLEAR,
         ),
         Row("smoothed", "smoothed", _names("moving_average"), (faults.smoothed((5, 7, 9)),)),
-        Row("smoothed_polynomial", "smoothed_polynomial", ADEQUATE, (faults.smoothed((9, 11), 2),)),
+        Row(
+            "smoothed_polynomial",
+            "smoothed_polynomial",
+            _names("moving_average", adequate=True),
+            (faults.smoothed((9, 11), 2),),
+        ),
         Row("speed_noise", "speed_noise", ADEQUATE, (faults.blur(60e-6),), FAST, _very_fast, quiet=0.5),
         Row(
             "trace_clock",
