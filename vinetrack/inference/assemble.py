@@ -117,6 +117,7 @@ def assemble(
             *_messages(layout, solution, numbers, known, chi2),
             *_disagreements(numbers, between),
             *_weighted(predictor.data),
+            *_smoothed(predictor.data),
         ),
         left_out=dict(left_out),
         converged=solution.converged,
@@ -401,6 +402,17 @@ def _free_in_trials(solution: Solution) -> str:
     """What every trial may have of its own, where it may: a falling body has neither B nor pressure."""
     felt = [SPREAD_NAMES[k] for k in (1, 0) if solution.problem.feels[:, k].any()]
     return f", with {' and '.join(felt)} of every trial free to help" if felt else ""
+
+
+def _smoothed(data: Sequence[FitTrial]) -> list[str]:
+    """What is said of positions that somebody smoothed."""
+    smoothing = next((trial_data.smoothing for trial_data in data if trial_data.smoothing is not None), None)
+    if smoothing is None:
+        return []
+    return [
+        f"positions look smoothed {smoothing}, so that one frame in {smoothing.alike} is used: give them as they were"
+        " measured, which shows more"
+    ]
 
 
 def _weighted(data: Sequence[FitTrial]) -> list[str]:

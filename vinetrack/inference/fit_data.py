@@ -17,6 +17,7 @@ from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
 from vinetrack.inference.gauge_noise import QuietTrace, quiet_traces
 from vinetrack.tracks.noise_shape import correlated_gain, noise_shape
 from vinetrack.tracks.position_noise import position_noise, rest_points, rough_noise
+from vinetrack.tracks.smoothed_positions import Smoothing, smoothing_of
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -115,6 +116,7 @@ class FitTrial:
     slow_m: Floats | None = None
     relative_sd: Floats | None = None
     blur_s: float = 0.0
+    smoothing: Smoothing | None = None  #: how positions were smoothed of which one in several is kept
 
     @cached_property
     def frame_s(self) -> float:
@@ -174,9 +176,10 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
     """
     data, left_out = [], {}
     pairs = list(pairs)
+    smoothing = smoothing_of(pairs)
     for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
         try:
-            data.append(prepare_trial(trial, track, quiet))
+            data.append(prepare_trial(trial, track, quiet, smoothing))
         except FitError as error:
             left_out[trial.name] = str(error)
     return _with_noise_shape(data) if weighted else data, left_out
@@ -209,7 +212,9 @@ def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:
     return weighted
 
 
-def prepare_trial(trial: Trial, track: Track, quiet: QuietTrace | None = None) -> FitTrial:
+def prepare_trial(
+    trial: Trial, track: Track, quiet: QuietTrace | None = None, smoothing: Smoothing | None = None
+) -> FitTrial:
     """The usable points of a track, rest included, with what they say of their own noise.
 
     Parameters
@@ -218,6 +223,8 @@ def prepare_trial(trial: Trial, track: Track, quiet: QuietTrace | None = None) -
     track : its positions.
     quiet : QuietTrace, optional
         Its recorded pressure without noise, from `quiet_traces`, where traces of other trials tell of it too.
+    smoothing : Smoothing, optional
+        How its positions were smoothed: of those that are alike one is kept.
 
     Returns
     -------
@@ -232,6 +239,10 @@ def prepare_trial(trial: Trial, track: Track, quiet: QuietTrace | None = None) -
     usable = track.usable & ~_nearing_end(trial, track)
     vague, vague_rest = _vague(track, usable)
     usable &= ~vague
+    smoothing = smoothing if trial.video is None else None
+    if smoothing is not None:
+        places = np.flatnonzero(usable)
+        usable[np.setdiff1d(places, places[:: smoothing.alike])] = False
     time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
     if time_s.size < FEWEST_POINTS:
         raise FitError(f"{time_s.size} usable points, at least {FEWEST_POINTS} are needed")
@@ -275,6 +286,7 @@ def prepare_trial(trial: Trial, track: Track, quiet: QuietTrace | None = None) -
         position_systematic_m=_position_systematic_m(trial),
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
         slow_m=_slow_error(track, usable) if filmed else None,
+        smoothing=smoothing,
     )
 
 

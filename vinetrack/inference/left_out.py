@@ -27,6 +27,7 @@ from vinetrack.inference.sensitivity import (
 )
 from vinetrack.inference.starts import align, initial_trial_effects
 from vinetrack.inference.whitening import all_products, at_correlation
+from vinetrack.tracks.smoothed_positions import smoothing_of
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit, TrialFit
@@ -209,9 +210,10 @@ def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
         If a trial cannot be used; the message names it.
     """
     data, pairs = [], list(pairs)
+    smoothing = smoothing_of(pairs)
     for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
         try:
-            data.append(prepare_trial(trial, track, quiet))
+            data.append(prepare_trial(trial, track, quiet, smoothing))
         except FitError as error:
             raise FitError(f"Trial {trial.name}: {error}.") from error
     return data

@@ -1,0 +1,137 @@
+"""Positions that were smoothed before they were handed in, told by the frequencies that their noise lacks.
+
+A moving average over N frames takes out all that oscillates N/j times a frame; a polynomial through N frames
+(Savitzky & Golay, Anal. Chem. 36, 1627, 1964) takes out what oscillates faster than it bends. No noise of a camera or a
+tracker has such holes. Positions of a campaign are compared with both kinds and with correlated noise by Whittle's
+likelihood of the spectrum (Whittle, J. R. Stat. Soc. B 15, 125, 1953), above the frequencies of the motion itself.
+
+Noise that was averaged over N frames is the same noise in N frames after one another, but for a part; what an
+autoregressive noise would make of it is a random walk, beside which a fit sees next to nothing. Of every N frames one
+is as good as all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import savgol_coeffs
+from scipy.signal.windows import hann
+
+from vinetrack.core.records import Floats, Track, Trial
+
+WINDOWS = (3, 5, 7, 9, 11, 13, 15, 17, 19, 21)
+"""Frames that are averaged over or that a polynomial goes through. Chosen: what spreadsheets and filters offer; longer
+windows leave of a growth of a hundred frames little to fit."""
+
+DEGREES = (0, 2)
+"""Of the polynomials; 0 is the moving average. Derived: of an odd window the middle of degree 1 is that of 0, of 3 that
+of 2."""
+
+SLOWEST = 0.06
+"""Oscillations a frame from which the spectrum is compared. Chosen: slower ones are motion; at half the release and the
+end of growth pass for noise, at twice a third of the spectrum of a window of three is left."""
+
+FEWEST_FRAMES = 40
+"""Of a stretch without gaps. Chosen: twenty frequencies; at half hardly any hole is seen, at twice fast vines drop
+out."""
+
+CORRELATIONS = tuple(np.linspace(0.0, 0.95, 20))
+FLOORS = (0.0, 1e-3, 1e-2, 0.1, 0.3)
+"""Of the correlated noise, and parts of the noise that came after the smoothing, such as rounded digits. Chosen: a
+grid, fine enough for ln L to differ by less than the level asked."""
+
+SURE = 30.0
+"""Gain of ln L from which positions count as smoothed. Chosen: tapered neighbours count twice, so that it is a chance
+of e⁻¹⁵ for each of twenty windows. Measured (laboratories with 8 to 12 trials, tuning seeds 20620 to 20622): smoothed
+positions gain 290 to 1200, those of six other kinds 18 at most. At half one of these would count, at twice none less of
+the smoothed."""
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Polynomials of this degree, 0 a moving average, through so many frames; `alike` is of how many one is as good."""
+
+    window: int
+    degree: int
+    alike: int
+
+    def __str__(self) -> str:
+        kind = "by a moving average" if self.degree == 0 else f"by polynomials of degree {self.degree}"
+        return f"{kind} over {self.window} frames"
+
+
+def smoothing_of(pairs: Iterable[tuple[Trial, Track]]) -> Smoothing | None:
+    """How the positions of a campaign were smoothed; None where they were not.
+
+    Parameters
+    ----------
+    pairs : trials of one campaign with their tracks; recordings, whose positions nobody smoothed, are passed over.
+
+    Returns
+    -------
+    Smoothing or None
+    """
+    spectra = [spectrum for trial, track in pairs if trial.video is None for spectrum in _spectra(track)]
+    if not spectra:
+        return None
+    plain = max(_whittle(spectra, [_correlated(f, rho, floor) for f, _ in spectra]) for rho, floor in _noises())
+    best, found = plain + SURE, None
+    for window in WINDOWS:
+        for degree in DEGREES:
+            if degree >= window - 1:
+                continue
+            weights = savgol_coeffs(window, degree)
+            passed = [_passed(f, weights) for f, _ in spectra]
+            for floor in FLOORS:
+                likelihood = _whittle(spectra, [(1 - floor) * part + max(floor, 1e-5) for part in passed])
+                if likelihood > best:
+                    # Averaged over N frames noise has 1/N of its variance left.
+                    best, found = likelihood, Smoothing(window, degree, max(round(1 / float(weights @ weights)), 2))
+    return found
+
+
+def _spectra(track: Track) -> Iterator[tuple[Floats, Floats]]:
+    """Frequencies, 1/frame, and power of the noise, of every even stretch of a track."""
+    time_s, position_m = track.time_s[track.usable], track.lead_position_m[track.usable]
+    if time_s.size < FEWEST_FRAMES:
+        return
+    steps = np.diff(time_s)
+    for part in np.split(np.arange(time_s.size), np.flatnonzero(steps > 1.5 * np.median(steps)) + 1):
+        if part.size < FEWEST_FRAMES:
+            continue
+        # Third differences are free of the motion, and change the noise by a known factor.
+        rough = np.diff(position_m[part], 3)
+        taper = hann(rough.size, sym=False)
+        frequency = np.fft.rfftfreq(rough.size)
+        power = np.abs(np.fft.rfft(rough * taper)) ** 2
+        seen = (frequency > SLOWEST) & (frequency < 0.5)
+        power = power[seen] / (2 * np.sin(math.pi * frequency[seen])) ** 6
+        if np.all(power > 0):
+            yield frequency[seen], power
+
+
+def _whittle(spectra: Sequence[tuple[Floats, Floats]], shapes: Sequence[Floats]) -> float:
+    """Ln L of the spectra under these shapes, the scale of each at its best."""
+    total = 0.0
+    for (_, power), shape in zip(spectra, shapes, strict=True):
+        total -= float(np.log(shape).sum()) + power.size * math.log(float(np.mean(power / shape)))
+    return total
+
+
+def _noises() -> Iterator[tuple[float, float]]:
+    return ((rho, floor) for rho in CORRELATIONS for floor in FLOORS)
+
+
+def _correlated(frequency: Floats, rho: float, floor: float) -> Floats:
+    """Spectrum of autoregressive noise with white noise beside it, of variance 1 together."""
+    power = (1 - rho**2) / (1 - 2 * rho * np.cos(2 * math.pi * frequency) + rho**2)
+    return np.asarray((1 - floor) * power + floor)
+
+
+def _passed(frequency: Floats, weights: Floats) -> Floats:
+    """Power that a filter of these weights lets pass."""
+    places = np.arange(weights.size) - weights.size // 2
+    return np.asarray((np.cos(2 * math.pi * np.outer(frequency, places)) @ weights) ** 2)
