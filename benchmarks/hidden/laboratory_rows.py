@@ -184,7 +184,7 @@ def _camera_rows() -> list[Row]:
             quiet=0.7,
             least_sigma=CLEAR,
         ),
-        Row("smoothed", "smoothed", _names("moving_average"), (faults.smoothed((5, 7, 9)),)),
+        Row("smoothed", "smoothed", _names("moving_average", adequate=True), (faults.smoothed((5, 7, 9)),)),
         Row(
             "smoothed_polynomial",
             "smoothed_polynomial",

@@ -117,11 +117,20 @@ class FitTrial:
     relative_sd: Floats | None = None
     blur_s: float = 0.0
     smoothing: Smoothing | None = None  #: how positions were smoothed of which one in several is kept
+    smoothed_frame_s: float = 0.0  #: spacing of the frames that were smoothed over, s
 
     @cached_property
     def frame_s(self) -> float:
         """Spacing of the points, s."""
         return float(np.median(np.diff(self.time_s)))
+
+    @cached_property
+    def window(self) -> tuple[Floats, Floats]:
+        """Instants about each point that it is a mean of, s, and their weights; one where it was not smoothed."""
+        if self.smoothing is None:
+            return np.zeros(1), np.ones(1)
+        places = np.arange(self.smoothing.window) - self.smoothing.window // 2
+        return places * self.smoothed_frame_s, self.smoothing.weights
 
     @property
     def point_sd(self) -> Floats:
@@ -240,8 +249,10 @@ def prepare_trial(
     vague, vague_rest = _vague(track, usable)
     usable &= ~vague
     smoothing = smoothing if trial.video is None else None
+    smoothed_frame_s = 0.0
     if smoothing is not None:
         places = np.flatnonzero(usable)
+        smoothed_frame_s = float(np.median(np.diff(track.time_s[places])))
         usable[np.setdiff1d(places, places[:: smoothing.alike])] = False
     time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
     if time_s.size < FEWEST_POINTS:
@@ -287,6 +298,7 @@ def prepare_trial(
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),
         slow_m=_slow_error(track, usable) if filmed else None,
         smoothing=smoothing,
+        smoothed_frame_s=smoothed_frame_s,
     )
 
 

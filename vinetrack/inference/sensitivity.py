@@ -24,11 +24,8 @@ from vinetrack.effects import TrialInputs
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.parameters import DAMPING, YIELD_PRESSURE, ParameterMap
 from vinetrack.inference.position_change import clip_at_end, position_change
-from vinetrack.inference.trajectory_jobs import Job, Jobs, Motions
+from vinetrack.inference.trajectory_jobs import OBSERVED, Average, Job, Jobs, Motions
 from vinetrack.inference.whitening import all_products
-
-OBSERVED = 3
-"""Column of `Motions.rows` that holds the position of the edge as the camera reports it. Defined by the kernel."""
 
 RELEASE, ORIGIN, PRESSURE, DAMPING_DEVIATION = range(4)
 OWN = 4
@@ -84,6 +81,9 @@ class Predictor:
         measured_otherwise = any(
             {"true_time", "observed_position", "row_delay", "averaged_over"} & set(effect.functions) for effect in model
         )
+        self.smoothed = any(trial_data.smoothing is not None for trial_data in data)
+        measured_otherwise |= self.smoothed
+        self.averages = [Average.of(trial_data.time_s, *trial_data.window) for trial_data in data]
         self.plain_release = np.array([trial_data.trace is None and not measured_otherwise for trial_data in data])
         self.twins = _twins(data, self.rigs, self.bends)
         self.has_twins = bool(np.any(self.twins != np.arange(self.twins.size)))
@@ -142,7 +142,11 @@ class Predictor:
             self.rigs[trials], self.rigs[trials, 0] * (1 + jobs.pressure_deviation), jobs.yield_pressure_Pa
         )
         rigs[:, PAYLOAD_COLUMN] *= jobs.payload_factor
-        instants = [self.times_s[i] for i in trials] if times_s is None else times_s
+        averages = [self.averages[i] for i in trials] if times_s is None and self.smoothed else None
+        if averages is not None:
+            instants = [average.instants_s for average in averages]
+        else:
+            instants = [self.times_s[i] for i in trials] if times_s is None else list(times_s)
         starts = starts_of(instants)
         batch = lay_out(
             model,
@@ -154,7 +158,8 @@ class Predictor:
             parameters=jobs.row,
             host=self.host,
         )
-        return Motions.of(batch, [self.data[i].trial for i in trials], like)
+        motions = Motions.of(batch, [self.data[i].trial for i in trials], like)
+        return motions if averages is None else motions.averaged(averages)
 
     def _traces(self, jobs: Jobs) -> list[Trace | None]:
         """Recorded pressures on the clock of each job."""

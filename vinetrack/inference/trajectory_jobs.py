@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -10,8 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Trial
-from vinetrack.dynamics.batch import Batch
+from vinetrack.dynamics.batch import Batch, starts_of
 from vinetrack.dynamics.simulate import Trajectory, check_completed, trajectories
+
+OBSERVED = 3
+"""Column of `Motions.rows` that holds the position of the edge as the camera reports it. Defined by the kernel."""
 
 
 class Job(NamedTuple):
@@ -131,6 +135,37 @@ class Jobs:
         return np.unique(like, return_inverse=True)
 
 
+class Average(NamedTuple):
+    """Positions that are means over instants about a point: all instants, s, those that each mean takes, its weights.
+
+    `instants_s` increases; `place` has shape (n_points, n_weights).
+    """
+
+    instants_s: Floats
+    place: NDArray[np.int_]
+    weights: Floats
+
+    @classmethod
+    def of(cls, time_s: Floats, offsets_s: Floats, weights: Floats) -> Average:
+        """About points at these times.
+
+        Parameters
+        ----------
+        time_s : array, shape (n_points,)
+        offsets_s, weights : array, shape (n_weights,)
+            An odd number, the middle one at the point itself.
+
+        Returns
+        -------
+        Average
+        """
+        about_s = np.add.outer(time_s, offsets_s)
+        order = np.argsort(about_s, axis=None, kind="stable")
+        place = np.empty(order.size, dtype=int)
+        place[order] = np.arange(order.size)
+        return cls(about_s.ravel()[order], place.reshape(about_s.shape), weights)
+
+
 @dataclass(frozen=True)
 class Motions:
     """What was simulated for jobs: rows of `out` and `ends` as `Batch.run` returns them, for distinct trajectories.
@@ -169,6 +204,30 @@ class Motions:
         out, ends = batch.run()
         check_completed(ends, [trial.name for trial in trials])
         return cls(batch, out, ends, [trial.travel_ratio for trial in trials], like)
+
+    def averaged(self, averages: Sequence[Average]) -> Motions:
+        """The same at the points that were asked for, their reported positions averaged over the instants about them.
+
+        Parameters
+        ----------
+        averages : sequence of Average
+            One a trajectory, whose instants it was followed at.
+
+        Returns
+        -------
+        Motions
+        """
+        out, stamps, times = [], [], []
+        for (first, last), average in zip(itertools.pairwise(self.batch.starts), averages, strict=True):
+            middle = average.place[:, average.weights.size // 2]
+            rows = self.out[first:last]
+            averaged = rows[middle]
+            averaged[:, OBSERVED] = rows[average.place, OBSERVED] @ average.weights
+            out.append(averaged)
+            stamps.append(self.batch.stamps[first:last][middle])
+            times.append(self.batch.times[first:last][middle])
+        batch = replace(self.batch, stamps=np.concatenate(stamps), times=np.concatenate(times), starts=starts_of(times))
+        return replace(self, batch=batch, out=np.concatenate(out))
 
     def rows(self, first: int, last: int) -> Floats:
         """Rows of `out` of jobs `first` up to `last`, end to end.

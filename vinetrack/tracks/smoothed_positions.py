@@ -38,10 +38,23 @@ FEWEST_FRAMES = 40
 """Of a stretch without gaps. Chosen: twenty frequencies; at half hardly any hole is seen, at twice fast vines drop
 out."""
 
-CORRELATIONS = tuple(np.linspace(0.0, 0.95, 20))
-FLOORS = (0.0, 1e-3, 1e-2, 0.1, 0.3)
-"""Of the correlated noise, and parts of the noise that came after the smoothing, such as rounded digits. Chosen: a
-grid, fine enough for ln L to differ by less than the level asked."""
+UNEVEN = 0.02
+"""Part of a frame by which frames may be apart unevenly. Chosen: positions between uneven frames are not those of a
+filter, and motion makes noise of them. At half clocks that jitter by a per cent drop out, at twice more are looked at."""
+
+CORRELATIONS = tuple(np.linspace(0.0, 0.9, 10))
+"""Of noise that was not smoothed. Chosen: a grid, fine enough for ln L to differ by less than the level asked."""
+
+FALLING = 4.0
+"""Power with which the spectrum of a motion falls that is rougher than its noise, as of a tube that sticks and slips
+and is read fifty times a second. Derived: that of a jump of the speed."""
+
+LEAST = 1e-5
+"""Part of its power that a smoothed noise keeps in a hole. Derived: 1/N⁴ of a taper over N of 20 samples and more."""
+
+MOST_STRETCHES, ROUNDS = 12, 30
+"""The longest stretches that are compared, and rounds in which the parts of their spectra are found. Chosen for time: a
+tenth of a second; at half as many smoothing of long windows is passed over, at twice none more is found."""
 
 SURE = 30.0
 """Gain of ln L from which positions count as smoothed. Chosen: tapered neighbours count twice, so that it is a chance
@@ -62,6 +75,11 @@ class Smoothing:
         kind = "by a moving average" if self.degree == 0 else f"by polynomials of degree {self.degree}"
         return f"{kind} over {self.window} frames"
 
+    @property
+    def weights(self) -> Floats:
+        """Of the frames in the window, shape (window,)."""
+        return np.asarray(savgol_coeffs(self.window, self.degree, use="dot"))
+
 
 def smoothing_of(pairs: Iterable[tuple[Trial, Track]]) -> Smoothing | None:
     """How the positions of a campaign were smoothed; None where they were not.
@@ -77,19 +95,18 @@ def smoothing_of(pairs: Iterable[tuple[Trial, Track]]) -> Smoothing | None:
     spectra = [spectrum for trial, track in pairs if trial.video is None for spectrum in _spectra(track)]
     if not spectra:
         return None
-    plain = max(_whittle(spectra, [_correlated(f, rho, floor) for f, _ in spectra]) for rho, floor in _noises())
+    spectra = sorted(spectra, key=lambda spectrum: -spectrum[0].size)[:MOST_STRETCHES]
+    plain = max(_whittle(spectra, [_correlated(f, rho) for f, _ in spectra]) for rho in CORRELATIONS)
     best, found = plain + SURE, None
     for window in WINDOWS:
         for degree in DEGREES:
             if degree >= window - 1:
                 continue
             weights = savgol_coeffs(window, degree)
-            passed = [_passed(f, weights) for f, _ in spectra]
-            for floor in FLOORS:
-                likelihood = _whittle(spectra, [(1 - floor) * part + max(floor, 1e-5) for part in passed])
-                if likelihood > best:
-                    # Averaged over N frames noise has 1/N of its variance left.
-                    best, found = likelihood, Smoothing(window, degree, max(round(1 / float(weights @ weights)), 2))
+            likelihood = _whittle(spectra, [np.maximum(_passed(f, weights), LEAST) for f, _ in spectra])
+            if likelihood > best:
+                # Averaged over N frames noise has 1/N of its variance left.
+                best, found = likelihood, Smoothing(window, degree, max(round(1 / float(weights @ weights)), 2))
     return found
 
 
@@ -99,6 +116,9 @@ def _spectra(track: Track) -> Iterator[tuple[Floats, Floats]]:
     if time_s.size < FEWEST_FRAMES:
         return
     steps = np.diff(time_s)
+    uneven = np.median(np.abs(steps - np.median(steps))) > UNEVEN * np.median(steps)
+    if uneven:
+        return
     for part in np.split(np.arange(time_s.size), np.flatnonzero(steps > 1.5 * np.median(steps)) + 1):
         if part.size < FEWEST_FRAMES:
             continue
@@ -114,21 +134,25 @@ def _spectra(track: Track) -> Iterator[tuple[Floats, Floats]]:
 
 
 def _whittle(spectra: Sequence[tuple[Floats, Floats]], shapes: Sequence[Floats]) -> float:
-    """Ln L of the spectra under these shapes, the scale of each at its best."""
+    """Log-likelihood of the spectra as sums of these shapes, white noise and rough motion, in parts of their own.
+
+    The parts maximise it by multiplicative steps (Févotte, Bertin & Durrieu, Neural Computation 21, 793, 2009).
+    """
     total = 0.0
-    for (_, power), shape in zip(spectra, shapes, strict=True):
-        total -= float(np.log(shape).sum()) + power.size * math.log(float(np.mean(power / shape)))
+    for (frequency, power), shape in zip(spectra, shapes, strict=True):
+        bases = np.stack([shape / shape.mean(), np.ones_like(shape), (SLOWEST / frequency) ** FALLING])
+        parts = power.mean() * np.array([0.8, 0.1, 0.1])
+        for _ in range(ROUNDS):
+            modelled = parts @ bases
+            parts = parts * np.sqrt((bases @ (power / modelled**2)) / (bases @ (1 / modelled)))
+        modelled = parts @ bases
+        total -= float(np.sum(np.log(modelled) + power / modelled))
     return total
 
 
-def _noises() -> Iterator[tuple[float, float]]:
-    return ((rho, floor) for rho in CORRELATIONS for floor in FLOORS)
-
-
-def _correlated(frequency: Floats, rho: float, floor: float) -> Floats:
-    """Spectrum of autoregressive noise with white noise beside it, of variance 1 together."""
-    power = (1 - rho**2) / (1 - 2 * rho * np.cos(2 * math.pi * frequency) + rho**2)
-    return np.asarray((1 - floor) * power + floor)
+def _correlated(frequency: Floats, rho: float) -> Floats:
+    """Spectrum of autoregressive noise."""
+    return np.asarray((1 - rho**2) / (1 - 2 * rho * np.cos(2 * math.pi * frequency) + rho**2))
 
 
 def _passed(frequency: Floats, weights: Floats) -> Floats:
