@@ -191,6 +191,22 @@ def _camera_rows() -> list[Row]:
             _names("moving_average", adequate=True),
             (faults.smoothed((9, 11), 2),),
         ),
+        Row(
+            "smoothed_depletion",
+            "smoothed_depletion",
+            _names("reservoir_depletion"),
+            (faults.physics(gamma=1.3), faults.smoothed((5, 7))),
+            Wants(payload=False, chamber=True),
+            least_sigma=CLEAR,
+        ),
+        Row(
+            "smoothed_valve",
+            "smoothed_valve",
+            _names("supply_rise"),
+            (faults.valve("exponential", 5, 7), faults.smoothed((5, 7))),
+            quiet=0.7,
+            least_sigma=CLEAR,
+        ),
         Row("speed_noise", "speed_noise", ADEQUATE, (faults.blur(60e-6),), FAST, _very_fast, quiet=0.5),
         Row(
             "trace_clock",

@@ -406,13 +406,7 @@ def _free_in_trials(solution: Solution) -> str:
 
 def _smoothed(data: Sequence[FitTrial]) -> list[str]:
     """What is said of positions that somebody smoothed."""
-    smoothing = next((trial_data.smoothing for trial_data in data if trial_data.smoothing is not None), None)
-    if smoothing is None:
-        return []
-    return [
-        f"positions look smoothed {smoothing}, so that one frame in {smoothing.alike} is used: give them as they were"
-        " measured, which shows more"
-    ]
+    return list(dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None))
 
 
 def _weighted(data: Sequence[FitTrial]) -> list[str]:

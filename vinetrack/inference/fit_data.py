@@ -130,7 +130,7 @@ class FitTrial:
         if self.smoothing is None:
             return np.zeros(1), np.ones(1)
         places = np.arange(self.smoothing.window) - self.smoothing.window // 2
-        return places * self.smoothed_frame_s, self.smoothing.weights
+        return np.asarray(places * self.smoothed_frame_s), self.smoothing.weights
 
     @property
     def point_sd(self) -> Floats:

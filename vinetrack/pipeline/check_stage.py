@@ -51,6 +51,7 @@ def check_folder(folder: Path) -> Checked:
     from vinetrack.pipeline.workflow import path_problems
     from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
     from vinetrack.tracks.importers import TrackError, load_track
+    from vinetrack.tracks.smoothed_positions import smoothing_of
     from vinetrack.video.recording_facts import axis_notes, direction_notes, facts_entry, facts_rows
     from vinetrack.video.survey import Surveyor
 
@@ -63,10 +64,12 @@ def check_folder(folder: Path) -> Checked:
     facts = {trial.name: known for trial, known in surveyor.facts.items()}
     trials = [trial for trial in experiment.trials if trial.name in facts]
     speeds = [(trial, facts[trial.name].mean_speed_m_s) for trial in trials]
+    handed_in = []
     for trial in experiment.trials:
         if trial.track is not None:
             with contextlib.suppress(TrackError):
-                speeds.append((trial, track_speed(load_track(trial))))
+                handed_in.append((trial, load_track(trial)))
+    speeds += [(trial, track_speed(track)) for trial, track in handed_in]
     # Sizes that are wrong make the damping wrong that speeds imply.
     if not any(problem.severity == "error" for problem in problems):
         stated_in = SHEET if "pressure_kPa" in experiment.columns else SETTINGS
@@ -76,4 +79,7 @@ def check_folder(folder: Path) -> Checked:
     if 0 < len(surveyor.looked_into) < len(seen):
         lines.append(f"{len(surveyor.looked_into)} of {len(seen)} recordings were looked into, one of each condition")
     notes = [*experiment.blank_notes, *direction_notes(seen, trials, experiment.angle_blank), *axis_notes(seen, trials)]
+    smoothing = smoothing_of(handed_in)
+    if smoothing is not None:
+        notes.append(smoothing.note)
     return Checked(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(notes))

@@ -40,7 +40,7 @@ out."""
 
 UNEVEN = 0.02
 """Part of a frame by which frames may be apart unevenly. Chosen: positions between uneven frames are not those of a
-filter, and motion makes noise of them. At half clocks that jitter by a per cent drop out, at twice more are looked at."""
+filter, and motion makes noise of them. At half clocks that jitter by a per cent drop out, at twice more count."""
 
 CORRELATIONS = tuple(np.linspace(0.0, 0.9, 10))
 """Of noise that was not smoothed. Chosen: a grid, fine enough for ln L to differ by less than the level asked."""
@@ -74,6 +74,14 @@ class Smoothing:
     def __str__(self) -> str:
         kind = "by a moving average" if self.degree == 0 else f"by polynomials of degree {self.degree}"
         return f"{kind} over {self.window} frames"
+
+    @property
+    def note(self) -> str:
+        """What a user is told."""
+        return (
+            f"positions look smoothed {self}: the model is smoothed alike, and one frame in {self.alike} is used; give"
+            " them as they were measured, which shows more"
+        )
 
     @property
     def weights(self) -> Floats:
@@ -130,7 +138,7 @@ def _spectra(track: Track) -> Iterator[tuple[Floats, Floats]]:
         seen = (frequency > SLOWEST) & (frequency < 0.5)
         power = power[seen] / (2 * np.sin(math.pi * frequency[seen])) ** 6
         if np.all(power > 0):
-            yield frequency[seen], power
+            yield np.asarray(frequency[seen], dtype=float), power
 
 
 def _whittle(spectra: Sequence[tuple[Floats, Floats]], shapes: Sequence[Floats]) -> float:

@@ -1,0 +1,82 @@
+"""Positions that somebody smoothed are told from those that nobody did; seeds 351 and up, which tuned nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hidden.laboratory_folder import write_experiment
+from hidden.laboratory_rows import campaign
+from lsoda_vine import as_track
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import savgol_filter
+
+import vinetrack as vt
+from vinetrack.core.records import Track, Trial
+from vinetrack.pipeline.check_stage import check_folder
+from vinetrack.tracks.position_noise import ar1_noise
+from vinetrack.tracks.smoothed_positions import Smoothing, smoothing_of
+
+TIME_S = np.arange(150) / 1000.0
+TRIAL = Trial(name="t", capture_fps=1000.0)
+
+
+def grown_m(time_s: np.ndarray) -> np.ndarray:
+    """From rest at 20 ms, at up to 3 m/s."""
+    since = np.clip(time_s - 0.02, 0.0, None)
+    return np.asarray(3.0 * (since - 0.01 * (1 - np.exp(-since / 0.01))))
+
+
+def tracks(seed: int, rho: float = 0.0, count: int = 8, smooth=lambda y: y) -> list[tuple[Trial, Track]]:  # type: ignore[no-untyped-def]
+    draw = np.random.default_rng(seed)
+    noisy = [grown_m(TIME_S) + ar1_noise(TIME_S.size, 1e-4, rho, draw) for _ in range(count)]
+    return [(TRIAL, as_track(TIME_S, smooth(y))) for y in noisy]
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.3, 0.6, 0.85])
+def test_noise_of_a_camera_is_not_smoothed(rho: float) -> None:
+    assert all(smoothing_of(tracks(seed, rho)) is None for seed in range(351, 371))
+
+
+@pytest.mark.parametrize("frames", [3, 5, 9])
+def test_a_moving_average_is_told_with_its_length(frames: int) -> None:
+    found = smoothing_of(tracks(352, smooth=lambda y: uniform_filter1d(y, frames)))
+    assert found is not None
+    assert (found.window, found.degree, found.alike) == (frames, 0, frames)
+    assert f"a moving average over {frames} frames" in found.note
+
+
+@pytest.mark.parametrize("frames", [7, 11])
+def test_a_polynomial_is_told_from_a_moving_average(frames: int) -> None:
+    found = smoothing_of(tracks(353, smooth=lambda y: savgol_filter(y, frames, 3)))
+    assert found is not None
+    assert (found.window, found.degree) == (frames, 2)
+    assert 1 < found.alike < frames
+
+
+def test_digits_that_were_rounded_afterwards_hide_nothing() -> None:
+    found = smoothing_of(tracks(354, smooth=lambda y: np.round(uniform_filter1d(y, 5), 5)))
+    assert found == Smoothing(5, 0, 5)
+
+
+def test_nothing_is_said_of_frames_that_are_unevenly_apart_nor_of_recordings(tmp_path: Path) -> None:
+    smoothed = tracks(355, smooth=lambda y: uniform_filter1d(y, 5))
+    uneven_s = TIME_S + 3e-4 * np.sin(np.arange(TIME_S.size))
+    assert smoothing_of([(trial, as_track(uneven_s, track.lead_position_m)) for trial, track in smoothed]) is None
+    filmed = Trial(name="t", video=tmp_path / "t.mp4", capture_fps=1000.0)
+    assert smoothing_of([(filmed, track) for _, track in smoothed]) is None
+    assert smoothing_of([]) is None
+
+
+def test_a_model_is_smoothed_as_its_positions_were(tmp_path: Path) -> None:
+    """Each release is rounded off by half a millimetre and more, ten times the noise."""
+    shot = campaign("smoothed", 20616, (8, 8), weighed=False)
+    write_experiment(shot, tmp_path / "laboratory")
+    fit = vt.fit(vt.base_model(), tmp_path / "laboratory", profile=False)
+    assert fit.chi2_per_dof < 1.2
+    assert any("moving average over 5 frames" in message for message in fit.messages)
+    (n,) = (number for number in fit.numbers if number.key == "eversion_damping.n")
+    truth = shot.truth["truths"]["eversion_damping.n"]  # type: ignore[index]
+    assert n.low < truth < n.high
+    assert any("moving average over 5 frames" in note for note in check_folder(tmp_path / "laboratory").notes)
