@@ -81,9 +81,9 @@ class Predictor:
         measured_otherwise = any(
             {"true_time", "observed_position", "row_delay", "averaged_over"} & set(effect.functions) for effect in model
         )
-        self.smoothed = any(trial_data.smoothing is not None for trial_data in data)
-        measured_otherwise |= self.smoothed
-        self.averages = [Average.of(trial_data.time_s, *trial_data.window) for trial_data in data]
+        smoothed = any(trial_data.smoothing is not None for trial_data in data)
+        self.averages = [Average.of(known.time_s, *known.window) for known in data] if smoothed else []
+        measured_otherwise |= smoothed
         self.plain_release = np.array([trial_data.trace is None and not measured_otherwise for trial_data in data])
         self.twins = _twins(data, self.rigs, self.bends)
         self.has_twins = bool(np.any(self.twins != np.arange(self.twins.size)))
@@ -142,24 +142,22 @@ class Predictor:
             self.rigs[trials], self.rigs[trials, 0] * (1 + jobs.pressure_deviation), jobs.yield_pressure_Pa
         )
         rigs[:, PAYLOAD_COLUMN] *= jobs.payload_factor
-        averages = [self.averages[i] for i in trials] if times_s is None and self.smoothed else None
-        if averages is not None:
-            instants = [average.instants_s for average in averages]
-        else:
-            instants = [self.times_s[i] for i in trials] if times_s is None else list(times_s)
-        starts = starts_of(instants)
+        averages = [self.averages[i] for i in trials] if times_s is None and self.averages else []
+        if times_s is None:
+            times_s = [average.instants_s for average in averages] or [self.times_s[i] for i in trials]
+        starts = starts_of(times_s)
         batch = lay_out(
             model,
             rigs,
             [self.bends[i] for i in trials],
-            np.concatenate(instants) - np.repeat(jobs.release_s, np.diff(starts)),
+            np.concatenate(times_s) - np.repeat(jobs.release_s, np.diff(starts)),
             starts,
             traces=self._traces(jobs) if self.with_trace.any() else None,
             parameters=jobs.row,
             host=self.host,
         )
         motions = Motions.of(batch, [self.data[i].trial for i in trials], like)
-        return motions if averages is None else motions.averaged(averages)
+        return motions.averaged(averages) if averages else motions
 
     def _traces(self, jobs: Jobs) -> list[Trace | None]:
         """Recorded pressures on the clock of each job."""

@@ -105,7 +105,7 @@ def smoothing_of(pairs: Iterable[tuple[Trial, Track]]) -> Smoothing | None:
         return None
     spectra = sorted(spectra, key=lambda spectrum: -spectrum[0].size)[:MOST_STRETCHES]
     plain = max(_whittle(spectra, [_correlated(f, rho) for f, _ in spectra]) for rho in CORRELATIONS)
-    best, found = plain + SURE, None
+    best, likeliest = plain + SURE, None
     for window in WINDOWS:
         for degree in DEGREES:
             if degree >= window - 1:
@@ -114,8 +114,8 @@ def smoothing_of(pairs: Iterable[tuple[Trial, Track]]) -> Smoothing | None:
             likelihood = _whittle(spectra, [np.maximum(_passed(f, weights), LEAST) for f, _ in spectra])
             if likelihood > best:
                 # Averaged over N frames noise has 1/N of its variance left.
-                best, found = likelihood, Smoothing(window, degree, max(round(1 / float(weights @ weights)), 2))
-    return found
+                best, likeliest = likelihood, Smoothing(window, degree, max(round(1 / float(weights @ weights)), 2))
+    return likeliest
 
 
 def _spectra(track: Track) -> Iterator[tuple[Floats, Floats]]:
