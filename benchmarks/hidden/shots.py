@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_coeffs
+from scipy.signal import savgol_filter
 
 from hidden.designs import Setting, Wants, design
 from hidden.motion import Floats, Physics, Tube, follow
@@ -57,7 +57,7 @@ class Camera:
     `gauge_rho` from frame to frame, is read `gauge_Hz` times a second (NaN: at every frame) in multiples of
     `gauge_digit_Pa`, and the file joined by lines in between or, where it `gauge_holds`, repeated. The file has
     multiples of `trace_digit_Pa`. Positions are `smoothed` over so many frames by polynomials of `smoothed_degree`, 0 a
-    moving average, and those at either end that have no full window are left out.
+    moving average; at either end by as many frames as there are, as spreadsheets do.
     """
 
     noise_m: float
@@ -230,20 +230,17 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
     trace = None
     if math.isfinite(camera.trace_late_s):
         trace = _recorded(times[:stop], gauge(times, gauge_Pa, camera.trace_late_s)[:stop], camera, draw) / 1e3
-    return _smoothed(times[:stop], position, trace, camera)
+    return times[:stop], _smoothed(position, camera), trace
 
 
-def _smoothed(
-    times: Floats, position: Floats, trace: Floats | None, camera: Camera
-) -> tuple[Floats, Floats, Floats | None] | None:
-    """Positions as somebody hands them in who smoothed them first; None where nothing is left."""
+def _smoothed(position: Floats, camera: Camera) -> Floats:
+    """Positions as somebody hands them in who smoothed them first."""
     if camera.smoothed < 2:
-        return times, position, trace
-    if position.size < camera.smoothed + FEWEST_MOVING:
-        return None
-    kernel = savgol_coeffs(camera.smoothed, camera.smoothed_degree, use="dot")
-    whole = slice(camera.smoothed // 2, -(camera.smoothed // 2))
-    return times[whole], np.correlate(position, kernel, "valid"), None if trace is None else trace[whole]
+        return position
+    if camera.smoothed_degree:
+        return np.asarray(savgol_filter(position, camera.smoothed, camera.smoothed_degree))
+    window = np.ones(camera.smoothed)
+    return np.asarray(np.convolve(position, window, "same") / np.convolve(np.ones(position.size), window, "same"))
 
 
 def _recorded(times: Floats, pressure_Pa: Floats, camera: Camera, draw: Draw) -> Floats:

@@ -251,9 +251,10 @@ def prepare_trial(
     smoothing = smoothing if trial.video is None else None
     smoothed_frame_s = 0.0
     if smoothing is not None:
-        places = np.flatnonzero(usable)
+        # At either end a filter has no full window, and everybody fills it up in another way.
+        places = np.flatnonzero(usable)[smoothing.window // 2 : -(smoothing.window // 2)]
         smoothed_frame_s = float(np.median(np.diff(track.time_s[places])))
-        usable[np.setdiff1d(places, places[:: smoothing.alike])] = False
+        usable = np.isin(np.arange(usable.size), places[:: smoothing.alike])
     time_s, position_m = track.time_s[usable].astype(float), track.lead_position_m[usable].astype(float)
     if time_s.size < FEWEST_POINTS:
         raise FitError(f"{time_s.size} usable points, at least {FEWEST_POINTS} are needed")
