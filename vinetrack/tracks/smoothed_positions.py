@@ -60,7 +60,7 @@ SURE = 30.0
 """Gain of ln L over noise without holes, and over every other filter, from which positions count as smoothed. Chosen:
 tapered neighbours count twice, so that it is a chance of e⁻¹⁵ for each of twenty windows. Measured (laboratories with 8
 to 12 trials, tuning seeds 20620 to 20625): smoothed positions gain 48 to 1400, those of eight other kinds 15 at most;
-two of twelve gained 12 and 13 less than another filter, and are passed over. Half or twice of it changes none of these."""
+two of twelve gained 12 and 13 less than another filter, and are passed over. At half or twice all these stay so."""
 
 
 @dataclass(frozen=True)
