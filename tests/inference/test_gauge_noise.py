@@ -11,12 +11,21 @@ from hidden.laboratory_rows import campaign
 from lsoda_vine import as_track
 
 import vinetrack as vt
-from vinetrack.inference.gauge_noise import QuietTrace, quiet_traces, without_noise
+from vinetrack.inference.gauge_clock import Growth, gauge_clocks
+from vinetrack.inference.gauge_noise import QuietTrace, quiet_traces
 from vinetrack.inference.gauge_readings import gauge_readings, noise_correlation, noise_of, noises_of
 
 TIMES_S = np.arange(0.0, 0.6, 1e-3)
 PASSED_PA = 9.5e3 + 22.0  # half-way between two samples
 LET_DOWN = np.interp(TIMES_S, [0.1, 0.12, 0.2, 0.5], [16e3, 3e3, 3e3, 16e3])
+
+
+def without_noise(pressure_Pa: np.ndarray, growth_m: np.ndarray | None = None) -> np.ndarray:
+    """A trace alone; the tip stands still where no growth is given."""
+    growth_m = np.zeros(pressure_Pa.size) if growth_m is None else growth_m
+    (quiet,) = quiet_traces([as_track(1e-3 * np.arange(pressure_Pa.size), growth_m, pressure_Pa)])
+    assert quiet is not None
+    return quiet.pressure_Pa
 
 
 @pytest.mark.parametrize("sigma_Pa", [30.0, 100.0, 300.0])
@@ -54,7 +63,7 @@ def test_a_pressure_that_hardly_changes_is_known_far_better_than_a_sample():
 
 
 def test_exact_pressures_stay_as_they_are():
-    assert without_noise(LET_DOWN) is LET_DOWN
+    np.testing.assert_array_equal(without_noise(LET_DOWN), LET_DOWN)
     fills = 16e3 * -np.expm1(-TIMES_S / 0.2)
     np.testing.assert_array_equal(without_noise(fills), fills)
     np.testing.assert_array_equal(without_noise(np.full(5, 3.0)), np.full(5, 3.0))
@@ -82,6 +91,52 @@ def test_the_growth_tells_where_a_chamber_begins_to_empty_whatever_the_gauges_cl
         at_corner.append(left[60])
     assert np.mean(wanders) < 1.5 * 50.0 * np.sqrt(TIMES_S.size)
     assert abs(np.mean(at_corner)) < 15.0
+
+
+@pytest.mark.parametrize("offset", [0.0, 12.4, -7.8])
+def test_the_clock_of_a_gauge_is_the_same_in_every_trial_and_told_by_all_together(offset: float):
+    """Read every eighth frame; the sixth trial has a clock of its own, 20 frames on."""
+    traces, growths = [], []
+    for seed in range(12):
+        pressure_Pa, _, growth_m = emptied(seed)
+        later = np.arange(TIMES_S.size) + offset + 20.0 * (seed == 5)
+        at_gauge_Pa = np.interp(later, np.arange(TIMES_S.size), pressure_Pa)
+        read_at = np.arange(0, TIMES_S.size + 8, 8)
+        readings_Pa = np.interp(read_at, np.arange(TIMES_S.size), at_gauge_Pa)
+        readings_Pa += 50.0 * np.random.default_rng(100 + seed).standard_normal(read_at.size)
+        traces.append(np.interp(np.arange(TIMES_S.size), read_at, readings_Pa))
+        growths.append(Growth(growth_m, 1e-3))
+    read = gauge_readings(traces)
+    noises = noises_of(read, 0.0)
+    told = gauge_clocks(read, growths, noises)
+    alone = [gauge_clocks(read[i : i + 1], growths[i : i + 1], noises[i : i + 1])[0] for i in range(12)]
+    off = np.array([clock.offset - offset for clock in told if clock is not None])
+    off_alone = np.array([clock.offset - offset for clock in alone if clock is not None])
+    assert off.size == off_alone.size == 12
+    assert off[5] == pytest.approx(20.0, abs=5.0)
+    others = np.arange(12) != 5
+    # Each alone is off by 2.5 frames, eleven together by 2.5 / √11.
+    assert 1.5 < np.std(off_alone[others]) < 4.0
+    assert np.max(np.abs(off[others])) < 2.0
+    assert np.std(off[others]) < 0.5
+
+
+def test_a_corner_between_two_readings_is_where_the_growth_begins():
+    """Of a gauge that is read 67 times a second, with 10 Pa of noise; lines between its readings cut the corner."""
+    tracks, true_Pa, cut_Pa = [], [], []
+    for seed in range(12):
+        pressure_Pa, _, growth_m = emptied(seed)
+        read_at = np.arange(seed, TIMES_S.size + 15, 15) - 12
+        readings_Pa = np.interp(read_at, np.arange(TIMES_S.size), pressure_Pa)
+        cut_Pa.append(np.max(np.abs(np.interp(np.arange(TIMES_S.size), read_at, readings_Pa) - pressure_Pa)))
+        readings_Pa += 10.0 * np.random.default_rng(200 + seed).standard_normal(read_at.size)
+        tracks.append(as_track(TIMES_S, growth_m, np.interp(np.arange(TIMES_S.size), read_at, readings_Pa)))
+        true_Pa.append(pressure_Pa)
+    quiet = quiet_traces(tracks)
+    off_Pa = [trace.pressure_Pa - pressure_Pa for trace, pressure_Pa in zip(quiet, true_Pa, strict=True) if trace]
+    assert len(off_Pa) == 12
+    assert np.max(cut_Pa) > 50.0
+    assert np.max(np.abs(off_Pa)) < 0.5 * np.max(cut_Pa)
 
 
 def test_without_the_growth_such_a_corner_is_rounded():

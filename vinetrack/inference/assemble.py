@@ -24,6 +24,7 @@ from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import SmoothErrors, smooth_errors
 from vinetrack.inference.robust_covariance import few_trials, widened_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
+from vinetrack.inference.trace_errors import penalty
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION
 from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation, whiten
@@ -80,7 +81,7 @@ def assemble(
     Fit
     """
     layout, state = predictor.layout, solution.state
-    plain = log_likelihood(solution)
+    plain = log_likelihood(solution) - 0.5 * penalty(predictor.data)
     smooth = smooth_errors(predictor, solution, options.get("held"))
     wide = smooth.solution if smooth else solution
     by_noise = precision(wide)

@@ -31,6 +31,7 @@ from vinetrack.inference.prediction_band import with_bands
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_again, solve_from, solve_from_scratch, solve_onward
 from vinetrack.inference.starts import align, initial_trial_effects
+from vinetrack.inference.trace_errors import with_errors_told
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -112,6 +113,7 @@ def fit(
     held = _held(spreads, noise, data)
     solution = solve_from_scratch(predictor, held, watch, thorough=thorough)
     _refuse_a_standstill(predictor, solution)
+    predictor, solution = with_errors_told(predictor, solution, held, watch=watch)
     fitted = assemble(predictor, solution, left_out, {**options, "held": held}, profile=profile)
     return replace(fitted, pairs=tuple(pairs))
 
@@ -267,6 +269,9 @@ def refit(
         raise FitError(f"The model cannot be followed from this start: {error}") from error
     if led:
         solution = solve_again(predictor, solution, held, watch, thorough=thorough, goal=goal)
+    predictor, solution = with_errors_told(
+        predictor, solution, held, most_iterations=most_iterations, watch=watch, search=not thorough
+    )
     fitted = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
     return replace(fitted, pairs=before.pairs)
 

@@ -92,7 +92,8 @@ class FitTrial:
     `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
     pressure, Pa, the last sample extrapolated; `gauge_error` is by what part of it the noise of the gauge leaves it
     wrong along the whole motion, and the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are a standard
-    deviation each of what varies of it.
+    deviation each of what varies of it; `trace_told`, shape (n_errors,), is by how many of them a fit moved the trace
+    from the recorded one (`vinetrack.inference.trace_errors`).
     `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
     changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
     the noise over speed that it follows from, 0 where it follows `stated_m`, the file's own standard deviations.
@@ -110,6 +111,7 @@ class FitTrial:
     trace: tuple[Floats, Floats] | None = None
     gauge_error: float = 0.0
     trace_errors_Pa: Floats | None = None
+    trace_told: Floats | None = None
     vague_rest: VagueRest | None = None
     position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
     stated_m: Floats | None = None

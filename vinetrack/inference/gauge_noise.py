@@ -23,11 +23,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 
 from vinetrack.core.records import Floats, Track
+from vinetrack.inference.gauge_clock import Clock, Growth, gauge_clocks, often, polynomial_along
 from vinetrack.inference.gauge_readings import (
     FEWEST,
     GaugeNoise,
+    Readings,
     gauge_readings,
     noise_correlation,
     noise_of,
@@ -57,22 +60,16 @@ LOCAL_SIGMAS = 5.0
 """Standard deviations by which a sum of neighbouring residuals may stand out. Chosen: of a thousand samples in sixteen
 widths one does by chance in two hundred traces; at 4 one in five, and the lines are taken where a curve would do."""
 
-MOST_SHIFTED, COARSE = 60, 4
-"""Samples by which the clocks of gauge and camera may differ here, and the step in which that is looked for first.
-Chosen: 60 frames are 40 ms at 1500 frames/s, beyond which a clock is mended and not doubted; a step of four samples is
-refined to one."""
-
-ENOUGH = 400
-"""Samples from which the shift is found. Chosen: a few hundred tell it to a frame, more only cost time."""
+AIR_PA, EMPTIES, EMPTIES_SD = 101_325.0, 1.2, 0.115
+"""Pressure of the air, and exponent by which a chamber empties into the tube, (P + P_air) V^γ, with its error: curves
+are fitted to the pressure on the scale on which it is then straight in the growth. Derived: anything between 1 with
+heat and 1.4 without. Measured on falls of 5 to 8 kPa, a straight line along the growth is off by 44 to 120 Pa at the
+start on the plain scale, and by 4 to 7 Pa on this where the truth is 1.3 (`gauge_slow_depletion` of the laboratories,
+seeds 20602 and 30019)."""
 
 ALONG_GROWTH = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
 """Degrees in time and in growth that are tried. Chosen: a chamber that empties without heat is of second degree in the
 growth to 1e-4 of its pressure, a supply that refills it is slow in time."""
-
-
-EXPECTATIONS = 30
-"""Rounds in which it is estimated how often each kind of curve occurs. Measured: after ten, shares in twelve
-campaigns (kind null:trace of the hidden effects, seeds 20600 to 20611) change by 1e-5 at most."""
 
 
 LEAST_WEIGHT = 0.01
@@ -130,42 +127,59 @@ class QuietTrace:
 
 @dataclass(frozen=True)
 class _Recorded:
-    """A trace with noise to be taken out: samples, Pa, their noise, and the growth at each, m.
+    """A trace with noise to be taken out: its readings, of how many samples, their noise, and the growth beside it.
 
-    `growth_m` is shifted to where it explains the pressure best, of so many `shifts`; None where nothing is known to
-    grow.
+    `growth` and `clock` are None where nothing is known to grow.
     """
 
-    pressure_Pa: Floats
+    readings: Readings
+    count: int
     noise: GaugeNoise
-    growth_m: Floats | None
-    shifts: int
+    growth: Growth | None
+    clock: Clock | None
+    exponent: float = EMPTIES
 
-    def basis(self, kind: int) -> Floats:
-        """Orthonormal columns of a kind of curve, the first of them the mean."""
+    def basis(self, kind: int, off: float = 0.0) -> tuple[Floats, Floats]:
+        """Columns of a kind of curve at the readings, where they are orthonormal, and at all samples.
+
+        The first is the mean. What few readings tell is known between them too: a pressure that follows the growth
+        bends where it does. The clocks may be so many standard deviations `off`.
+        """
+        samples = np.arange(float(self.count))
+        places = self.readings.places
+        t, t_samples = (2 * (at - places[0]) / (places[-1] - places[0]) - 1 for at in (places, samples))
         if kind <= MOST_BENT:
-            return _polynomials(self.pressure_Pa.size, kind)
-        assert self.growth_m is not None
-        return np.asarray(np.linalg.qr(_along(self.growth_m, *ALONG_GROWTH[kind - MOST_BENT - 1]))[0])
+            at_readings, at_samples = (legvander(at, kind) for at in (t, t_samples))
+        else:
+            assert self.growth is not None
+            assert self.clock is not None
+            offset = self.clock.offset + off * self.clock.sigma
+            g_m, g_samples_m = (self.growth.at(at + offset) for at in (places, samples))
+            begin_m, range_m = g_m[0], np.ptp(g_m)
+            at_readings, at_samples = (
+                polynomial_along(at, (grown_m - begin_m) / range_m, *ALONG_GROWTH[kind - MOST_BENT - 1])
+                for at, grown_m in ((t, g_m), (t_samples, g_samples_m))
+            )
+        q, r = np.linalg.qr(at_readings)
+        return q, np.linalg.solve(r.T, at_samples.T).T
 
     def criteria(self) -> list[float]:
         """BIC of every kind of curve, infinite where it leaves more than noise."""
-        rho, y = self.noise.rho, whitened(self.pressure_Pa, self.noise.rho)
+        rho, y = self.noise.rho, whitened(self._straight(self.readings.values_Pa), self.noise.rho)
         slow = _polynomials(y.size, min(MOST_BENT + LOOKED_BEYOND, y.size // 3))
         bent = [(kind + 1 < slow.shape[1], False) for kind in range(MOST_BENT + 1)]
-        most = y.size // 3 - 2 if self.growth_m is not None else -1
+        most = y.size // 3 - 2 if self.clock is not None else -1
         along = [(sum(degrees) <= most, True) for degrees in ALONG_GROWTH]
-        # The shift of the growth is one of so many, each as likely as the others.
-        shift_cost = 2 * math.log(self.shifts)
+        clock_cost = self.clock.cost if self.clock is not None else 0.0
         values = []
         for kind, (possible, shifted) in enumerate(bent + along):
             values.append(math.inf)
             if not possible:
                 continue
-            basis = np.linalg.qr(whitened(self.basis(kind), rho))[0]
+            basis = np.linalg.qr(whitened(self.basis(kind)[0], rho))[0]
             left, numbers = y - basis @ (basis.T @ y), basis.shape[1]
             if _is_noise(left, self.noise, numbers + shifted, slow):
-                penalty = math.log(y.size) * numbers + shifted * shift_cost
+                penalty = math.log(y.size) * numbers + shifted * clock_cost
                 # Where the noise itself is known from few differences, what is left weighs as Student's t has it.
                 degrees = self.noise.degrees
                 spread = float(left @ left) / (degrees * self.noise.sigma_Pa**2)
@@ -181,58 +195,75 @@ class _Recorded:
         if not kinds.size:
             return self.curve(None)
         smooth_Pa, of_mean_Pa, errors_Pa = self.curve(int(np.argmax(weights)))
+        every_Pa = [errors_Pa, *self._by_clock_and_exponent(int(np.argmax(weights)))]
         if kinds.size == 1:
-            return smooth_Pa, of_mean_Pa, errors_Pa
+            return smooth_Pa, of_mean_Pa, _fewest(np.column_stack(every_Pa))
         shares = weights[kinds] / weights[kinds].sum()
         curves_Pa = np.column_stack([self.curve(int(kind))[0] for kind in kinds])
         mean_Pa = curves_Pa @ shares
         between_Pa = (curves_Pa - mean_Pa[:, None]) * np.sqrt(shares)
-        every_Pa = np.column_stack([errors_Pa, between_Pa - np.mean(between_Pa, axis=0)])
-        # The same covariance in as few columns as it takes: kinds that are alike differ in the same way.
-        along, sizes_Pa, _ = np.linalg.svd(every_Pa, full_matrices=False)
-        tells = sizes_Pa**2 > SMALL_ERROR * np.sum(sizes_Pa**2)
-        return mean_Pa, of_mean_Pa, (along * sizes_Pa)[:, tells]
+        every_Pa.append(between_Pa - np.mean(between_Pa, axis=0))
+        return mean_Pa, of_mean_Pa, _fewest(np.column_stack(every_Pa))
 
-    def curve(self, kind: int | None) -> tuple[Floats, float, Floats]:
+    def _by_clock_and_exponent(self, kind: int) -> list[Floats]:
+        """What a curve along the growth is wrong by where clock or exponent are, by one standard deviation each, Pa."""
+        if kind <= MOST_BENT:
+            return []
+        moved_Pa = [
+            0.5 * (self.curve(kind, off=1.0)[0] - self.curve(kind, off=-1.0)[0]),
+            0.5 * (self._emptying(1.0).curve(kind)[0] - self._emptying(-1.0).curve(kind)[0]),
+        ]
+        return [each - np.mean(each) for each in moved_Pa if np.ptp(each) > 0]
+
+    def _emptying(self, off: float) -> _Recorded:
+        return replace(self, exponent=EMPTIES + off * EMPTIES_SD)
+
+    def curve(self, kind: int | None, off: float = 0.0) -> tuple[Floats, float, Floats]:
         """The curve of a kind, Pa, how well its mean is known, Pa, and a standard deviation each of what else is wrong.
 
-        Without a kind it is made of straight lines.
+        All are at the samples. Without a kind the curve is made of straight lines.
         """
-        noise = self.noise
+        noise, values_Pa = self.noise, self.readings.values_Pa
         if kind is None:
             # Of a pressure that moves a correlation may be told that is none of its noise.
-            white_Pa = noise_of(self.pressure_Pa) if self.pressure_Pa.size >= FEWEST else noise.sigma_Pa
+            white_Pa = noise_of(values_Pa) if values_Pa.size >= FEWEST else noise.sigma_Pa
             noise = replace(noise, sigma_Pa=white_Pa, rho=0.0)
             # What straight lines leave wrong is slow where they are long: as wrong as a curve of so many degrees.
-            basis = _polynomials(self.pressure_Pa.size, min(MOST_BENT, self.pressure_Pa.size - 2))
-            smooth = _lines(self.pressure_Pa, noise)
+            basis = _polynomials(values_Pa.size, min(MOST_BENT, values_Pa.size - 2))
+            curves = np.column_stack([_lines(values_Pa, noise), noise.sigma_Pa * basis])
+            at_samples = _at_samples(curves, self.readings.places, self.count)
+            smooth, per_error = at_samples[:, 0], at_samples[:, 1:]
         else:
-            basis = self.basis(kind)
-        q, r = np.linalg.qr(whitened(basis, noise.rho))
-        per_error = noise.sigma_Pa * np.linalg.solve(r.T, basis.T).T
-        if kind is not None:
-            smooth = basis @ np.linalg.solve(r, q.T @ whitened(self.pressure_Pa, noise.rho))
+            basis, basis_at_samples = self.basis(kind, off)
+            q, r = np.linalg.qr(whitened(basis, noise.rho))
+            per_error = noise.sigma_Pa * np.linalg.solve(r.T, basis_at_samples.T).T
+            straight = basis_at_samples @ np.linalg.solve(r, q.T @ whitened(self._straight(values_Pa), noise.rho))
+            smooth, slope = self._pressure(straight)
+            per_error = per_error * slope[:, None]
         means = np.mean(per_error, axis=0)
         return smooth, float(np.linalg.norm(means)), (per_error - means)[:, 1:]
 
+    @property
+    def _typical_Pa(self) -> float:
+        """Absolute pressure about which scales agree."""
+        return max(float(np.median(self.readings.values_Pa)), -0.5 * AIR_PA) + AIR_PA
 
-def without_noise(pressure_Pa: Floats, growth_m: Floats | None = None) -> Floats:
-    """Pressure, shape (n,), of samples about evenly spaced, with white noise taken out.
+    def _straight(self, pressure_Pa: Floats) -> Floats:
+        """Pressure on the scale on which it is straight in the growth of a tube that empties its chamber, Pa."""
+        whole = np.maximum(pressure_Pa + AIR_PA, 0.1 * AIR_PA) / self._typical_Pa
+        return np.asarray(-self.exponent * self._typical_Pa * whole ** (-1 / self.exponent))
 
-    Returns the same values where there is no noise to speak of, or too few samples (under 9) to tell.
+    def _pressure(self, straight: Floats) -> tuple[Floats, Floats]:
+        """The pressure of values on that scale, Pa, and its slope against them."""
+        part = np.maximum(-straight / (self.exponent * self._typical_Pa), 0.01)
+        return self._typical_Pa * part**-self.exponent - AIR_PA, part ** (-self.exponent - 1)
 
-    Parameters
-    ----------
-    pressure_Pa : array, shape (n,), Pa
-        Samples of a trace.
-    growth_m : array, shape (n,), m, optional
-        Position of the leading edge at the same instants.
 
-    Returns
-    -------
-    array, shape (n,), Pa
-    """
-    return _quieted([(pressure_Pa, growth_m)])[0][0]
+def _fewest(errors_Pa: Floats) -> Floats:
+    """The same covariance of errors in as few columns as it takes: kinds that are alike differ in the same way."""
+    along, sizes_Pa, _ = np.linalg.svd(errors_Pa, full_matrices=False)
+    tells = sizes_Pa**2 > SMALL_ERROR * np.sum(sizes_Pa**2)
+    return np.asarray((along * sizes_Pa)[:, tells])
 
 
 def quiet_traces(tracks: Sequence[Track]) -> list[QuietTrace | None]:
@@ -251,7 +282,7 @@ def quiet_traces(tracks: Sequence[Track]) -> list[QuietTrace | None]:
         At the samples that are known.
     """
     times: dict[int, Floats] = {}
-    recorded = []
+    recorded: list[tuple[Floats, Growth | None]] = []
     for i, track in enumerate(tracks):
         if track.pressure_Pa is None:
             continue
@@ -260,36 +291,35 @@ def quiet_traces(tracks: Sequence[Track]) -> list[QuietTrace | None]:
             continue
         times[i] = track.time_s[known].astype(float)
         seen = track.usable & np.isfinite(track.lead_position_m) & np.isfinite(track.time_s)
-        grows = np.count_nonzero(seen) > 1
-        growth_m = np.interp(times[i], track.time_s[seen], track.lead_position_m[seen]) if grows else None
-        recorded.append((track.pressure_Pa[known].astype(float), growth_m))
+        growth = None
+        if np.count_nonzero(seen) > 1:
+            grown_m = np.interp(times[i], track.time_s[seen], track.lead_position_m[seen])
+            growth = Growth(grown_m, float(np.median(np.diff(times[i]))))
+        recorded.append((track.pressure_Pa[known].astype(float), growth))
     quiet = dict(zip(times, _quieted(recorded), strict=True))
     return [QuietTrace(times[i], *quiet[i]) if i in times else None for i in range(len(tracks))]
 
 
-def _quieted(traces: Sequence[tuple[Floats, Floats | None]]) -> list[tuple[Floats, float, Floats]]:
+def _quieted(traces: Sequence[tuple[Floats, Growth | None]]) -> list[tuple[Floats, float, Floats]]:
     """Of traces with the growth in each the pressure without noise, how wrong its mean is, and what else is, Pa."""
     read = gauge_readings([pressure_Pa for pressure_Pa, _ in traces])
     rho = noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])
-    noisy: dict[int, _Recorded] = {}
-    for i, ((_, growth_m), readings, noise) in enumerate(zip(traces, read, noises_of(read, rho), strict=True)):
-        if noise.sigma_Pa > 0:
-            grows = growth_m is not None and np.ptp(growth_m) > 0
-            shifted_m = (
-                _shifted(readings.values_Pa, readings.places, growth_m) if growth_m is not None and grows else None
-            )
-            shifts = 2 * _reach(growth_m.size) + 1 if growth_m is not None else 1
-            noisy[i] = _Recorded(readings.values_Pa, noise, shifted_m, shifts)
+    noises = noises_of(read, rho)
+    growths = [growth for _, growth in traces]
+    clocks = gauge_clocks(read, growths, noises)
+    noisy = {
+        i: _Recorded(readings, traces[i][0].size, noise, growth, clock)
+        for i, (readings, noise, growth, clock) in enumerate(zip(read, noises, growths, clocks, strict=True))
+        if noise.sigma_Pa > 0
+    }
     criteria = np.array([recorded.criteria() for recorded in noisy.values()])
     weights = dict(zip(noisy, _weights(criteria), strict=True)) if noisy else {}
     quiet = []
-    for i, ((pressure_Pa, _), readings) in enumerate(zip(traces, read, strict=True)):
-        if i not in noisy:
+    for i, (pressure_Pa, _) in enumerate(traces):
+        if i in noisy:
+            quiet.append(noisy[i].averaged(weights[i]))
+        else:
             quiet.append((pressure_Pa, 0.0, np.zeros((pressure_Pa.size, 0))))
-            continue
-        smooth_Pa, of_mean_Pa, errors_Pa = noisy[i].averaged(weights[i])
-        curves = _at_samples(np.column_stack([smooth_Pa, errors_Pa]), readings.places, pressure_Pa.size)
-        quiet.append((curves[:, 0], of_mean_Pa, curves[:, 1:]))
     return quiet
 
 
@@ -311,72 +341,17 @@ def _weights(criteria: Floats) -> Floats:
 
     0 where it is not likely enough to matter, and for all kinds of a trace of which none will do.
     """
-    totals = criteria - 2 * np.log(_often(criteria))
     possible = np.asarray(np.isfinite(criteria).any(axis=1))
+    lowest = np.where(possible, criteria.min(axis=1), 0.0)
+    totals = criteria - 2 * np.log(often(np.exp(-0.5 * (criteria - lowest[:, None]))))
     least = np.where(possible, totals.min(axis=1), 0.0)
     weights = np.where(possible[:, None], np.exp(-0.5 * (totals - least[:, None])), 0.0)
     return np.where(weights >= LEAST_WEIGHT, weights, 0.0)
 
 
-def _often(criteria: Floats) -> Floats:
-    """How often each kind of curve occurs among the other traces, of the shape of `criteria`, (n_traces, n_kinds).
-
-    By expectation and maximisation, with one trace counted beside them that is of every kind alike, so that none is
-    ruled out. A trace tells nothing of how often its own kind occurs, or one bend by chance would make itself likely
-    (the collapsed variational rule: Asuncion et al., Proc. 25th UAI, 27, 2009).
-    """
-    told = np.asarray(np.isfinite(criteria).any(axis=1))
-    n_kinds = criteria.shape[1]
-    least = np.where(told, criteria.min(axis=1), 0.0)
-    likely = np.where(told[:, None], np.exp(-0.5 * (criteria - least[:, None])), 0.0)
-    often: Floats = np.full(criteria.shape, 1 / n_kinds)
-    for _ in range(EXPECTATIONS if np.count_nonzero(told) > 1 else 0):
-        belongs = likely * often
-        belongs = belongs / np.where(told, belongs.sum(axis=1), 1.0)[:, None]
-        others = belongs.sum(axis=0) - belongs
-        often = (others + 1 / n_kinds) / (others.sum(axis=1, keepdims=True) + 1)
-    return often
-
-
 def _polynomials(count: int, degree: int) -> Floats:
     """Orthonormal polynomials in time, shape (count, degree + 1)."""
-    from numpy.polynomial.legendre import legvander
-
     return np.asarray(np.linalg.qr(legvander(np.linspace(-1, 1, count), degree))[0])
-
-
-def _along(growth_m: Floats, bent: int, along: int) -> Floats:
-    """Powers of time and of growth, shape (n, bent + along + 1)."""
-    t, g = np.linspace(-1, 1, growth_m.size), (growth_m - growth_m[0]) / np.ptp(growth_m)
-    return np.column_stack([t**k for k in range(bent + 1)] + [g**k for k in range(1, along + 1)])
-
-
-def _reach(count: int) -> int:
-    """Samples by which the growth may be shifted, either way, of so many."""
-    return min(count // 4, MOST_SHIFTED)
-
-
-def _shifted(pressure_Pa: Floats, places: Floats, growth_m: Floats) -> Floats:
-    """The growth at readings, of shape (n,), moved by as many samples as explain their pressure best.
-
-    `growth_m`, shape (n_samples,), is that of all samples.
-    """
-    reach = _reach(growth_m.size)
-    samples = np.arange(growth_m.size)
-    every = max(places.size // ENOUGH, 1)
-
-    def moved(shift: int) -> Floats:
-        return np.interp(places + shift, samples, growth_m)
-
-    def explained(shift: int) -> float:
-        there_m = moved(shift)
-        if not np.ptp(there_m) > 0:
-            return -math.inf
-        few = np.linalg.qr(_along(there_m, 1, 2)[::every])[0]
-        return float(np.sum((few.T @ pressure_Pa[::every]) ** 2))
-
-    best = max(range(-reach, reach + 1, COARSE), key=explained)
-    return moved(max(range(best - COARSE, best + COARSE + 1), key=explained))
 
 
 def _is_noise(residual_Pa: Floats, noise: GaugeNoise, fitted: int, slow: Floats) -> bool:

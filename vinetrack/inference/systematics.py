@@ -116,7 +116,7 @@ def systematics_of(
     parts = [
         _payloads(predictor, solution, trials),
         _set_pressures(predictor, solution),
-        _recorded_pressures(predictor, solution),
+        recorded_pressures(predictor, solution),
         *(_felt_by_all(columns) for columns in dense),
     ]
     columns = [np.empty((size, sum(part.n_felt for part in parts))) for size in points]
@@ -169,8 +169,18 @@ def _set_pressures(predictor: Predictor, solution: Solution) -> Systematics:
     return _one_each(columns, [trial.condition if felt else None for trial, felt in zip(data, feels, strict=True)])
 
 
-def _recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics:
-    """What the noise of the gauge leaves wrong in each recorded pressure beside its mean, which the fit has."""
+def recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics:
+    """What the noise of the gauge leaves wrong in each recorded pressure beside its mean, which the fit has.
+
+    Parameters
+    ----------
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
+
+    Returns
+    -------
+    Systematics
+    """
     data = predictor.data
     counts = [0 if trial_data.trace_errors_Pa is None else trial_data.trace_errors_Pa.shape[1] for trial_data in data]
     felt = max(counts)

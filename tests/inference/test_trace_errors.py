@@ -1,0 +1,77 @@
+"""What the noise of a gauge leaves wrong in a recorded pressure is found from the motion, and not taken for physics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hidden.laboratory_folder import write_experiment
+from hidden.laboratory_rows import campaign
+
+import vinetrack as vt
+from vinetrack.inference.optimiser import FixedTerms
+from vinetrack.inference.sensitivity import Predictor
+from vinetrack.inference.solving import solve_onward
+from vinetrack.inference.systematics import recorded_pressures
+from vinetrack.inference.trace_errors import penalty, with_errors_told
+
+SEED = 20602
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
+    """Twelve trials that empty their chambers, a gauge of 50 Pa noise read some 150 times a second; camera noise, m."""
+    shot = campaign("gauge_slow_depletion", SEED, (12, 12), weighed=False)
+    folder = tmp_path_factory.mktemp("gauge") / "laboratory"
+    write_experiment(shot, folder)
+    return folder, float(shot.truth["camera"]["noise_m"])  # type: ignore[index]
+
+
+@pytest.fixture(scope="module")
+def fit(laboratory: tuple[Path, float]) -> vt.Fit:
+    return vt.fit(vt.base_model(), laboratory[0], profile=False)
+
+
+def test_what_is_left_is_the_noise_of_the_positions_and_each_error_is_of_the_size_that_was_stated(
+    fit: vt.Fit, laboratory: tuple[Path, float]
+):
+    assert fit.noise_m == pytest.approx(laboratory[1], rel=0.1)
+    assert fit.chi2_per_dof < 1.1
+    told = np.concatenate([each.trace_told for each in fit.predictor.data if each.trace_told is not None])
+    assert told.size > 12
+    assert 0.4 < np.sqrt(np.mean(told**2)) < 1.6
+    assert penalty(fit.predictor.data) == pytest.approx(np.sum(told**2))
+
+
+def test_an_error_that_a_trace_has_is_found(fit: vt.Fit):
+    """A trace moved by two of its standard deviations, in the way that its motion tells best, is moved back."""
+    shapes = recorded_pressures(fit.predictor, fit.solution)
+    moves_m = [np.max(np.abs(columns[:, 0])) for columns in shapes.columns]
+    which = int(np.argmax(np.array(moves_m) / [each.noise_m for each in fit.predictor.data]))
+    data = list(fit.predictor.data)
+    clock_s, pressure_Pa = data[which].trace
+    errors_Pa, told = data[which].trace_errors_Pa, data[which].trace_told
+    assert errors_Pa is not None
+    assert told is not None
+    data[which] = replace(data[which], trace=(clock_s, pressure_Pa + 2.0 * errors_Pa[:, 0]), trace_told=told)
+    moved = Predictor(fit.predictor.layout, data, fit.predictor.host)
+    solution = solve_onward(moved, fit.solution, fit.solution.state.theta, FixedTerms())
+    back, _ = with_errors_told(moved, solution, FixedTerms())
+    after = back.data[which]
+    assert after.trace_told is not None
+    assert after.trace_told[0] - told[0] == pytest.approx(-2.0, abs=0.5)
+    assert np.max(np.abs(after.trace[1] - pressure_Pa)) < 0.3 * np.max(np.abs(2.0 * errors_Pa[:, 0]))
+
+
+def test_a_model_far_off_bends_no_pressure(laboratory: tuple[Path, float]):
+    held = vt.fit(vt.base_model(), laboratory[0], fixed=["n"], start={"eversion_damping.n": 0.9}, profile=False)
+    assert held.chi2_per_dof > 3
+    assert all(each.trace_told is None for each in held.predictor.data)
+
+
+def test_no_vine_is_given_an_exponent_of_its_own_by_them(fit: vt.Fit):
+    """A gauge's errors taken for the noise of positions gained 316 in −2 ln L for it in 48 such trials."""
+    apart = vt.refit(fit, shared={"eversion_damping.n": "vine"})
+    assert 2 * (apart.log_likelihood - fit.log_likelihood) < 15
