@@ -119,6 +119,7 @@ def assemble(
             *_disagreements(numbers, between),
             *_weighted(predictor.data),
             *_smoothed(predictor.data),
+            *_mended(predictor.data),
         ),
         left_out=dict(left_out),
         converged=solution.converged,
@@ -408,6 +409,19 @@ def _free_in_trials(solution: Solution) -> str:
 def _smoothed(data: Sequence[FitTrial]) -> list[str]:
     """What is said of positions that somebody smoothed."""
     return list(dict.fromkeys(trial_data.smoothing.note for trial_data in data if trial_data.smoothing is not None))
+
+
+def _mended(data: Sequence[FitTrial]) -> list[str]:
+    """What is said of recorded pressures that the motion told better than their gauge."""
+    moved = [float(np.max(np.abs(each.trace_errors_Pa @ each.trace_told))) for each in data
+             if each.trace_told is not None and each.trace_errors_Pa is not None]  # fmt: skip
+    if not moved:
+        return []
+    trials = f"{len(moved)} trials" if len(moved) > 1 else "one trial"
+    return [
+        f"recorded pressures of {trials} are corrected by up to {max(moved) / 1e3:.2g} kPa, as far as the noise of the"
+        " gauge leaves them open and the motion tells them"
+    ]
 
 
 def _weighted(data: Sequence[FitTrial]) -> list[str]:
