@@ -139,7 +139,7 @@ def gauge_clocks(
     if not frames_s:
         return [None] * len(read)
     step_s = float(np.median(frames_s))
-    offsets_s = step_s * np.arange(-MOST_SHIFTED, MOST_SHIFTED + 1)
+    offsets_s: Floats = step_s * np.arange(-MOST_SHIFTED, MOST_SHIFTED + 1.0)
     logs: dict[int, Floats] = {}
     for i, (readings, growth, noise) in enumerate(zip(read, growths, noises, strict=True)):
         if growth is not None and noise.sigma_Pa > 0:
