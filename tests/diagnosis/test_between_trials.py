@@ -12,8 +12,8 @@ from grown import Pairs, pairs_of, sheet
 import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.between_gain import Difference, beside_systematics, gains_from_each, linear_gain
-from vinetrack.diagnosis.between_trials import confounded, differences
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
+from vinetrack.diagnosis.between_trials import between_fits, confounded, differences
+from vinetrack.diagnosis.likelihood_ratio import MOST_INFLATION, LikelihoodRatio, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
 from vinetrack.effects import find_effect
@@ -181,6 +181,20 @@ def test_errors_that_replicates_share_take_from_a_difference_what_they_may_expla
     assert gains[0] == pytest.approx(gain, abs=1e-2)
     assert gains[0] > gains[2]
     assert gains[2] < 0.5 * gain
+
+
+def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(
+    questioned: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by_vine = Difference("n_by_vine", shared={EXPONENT: "vine"}, gain=5.0)
+    (plain,) = between_fits(questioned, [by_vine], 0.0, str)
+    robust = robust_ratio(plain.fit, (EXPONENT,))
+    assert robust_ratio(plain.fit, ("n_by_vine",)) == 1.0  # no number is called that
+    assert abs(plain.sigma) == pytest.approx(np.sqrt(abs(plain.delta_chi2)) / robust)
+    monkeypatch.setattr("vinetrack.diagnosis.between_trials.robust_ratio", lambda _, names: 3.0 * (EXPONENT in names))
+    (wider,) = between_fits(questioned, [by_vine], 0.0, str)
+    assert abs(wider.sigma) == pytest.approx(np.sqrt(abs(wider.delta_chi2)) / 3)
+    assert wider.inflation == MOST_INFLATION
 
 
 def test_a_random_effect_without_width_is_no_effect(questioned: Fit) -> None:

@@ -32,7 +32,7 @@ from vinetrack.diagnosis.between_gain import (
     gains_from_each,
     linear_gain,
 )
-from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.likelihood_ratio import MOST_INFLATION, LikelihoodRatio, likelihood_ratio, robust_ratio
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
     BETWEEN_TRIALS,
@@ -187,18 +187,22 @@ def between_fits(
         if fit is None:
             continue
         ratio = likelihood_ratio(before, (_effect_of(difference),), fit)
-        fitted.append(BetweenRatio(**{**vars(ratio), "difference": difference, **_without_scatter(difference, ratio)}))
+        fitted.append(BetweenRatio(**{**vars(ratio), "difference": difference, **_widened(difference, ratio)}))
     return fitted
 
 
-def _without_scatter(difference: Difference, ratio: LikelihoodRatio) -> dict[str, float]:
-    """Significance and inflation of random effects of groups, which the scatter of trials cannot widen.
+def _widened(difference: Difference, ratio: LikelihoodRatio) -> dict[str, float]:
+    """Significance and inflation of a difference, as far as the scatter of trials can widen it.
 
-    A coefficient that only the few trials of its group feel has a robust error that says nothing.
+    Exponents of the vines are widened by what their own errors are. A coefficient of a random effect, which only the
+    few trials of its group feel, has a robust error that says nothing.
     """
-    if not any(math.isfinite(term.prior_sd) for term in difference.terms):
+    random = any(math.isfinite(term.prior_sd) for term in difference.terms)
+    if not random and not difference.shared:
         return {}
-    return {"sigma": math.copysign(math.sqrt(abs(ratio.delta_chi2)), ratio.delta_chi2), "inflation": 1.0}
+    wider = 1.0 if random else robust_ratio(ratio.fit, tuple(difference.shared))
+    sigma = math.copysign(math.sqrt(abs(ratio.delta_chi2)), ratio.delta_chi2) / wider
+    return {"sigma": sigma, "inflation": min(wider**2, MOST_INFLATION)}
 
 
 def _effect_of(difference: Difference) -> Effect:

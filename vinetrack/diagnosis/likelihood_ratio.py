@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,7 +107,7 @@ def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> Like
     LikelihoodRatio
     """
     fall = 2 * (after.log_likelihood - before.log_likelihood)
-    ratio = _robust_ratio(after, [effect.name for effect in effects])
+    ratio = robust_ratio(after, [effect.name for effect in effects])
     plausible, reason = plausibility(effects, after)
     parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
     nothing = _compatible_with_nothing(effects, after)
@@ -174,13 +174,30 @@ def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) ->
     return True, ""
 
 
-def _robust_ratio(after: Fit, names: Sequence[str]) -> float:
-    """How much larger the error of an effect's size is by the scatter of trials than by the noise model; at least 1."""
+def robust_ratio(after: Fit, names: Collection[str]) -> float:
+    """How much larger the error of a size is by the scatter of trials than by the noise model; at least 1.
+
+    Parameters
+    ----------
+    after
+        The fit with the sizes.
+    names : collection of str
+        Of effects, or of single parameters (`effect.parameter`).
+
+    Returns
+    -------
+    float
+        The largest of all of them.
+    """
     if len(after.trials) < FEWEST_CLUSTERS:
         return 1.0
     matrices = robust_covariance(after.predictor, after.solution)
     plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in matrices)
-    mine = [k for k, number in enumerate(after.numbers) if number.key.split(".")[0] in names and plain[k] > 0]
+    mine = [
+        k
+        for k, number in enumerate(after.numbers)
+        if (number.key.split(".")[0] in names or number.key in names) and plain[k] > 0
+    ]
     return max([1.0, *(float(robust[k] / plain[k]) for k in mine)])
 
 
