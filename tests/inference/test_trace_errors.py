@@ -11,6 +11,7 @@ from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
+from vinetrack.inference.assemble import assemble
 from vinetrack.inference.optimiser import FixedTerms
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_onward
@@ -75,3 +76,11 @@ def test_no_vine_is_given_an_exponent_of_its_own_by_them(fit: vt.Fit):
     """A gauge's errors taken for the noise of positions gained 316 in −2 ln L for it in 48 such trials."""
     apart = vt.refit(fit, shared={"eversion_damping.n": "vine"})
     assert 2 * (apart.log_likelihood - fit.log_likelihood) < 15
+
+
+def test_errors_that_were_found_count_in_the_likelihood(fit: vt.Fit):
+    data = [replace(each, trace_told=None) for each in fit.predictor.data]
+    predictor = Predictor(fit.predictor.layout, data, fit.predictor.host)
+    free = assemble(predictor, fit.solution, {}, fit.options, profile=False)
+    assert free.log_likelihood - fit.log_likelihood == pytest.approx(0.5 * penalty(fit.predictor.data))
+    assert penalty(fit.predictor.data) > 1.0
