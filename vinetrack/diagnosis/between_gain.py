@@ -25,7 +25,7 @@ from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import BetweenTerm, ParameterMap, make_layout
 from vinetrack.inference.position_errors import with_shapes
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, OWN, PRESSURE, Predictor
-from vinetrack.inference.systematics import systematics_of
+from vinetrack.inference.systematics import Systematics, recorded_pressures, systematics_of
 
 
 @dataclass(frozen=True)
@@ -132,12 +132,31 @@ def beside_systematics(fit: Fit, base: Solution) -> Solution:
     Solution
         Each error has a prior of mean 0 and standard deviation 1; sensitivities stay those of the solution.
     """
-    errors = systematics_of(fit.predictor, fit.solution, fit.trials, positions=False)
+    return _beside(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials, positions=False))
+
+
+def beside_trace_errors(fit: Fit, base: Solution) -> Solution:
+    """A solution with the errors of recorded pressures among its numbers, as its fit has them.
+
+    Parameters
+    ----------
+    fit : the fit that is questioned.
+    base : its solution, smooth errors of position among its numbers where there are any.
+
+    Returns
+    -------
+    Solution
+        As of `beside_systematics`.
+    """
+    return _beside(fit, base, recorded_pressures(fit.predictor, fit.solution))
+
+
+def _beside(fit: Fit, base: Solution, errors: Systematics) -> Solution:
     if not errors.n_felt:
         return base
     columns = [
         np.column_stack([of_fit[:, :-1], systematic, of_fit[:, -1]])
-        for of_fit, systematic in zip(base.columns, errors.columns, strict=True)
+        for of_fit, systematic in zip(errors.put_back(base.columns), errors.columns, strict=True)
     ]
     places = np.where(errors.places < errors.count, base.problem.prior_mean.size + errors.places, -1)
     problem = with_shapes(base.problem, errors.count)

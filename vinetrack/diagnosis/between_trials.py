@@ -28,6 +28,7 @@ from vinetrack.core.records import Floats, Trial
 from vinetrack.diagnosis.between_gain import (
     Difference,
     beside_systematics,
+    beside_trace_errors,
     chance_of_gain,
     gains_from_each,
     linear_gain,
@@ -125,10 +126,11 @@ def differences(fit: Fit) -> list[Difference]:
         return []
     trials = [trial.trial for trial in fit.trials]
     smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
-    base = smooth.solution if smooth else fit.solution
+    plain = smooth.solution if smooth else fit.solution
+    base = beside_trace_errors(fit, plain)
     best: dict[str, Difference] = {}
     for difference in (*_law(fit, trials), *_drifts(trials), *_groups(trials), *_changes(fit, base, trials)):
-        estimated = _estimated(fit, base, difference)
+        estimated = _estimated(fit, plain, base, difference)
         if estimated is not None and (difference.name not in best or estimated.gain > best[difference.name].gain):
             best[difference.name] = estimated
     return list(best.values())
@@ -356,14 +358,14 @@ def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
     return total, len(groups) - len(names)
 
 
-def _estimated(fit: Fit, base: Solution, difference: Difference) -> Difference | None:
+def _estimated(fit: Fit, plain: Solution, base: Solution, difference: Difference) -> Difference | None:
     """The difference with its linear estimate; None where it cannot be laid out."""
     gain = linear_gain(fit, base, difference)
     if not math.isfinite(gain):
         return None
     p = chance_of_gain(fit, difference, gain)
     if p < ASKED_AGAIN and difference.stated and difference.confounded:
-        beside = linear_gain(fit, beside_systematics(fit, base), difference)
+        beside = linear_gain(fit, beside_systematics(fit, plain), difference)
         p = max(p, chance_of_gain(fit, difference, beside))
     return replace(difference, gain=gain, p=p)
 

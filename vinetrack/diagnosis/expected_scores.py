@@ -170,7 +170,9 @@ def score_ratio(questions: MisfitTests, place: int, size: float, start: Noiseles
             return 1.0
         systematics = systematics_of(after.predictor, after.solution, after.trials)
         # No point lies where growth ends, so the columns of the last step are those that `fit_columns` would make.
-        scores = scores_of(after, products_of(after, after.solution.columns, answers, systematics))
+        scores = scores_of(
+            after, products_of(after, systematics.put_back(after.solution.columns), answers, systematics)
+        )
     except (SimulationError, np.linalg.LinAlgError):
         return 1.0
     return float(scores.size[0] / scores.plain_sigma[0]) / (size / sigma)

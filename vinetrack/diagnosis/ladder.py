@@ -22,6 +22,7 @@ from vinetrack.inference.fit_data import FitError, FitTrial
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_prepared
 from vinetrack.inference.subset import fit_subset
+from vinetrack.inference.trace_errors import as_recorded
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -162,7 +163,7 @@ def in_sample(fit: Fit) -> Errors:
     -------
     Errors
     """
-    return _predicted(fit, fit.predictor.data)
+    return _predicted(fit, [as_recorded(trial_data) for trial_data in fit.predictor.data])
 
 
 def left_out(fit: Fit) -> Errors:
@@ -206,7 +207,7 @@ def highest_pressure(fit: Fit) -> Errors:
 
 def _without(fit: Fit, gone: Sequence[bool]) -> Errors:
     """Predictions of the trials that are `gone` by the model fitted to the rest."""
-    data = [trial_data for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
+    data = [as_recorded(trial_data) for trial_data, out in zip(fit.predictor.data, gone, strict=True) if out]
     try:
         others = fit_subset(
             fit,

@@ -322,7 +322,7 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTes
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect)]
     answers = effect_sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials)
-    columns = fit_columns(fit)
+    columns = systematics.put_back(fit_columns(fit))
     sums = products_of(fit, columns, answers, systematics)
     structure = structure_of(fit, columns, systematics)
     return MisfitTests(fit, effects, answers, sums, scores_of(fit, sums), structure, level)

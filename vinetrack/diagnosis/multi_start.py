@@ -28,6 +28,7 @@ from vinetrack.inference.parameters import EXPONENT, YIELD_PRESSURE, ParameterMa
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, PRESSURE, Predictor
 from vinetrack.inference.solving import SLOW_NOISE
 from vinetrack.inference.starts import align, one_of_each_condition
+from vinetrack.inference.trace_errors import as_recorded
 
 Start = tuple[Sequence[Effect], Mapping[str, Value]]
 """Effects to add and values to begin from."""
@@ -98,7 +99,7 @@ class SubsetFitter:
     def __init__(self, fit: Fit) -> None:
         self.fit = fit
         self.chosen = _one_of_each(fit.predictor.data)
-        self.data = [fit.predictor.data[i] for i in self.chosen]
+        self.data = [as_recorded(fit.predictor.data[i]) for i in self.chosen]
         self.correlation = track_correlation(self.data)
 
     def climb(

@@ -31,7 +31,7 @@ from vinetrack.inference.prediction_band import with_bands
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_again, solve_from, solve_from_scratch, solve_onward
 from vinetrack.inference.starts import align, initial_trial_effects
-from vinetrack.inference.trace_errors import with_errors_told
+from vinetrack.inference.trace_errors import as_recorded, with_errors_told
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -224,7 +224,8 @@ def refit(
     model = model or before.model
     known = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
     model = model.with_values({**known, **(start or {})})
-    data = before.predictor.data
+    # What another model found of the errors of recorded pressures would hold this one to it.
+    data = before.predictor.data if model.names == before.model.names else _as_recorded(before.predictor.data)
     names = {*model.parameter_names, "yield_pressure.P_y"}
     kept = {
         key: tuple(name for name in before.options[key] if _belongs(name, names)) if given is None else tuple(given)
@@ -274,6 +275,10 @@ def refit(
     )
     fitted = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
     return replace(fitted, pairs=before.pairs)
+
+
+def _as_recorded(data: Sequence[FitTrial]) -> list[FitTrial]:
+    return [as_recorded(trial_data) for trial_data in data]
 
 
 def _belongs(name: str, names: Iterable[str]) -> bool:

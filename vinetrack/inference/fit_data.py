@@ -91,9 +91,9 @@ class FitTrial:
     where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
     `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
     pressure, Pa, the last sample extrapolated; `gauge_error` is by what part of it the noise of the gauge leaves it
-    wrong along the whole motion, and the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are a standard
-    deviation each of what varies of it; `trace_told`, shape (n_errors,), is by how many of them a fit moved the trace
-    from the recorded one (`vinetrack.inference.trace_errors`).
+    wrong along the whole motion, the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are a standard deviation
+    each of what varies of it; where `trace_is_curve` a fit finds them, and `trace_told`, shape (n_errors,), is by how
+    many of them it moved the trace from the recorded one (`vinetrack.inference.trace_errors`).
     `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
     changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
     the noise over speed that it follows from, 0 where it follows `stated_m`, the file's own standard deviations.
@@ -111,6 +111,7 @@ class FitTrial:
     trace: tuple[Floats, Floats] | None = None
     gauge_error: float = 0.0
     trace_errors_Pa: Floats | None = None
+    trace_is_curve: bool = False
     trace_told: Floats | None = None
     vague_rest: VagueRest | None = None
     position_systematic_m: float = 0.0  #: standard deviation of smooth errors of position that trials share
@@ -296,6 +297,7 @@ def prepare_trial(
         trace=None if extended is None else (extended.time_s, extended.pressure_Pa),
         gauge_error=0.0 if quiet is None else _gauge_error(quiet, time_s[max(n_rest - 1, 0) :]),
         trace_errors_Pa=None if extended is None or not extended.errors_Pa.size else extended.errors_Pa,
+        trace_is_curve=extended is not None and extended.is_curve,
         vague_rest=vague_rest,
         position_systematic_m=_position_systematic_m(trial),
         stated_m=None if filmed or not np.isfinite(stated_m).any() else stated_m.astype(float),

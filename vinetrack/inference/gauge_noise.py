@@ -94,13 +94,15 @@ class QuietTrace:
     """A recorded pressure without its noise, s and Pa, shape (n,).
 
     `mean_error_Pa` is the standard deviation of its mean, 0 where the trace was left as it is. The columns of
-    `errors_Pa`, shape (n, n_errors), are one standard deviation each of what else the curve may be wrong by.
+    `errors_Pa`, shape (n, n_errors), are one standard deviation each of what else the curve may be wrong by. Where it
+    `is_curve` these follow from it; of lines through neighbouring samples they only say how much it is in all.
     """
 
     time_s: Floats
     pressure_Pa: Floats
     mean_error_Pa: float
     errors_Pa: Floats
+    is_curve: bool = False
 
     def extended(self) -> QuietTrace:
         """The trace with one more sample beyond its end, along the line through its last part.
@@ -122,6 +124,7 @@ class QuietTrace:
             np.append(self.pressure_Pa, end[0]),
             self.mean_error_Pa,
             np.vstack([self.errors_Pa, end[1:]]),
+            self.is_curve,
         )
 
 
@@ -300,8 +303,8 @@ def quiet_traces(tracks: Sequence[Track]) -> list[QuietTrace | None]:
     return [QuietTrace(times[i], *quiet[i]) if i in times else None for i in range(len(tracks))]
 
 
-def _quieted(traces: Sequence[tuple[Floats, Growth | None]]) -> list[tuple[Floats, float, Floats]]:
-    """Of traces with the growth in each the pressure without noise, how wrong its mean is, and what else is, Pa."""
+def _quieted(traces: Sequence[tuple[Floats, Growth | None]]) -> list[tuple[Floats, float, Floats, bool]]:
+    """Of traces with the growth in each all but the times of a `QuietTrace`."""
     read = gauge_readings([pressure_Pa for pressure_Pa, _ in traces])
     rho = noise_correlation([readings.values_Pa for readings in read if not readings.all_noise])
     noises = noises_of(read, rho)
@@ -317,9 +320,9 @@ def _quieted(traces: Sequence[tuple[Floats, Growth | None]]) -> list[tuple[Float
     quiet = []
     for i, (pressure_Pa, _) in enumerate(traces):
         if i in noisy:
-            quiet.append(noisy[i].averaged(weights[i]))
+            quiet.append((*noisy[i].averaged(weights[i]), bool(np.any(weights[i]))))
         else:
-            quiet.append((pressure_Pa, 0.0, np.zeros((pressure_Pa.size, 0))))
+            quiet.append((pressure_Pa, 0.0, np.zeros((pressure_Pa.size, 0)), False))
     return quiet
 
 

@@ -65,11 +65,14 @@ class Systematics:
         Which error each column belongs to, `count` where a trial does not feel one of that kind.
     count : int
         Number of errors of the campaign.
+    told : list of arrays, shape (n_points,), m
+        What errors that the fit found already move each trial by.
     """
 
     columns: list[Floats]
     places: NDArray[np.int_]
     count: int
+    told: list[Floats] | None = None
 
     @classmethod
     def none(cls, points: Sequence[int]) -> Systematics:
@@ -85,6 +88,26 @@ class Systematics:
         Systematics
         """
         return cls([np.zeros((size, 0)) for size in points], np.zeros((len(points), 0), dtype=int), 0)
+
+    def put_back(self, columns: Sequence[Floats]) -> list[Floats]:
+        """Columns of a fit with what the errors explain so far in the residual, the last column, again.
+
+        Parameters
+        ----------
+        columns : sequence of arrays, shape (n_points, k), m
+            As `Predictor.linearise`.
+
+        Returns
+        -------
+        list of arrays, of the same shapes
+            With errors of mean 0 beside them they are what was measured, whatever the fit found of the errors.
+        """
+        if self.told is None:
+            return list(columns)
+        whole = [of_fit.copy() for of_fit in columns]
+        for of_fit, told_m in zip(whole, self.told, strict=True):
+            of_fit[:, -1] += told_m
+        return whole
 
     @property
     def n_felt(self) -> int:
@@ -113,10 +136,11 @@ def systematics_of(
     points = [trial.time_s.size for trial in trials]
     grown = [trial.predicted_position_m - trial.origin_m for trial in trials]
     dense = [_tracker(predictor, trials)] + ([position_shapes(predictor, grown)] if positions else [])
+    recorded = recorded_pressures(predictor, solution)
     parts = [
         _payloads(predictor, solution, trials),
         _set_pressures(predictor, solution),
-        recorded_pressures(predictor, solution),
+        recorded,
         *(_felt_by_all(columns) for columns in dense),
     ]
     columns = [np.empty((size, sum(part.n_felt for part in parts))) for size in points]
@@ -128,7 +152,7 @@ def systematics_of(
         for column, felt in zip(columns, part.columns, strict=True):
             column[:, beside] = felt
         count, begin = count + part.count, begin + part.n_felt
-    return Systematics(columns, places, total)
+    return Systematics(columns, places, total, recorded.told)
 
 
 def _felt_by_all(columns: list[Floats]) -> Systematics:
@@ -201,7 +225,11 @@ def recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics:
                 places[i, k] = begins[i] + k
     except SimulationError:
         return nothing
-    return Systematics(columns, places, sum(counts))
+    told = [np.zeros(trial_data.time_s.size) for trial_data in data]
+    for told_m, column, trial_data in zip(told, columns, data, strict=True):
+        if trial_data.trace_told is not None:
+            told_m += column[:, : trial_data.trace_told.size] @ trial_data.trace_told
+    return Systematics(columns, places, sum(counts), told)
 
 
 def _with_trace_error(trial_data: FitTrial, k: int) -> FitTrial:

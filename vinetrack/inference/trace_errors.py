@@ -47,7 +47,8 @@ def with_errors_told(
 ) -> tuple[Predictor, Solution]:
     """A solution with the errors of the recorded pressures found along, and the predictor of the pressures so mended.
 
-    A model far off would bend the pressures to it: its trials keep those that were recorded.
+    A model far off would bend the pressures to it: its trials keep those that were recorded. So do those whose trace is
+    no curve: of lines through neighbouring samples it is not known in which ways they are wrong.
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ def with_errors_told(
     -------
     Predictor, Solution
     """
-    if all(trial_data.trace_errors_Pa is None for trial_data in predictor.data):
+    if not any(_has_errors(trial_data) for trial_data in predictor.data):
         return predictor, solution
     for _ in range(MOST_ROUNDS):
         if is_poor_fit(predictor, solution):
@@ -100,10 +101,35 @@ def penalty(data: Sequence[FitTrial]) -> float:
     return sum(float(np.sum(trial_data.trace_told**2)) for trial_data in data if trial_data.trace_told is not None)
 
 
+def as_recorded(trial_data: FitTrial) -> FitTrial:
+    """A trial with its pressure as it was recorded, whatever a fit found of its errors.
+
+    Parameters
+    ----------
+    trial_data : FitTrial
+
+    Returns
+    -------
+    FitTrial
+    """
+    if trial_data.trace is None or trial_data.trace_errors_Pa is None or trial_data.trace_told is None:
+        return trial_data
+    clock_s, pressure_Pa = trial_data.trace
+    recorded_Pa = pressure_Pa - trial_data.trace_errors_Pa @ trial_data.trace_told
+    return replace(trial_data, trace=(clock_s, recorded_Pa), trace_told=None)
+
+
+def _has_errors(trial_data: FitTrial) -> bool:
+    """Whether the trial has a recorded pressure whose errors can be found."""
+    return trial_data.trace is not None and trial_data.trace_errors_Pa is not None and trial_data.trace_is_curve
+
+
 def _mended(trial_data: FitTrial, more: Floats) -> FitTrial:
     """A trial whose recorded pressure is moved by so many standard deviations of each of its errors."""
-    if trial_data.trace is None or trial_data.trace_errors_Pa is None:
+    if not _has_errors(trial_data):
         return trial_data
+    assert trial_data.trace is not None
+    assert trial_data.trace_errors_Pa is not None
     clock_s, pressure_Pa = trial_data.trace
     errors_Pa = trial_data.trace_errors_Pa
     more = more[: errors_Pa.shape[1]]
@@ -119,6 +145,9 @@ def _told_by_motion(predictor: Predictor, solution: Solution) -> Floats:
         if trial_data.trace_told is not None:
             row[: trial_data.trace_told.size] = trial_data.trace_told
     problem, state = solution.problem, solution.state
+    for columns, trial_data in zip(errors.columns, predictor.data, strict=True):
+        if not _has_errors(trial_data):
+            columns[:] = 0.0
     grams = predictor.products([np.column_stack(both) for both in zip(solution.columns, errors.columns, strict=True)])
     p = solution.grams.shape[-1] - OWN - 1
     blocks = trial_effects_eliminated(grams, p, problem, state)
