@@ -91,9 +91,9 @@ class FitTrial:
     where the track begins in motion. `noise_m` and `correlation` are those of the track alone, without any model.
     `vague_rest` stands for a rest whose points are left out. `trace` holds time, s, on the clock of the track and gauge
     pressure, Pa, the last sample extrapolated; `gauge_error` is by what part of it the noise of the gauge leaves it
-    wrong along the whole motion, the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are a standard deviation
-    each of what varies of it; where `trace_is_curve` a fit finds them, and `trace_told`, shape (n_errors,), is by how
-    many of them it moved the trace from the recorded one (`vinetrack.inference.trace_errors`).
+    wrong along the whole motion, the columns of `trace_errors_Pa`, shape (n_samples, n_errors), are one standard
+    deviation each of what varies of it; where `trace_is_curve` a fit finds them, and `trace_told`, shape (n_errors,),
+    is by how many of them it moved the trace from the recorded one (`vinetrack.inference.trace_errors`).
     `relative_sd` is the noise of every point relative to that of the trial, of geometric mean 1 so that no likelihood
     changes by it alone; None where all points are equally noisy. `noise_m` is then the geometric mean too. `blur_s` is
     the noise over speed that it follows from, 0 where it follows `stated_m`, the file's own standard deviations.
