@@ -11,12 +11,15 @@ from hidden.laboratory_folder import write_experiment
 from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
+from vinetrack.diagnosis.ladder import left_out
 from vinetrack.inference.assemble import assemble
+from vinetrack.inference.fit_data import prepare
+from vinetrack.inference.left_out import predict_prepared
 from vinetrack.inference.optimiser import FixedTerms
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_onward
-from vinetrack.inference.systematics import recorded_pressures
-from vinetrack.inference.trace_errors import penalty, with_errors_told
+from vinetrack.inference.systematics import recorded_pressures, systematics_of
+from vinetrack.inference.trace_errors import as_recorded, penalty, with_errors_told
 
 SEED = 20602
 
@@ -84,3 +87,53 @@ def test_errors_that_were_found_count_in_the_likelihood(fit: vt.Fit):
     free = assemble(predictor, fit.solution, {}, fit.options, profile=False)
     assert free.log_likelihood - fit.log_likelihood == pytest.approx(0.5 * penalty(fit.predictor.data))
     assert penalty(fit.predictor.data) > 1.0
+
+
+def test_what_was_recorded_is_kept(fit: vt.Fit):
+    recorded, _ = prepare(fit.pairs)
+    for told, before in zip(map(as_recorded, fit.predictor.data), recorded, strict=True):
+        assert told.trace_told is None
+        np.testing.assert_allclose(told.trace[1], before.trace[1], rtol=1e-9)
+
+
+def test_the_tests_see_the_pressures_that_were_recorded(fit: vt.Fit):
+    state = fit.solution.state
+    recorded = Predictor(fit.predictor.layout, list(map(as_recorded, fit.predictor.data)), fit.predictor.host)
+    there = recorded.residuals(state.theta, state.trial_effects)
+    errors = systematics_of(fit.predictor, fit.solution, fit.trials)
+    seen = errors.put_back(fit.solution.columns)
+    off = np.concatenate([columns[:, -1] - left for columns, left in zip(seen, there, strict=True)])
+    moved = np.concatenate([columns[:, -1] - left for columns, left in zip(fit.solution.columns, there, strict=True)])
+    assert np.sqrt(np.mean(moved**2)) > 1e-5
+    assert np.sqrt(np.mean(off**2)) < 0.01 * np.sqrt(np.mean(moved**2))
+
+
+def test_left_out_trials_are_predicted_from_what_was_recorded(fit: vt.Fit, monkeypatch: pytest.MonkeyPatch):
+    """Pressures that were mended by a trial's own motion would predict it too well."""
+    given = []
+
+    def seen(fitted: vt.Fit, data: list, **how: bool) -> list:
+        given.extend(data)
+        return predict_prepared(fitted, data, **how)
+
+    monkeypatch.setattr("vinetrack.diagnosis.ladder.predict_prepared", seen)
+    left_out(fit)
+    assert len(given) == len(fit.trials)
+    assert all(trial_data.trace_told is None for trial_data in given)
+
+
+def test_another_model_begins_from_what_was_recorded(fit: vt.Fit):
+    """An effect whose curve the errors had imitated would not be found beside them."""
+    begun: list = []
+
+    def seen(_: object, data: list, **_more: object) -> None:
+        begun.append(data)
+        raise InterruptedError
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vinetrack.inference.fit.make_layout", seen)
+        for model in (fit.model + "air_drag", fit.model):
+            with pytest.raises(InterruptedError):
+                vt.refit(fit, model)
+    assert all(trial_data.trace_told is None for trial_data in begun[0])
+    assert begun[1] is fit.predictor.data
