@@ -19,7 +19,7 @@ from vinetrack.inference.optimiser import FixedTerms
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_onward
 from vinetrack.inference.systematics import recorded_pressures, systematics_of
-from vinetrack.inference.trace_errors import as_recorded, penalty, with_errors_told
+from vinetrack.inference.trace_errors import as_recorded, penalty, told_by_motion, with_errors_told
 
 SEED = 20602
 
@@ -137,3 +137,16 @@ def test_another_model_begins_from_what_was_recorded(fit: vt.Fit):
                 vt.refit(fit, model)
     assert all(trial_data.trace_told is None for trial_data in begun[0])
     assert begun[1] is fit.predictor.data
+
+
+def test_errors_of_which_the_motion_tells_nothing_are_none(fit: vt.Fit):
+    state = fit.solution.state
+    deaf = replace(fit.solution, state=replace(state, variance=1e8 * state.variance))
+    far = [
+        each if each.trace_errors_Pa is None else replace(each, trace_told=np.full(each.trace_errors_Pa.shape[1], 3.0))
+        for each in fit.predictor.data
+    ]
+    moved = told_by_motion(Predictor(fit.predictor.layout, far, fit.predictor.host), deaf)
+    for back, each in zip(moved, far, strict=True):
+        felt = 0 if each.trace_told is None else each.trace_told.size
+        np.testing.assert_allclose(back[:felt], -3.0, atol=0.05)

@@ -71,7 +71,7 @@ def with_errors_told(
     for _ in range(MOST_ROUNDS):
         if is_poor_fit(predictor, solution):
             break
-        moved = _told_by_motion(predictor, solution)
+        moved = told_by_motion(predictor, solution)
         if not np.max(np.abs(moved), initial=0.0) > SETTLED:
             break
         mended = [_mended(trial_data, more) for trial_data, more in zip(predictor.data, moved, strict=True)]
@@ -137,8 +137,19 @@ def _mended(trial_data: FitTrial, more: Floats) -> FitTrial:
     return replace(trial_data, trace=(clock_s, pressure_Pa + errors_Pa @ more), trace_told=told)
 
 
-def _told_by_motion(predictor: Predictor, solution: Solution) -> Floats:
-    """By how many standard deviations each error moves beside what was found before, shape (n_trials, n_errors)."""
+def told_by_motion(predictor: Predictor, solution: Solution) -> Floats:
+    """By how many standard deviations each error moves beside what was found before.
+
+    Parameters
+    ----------
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
+
+    Returns
+    -------
+    array, shape (n_trials, n_errors)
+        0 for errors that a trial does not have.
+    """
     errors = recorded_pressures(predictor, solution)
     told = np.zeros((len(predictor.data), errors.n_felt))
     for row, trial_data in zip(told, predictor.data, strict=True):
