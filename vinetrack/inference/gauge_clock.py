@@ -176,15 +176,18 @@ def _explained(readings: Readings, growth: Growth, noise: GaugeNoise, offsets: F
     """
     size = readings.places.size
     reach = growth.grown_m.size // 4
-    places = readings.places + offsets[:, None]
-    there_m = growth.at(places)
+    means = readings.edges is not None
+    at = np.arange(growth.grown_m.size) if means else readings.places
+    there_m = growth.at(at + offsets[:, None])
     ranges_m = np.ptp(there_m, axis=1)
     possible = (np.abs(offsets) <= reach) & (ranges_m > 0)
     columns = BENT + ALONG + 1
     if not possible.any() or size <= columns:
         return None
     g = (there_m[possible] - there_m[possible][:, :1]) / ranges_m[possible][:, None]
-    curves = polynomial_along(np.linspace(-1, 1, size), g, BENT, ALONG)
+    curves = polynomial_along(np.linspace(-1, 1, at.size), g, BENT, ALONG)
+    if means:
+        curves = np.moveaxis(readings.means_of(np.moveaxis(curves, 1, 0)), 0, 1)
     y = readings.values_Pa - float(np.mean(readings.values_Pa))
     stacked = np.moveaxis(curves, 0, 1).reshape(size, -1)
     white = np.moveaxis(whitened(stacked, noise.rho).reshape(size, -1, columns), 1, 0)

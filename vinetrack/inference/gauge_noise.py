@@ -163,6 +163,8 @@ class _Recorded:
                 polynomial_along(at, (grown_m - begin_m) / range_m, *ALONG_GROWTH[kind - MOST_BENT - 1])
                 for at, grown_m in ((t, g_m), (t_samples, g_samples_m))
             )
+        if self.readings.edges is not None:
+            at_readings = self.readings.means_of(at_samples)
         q, r = np.linalg.qr(at_readings)
         return q, np.linalg.solve(r.T, at_samples.T).T
 

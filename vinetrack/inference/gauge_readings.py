@@ -102,13 +102,31 @@ class Readings:
     """What a gauge read in the course of a trace, Pa, and where, in samples from its first; both of shape (n,).
 
     `rounding_Pa` is the standard deviation that rounding leaves in each, 0 where nothing is rounded. Where it is
-    `all_noise`, what the readings scatter by tells nothing of it.
+    `all_noise`, what the readings scatter by tells nothing of it. Where readings are means of blocks of samples, these
+    begin and end at `edges`, shape (n + 1,).
     """
 
     places: Floats
     values_Pa: Floats
     rounding_Pa: float = 0.0
     all_noise: bool = False
+    edges: NDArray[np.intp] | None = None
+
+    def means_of(self, curves: Floats) -> Floats:
+        """Means over the blocks of curves at all samples, where the readings are such means.
+
+        Parameters
+        ----------
+        curves : array, shape (n_samples, …)
+
+        Returns
+        -------
+        array, shape (n, …)
+        """
+        assert self.edges is not None
+        sums = np.add.reduceat(curves, self.edges[:-1], axis=0)
+        counts = np.diff(self.edges).reshape(-1, *(1,) * (curves.ndim - 1))
+        return np.asarray(sums / counts)
 
 
 def gauge_readings(traces: Sequence[Floats]) -> list[Readings]:
@@ -153,8 +171,9 @@ def _sampled(pressure_Pa: Floats) -> Readings:
     edges = np.round(np.linspace(0, count, blocks + 1)).astype(int)
     means = [float(np.mean(pressure_Pa[begin:end])) for begin, end in itertools.pairwise(edges)]
     return Readings(
-        0.5 * (edges[:-1] + edges[1:] - 1), np.array(means), rounding_Pa * math.sqrt(blocks / steps), all_noise=True
-    )
+        0.5 * (edges[:-1] + edges[1:] - 1), np.array(means), rounding_Pa * math.sqrt(blocks / steps), all_noise=True,
+        edges=edges,
+    )  # fmt: skip
 
 
 def _filled(pressure_Pa: Floats) -> tuple[Readings, float] | None:
