@@ -60,12 +60,11 @@ LOCAL_SIGMAS = 5.0
 """Standard deviations by which a sum of neighbouring residuals may stand out. Chosen: of a thousand samples in sixteen
 widths one does by chance in two hundred traces; at 4 one in five, and the lines are taken where a curve would do."""
 
-AIR_PA, EMPTIES, EMPTIES_SD = 101_325.0, 1.2, 0.115
-"""Pressure of the air, and exponent by which a chamber empties into the tube, (P + P_air) V^γ, with its error: curves
-are fitted to the pressure on the scale on which it is then straight in the growth. Derived: anything between 1 with
-heat and 1.4 without. Measured on falls of 5 to 8 kPa, a straight line along the growth is off by 44 to 120 Pa at the
-start on the plain scale, and by 4 to 7 Pa on this where the truth is 1.3 (`gauge_slow_depletion` of the laboratories,
-seeds 20602 and 30019)."""
+AIR_PA, EXPONENTS = 101_325.0, (1.0, 1.1, 1.2, 1.3, 1.4)
+"""Pressure of the air, and exponents by which a chamber may empty into the tube, (P + P_air) V^γ: curves are fitted to
+the pressure on the scale on which it is then straight in the growth. Derived: 1 with heat, 1.4 without. Measured on
+falls of 5 to 8 kPa, a straight line along the growth is off by 44 to 120 Pa at the start on the plain scale, by 4 to 7
+with an exponent that is wrong by 0.1 (`gauge_slow_depletion` of the laboratories, seeds 20602 and 30019)."""
 
 ALONG_GROWTH = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
 """Degrees in time and in growth that are tried. Chosen: a chamber that empties without heat is of second degree in the
@@ -132,7 +131,8 @@ class QuietTrace:
 class _Recorded:
     """A trace with noise to be taken out: its readings, of how many samples, their noise, and the growth beside it.
 
-    `growth` and `clock` are None where nothing is known to grow.
+    `growth` and `clock` are None where nothing is known to grow. The exponent by which a chamber empties has an error,
+    and `alike` trials have it and the clock together.
     """
 
     readings: Readings
@@ -140,7 +140,9 @@ class _Recorded:
     noise: GaugeNoise
     growth: Growth | None
     clock: Clock | None
-    exponent: float = EMPTIES
+    exponent: float = EXPONENTS[len(EXPONENTS) // 2]
+    exponent_sigma: float = 0.0
+    alike: int = 1
 
     def basis(self, kind: int, off: float = 0.0) -> tuple[Floats, Floats]:
         """Columns of a kind of curve at the readings, where they are orthonormal, and at all samples.
@@ -211,17 +213,21 @@ class _Recorded:
         return mean_Pa, of_mean_Pa, _fewest(np.column_stack(every_Pa))
 
     def _by_clock_and_exponent(self, kind: int) -> list[Floats]:
-        """What a curve along the growth is wrong by where clock or exponent are, by one standard deviation each, Pa."""
+        """What a curve along the growth is wrong by where clock or exponent are, by one standard deviation each, Pa.
+
+        n trials have these errors σ together. Told trial by trial, each is given √n σ: what all have then costs what
+        one error does.
+        """
         if kind <= MOST_BENT:
             return []
         moved_Pa = [
             0.5 * (self.curve(kind, off=1.0)[0] - self.curve(kind, off=-1.0)[0]),
             0.5 * (self._emptying(1.0).curve(kind)[0] - self._emptying(-1.0).curve(kind)[0]),
         ]
-        return [each - np.mean(each) for each in moved_Pa if np.ptp(each) > 0]
+        return [math.sqrt(self.alike) * (each - np.mean(each)) for each in moved_Pa if np.ptp(each) > 0]
 
     def _emptying(self, off: float) -> _Recorded:
-        return replace(self, exponent=EMPTIES + off * EMPTIES_SD)
+        return replace(self, exponent=self.exponent + off * self.exponent_sigma)
 
     def curve(self, kind: int | None, off: float = 0.0) -> tuple[Floats, float, Floats]:
         """The curve of a kind, Pa, how well its mean is known, Pa, and a standard deviation each of what else is wrong.
@@ -317,6 +323,7 @@ def _quieted(traces: Sequence[tuple[Floats, Growth | None]]) -> list[tuple[Float
         for i, (readings, noise, growth, clock) in enumerate(zip(read, noises, growths, clocks, strict=True))
         if noise.sigma_Pa > 0
     }
+    noisy = _emptied_alike(noisy)
     criteria = np.array([recorded.criteria() for recorded in noisy.values()])
     weights = dict(zip(noisy, _weights(criteria), strict=True)) if noisy else {}
     quiet = []
@@ -326,6 +333,22 @@ def _quieted(traces: Sequence[tuple[Floats, Growth | None]]) -> list[tuple[Float
         else:
             quiet.append((pressure_Pa, 0.0, np.zeros((pressure_Pa.size, 0)), False))
     return quiet
+
+
+def _emptied_alike(noisy: dict[int, _Recorded]) -> dict[int, _Recorded]:
+    """The traces with the exponent by which their chamber empties, which is that of all, and its error."""
+    least = np.array([[min(replace(each, exponent=e).criteria()) for e in EXPONENTS] for each in noisy.values()])
+    told = least[np.isfinite(least).all(axis=1)] if noisy else np.zeros((0, len(EXPONENTS)))
+    levels = np.sum(told, axis=0)
+    likely = np.exp(-0.5 * (levels - np.min(levels)))
+    exponent = float(np.average(EXPONENTS, weights=likely))
+    # Each stands for all about it.
+    width = (EXPONENTS[-1] - EXPONENTS[0]) / (len(EXPONENTS) - 1)
+    variance = float(np.average((np.array(EXPONENTS) - exponent) ** 2, weights=likely)) + width**2 / 12
+    return {
+        i: replace(each, exponent=exponent, exponent_sigma=math.sqrt(variance), alike=len(noisy))
+        for i, each in noisy.items()
+    }
 
 
 def _at_samples(curves: Floats, places: Floats, count: int) -> Floats:
