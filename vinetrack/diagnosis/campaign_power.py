@@ -180,9 +180,10 @@ def planned_questions(design: CampaignDesign) -> tuple[MisfitTests, dict[str, st
     host = host_for(design.model, questioned)
     quiet = [replace(camera, noise_m=NOISELESS * camera.noise_m, noise_correlation=0.0) for camera in design.cameras]
     exact = [replace(trial, yield_pressure_sigma_Pa=0.0) for trial in design.trials]
-    # Replicates without noise are the same track: what they do alike is then simulated once.
+    # Replicates without noise are the same track: what they do alike is then simulated once. Told by what is written
+    # of them, since from Python 3.13 on records that hold a NaN equal none.
     kinds = [
-        (replace(trial, name="", specimen="", day="", order=0.0), camera)
+        repr((replace(trial, name="", specimen="", day="", order=0.0), camera))
         for trial, camera in zip(exact, quiet, strict=True)
     ]
     first = [kinds.index(kind) for kind in kinds]

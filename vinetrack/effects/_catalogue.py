@@ -135,7 +135,8 @@ def load_effect(path: Path | str) -> Effect:
 
 def _effect_of(module: ModuleType, path: Path) -> Effect:
     """What the file says, as yet unchecked."""
-    text = (module.__doc__ or "").strip()  # not `getdoc`: where only the formula follows, it would lose its indent
+    # From the source: from Python 3.13 on `__doc__`, as `getdoc` does, loses the indent where only the formula follows.
+    text = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")), clean=False) or "").strip()
     functions = {hook: getattr(module, hook) for hook in HOOKS if callable(getattr(module, hook, None))}
     return Effect(
         name=path.stem,
