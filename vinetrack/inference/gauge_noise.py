@@ -132,7 +132,7 @@ class _Recorded:
     """A trace with noise to be taken out: its readings, of how many samples, their noise, and the growth beside it.
 
     `growth` and `clock` are None where nothing is known to grow. The exponent by which a chamber empties has an error,
-    and `alike` trials have it and the clock together.
+    which `alike` trials have together.
     """
 
     readings: Readings
@@ -215,8 +215,8 @@ class _Recorded:
     def _by_clock_and_exponent(self, kind: int) -> list[Floats]:
         """What a curve along the growth is wrong by where clock or exponent are, by one standard deviation each, Pa.
 
-        n trials have these errors σ together. Told trial by trial, each is given √n σ: what all have then costs what
-        one error does.
+        n trials have that of the exponent, σ, together. Told trial by trial, each is given √n σ: what all have then
+        costs what one error does; no more, though, than the exponents that there are leave it.
         """
         if kind <= MOST_BENT:
             return []
@@ -224,10 +224,11 @@ class _Recorded:
             0.5 * (self.curve(kind, off=1.0)[0] - self.curve(kind, off=-1.0)[0]),
             0.5 * (self._emptying(1.0).curve(kind)[0] - self._emptying(-1.0).curve(kind)[0]),
         ]
-        return [math.sqrt(self.alike) * (each - np.mean(each)) for each in moved_Pa if np.ptp(each) > 0]
+        return [each - np.mean(each) for each in moved_Pa if np.ptp(each) > 0]
 
     def _emptying(self, off: float) -> _Recorded:
-        return replace(self, exponent=self.exponent + off * self.exponent_sigma)
+        sigma = min(math.sqrt(self.alike) * self.exponent_sigma, (EXPONENTS[-1] - EXPONENTS[0]) / math.sqrt(12))
+        return replace(self, exponent=self.exponent + off * sigma)
 
     def curve(self, kind: int | None, off: float = 0.0) -> tuple[Floats, float, Floats]:
         """The curve of a kind, Pa, how well its mean is known, Pa, and a standard deviation each of what else is wrong.
