@@ -191,7 +191,7 @@ def test_exponents_that_scatter_more_than_the_noise_tells_are_worth_less(
     robust = robust_ratio(plain.fit, (EXPONENT,))
     assert robust_ratio(plain.fit, ("n_by_vine",)) == 1.0  # no number is called that
     assert abs(plain.sigma) == pytest.approx(np.sqrt(abs(plain.delta_chi2)) / robust)
-    monkeypatch.setattr("vinetrack.diagnosis.between_trials.robust_ratio", lambda _, names: 3.0 * (EXPONENT in names))
+    monkeypatch.setattr("vinetrack.diagnosis.likelihood_ratio.robust_ratio", lambda _, names: 3.0 * (EXPONENT in names))
     (wider,) = between_fits(questioned, [by_vine], 0.0, str)
     assert abs(wider.sigma) == pytest.approx(np.sqrt(abs(wider.delta_chi2)) / 3)
     assert wider.inflation == MOST_INFLATION

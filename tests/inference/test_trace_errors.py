@@ -12,6 +12,7 @@ from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
 from vinetrack.diagnosis.ladder import left_out
+from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.assemble import assemble
 from vinetrack.inference.fit_data import prepare
 from vinetrack.inference.left_out import predict_prepared
@@ -150,3 +151,14 @@ def test_errors_of_which_the_motion_tells_nothing_are_none(fit: vt.Fit):
     for back, each in zip(moved, far, strict=True):
         felt = 0 if each.trace_told is None else each.trace_told.size
         np.testing.assert_allclose(back[:felt], -3.0, atol=0.05)
+
+
+def test_errors_that_cannot_be_simulated_stay_as_they_were_told(fit: vt.Fit, monkeypatch: pytest.MonkeyPatch):
+    def fails(*_: object, **__: object) -> None:
+        raise SimulationError("the tube stands still")
+
+    monkeypatch.setattr(Predictor, "run", fails)
+    assert told_by_motion(fit.predictor, fit.solution).shape == (len(fit.trials), 0)
+    same, solution = with_errors_told(fit.predictor, fit.solution, FixedTerms())
+    assert same is fit.predictor
+    assert solution is fit.solution

@@ -136,7 +136,7 @@ def beside_systematics(fit: Fit, base: Solution) -> Solution:
 
 
 def beside_trace_errors(fit: Fit, base: Solution) -> Solution:
-    """A solution with the errors of recorded pressures among its numbers, as its fit has them.
+    """A solution with the errors of recorded pressures among its numbers, those that its fit found put back.
 
     Parameters
     ----------

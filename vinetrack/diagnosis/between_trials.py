@@ -33,7 +33,7 @@ from vinetrack.diagnosis.between_gain import (
     gains_from_each,
     linear_gain,
 )
-from vinetrack.diagnosis.likelihood_ratio import MOST_INFLATION, LikelihoodRatio, likelihood_ratio, robust_ratio
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
     BETWEEN_TRIALS,
@@ -188,23 +188,19 @@ def between_fits(
         fit = _fitted(before, difference)
         if fit is None:
             continue
-        ratio = likelihood_ratio(before, (_effect_of(difference),), fit)
-        fitted.append(BetweenRatio(**{**vars(ratio), "difference": difference, **_widened(difference, ratio)}))
+        ratio = likelihood_ratio(before, (_effect_of(difference),), fit, widened_by=_widened_by(difference))
+        fitted.append(BetweenRatio(**{**vars(ratio), "difference": difference}))
     return fitted
 
 
-def _widened(difference: Difference, ratio: LikelihoodRatio) -> dict[str, float]:
-    """Significance and inflation of a difference, as far as the scatter of trials can widen it.
+def _widened_by(difference: Difference) -> tuple[str, ...]:
+    """Names whose scatter from trial to trial takes away from the significance of a difference.
 
-    Exponents of the vines are widened by what their own errors are. A coefficient of a random effect, which only the
-    few trials of its group feel, has a robust error that says nothing.
+    Those of its numbers; but a coefficient of a random effect, which only the few trials of its group feel, has a
+    robust error that says nothing.
     """
     random = any(math.isfinite(term.prior_sd) for term in difference.terms)
-    if not random and not difference.shared:
-        return {}
-    wider = 1.0 if random else robust_ratio(ratio.fit, tuple(difference.shared))
-    sigma = math.copysign(math.sqrt(abs(ratio.delta_chi2)), ratio.delta_chi2) / wider
-    return {"sigma": sigma, "inflation": min(wider**2, MOST_INFLATION)}
+    return () if random else (difference.name, *difference.shared)
 
 
 def _effect_of(difference: Difference) -> Effect:

@@ -90,7 +90,9 @@ class LikelihoodRatio:
         return tuple(number for number in self.fit.numbers if number.key.split(".")[0] not in self.names)
 
 
-def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> LikelihoodRatio:
+def likelihood_ratio(
+    before: Fit, effects: Sequence[Effect], after: Fit, *, widened_by: Collection[str] | None = None
+) -> LikelihoodRatio:
     """Hold a refit against the fit without the effects.
 
     Parameters
@@ -101,13 +103,16 @@ def likelihood_ratio(before: Fit, effects: Sequence[Effect], after: Fit) -> Like
         Those that were added.
     after
         The fit with them.
+    widened_by : collection of str, optional
+        Names as of `robust_ratio` whose scatter from trial to trial takes away from significance; by default those of
+        the effects.
 
     Returns
     -------
     LikelihoodRatio
     """
     fall = 2 * (after.log_likelihood - before.log_likelihood)
-    ratio = robust_ratio(after, [effect.name for effect in effects])
+    ratio = robust_ratio(after, [effect.name for effect in effects] if widened_by is None else widened_by)
     plausible, reason = plausibility(effects, after)
     parameters = {f"{effect.name}.{parameter.name}": parameter for effect in effects for parameter in effect.parameters}
     nothing = _compatible_with_nothing(effects, after)
@@ -189,7 +194,7 @@ def robust_ratio(after: Fit, names: Collection[str]) -> float:
     float
         The largest of all of them.
     """
-    if len(after.trials) < FEWEST_CLUSTERS:
+    if not names or len(after.trials) < FEWEST_CLUSTERS:
         return 1.0
     matrices = robust_covariance(after.predictor, after.solution)
     plain, robust = (np.sqrt(np.maximum(np.diag(matrix), 0.0)) for matrix in matrices)

@@ -24,7 +24,7 @@ from vinetrack.inference.pooling import Pooled, pool
 from vinetrack.inference.position_errors import SmoothErrors, smooth_errors
 from vinetrack.inference.robust_covariance import few_trials, widened_covariance
 from vinetrack.inference.sensitivity import DAMPING_DEVIATION, ORIGIN, OWN, PRESSURE, RELEASE, Predictor
-from vinetrack.inference.trace_errors import penalty
+from vinetrack.inference.trace_errors import mended_Pa, penalty
 from vinetrack.inference.trial_effects import LARGEST_DEVIATION
 from vinetrack.inference.variance_kernels import RIDGE
 from vinetrack.inference.whitening import at_correlation, whiten
@@ -413,8 +413,7 @@ def _smoothed(data: Sequence[FitTrial]) -> list[str]:
 
 def _mended(data: Sequence[FitTrial]) -> list[str]:
     """What is said of recorded pressures that the motion told better than their gauge."""
-    moved = [float(np.max(np.abs(each.trace_errors_Pa @ each.trace_told))) for each in data
-             if each.trace_told is not None and each.trace_errors_Pa is not None]  # fmt: skip
+    moved = [float(np.max(np.abs(mended_Pa(each)))) for each in data if each.trace_told is not None]
     if not moved:
         return []
     trials = f"{len(moved)} trials" if len(moved) > 1 else "one trial"

@@ -225,7 +225,7 @@ def refit(
     known = {key: value for key, value in before.model.values.items() if key in model.parameter_names}
     model = model.with_values({**known, **(start or {})})
     # What another model found of the errors of recorded pressures would hold this one to it.
-    data = before.predictor.data if model.names == before.model.names else _as_recorded(before.predictor.data)
+    data = before.predictor.data if model.names == before.model.names else list(map(as_recorded, before.predictor.data))
     names = {*model.parameter_names, "yield_pressure.P_y"}
     kept = {
         key: tuple(name for name in before.options[key] if _belongs(name, names)) if given is None else tuple(given)
@@ -275,10 +275,6 @@ def refit(
     )
     fitted = assemble(predictor, solution, before.left_out, {**kept, "shared": sharing, "held": held}, profile=profile)
     return replace(fitted, pairs=before.pairs)
-
-
-def _as_recorded(data: Sequence[FitTrial]) -> list[FitTrial]:
-    return [as_recorded(trial_data) for trial_data in data]
 
 
 def _belongs(name: str, names: Iterable[str]) -> bool:

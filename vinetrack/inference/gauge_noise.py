@@ -4,12 +4,13 @@ The speed of a light vine follows the pressure at once, so that 0.1 kPa of noise
 that it never moved; and a noisy pressure passes a threshold early, in every trial by another time.
 
 Where a few numbers explain a trace, they are fitted: a polynomial in time, or, since the pressure falls as the tube
-fills and has its corner where the growth begins, a polynomial in time and in the growth that is seen. Gauge and camera
-may differ in their clocks, so the growth may be shifted, by any of so many samples alike. Of the curves that leave only
-noise that with the least BIC (Schwarz, Ann. Stat. 6, 461, 1978) is taken: a term too many bends the speed all
-through a trial, at 0.1 kPa of noise by more than its positions err. How often each kind of curve occurs in a campaign
-is estimated along (empirical Bayes: Robbins, Proc. 3rd Berkeley Symp. 1, 157, 1956). Where a second kind is not much
-less likely, the curve is the mean of both, and what they differ by an error. Where no curve will do, straight lines
+fills and has its corner where the growth begins, a polynomial in time and in the growth that is seen, moved by what the
+clocks of gauge and camera differ by (`vinetrack.inference.gauge_clock`), on the scale on which an expanding gas is
+straight in the growth. Of the curves that leave only noise that with the least BIC (Schwarz, Ann. Stat. 6, 461, 1978)
+is taken: a term too many bends the speed all through a trial, at 0.1 kPa of noise by more than its positions err. How
+often each kind of curve occurs in a campaign is estimated along (empirical Bayes: Robbins, Proc. 3rd Berkeley Symp. 1,
+157, 1956), and so is the exponent of the gas, which all trials have together. Where a second kind is not much less
+likely, the curve is the mean of both, and what they differ by an error. Where no curve will do, straight lines
 are laid around every sample through ever more neighbours, for as long as what is left beside them looks like noise and
 each agrees with all narrower ones: wide where the pressure runs straight, narrow at a corner (the intersection of
 confidence intervals: Goldenshluger & Nemirovski, Math. Methods Stat. 6, 135, 1997).
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
+from vinetrack.core.constants import AMBIENT_PRESSURE_PA
 from vinetrack.core.records import Floats, Track
 from vinetrack.inference.gauge_clock import Clock, Growth, gauge_clocks, often, polynomial_along
 from vinetrack.inference.gauge_readings import (
@@ -60,28 +62,25 @@ LOCAL_SIGMAS = 5.0
 """Standard deviations by which a sum of neighbouring residuals may stand out. Chosen: of a thousand samples in sixteen
 widths one does by chance in two hundred traces; at 4 one in five, and the lines are taken where a curve would do."""
 
-AIR_PA, EXPONENTS = 101_325.0, (1.0, 1.1, 1.2, 1.3, 1.4)
-"""Pressure of the air, and exponents by which a chamber may empty into the tube, (P + P_air) V^γ: curves are fitted to
-the pressure on the scale on which it is then straight in the growth. Derived: 1 with heat, 1.4 without. Measured on
-falls of 5 to 8 kPa, a straight line along the growth is off by 44 to 120 Pa at the start on the plain scale, by 4 to 7
-with an exponent that is wrong by 0.1 (`gauge_slow_depletion` of the laboratories, seeds 20602 and 30019)."""
+EXPONENTS = (1.0, 1.1, 1.2, 1.3, 1.4)
+"""Exponents by which a chamber may empty into the tube, (P + P_air) V^γ: curves are fitted to the pressure on the scale
+on which it is then straight in the growth. Derived: 1 with heat, 1.4 without. Measured on falls of 5 to 8 kPa, a straight line
+along the growth is off by 44 to 120 Pa at the start on the plain scale, by 4 to 7 with an exponent that is wrong by 0.1
+(`gauge_slow_depletion` of the laboratories, seeds 20602 and 30019)."""
 
 ALONG_GROWTH = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
 """Degrees in time and in growth that are tried. Chosen: a chamber that empties without heat is of second degree in the
 growth to 1e-4 of its pressure, a supply that refills it is slow in time."""
 
-
 LEAST_WEIGHT = 0.01
 """Probability beside the likeliest from which a kind of curve counts. Chosen: a tenth of what such a kind differs by is
 an error then; at half and at twice 0.07 and 0.14 of it are left out."""
-
 
 LAST_PART, GOES_ON = 0.1, 0.2
 """Part of a trace along whose line it goes on beyond its end, and for how long, in parts of it. Measured: offsets of
 13.5, 25 and 40 ms between clocks in 16 trials of 0.2 to 0.4 s (`trace_clock` of the laboratories, tuning seeds 20611 to
 20613). With an end that is held a fit finds 6 to 9, 11 to 13 and 20 to 23 ms; with this 11 to 13, 21 to 25, 31 to 37.
 At half or twice the first it finds the same to 4 ms; at half of the second 18 to 22 of 25 ms and 25 to 27 of 40."""
-
 
 SMALL_ERROR = 1e-3
 """Part of the variance of all errors of a curve below which a direction of them is left out. Chosen: 3 % of their
@@ -150,48 +149,49 @@ class _Recorded:
         The first is the mean. What few readings tell is known between them too: a pressure that follows the growth
         bends where it does. The clocks may be so many standard deviations `off`.
         """
-        samples = np.arange(float(self.count))
-        places = self.readings.places
-        t, t_samples = (2 * (at - places[0]) / (places[-1] - places[0]) - 1 for at in (places, samples))
-        if kind <= MOST_BENT:
-            at_readings, at_samples = (legvander(at, kind) for at in (t, t_samples))
-        else:
-            assert self.growth is not None
-            assert self.clock is not None
-            offset = self.clock.offset + off * self.clock.sigma
-            g_m, g_samples_m = (self.growth.at(at + offset) for at in (places, samples))
-            begin_m, range_m = g_m[0], np.ptp(g_m)
-            at_readings, at_samples = (
-                polynomial_along(at, (grown_m - begin_m) / range_m, *ALONG_GROWTH[kind - MOST_BENT - 1])
-                for at, grown_m in ((t, g_m), (t_samples, g_samples_m))
-            )
-        if self.readings.edges is not None:
-            at_readings = self.readings.means_of(at_samples)
+        at_samples = self._columns(kind, np.arange(float(self.count)), off)
+        means = self.readings.edges is not None
+        at_readings = self.readings.means_of(at_samples) if means else self._columns(kind, self.readings.places, off)
         q, r = np.linalg.qr(at_readings)
         return q, np.linalg.solve(r.T, at_samples.T).T
 
-    def criteria(self) -> list[float]:
-        """BIC of every kind of curve, infinite where it leaves more than noise."""
-        rho, y = self.noise.rho, whitened(self._straight(self.readings.values_Pa), self.noise.rho)
-        slow = _polynomials(y.size, min(MOST_BENT + LOOKED_BEYOND, y.size // 3))
-        bent = [(kind + 1 < slow.shape[1], False) for kind in range(MOST_BENT + 1)]
-        most = y.size // 3 - 2 if self.clock is not None else -1
-        along = [(sum(degrees) <= most, True) for degrees in ALONG_GROWTH]
-        clock_cost = self.clock.cost if self.clock is not None else 0.0
-        values = []
-        for kind, (possible, shifted) in enumerate(bent + along):
-            values.append(math.inf)
-            if not possible:
-                continue
-            basis = np.linalg.qr(whitened(self.basis(kind)[0], rho))[0]
-            left, numbers = y - basis @ (basis.T @ y), basis.shape[1]
-            if _is_noise(left, self.noise, numbers + shifted, slow):
-                penalty = math.log(y.size) * numbers + shifted * clock_cost
-                # Where the noise itself is known from few differences, what is left weighs as Student's t has it.
-                degrees = self.noise.degrees
-                spread = float(left @ left) / (degrees * self.noise.sigma_Pa**2)
-                values[-1] = (degrees + y.size) * math.log1p(spread) + penalty
-        return values
+    def _columns(self, kind: int, at: Floats, off: float) -> Floats:
+        """Powers of time, or of time and growth, at places among the samples."""
+        places = self.readings.places
+        t = 2 * (at - places[0]) / (places[-1] - places[0]) - 1
+        if kind <= MOST_BENT:
+            return legvander(t, kind)
+        assert self.growth is not None
+        assert self.clock is not None
+        offset = self.clock.offset + off * self.clock.sigma
+        seen_m = self.growth.at(places + offset)
+        grown = (self.growth.at(at + offset) - seen_m[0]) / np.ptp(seen_m)
+        return polynomial_along(t, grown, *ALONG_GROWTH[kind - MOST_BENT - 1])
+
+    def criteria(self, exponents: Sequence[float] | None = None) -> Floats:
+        """BIC of every kind of curve, infinite where it leaves more than noise.
+
+        Of shape (n_kinds,), or (n_exponents, n_kinds) for several exponents by which the chamber may empty.
+        """
+        recorded = [self] if exponents is None else [replace(self, exponent=exponent) for exponent in exponents]
+        y = whitened(np.column_stack([each._straight(self.readings.values_Pa) for each in recorded]), self.noise.rho)
+        size, degrees = len(y), self.noise.degrees
+        slow = _polynomials(size, min(MOST_BENT + LOOKED_BEYOND, size // 3))
+        bent = [kind + 1 < slow.shape[1] for kind in range(MOST_BENT + 1)]
+        along = [self.clock is not None and sum(of) <= size // 3 - 2 for of in ALONG_GROWTH]
+        values = np.full((len(recorded), len(bent) + len(along)), math.inf)
+        for kind in np.flatnonzero(bent + along):
+            basis = np.linalg.qr(whitened(self.basis(int(kind))[0], self.noise.rho))[0]
+            numbers, clock_cost = basis.shape[1], 0.0
+            if kind > MOST_BENT:
+                assert self.clock is not None
+                numbers, clock_cost = numbers + 1, self.clock.cost - math.log(size)
+            for value, left in zip(values, (y - basis @ (basis.T @ y)).T, strict=True):
+                if _is_noise(left, self.noise, numbers, slow):
+                    # Where the noise itself is known from few differences, what is left weighs as Student's t has it.
+                    spread = float(left @ left) / (degrees * self.noise.sigma_Pa**2)
+                    value[kind] = (degrees + size) * math.log1p(spread) + math.log(size) * numbers + clock_cost
+        return values[0] if exponents is None else values
 
     def averaged(self, weights: Floats) -> tuple[Floats, float, Floats]:
         """As `curve`, of kinds of these weights: what they differ by is an error of their mean as well.
@@ -258,17 +258,17 @@ class _Recorded:
     @property
     def _typical_Pa(self) -> float:
         """Absolute pressure about which scales agree."""
-        return max(float(np.median(self.readings.values_Pa)), -0.5 * AIR_PA) + AIR_PA
+        return max(float(np.median(self.readings.values_Pa)), -0.5 * AMBIENT_PRESSURE_PA) + AMBIENT_PRESSURE_PA
 
     def _straight(self, pressure_Pa: Floats) -> Floats:
         """Pressure on the scale on which it is straight in the growth of a tube that empties its chamber, Pa."""
-        whole = np.maximum(pressure_Pa + AIR_PA, 0.1 * AIR_PA) / self._typical_Pa
+        whole = np.maximum(pressure_Pa + AMBIENT_PRESSURE_PA, 0.1 * AMBIENT_PRESSURE_PA) / self._typical_Pa
         return np.asarray(-self.exponent * self._typical_Pa * whole ** (-1 / self.exponent))
 
     def _pressure(self, straight: Floats) -> tuple[Floats, Floats]:
         """The pressure of values on that scale, Pa, and its slope against them."""
         part = np.maximum(-straight / (self.exponent * self._typical_Pa), 0.01)
-        return self._typical_Pa * part**-self.exponent - AIR_PA, part ** (-self.exponent - 1)
+        return self._typical_Pa * part**-self.exponent - AMBIENT_PRESSURE_PA, part ** (-self.exponent - 1)
 
 
 def _fewest(errors_Pa: Floats) -> Floats:
@@ -338,7 +338,7 @@ def _quieted(traces: Sequence[tuple[Floats, Growth | None]]) -> list[tuple[Float
 
 def _emptied_alike(noisy: dict[int, _Recorded]) -> dict[int, _Recorded]:
     """The traces with the exponent by which their chamber empties, which is that of all, and its error."""
-    least = np.array([[min(replace(each, exponent=e).criteria()) for e in EXPONENTS] for each in noisy.values()])
+    least = np.array([np.min(each.criteria(EXPONENTS), axis=1) for each in noisy.values()])
     told = least[np.isfinite(least).all(axis=1)] if noisy else np.zeros((0, len(EXPONENTS)))
     levels = np.sum(told, axis=0)
     likely = np.exp(-0.5 * (levels - np.min(levels)))
@@ -398,16 +398,16 @@ def _is_noise(residual_Pa: Floats, noise: GaugeNoise, fitted: int, slow: Floats)
 
 def _reach_Pa(sigmas: float, noise: GaugeNoise) -> float:
     """How far chance reaches, Pa, that of normal noise would reach so many standard deviations, were they known."""
-    from scipy.stats import norm, t
+    from scipy.special import ndtr, stdtrit
 
-    return noise.sigma_Pa * float(t.isf(norm.sf(sigmas), noise.degrees))
+    return -noise.sigma_Pa * float(stdtrit(noise.degrees, ndtr(-sigmas)))
 
 
 def _most_left(noise: GaugeNoise, degrees: Floats | int) -> Any:
     """Sum of squares of noise of so many degrees of freedom at most, Pa²."""
-    from scipy.stats import f
+    from scipy.special import fdtri
 
-    return noise.sigma_Pa**2 * degrees * f.isf(CHANCE, degrees, noise.degrees)
+    return noise.sigma_Pa**2 * degrees * fdtri(degrees, noise.degrees, 1 - CHANCE)
 
 
 def _lines(pressure_Pa: Floats, noise: GaugeNoise) -> Floats:

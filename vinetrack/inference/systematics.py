@@ -193,20 +193,27 @@ def _set_pressures(predictor: Predictor, solution: Solution) -> Systematics:
     return _one_each(columns, [trial.condition if felt else None for trial, felt in zip(data, feels, strict=True)])
 
 
-def recorded_pressures(predictor: Predictor, solution: Solution) -> Systematics:
+def recorded_pressures(predictor: Predictor, solution: Solution, *, curves_only: bool = False) -> Systematics:
     """What the noise of the gauge leaves wrong in each recorded pressure beside its mean, which the fit has.
 
     Parameters
     ----------
     predictor : of the trials that were fitted.
     solution : where the iterations ended.
+    curves_only : bool
+        Whether traces that are made of straight lines are left out.
 
     Returns
     -------
     Systematics
     """
     data = predictor.data
-    counts = [0 if trial_data.trace_errors_Pa is None else trial_data.trace_errors_Pa.shape[1] for trial_data in data]
+    counts = [
+        0
+        if each.trace_errors_Pa is None or (curves_only and not each.trace_is_curve)
+        else each.trace_errors_Pa.shape[1]
+        for each in data
+    ]
     felt = max(counts)
     nothing = Systematics.none([trial_data.time_s.size for trial_data in data])
     if not felt:
