@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pandas as pd
@@ -25,7 +26,7 @@ from vinetrack.inference.mixed_effects import (
 )
 from vinetrack.inference.model_check import CHECK_COLUMNS, _deviate
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.variance_kernels import decrease_within_bounds
+from vinetrack.inference.variance_kernels import decrease_within_bounds, sums_without_deviations
 from vinetrack.inference.whitening import all_products, at_correlation, products, whiten
 
 RHO, SIGMA = 0.45, 0.3
@@ -134,6 +135,38 @@ def test_the_decrease_within_bounds_is_that_of_the_bounded_step(seed: int) -> No
     assert solved
     assert decrease == pytest.approx(step @ (2 * slope - square @ step))
     assert log_det == pytest.approx(np.linalg.slogdet(square[np.ix_(k, k)])[1])
+
+
+def test_deviations_that_are_nearly_the_same_are_integrated_out_of_precise_positions() -> None:
+    """Squares of 1e12 times the noise, of which that of the noise is left: held against exact fractions.
+
+    With the inverse of I + S Z S written out, 30 trials of 16 µm were credited with 250 in ln L.
+    """
+    k = np.arange(100)
+    pressure = 20_000 * k
+    damping = 2 * pressure + 40 * (k % 7) + k**2 // 9
+    key, residual = 3 * damping + 5 * k, damping // 15 - 7 * k + k % 3
+    columns = np.column_stack([pressure, damping, key, residual])
+    block = [[Fraction(int(a @ b)) for b in columns.T] for a in columns.T]
+    roots = (Fraction(1, 25), Fraction(3, 50))
+    whole = [[value * (roots[i] if i < 2 else 1) * (roots[j] if j < 2 else 1) for j, value in enumerate(row)]
+             for i, row in enumerate(block)]  # fmt: skip
+    determinant = Fraction(1)
+    for i in range(2):
+        whole[i][i] += 1
+    for i in range(2):
+        pivot = whole[i]
+        determinant *= pivot[i]
+        for j in range(i + 1, 4):
+            part = whole[j][i] / pivot[i]
+            whole[j] = [a - part * b for a, b in zip(whole[j], pivot, strict=True)]
+    information, slope, square, log_det = sums_without_deviations(
+        np.array(block, dtype=float)[None], np.array([[0]]), np.array([roots], dtype=float), 1
+    )
+    assert square == pytest.approx(float(whole[3][3]), rel=1e-3)
+    assert slope[0] == pytest.approx(float(whole[2][3]), rel=1e-3)
+    assert information[0, 0] == pytest.approx(float(whole[2][2]), rel=1e-3)
+    assert log_det == pytest.approx(math.log(determinant), rel=1e-9)
 
 
 def test_two_numbers_that_only_move_together_are_left_to_least_squares() -> None:

@@ -127,22 +127,22 @@ def sums_without_deviations(
     last = blocks.shape[1] - 1
     information, slope = np.zeros((size + 1, size + 1)), np.zeros(size + 1)
     square, log_det = 0.0, 0.0
+    of_pressure, of_damping = np.empty(last + 1), np.empty(last + 1)
     for i in range(len(blocks)):
         block, of = blocks[i], places[i]
         s, t = roots[i, 0], roots[i, 1]
-        # I + S Z S factored: its inverse between two S is the matrix of a, b, c.
+        # One after the other, by the Cholesky factor of I + S Z S: the two are nearly the same where speed is steady,
+        # and its inverse, written out, takes from the squares of precise positions more than is left of them.
         first = 1.0 + s * s * block[0, 0]
-        side = s * t * block[0, 1]
-        second = 1.0 + t * t * block[1, 1] - side * side / first
-        log_det += math.log(first) + math.log(second)
-        c = t * t / second
-        b = -s * side / first * t / second
-        a = s * s / first + (s * side / first) * (s * side / first) / second
+        for u in range(1, last + 1):
+            of_pressure[u] = s * block[0, u] / math.sqrt(first)
+        second = 1.0 + t * t * (block[1, 1] - of_pressure[1] * of_pressure[1])
         for u in range(2, last + 1):
-            of_pressure = a * block[0, u] + b * block[1, u]
-            of_damping = b * block[0, u] + c * block[1, u]
+            of_damping[u] = t * (block[1, u] - of_pressure[1] * of_pressure[u]) / math.sqrt(second)
+        log_det += math.log(first) + math.log(second)
+        for u in range(2, last + 1):
             for v in range(2, u + 1):
-                left = block[u, v] - of_pressure * block[0, v] - of_damping * block[1, v]
+                left = block[u, v] - of_pressure[u] * of_pressure[v] - of_damping[u] * of_damping[v]
                 if u < last:
                     information[of[u - 2], of[v - 2]] += left
                     if v < u:
