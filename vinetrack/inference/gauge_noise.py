@@ -64,9 +64,9 @@ widths one does by chance in two hundred traces; at 4 one in five, and the lines
 
 EXPONENTS = (1.0, 1.1, 1.2, 1.3, 1.4)
 """Exponents by which a chamber may empty into the tube, (P + P_air) V^γ: curves are fitted to the pressure on the scale
-on which it is then straight in the growth. Derived: 1 with heat, 1.4 without. Measured on falls of 5 to 8 kPa, a straight line
-along the growth is off by 44 to 120 Pa at the start on the plain scale, by 4 to 7 with an exponent that is wrong by 0.1
-(`gauge_slow_depletion` of the laboratories, seeds 20602 and 30019)."""
+on which it is then straight in the growth. Derived: 1 with heat, 1.4 without. On falls of 5 to 8 kPa a line along
+the growth is off by 44 to 120 Pa at the start on the plain scale, by 4 to 7 with an exponent wrong by 0.1 (measured on
+`gauge_slow_depletion` of the laboratories, seeds 20602 and 30019)."""
 
 ALONG_GROWTH = ((0, 1), (0, 2), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 4))
 """Degrees in time and in growth that are tried. Chosen: a chamber that empties without heat is of second degree in the

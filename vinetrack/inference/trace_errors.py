@@ -34,8 +34,8 @@ from vinetrack.inference.systematics import recorded_pressures
 MOST_ROUNDS, SETTLED = 4, 0.1
 """Rounds at most, and by how many of its standard deviations an error may still move. Measured: nine fits settle after
 one to three rounds (`trace_clock` of the laboratories, tuning seed 20600); at half some would not, twice as many are
-never asked. Chosen: −2 ln L is quadratic
-about the likeliest, and 0.1 in one error is 0.01 of it; at half a round more is asked now and then, at twice 0.04."""
+never asked. Chosen: −2 ln L is quadratic about the likeliest, and 0.1 in one error is 0.01 of it; at half a round more
+is asked now and then, at twice 0.04."""
 
 
 def with_errors_told(
