@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,10 +13,18 @@ import pytest
 from hidden_truth import Pairs, grown, sheet
 
 import vinetrack as vt
-from vinetrack.diagnosis.trial_effect_tests import STRETCH, conditions_apart, noisier_in_motion
+from vinetrack.core.records import Trial
+from vinetrack.diagnosis.trial_effect_tests import (
+    MORE_THAN_VINES,
+    STRETCH,
+    conditions_apart,
+    noisier_in_motion,
+    scatters_much,
+)
+from vinetrack.experiment.naming import with_names
 from vinetrack.inference.fit_result import Fit
 from vinetrack.laboratory.tracks import BASE, Nature, grow
-from vinetrack.laboratory.vine_campaigns import damping_values
+from vinetrack.laboratory.vine_campaigns import campaign, damping_values, isometric_vine
 
 WANDER_M = 2e-4
 
@@ -24,17 +33,17 @@ def fitted(pairs: Pairs) -> Fit:
     return vt.fit(vt.base_model(), pairs, profile=False)
 
 
-def of_another_film(factors: dict[float, float]) -> Pairs:
-    """Trials whose B is another at some of the pressures, kPa, alike in replicates."""
+def of_another_film(factors: dict[float, float], scatter: float = 0.02, trials: Sequence[Trial] = ()) -> Pairs:
+    """Trials whose B is another at some of the pressures, kPa, alike in replicates but for some scatter."""
     pairs: Pairs = []
-    for k, trial in enumerate(sheet()):
+    for k, trial in enumerate(trials or sheet()):
         values = damping_values([trial])
         factor = factors.get(round(trial.pressure_Pa / 1e3), 1.0)
         by_vine = values["eversion_damping.B"]
         assert isinstance(by_vine, dict)
         values["eversion_damping.B"] = {vine: B * factor for vine, B in by_vine.items()}
         nature = Nature(
-            effects=BASE, values=values, damping_scatter=0.02, pressure_scatter=0.005, yield_error_kPa=0.1,
+            effects=BASE, values=values, damping_scatter=scatter, pressure_scatter=0.005, yield_error_kPa=0.1,
             noise_m=1e-4, noise_correlation=0.3, seed=40 + k,
         )  # fmt: skip
         pairs += [(one.stated, one.track) for one in grow([trial], nature)]
@@ -64,6 +73,31 @@ def test_replicates_that_deviate_together_are_seen() -> None:
 
 def test_replicates_that_scatter_are_not() -> None:
     assert all(conditions_apart(fitted(grown(seed=seed))) > 0.05 for seed in (32, 33, 34))
+
+
+def test_a_scatter_that_replicates_have_too_is_none_of_the_model() -> None:
+    """Tubes of which no two are alike scatter as a model does that bends each trial, but not by condition."""
+    trials = with_names(campaign(isometric_vine(4), (14, 17, 20, 24, 28, 33), 2, prefix="a"))
+    loose = fitted(of_another_film({}, 0.08, trials))
+    bent = fitted(of_another_film({17: 0.6, 24: 1.5}, 0.02, trials))
+    assert min(loose.state.spread[1], bent.state.spread[1]) > MORE_THAN_VINES
+    assert not scatters_much(loose)
+    assert scatters_much(bent)
+
+
+@pytest.mark.parametrize("replicate", [0, 1])
+def test_without_replicates_a_scatter_may_be_that_of_the_model(replicate: int) -> None:
+    fit = fitted(of_another_film({}, 0.08)[replicate::2])
+    assert len({trial.trial.condition for trial in fit.trials}) == len(fit.trials)
+    assert fit.state.spread[1] > MORE_THAN_VINES
+    assert scatters_much(fit)
+
+
+def test_deviations_alike_in_all_replicates_are_of_their_conditions() -> None:
+    fit = fitted(of_another_film({20: 1.5, 22: 0.6}))
+    level = dict(zip(sorted({trial.trial.condition for trial in fit.trials}), np.linspace(-0.1, 0.1, 20), strict=False))
+    alike = [replace(trial, damping_deviation=level[trial.trial.condition]) for trial in fit.trials]
+    assert scatters_much(replace(fit, trials=tuple(alike)))
 
 
 def test_what_is_louder_in_motion_than_at_rest_is_heard() -> None:

@@ -35,6 +35,11 @@ FEW_PER_CENT = 0.02
 """Relative deviation below which conditions that differ are within what vines do. Chosen: what a gauge and a batch of
 vines may do."""
 
+LIKE_REPLICATES = 0.05
+"""Chance from which conditions are taken to differ by no more than their replicates do. Chosen: a model that bends its
+trials passes for their scatter once in twenty times at most; at half seldomer, at twice one campaign in ten whose
+trials scatter on their own is searched throughout for nothing."""
+
 
 def conditions_apart(fit: Fit) -> float:
     """Chance at which conditions differ in their trials' own pressure, or B, by so much more than replicates do.
@@ -56,17 +61,18 @@ def conditions_apart(fit: Fit) -> float:
     ]
     known = [part for part in stated if math.isfinite(part)]
     pressure = max(MORE_THAN_STATED * float(np.median(known)) if known else 0.0, FEW_PER_CENT)
-    conditions = [trial.trial.condition for trial in fit.trials]
-    fitted = sum(1 for number in fit.numbers if not math.isfinite(number.bound))
+    allowed = pressure, MORE_THAN_VINES
     chances = [
-        _one_way(np.array([trial.pressure_deviation for trial in fit.trials]), conditions, fitted, pressure),
-        _one_way(np.log1p([trial.damping_deviation for trial in fit.trials]), conditions, fitted, MORE_THAN_VINES),
+        _one_way(deviations, *_grouping(fit), most)
+        for deviations, most in zip(_own_deviations(fit), allowed, strict=True)
     ]
     return min(2 * min(chances), 1.0)
 
 
 def scatters_much(fit: Fit) -> bool:
     """Whether trials deviate by more than an experimenter's care allows: a model may have bent them to fit.
+
+    It has not where conditions differ by no more than replicates: what makes up for a model is alike in these.
 
     Parameters
     ----------
@@ -76,8 +82,35 @@ def scatters_much(fit: Fit) -> bool:
     -------
     bool
     """
-    pressure, damping = fit.state.spread
-    return pressure > FEW_PER_CENT or damping > MORE_THAN_VINES
+    allowed = FEW_PER_CENT, MORE_THAN_VINES
+    return any(
+        spread > most and not _like_replicates(deviations, *_grouping(fit))
+        for spread, most, deviations in zip(fit.state.spread, allowed, _own_deviations(fit), strict=True)
+    )
+
+
+def _own_deviations(fit: Fit) -> tuple[Floats, Floats]:
+    """Each trial's own deviation of pressure and of ln B."""
+    return (
+        np.array([trial.pressure_deviation for trial in fit.trials]),
+        np.log1p([trial.damping_deviation for trial in fit.trials]),
+    )
+
+
+def _grouping(fit: Fit) -> tuple[list[str], int]:
+    """The condition of each trial, and how many numbers were fitted to all."""
+    fitted = sum(1 for number in fit.numbers if not math.isfinite(number.bound))
+    return [trial.trial.condition for trial in fit.trials], fitted
+
+
+def _like_replicates(values: Floats, groups: Sequence[str], fitted: int) -> bool:
+    """Whether groups differ by no more than their members do, where there are enough members to tell.
+
+    Of no more groups than numbers that were fitted to them nothing would show.
+    """
+    inner, outer = values.size - len(set(groups)), len(set(groups)) - fitted
+    told = inner >= FEWEST_REPLICATED and outer > 0
+    return told and _one_way(values, groups, fitted, 0.0) > LIKE_REPLICATES
 
 
 def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
@@ -89,11 +122,11 @@ def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     within = sum(float(np.sum((member - member.mean()) ** 2)) for member in members)
     inner, outer = values.size - len(names), max(len(names) - fitted, 1)
     between = sum(member.size * float(member.mean()) ** 2 for member in members)
-    if inner < FEWEST_REPLICATED or not within > 0 or math.sqrt(between / values.size) < allowed:
+    if inner < FEWEST_REPLICATED or math.sqrt(between / values.size) <= allowed:
         return 1.0
     # Those of replicates that hardly differ are held against what an experimenter's care allows.
     care = max(within / inner, allowed**2 / 9)
-    return float(f.sf(between / outer / care, outer, inner))
+    return float(f.sf(between / outer / care, outer, inner)) if care > 0 else 0.0
 
 
 def noisier_in_motion(fit: Fit) -> float:
