@@ -17,6 +17,7 @@ from hidden_truth import Pairs, grown, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Track
+from vinetrack.diagnosis.lost_frames import LostFrames, with_lost_frames
 from vinetrack.diagnosis.result import DROPPED_FRAMES, NOT_TESTABLE, VERDICTS, Diagnosis
 from vinetrack.effects import EffectError, own_effects
 from vinetrack.laboratory.vine_campaigns import damping_values
@@ -185,6 +186,16 @@ def test_missing_frames_are_said_first(depleted_pairs: Pairs) -> None:
     assert (found.verdict, found.answer_set) == ("artefact", (DROPPED_FRAMES,))
     assert trial.name in found.explanation
     assert "reservoir_depletion" in found.notes[0]
+
+
+def test_frames_that_may_be_missing_are_a_note_beside_the_verdict(depleted: Diagnosis) -> None:
+    """A step that a few points with heavy tails may have made had been the verdict in place of `supply_pulsation`."""
+    missing = LostFrames(("a", "b"))
+    result = with_lost_frames(depleted, missing)
+    assert (result.verdict, result.effects) == (depleted.verdict, depleted.effects)
+    assert "missing from 2 recordings (a and b)" in result.notes[-1]
+    assert with_lost_frames(depleted, replace(missing, sure=("b",))).answer_set == (DROPPED_FRAMES,)
+    assert with_lost_frames(depleted, LostFrames()) is depleted
 
 
 def test_a_users_own_effect_is_found_like_any_other(tmp_path: Path) -> None:

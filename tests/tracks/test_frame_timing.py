@@ -9,7 +9,7 @@ import pytest
 from vine_truth import CAPTURE_FPS, Vine, ar1, make_track, record
 
 from vinetrack.core.records import Track
-from vinetrack.tracks.frame_timing import correct_frames
+from vinetrack.tracks.frame_timing import correct_frames, lost_for_sure
 from vinetrack.tracks.step_gaps import count_missing
 
 FRAME_S = 1 / CAPTURE_FPS
@@ -53,6 +53,19 @@ def steady_track(noise_m: float = 2e-5, n: int = 120) -> Track:
     time_s = np.arange(n) * FRAME_S
     y = 1.0 * np.maximum(time_s - time_s[30], 0) + ar1(n, noise_m, 0.0, np.random.default_rng(1000))
     return make_track(time_s, y)
+
+
+@pytest.mark.parametrize(("row", "noise_m", "sure"), [(70, 1e-4, True), (110, 1e-4, False), (110, 1e-5, True)])
+def test_a_jump_that_only_the_nearest_points_tell_is_sure_where_noise_is_far_below_it(
+    row: int, noise_m: float, sure: bool
+):
+    out = correct_frames(dropped(steady_track(noise_m), row))
+    assert flags(out) == {row: "gap;retimed"}
+    assert lost_for_sure(out) is sure
+
+
+def test_nothing_is_lost_of_a_track_whose_times_nobody_moved():
+    assert not lost_for_sure(steady_track())
 
 
 def test_a_stale_copy_is_flagged_and_times_stay():

@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinetrack.core.records import Track, Trial, plain_track, with_flag
+from vinetrack.core.records import Track
 from vinetrack.diagnosis.between_trials import between_candidates
 from vinetrack.diagnosis.candidates import testable
 from vinetrack.diagnosis.contradictions import contradictions
 from vinetrack.diagnosis.initial_fit import candidates_of, host_for, initial_fit, with_host
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio, weights_of
 from vinetrack.diagnosis.linear_power import power_of
+from vinetrack.diagnosis.lost_frames import frames_put_right, lost_in_fit, with_lost_frames
 from vinetrack.diagnosis.misfit_tests import MisfitTests
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
     ARTEFACT,
     BETWEEN_TRIALS,
-    DROPPED_FRAMES,
     NOT_TESTABLE,
     REFITTED,
     SCREENED,
@@ -45,7 +45,7 @@ from vinetrack.effects import Effect, EffectError
 from vinetrack.inference.fit_data import FitError, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit
 from vinetrack.narrative.verdict_summary import joined
-from vinetrack.narrative.verdict_text import dropped_in_words, explain
+from vinetrack.narrative.verdict_text import explain
 from vinetrack.tracks.wild_points import listed_wild_points
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def diagnose(
     wild = ""
     if isinstance(source, Fit):
         questioned = candidates_of(source.model, candidates, user_effects)
-        fit, dropped = with_host(source, host_for(source.model, questioned)), _dropped_in_fit(source)
+        fit, missing = with_host(source, host_for(source.model, questioned)), lost_in_fit(source)
     else:
         settings = _settings(source)
         if settings is not None:
@@ -125,7 +125,7 @@ def diagnose(
         model = model or base_model()
         questioned = candidates_of(model, candidates, user_effects)
         pairs, left_out = pairs_of(source, tracks)
-        pairs, dropped = _frames_put_right(pairs)
+        pairs, missing = frames_put_right(pairs)
         wild = listed_wild_points({trial.name: track for trial, track in pairs if trial.video is None})
         report("fitting the model")
         fit = initial_fit(model, pairs, questioned, profile=False)
@@ -133,8 +133,7 @@ def diagnose(
     effects, blind = testable(questioned, fit.predictor.data)
     findings = select_effects(fit, effects, report)
     result = _conclude(fit, findings, blind)
-    if dropped:
-        result = _artefact_first(result, dropped)
+    result = with_lost_frames(result, missing)
     if wild:
         result = replace(result, notes=(*result.notes, wild))
     if ladder:
@@ -162,32 +161,6 @@ def _settings(
     settings = source.settings
     user_effects = own_effects([source.folder / path for path in settings.effects])
     return source, make_model(settings.model, user_effects), settings.candidates, dict(user_effects), settings.limits
-
-
-def _frames_put_right(pairs: Iterable[tuple[Trial, Track]]) -> tuple[list[tuple[Trial, Track]], list[str]]:
-    """Tracks with dropped and repeated frames put right, and the trials from which frames are missing."""
-    from vinetrack.tracks.frame_timing import correct_frames
-
-    right, dropped = [], []
-    for trial, track in pairs:
-        if trial.video is None and not with_flag(track.flag, "retimed").any():
-            track = correct_frames(track)
-        if with_flag(track.flag, "retimed").any():
-            dropped.append(trial.name)
-        right.append((trial, track))
-    return right, dropped
-
-
-def _dropped_in_fit(fit: Fit) -> list[str]:
-    """Trials of a fit from which frames are missing that nobody has put right."""
-    from vinetrack.tracks.frame_timing import correct_frames
-
-    dropped = []
-    for trial_data in fit.predictor.data:
-        track = plain_track(trial_data.time_s, trial_data.lead_position_m)
-        if with_flag(correct_frames(track).flag, "retimed").any():
-            dropped.append(trial_data.trial.name)
-    return dropped
 
 
 def _conclude(fit: Fit, findings: Sequence[SelectionStep], blind: Mapping[str, str]) -> Diagnosis:
@@ -346,26 +319,6 @@ def _behind(finding: SelectionStep, name: str) -> str:
 
 def _known(value: float) -> float:
     return value if math.isfinite(value) else -math.inf
-
-
-def _artefact_first(result: Diagnosis, dropped: Sequence[str]) -> Diagnosis:
-    """Frames are missing: that is said first, and what follows from the times put right stands as a note."""
-    first = result.rounds[0]
-    words = dropped_in_words(dropped)
-    artefact = Round(
-        model=first.model,
-        verdict=ARTEFACT,
-        answer_set=(DROPPED_FRAMES,),
-        ranking=first.ranking,
-        explanation=words,
-        cosine_names=first.cosine_names,
-        cosines=first.cosines,
-        fit=first.fit,
-    )
-    note = f"With the times put right: {result.verdict}. {result.explanation}"
-    return Diagnosis(
-        rounds=(artefact,), effects=(), explanation=words, fits=result.fits[:1], notes=(note,), power=result.power
-    )
 
 
 def _with_ladder(result: Diagnosis, report: Report) -> Diagnosis:

@@ -248,9 +248,30 @@ def dropped_in_words(trials: Sequence[str]) -> str:
     -------
     str
     """
-    some = joined(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
     return (
-        f"Frames are missing from {len(trials)} recording{'s' if len(trials) > 1 else ''} ({some}): the step of one "
+        f"Frames are missing from {_recordings(trials)}: the step of one "
         "frame is far above those of its neighbours. Camera or disk dropped frames. The times were corrected; record "
         "again where it matters."
     )
+
+
+def perhaps_dropped_in_words(trials: Sequence[str]) -> str:
+    """Return the note of a diagnosis where frames may be missing from these recordings.
+
+    Parameters
+    ----------
+    trials : names of the recordings.
+
+    Returns
+    -------
+    str
+    """
+    return (
+        f"Frames may be missing from {_recordings(trials)}: one step is above those of its neighbours, and the later "
+        "times were moved on. Points farther away are too few or too noisy to confirm it: look at the recording."
+    )
+
+
+def _recordings(trials: Sequence[str]) -> str:
+    some = joined(list(trials[:4])) + (" and others" if len(trials) > 4 else "")
+    return f"{len(trials)} recording{'s' if len(trials) > 1 else ''} ({some})"
