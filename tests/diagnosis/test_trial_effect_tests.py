@@ -93,11 +93,15 @@ def test_without_replicates_a_scatter_may_be_that_of_the_model(replicate: int) -
     assert scatters_much(fit)
 
 
-def test_deviations_alike_in_all_replicates_are_of_their_conditions() -> None:
-    fit = fitted(of_another_film({20: 1.5, 22: 0.6}))
-    level = dict(zip(sorted({trial.trial.condition for trial in fit.trials}), np.linspace(-0.1, 0.1, 20), strict=False))
-    alike = [replace(trial, damping_deviation=level[trial.trial.condition]) for trial in fit.trials]
-    assert scatters_much(replace(fit, trials=tuple(alike)))
+def test_of_many_replicates_a_difference_that_care_allows_is_none_of_the_model() -> None:
+    """Two in a hundred between conditions are significant among fifty replicates each, and no reason to search."""
+    fit = fitted(of_another_film({}, 0.08, with_names(campaign(isometric_vine(4), (14, 17, 20, 24, 28, 33), 2))))
+    draw = np.random.default_rng(20750)
+    trials = [
+        replace(trial, damping_deviation=float(np.expm1(0.05 * draw.standard_normal() + 0.02 * (-1) ** (k % 12 // 2))))
+        for k, trial in enumerate(50 * fit.trials)
+    ]
+    assert not scatters_much(replace(fit, trials=tuple(trials)))
 
 
 def test_what_is_louder_in_motion_than_at_rest_is_heard() -> None:
@@ -118,7 +122,9 @@ def test_heavy_tails_alone_are_not_louder_in_motion(heavy: bool, most: float) ->
         if heavy:
             white /= np.sqrt(draw.chisquare(5, (12, 16, 1)) / 5)
         trials = [SimpleNamespace(whitened=one.ravel()) for one in white]
-        data = SimpleNamespace(slow_m=None, gauge_error=0.0, n_rest=8 * STRETCH)
+        data = SimpleNamespace(
+            slow_m=None, gauge_error=0.0, n_rest=8 * STRETCH, noise_m=1e-4, lead_position_m=np.array([0.0, 0.3])
+        )
         fit: Any = SimpleNamespace(trials=trials, predictor=SimpleNamespace(data=[data] * 12))
         alarms += noisier_in_motion(fit) < 0.01
     assert alarms / 600 < most

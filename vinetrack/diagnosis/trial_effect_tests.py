@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vinetrack.core.records import Floats
+from vinetrack.inference.fit_problem import floor
 from vinetrack.inference.fit_result import Fit
 
 STRETCH = 8
@@ -72,7 +73,8 @@ def conditions_apart(fit: Fit) -> float:
 def scatters_much(fit: Fit) -> bool:
     """Whether trials deviate by more than an experimenter's care allows: a model may have bent them to fit.
 
-    It has not where conditions differ by no more than replicates: what makes up for a model is alike in these.
+    It has not where conditions differ by no more than replicates, or than care allows: what makes up for a model is
+    alike in replicates.
 
     Parameters
     ----------
@@ -84,7 +86,7 @@ def scatters_much(fit: Fit) -> bool:
     """
     allowed = FEW_PER_CENT, MORE_THAN_VINES
     return any(
-        spread > most and not _like_replicates(deviations, *_grouping(fit))
+        spread > most and not _like_replicates(deviations, *_grouping(fit), most)
         for spread, most, deviations in zip(fit.state.spread, allowed, _own_deviations(fit), strict=True)
     )
 
@@ -103,14 +105,14 @@ def _grouping(fit: Fit) -> tuple[list[str], int]:
     return [trial.trial.condition for trial in fit.trials], fitted
 
 
-def _like_replicates(values: Floats, groups: Sequence[str], fitted: int) -> bool:
-    """Whether groups differ by no more than their members do, where there are enough members to tell.
+def _like_replicates(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> bool:
+    """Whether groups differ by no more than their members do, or than is allowed, where enough members tell.
 
     Of no more groups than numbers that were fitted to them nothing would show.
     """
     inner, outer = values.size - len(set(groups)), len(set(groups)) - fitted
     told = inner >= FEWEST_REPLICATED and outer > 0
-    return told and _one_way(values, groups, fitted, 0.0) > LIKE_REPLICATES
+    return told and _one_way(values, groups, fitted, allowed) > LIKE_REPLICATES
 
 
 def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float) -> float:
@@ -122,18 +124,19 @@ def _one_way(values: Floats, groups: Sequence[str], fitted: int, allowed: float)
     within = sum(float(np.sum((member - member.mean()) ** 2)) for member in members)
     inner, outer = values.size - len(names), max(len(names) - fitted, 1)
     between = sum(member.size * float(member.mean()) ** 2 for member in members)
-    if inner < FEWEST_REPLICATED or math.sqrt(between / values.size) <= allowed:
+    if inner < FEWEST_REPLICATED or not within > 0 or math.sqrt(between / values.size) < allowed:
         return 1.0
     # Those of replicates that hardly differ are held against what an experimenter's care allows.
     care = max(within / inner, allowed**2 / 9)
-    return float(f.sf(between / outer / care, outer, inner)) if care > 0 else 0.0
+    return float(f.sf(between / outer / care, outer, inner))
 
 
 def noisier_in_motion(fit: Fit) -> float:
     """Chance at which positions in motion are so much noisier, over stretches, than at rest; 1 where nobody can tell.
 
     Positions read from recordings are not asked, for a tracker's slow errors in motion are larger than those at rest,
-    and none under a recorded pressure, for a gauge's noise moves what the model predicts.
+    none under a recorded pressure, for a gauge's noise moves what the model predicts, and none that are more precise
+    than the integrator, as those of a simulation.
 
     Parameters
     ----------
@@ -151,7 +154,11 @@ def noisier_in_motion(fit: Fit) -> float:
     motion: list[Floats] = []
     freedom = 0.0
     for trial, trial_data in zip(fit.trials, fit.predictor.data, strict=True):
-        if trial_data.slow_m is not None or trial_data.gauge_error > 0:
+        if (
+            trial_data.slow_m is not None
+            or trial_data.gauge_error > 0
+            or trial_data.noise_m**2 < floor([trial_data])[0]
+        ):
             continue
         here = _sums(trial.whitened[: trial_data.n_rest])
         if here.size < 2:

@@ -272,7 +272,9 @@ def _step_report(predictor: Predictor, state: FitState, iteration: int, promised
 
 
 def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
-    """What the model leaves against the noise that the tracks show alone, of their correlation; NaN if none do.
+    """What the model leaves against the noise that the tracks show alone, of their correlation.
+
+    Noise below what the integrator can answer for counts as that much, see `fit_problem.floor`.
 
     Parameters
     ----------
@@ -285,9 +287,7 @@ def chi2_per_dof(predictor: Predictor, solution: Solution) -> float:
     """
     data = predictor.data
     rho = track_correlation(data)
-    noise = np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2)
-    if not (noise > 0).all():
-        return math.nan
+    noise = np.maximum(np.array([trial_data.noise_m**2 for trial_data in data]) * (1 - rho**2), floor(data))
     left = at_correlation(solution.grams, rho)[:, -1, -1]
     taken = np.count_nonzero(solution.problem.free) / left.size + 2 + solution.problem.feels.any(axis=1)
     return float(np.sum(left / noise) / np.sum(np.maximum(solution.problem.points - taken, 1.0)))
