@@ -6,12 +6,15 @@ Seeds from 7200 are used here alone.
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
+from typing import Any
 
 import pandas as pd
 import pytest
 from hidden_truth import Pairs, grown, sheet
 
 import vinetrack as vt
+from vinetrack.diagnosis import selection
 from vinetrack.diagnosis.ladder import LADDER_COLUMNS
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.narrative.diagnosis_text import diagnosis_text
@@ -51,6 +54,22 @@ def test_three_effects_are_found_one_after_the_other(three_missing: Diagnosis) -
     numbers = {number.key: number for number in three_missing.parameters}
     for key in ("reservoir_depletion.gamma", "tail_friction.mu_w"):
         assert abs(numbers[key].value - TRUTH[key]) < 4 * numbers[key].sigma
+
+
+def test_a_set_that_mends_everything_but_is_worth_no_more_than_chance_is_said_to_be_that(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It had been said that something is left once it is added."""
+    pair = SimpleNamespace(label="leak with air_drag", credible=True, fit=SimpleNamespace(log_likelihood=1.0))
+    sets = SimpleNamespace(
+        grow=lambda _: [pair], of_size=lambda _: [pair], is_better=lambda _: False, steps=lambda: (), known={}
+    )
+    questions: Any = SimpleNamespace(fit=SimpleNamespace(chi2_per_dof=2.0))
+    monkeypatch.setattr(selection, "EffectSets", lambda *_: sets)
+    monkeypatch.setattr(selection, "_mending", lambda *_: ([pair], {}, questions))
+    (step,) = selection._together(questions, questions, [pair], str)  # type: ignore[list-item]
+    assert step.verdict == "unexplained"
+    assert step.aside == (("leak with air_drag", "it gains no more over the best smaller set than chance may"),)
 
 
 def test_every_round_says_which_effects_it_adds_together(three_missing: Diagnosis) -> None:

@@ -307,8 +307,10 @@ def _together(
         if not grown or not any(hypothesis.credible for hypothesis in grown):
             break
         kept, aside, after = _mending(grown, search, sets)
-        if after is not None and sets.is_better(kept[0]):
-            return _of_sets(questions, sets, kept, aside, after)
+        if after is not None:
+            if sets.is_better(kept[0]):
+                return _of_sets(questions, sets, kept, aside, after)
+            aside[kept[0].label] = "it gains no more over the best smaller set than chance may"
         if not sets.is_better(grown[0]):
             break
         leads_nowhere = size > 2 and _leads_nowhere(grown, reached)
