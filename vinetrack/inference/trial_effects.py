@@ -219,7 +219,10 @@ class ReleaseSearch:
         self.led_back |= np.abs(release_s - self.jumped_from) < np.abs(release_s - self.jumped_to)
         tried = self._likelier(state, residuals)
         kept = state if tried is None else self._borne_out(state, tried)
-        self.jumped_from, self.jumped_to = release_s, kept.trial_effects[:, RELEASE]
+        jumped_s = kept.trial_effects[:, RELEASE]
+        jumps = jumped_s != release_s
+        self.jumped_from = np.where(jumps, release_s, self.jumped_from)
+        self.jumped_to = np.where(jumps, jumped_s, self.jumped_to)
         return None if np.array_equal(kept.trial_effects, state.trial_effects) else kept
 
     def _likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
