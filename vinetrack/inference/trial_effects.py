@@ -186,6 +186,16 @@ DAMPING_STEP, PRESSURE_STEP = 1e-2, 1e-2
 error and bends it by 1e-4."""
 
 
+LED_BACK = 0.25
+"""Part of a jump to within which steps have led back to where it began. Chosen: steps that go round in a circle come
+back to a tenth and less. At half some circles are not seen, at twice trials that settle between are bound to what is
+missed least."""
+
+SAME_NUMBERS = 1e-3
+"""Largest change of a shared number, scaled, at which it is the same. Chosen: a tenth of a per cent of B, far below its
+error. At half circles are seen a step later, at twice a step still under way may count as one."""
+
+
 class ReleaseSearch:
     """Releases looked for elsewhere during a fit, and what its steps made of those that were taken.
 
@@ -198,6 +208,7 @@ class ReleaseSearch:
         self.predictor, self.problem = predictor, problem
         self.led_back = np.zeros(len(predictor.data), dtype=bool)
         self.jumped_from = self.jumped_to = np.zeros(len(predictor.data))
+        self.numbers = np.full((len(predictor.data), problem.prior_mean.size), np.nan)
 
     def look(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
         """The state with likelier releases; None if none is.
@@ -216,13 +227,16 @@ class ReleaseSearch:
         FitState or None
         """
         release_s = state.trial_effects[:, RELEASE]
-        self.led_back |= np.abs(release_s - self.jumped_from) < np.abs(release_s - self.jumped_to)
+        back = np.abs(release_s - self.jumped_from) < LED_BACK * np.abs(self.jumped_to - self.jumped_from)
+        # Where the shared numbers have moved since, it is they that led there.
+        self.led_back |= back & (np.max(np.abs(state.theta - self.numbers), axis=1) < SAME_NUMBERS)
         tried = self._likelier(state, residuals)
         kept = state if tried is None else self._borne_out(state, tried)
         jumped_s = kept.trial_effects[:, RELEASE]
         jumps = jumped_s != release_s
         self.jumped_from = np.where(jumps, release_s, self.jumped_from)
         self.jumped_to = np.where(jumps, jumped_s, self.jumped_to)
+        self.numbers[jumps] = state.theta
         return None if np.array_equal(kept.trial_effects, state.trial_effects) else kept
 
     def _likelier(self, state: FitState, residuals: Sequence[Floats]) -> FitState | None:
