@@ -229,7 +229,7 @@ class ReleaseSearch:
         release_s = state.trial_effects[:, RELEASE]
         back = np.abs(release_s - self.jumped_from) < LED_BACK * np.abs(self.jumped_to - self.jumped_from)
         # Where the shared numbers have moved since, it is they that led there.
-        self.led_back |= back & (np.max(np.abs(state.theta - self.numbers), axis=1) < SAME_NUMBERS)
+        self.led_back |= back & (np.max(np.abs(state.theta - self.numbers), axis=1, initial=0.0) < SAME_NUMBERS)
         tried = self._likelier(state, residuals)
         kept = state if tried is None else self._borne_out(state, tried)
         jumped_s = kept.trial_effects[:, RELEASE]
