@@ -12,6 +12,7 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -272,6 +273,32 @@ def test_one_trial_gives_everything_but_a_law_and_says_why(tmp_path: Path) -> No
     law = json.loads((tmp_path / "results" / "damping.json").read_text())["both_axes"]
     assert law["n"] is None
     assert law["refused"] in (tmp_path / "results" / "report.html").read_text().replace("&#39;", "'")
+
+
+def test_stages_of_single_trials_do_those_they_are_told_and_refuse_others(tmp_path: Path) -> None:
+    folder, results = tmp_path / "v", tmp_path / "results"
+    write_track(folder / "a.csv", 12, 20, 7)
+    (folder / "trials.csv").write_text(
+        "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa\n"
+        "a,a.csv,12,100,300,20,3\nb,a.csv,12,100,300,20,3\nc,a.csv,12,100,300,9999,3\nd,a.csv,12,100,300,9999,3\n"
+    )
+    invoke = partial(CliRunner().invoke, app)
+    for stage, *options in (
+        ("tracks", "--trials", '["a", "c"]'),
+        ("tracks", "--trials", '["b", "d"]'),
+        ("gather",),
+        ("figures", "--of", "trials", "--trials", '["c"]'),
+    ):
+        done = invoke([stage, str(folder), str(results), *options], catch_exceptions=False)
+        assert done.exit_code == 0, done.output
+    assert sorted(path.name for path in (results / "figures").iterdir()) == ["trial_c.png", "trial_c.svg"]
+    assert {name: row["status"] for name, row in read_rows(results / "trials.csv").items()} == {
+        "a": "ok", "b": "ok", "c": "failed", "d": "failed",
+    }  # fmt: skip
+    for given, said in (('["x"]', "'x' is no trial"), ("x", "is not JSON"), ('"a"', "is not a JSON list")):
+        refused = invoke(["tracks", str(folder), str(results), "--trials", given])
+        assert refused.exit_code == 2
+        assert said in " ".join(refused.output.split())
 
 
 def test_where_all_trials_are_broken_the_report_still_lists_them_with_their_reasons(tmp_path: Path) -> None:

@@ -14,8 +14,9 @@ from lsoda_vine import grown_position, vine_trial
 
 from vinetrack.core.problems import ExperimentError
 from vinetrack.pipeline import run_stage
+from vinetrack.pipeline.run_folders import claim_results
 from vinetrack.pipeline.run_stage import RunError, RunPaths, check_first, run_chain, run_lines, run_paths
-from vinetrack.pipeline.workflow import claim_results, make_plan
+from vinetrack.pipeline.workflow import make_plan
 
 SHEET = "trial,track,diameter_mm,thickness_um,length_mm,pressure_kPa,yield_pressure_kPa,growth_angle_deg\n"
 
@@ -82,6 +83,19 @@ def test_progress_is_a_line_a_step_and_a_failure_names_stage_and_reason() -> Non
     assert said == ["step 1 of 9 done: recordings tracked", "step 2 of 9 done: 2 recordings tracked"]
     assert failed == {"model": "/out/logs/model.log"}
     assert words == ["tracks: the disk is full"]
+
+
+def test_a_stage_shared_out_over_jobs_says_which_part_is_done() -> None:
+    printed = [
+        "Finished jobid: 3 (Rule: tracks_2)", "1 of 9 steps (11%) done",
+        "Finished jobid: 4 (Rule: trial_figures_10)", "2 of 9 steps (22%) done",
+    ]  # fmt: skip
+    said: list[str] = []
+    run_stage._follow(iter(printed), said.append)
+    assert said == [
+        "step 1 of 9 done: tracks analysed, part 2",
+        "step 2 of 9 done: figures of the trials drawn, part 10",
+    ]
 
 
 def test_a_run_that_fails_says_why_whatever_its_folder_is_called(tmp_path: Path) -> None:

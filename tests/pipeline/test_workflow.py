@@ -11,7 +11,8 @@ import pytest
 from vinetrack.core.problems import ExperimentError
 from vinetrack.figures.registry import FIGURES
 from vinetrack.pipeline import workflow
-from vinetrack.pipeline.workflow import find_experiment, make_plan, shell_prefix
+from vinetrack.pipeline.run_folders import find_experiment
+from vinetrack.pipeline.workflow import make_plan, shell_prefix
 from vinetrack.report.build import figure_caption
 
 ROOT = Path(__file__).parents[2]
@@ -212,6 +213,21 @@ def test_a_folder_that_snakemake_cannot_name_is_refused_by_check_at_once(tmp_pat
 
 
 def test_a_folder_with_marks_blanks_and_quotes_is_no_pattern(tmp_path: Path) -> None:
-    from vinetrack.pipeline.workflow import path_problems
+    from vinetrack.pipeline.run_folders import path_problems
 
     assert path_problems(tmp_path / "b>x&amp; 'q\" ü $(x)") == []
+
+
+def test_many_trials_are_shared_out_over_jobs_and_a_few_are_one(tmp_path: Path) -> None:
+    names = [f"t{i}" for i in range(2 * workflow.TRIALS_A_JOB + 1)]
+    rows = "".join(f"{name},{name}.csv,12,100,300,20,3,\n" for name in names)
+    folder = experiment(tmp_path / "v", rows)
+    (folder / "t1.csv").write_bytes((folder / "a.csv").read_bytes())
+    plan = make_plan({"experiment": str(folder)}, tmp_path)
+    parts = plan.parts("tracks", plan.tracked)
+    assert list(parts) == ["tracks_1", "tracks_2", "tracks_3"]
+    assert [name for part in parts.values() for name in part] == names
+    assert plan.track_files(parts["tracks_1"]) == [(folder / "t1.csv").as_posix()]
+    assert plan.track_files(parts["tracks_2"]) == []
+    assert plan.parts("tracks", names[:3]) == {"tracks": names[:3]}
+    assert plan.parts("tracks", []) == {}

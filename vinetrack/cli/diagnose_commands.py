@@ -53,7 +53,7 @@ def _diagnose(
     with _sentences(log):
         from vinetrack.diagnosis.diagnose import diagnose
         from vinetrack.experiment.provenance import PROVENANCE
-        from vinetrack.pipeline.workflow import find_experiment
+        from vinetrack.pipeline.run_folders import find_experiment
 
         with _told() as report:
             if (target / PROVENANCE).exists():
@@ -137,7 +137,7 @@ def _diagnosis(
     with _sentences(log):
         from vinetrack.experiment.folder import read_experiment
         from vinetrack.pipeline.diagnosis_stage import diagnose_results, diagnosis_lines
-        from vinetrack.pipeline.workflow import find_experiment
+        from vinetrack.pipeline.run_folders import find_experiment
 
         with _told() as report:
             diagnose_results(read_experiment(find_experiment(experiment)), results, report, _run_settings(settings))

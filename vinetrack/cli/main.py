@@ -43,6 +43,9 @@ app = typer.Typer(
 ExperimentPath = Annotated[Path, typer.Argument(help="The experiment's folder.", metavar="EXPERIMENT")]
 ResultsPath = Annotated[Path, typer.Argument(help="The results folder.", metavar="RESULTS")]
 SettingsText = Annotated[str, typer.Option("--settings", help="Settings that differ from the defaults, as JSON.")]
+TrialNames = Annotated[
+    str | None, typer.Option("--trials", help="Names of the trials, a JSON list; all by default.", show_default=False)
+]
 Threads = Annotated[int, typer.Option("--threads", min=1, help="Processes to use.")]
 LogPath = Annotated[Path | None, typer.Option("--log", help="File for messages and tracebacks.")]
 
@@ -126,7 +129,7 @@ def _effects(
     """The catalogue of effects, with formulas, parameters and units; or one explained."""
     with _sentences(None):
         from vinetrack.pipeline.effects_stage import describe_effects, effects_content
-        from vinetrack.pipeline.workflow import find_experiment
+        from vinetrack.pipeline.run_folders import find_experiment
 
         folder = None if experiment is None else find_experiment(experiment)
         tell(describe_effects(name, folder, figure), effects_content(name, folder), json_file)
@@ -210,6 +213,7 @@ def _recording(
 def _tracks(
     experiment: ExperimentPath,
     results: ResultsPath,
+    trials: TrialNames = None,
     settings: SettingsText = "{}",
     threads: Threads = 1,
     log: LogPath = None,
@@ -218,7 +222,8 @@ def _tracks(
     with _sentences(log):
         from vinetrack.pipeline.tracks_stage import analyse_tracks
 
-        failed = analyse_tracks(_read(experiment), results, _run_settings(settings), threads)
+        read = _read(experiment)
+        failed = analyse_tracks(read, results, _run_settings(settings), threads, _trial_names(trials, read))
         for line in failed[:10]:
             typer.echo(f"  {line}")
 
@@ -266,6 +271,7 @@ def _figures(
     experiment: ExperimentPath,
     results: ResultsPath,
     of: Annotated[str, typer.Option("--of", help="`trials`, `campaign` or `all`.")] = "all",
+    trials: TrialNames = None,
     settings: SettingsText = "{}",
     threads: Threads = 1,
     log: LogPath = None,
@@ -279,7 +285,7 @@ def _figures(
         chosen = _run_settings(settings).figures
         read = _read(experiment)
         if of != "campaign":
-            draw_trials(read, results, chosen, threads)
+            draw_trials(read, results, chosen, threads, _trial_names(trials, read))
         if of != "trials":
             with _busy("drawing the experiment", log):
                 draw_campaign(read, results, chosen)
@@ -324,7 +330,7 @@ def _busy(what: str, log: Path | None) -> AbstractContextManager[object]:
 
 def _read(folder: Path) -> Experiment:
     from vinetrack.experiment.folder import read_experiment
-    from vinetrack.pipeline.workflow import find_experiment
+    from vinetrack.pipeline.run_folders import find_experiment
 
     return read_experiment(find_experiment(folder))
 
@@ -341,6 +347,22 @@ def _run_settings(text: str) -> RunSettings:
     if not isinstance(values, dict):
         raise typer.BadParameter('is not a JSON object such as {"damping": {"seed": 7}}', param_hint="--settings")
     return run_settings(values)
+
+
+def _trial_names(text: str | None, experiment: Experiment) -> list[str] | None:
+    import json
+
+    if text is None:
+        return None
+    try:
+        names = json.loads(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"is not JSON ({error})", param_hint="--trials") from None
+    if not isinstance(names, list):
+        raise typer.BadParameter('is not a JSON list such as ["t1", "t2"]', param_hint="--trials")
+    if unknown := [name for name in names if name not in experiment.names]:
+        raise typer.BadParameter(f"{unknown[0]!r} is no trial of the sheet", param_hint="--trials")
+    return names
 
 
 @contextmanager

@@ -31,7 +31,7 @@ def _check(
 
     with _sentences(None):
         from vinetrack.pipeline.check_stage import check_folder
-        from vinetrack.pipeline.workflow import find_experiment
+        from vinetrack.pipeline.run_folders import find_experiment
 
         checked = check_folder(find_experiment(experiment))
         lines = checked.lines()

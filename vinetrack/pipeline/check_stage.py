@@ -48,7 +48,7 @@ def check_folder(folder: Path) -> Checked:
     """
     from vinetrack.experiment.folder import SETTINGS, SHEET, check_experiment, read_experiment
     from vinetrack.pipeline.effects_stage import model_problems
-    from vinetrack.pipeline.workflow import path_problems
+    from vinetrack.pipeline.run_folders import path_problems
     from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
     from vinetrack.tracks.importers import TrackError, load_track
     from vinetrack.tracks.smoothed_positions import smoothing_of

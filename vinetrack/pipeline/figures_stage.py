@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -38,7 +38,13 @@ class _TrialPicture:
     windows: pd.DataFrame
 
 
-def draw_trials(experiment: Experiment, folder: Path, settings: FigureSettings, n_workers: int = 1) -> int:
+def draw_trials(
+    experiment: Experiment,
+    folder: Path,
+    settings: FigureSettings,
+    n_workers: int = 1,
+    only: Collection[str] | None = None,
+) -> int:
     """Draw `figures/trial_<trial>` for every trial that is not left out; return how many.
 
     Parameters
@@ -51,6 +57,8 @@ def draw_trials(experiment: Experiment, folder: Path, settings: FigureSettings, 
         Formats and resolution.
     n_workers : int
         Number of processes.
+    only : collection of str, optional
+        Names of the trials; all by default.
 
     Returns
     -------
@@ -68,7 +76,7 @@ def draw_trials(experiment: Experiment, folder: Path, settings: FigureSettings, 
             by_trial.get(name, nothing),
         )
         for name in experiment.names
-        if name not in experiment.left_out
+        if name not in experiment.left_out and (only is None or name in only)
     ]
     work = partial(_draw_trial, results=results, settings=settings)
     return sum(1 for _ in map_trials(work, pictures, n_workers, "trial figures"))

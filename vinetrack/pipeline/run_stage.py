@@ -16,19 +16,13 @@ from typing import TextIO
 from vinetrack.core.problems import ExperimentError, UserError
 from vinetrack.core.tables import write_text
 from vinetrack.core.terminal import Progress, progress
+from vinetrack.pipeline.run_folders import PACKAGE, claim_results, find_experiment, find_nature, refuse_shared_results
 from vinetrack.pipeline.run_lock import TAKEN_AWAY, refuse_running
-from vinetrack.pipeline.workflow import (
-    PACKAGE,
-    SNAKEFILE,
-    claim_results,
-    find_experiment,
-    find_nature,
-    refuse_shared_results,
-)
+from vinetrack.pipeline.workflow import SNAKEFILE
 
 Say = Callable[[str], None]
 
-_FINISHED = re.compile(r"^Finished jobid: \d+ \(Rule: (\w+)\)")
+_FINISHED = re.compile(r"^Finished jobid: \d+ \(Rule: (\w+?)(?:_(\d+))?\)")
 _STEPS = re.compile(r"^(\d+) of (\d+) steps")
 _FAILED = re.compile(r"^Error in rule (\w+)")
 _STAGE_LOG = re.compile(r"^\s+log: (\S.*\.log)")
@@ -174,15 +168,19 @@ def _follow(lines: Iterator[str], say: Say) -> tuple[dict[str, str], list[str]]:
     failed: dict[str, str] = {}
     words: deque[str] = deque(maxlen=LAST_WORDS)
     done: Counter[str] = Counter()
-    shown, rule = sys.stderr.isatty(), ""
+    shown, rule, part = sys.stderr.isatty(), "", None
     bar: Progress[int] | None = None
     for line in lines:
         if match := _FINISHED.match(line):
-            rule = match[1]
+            rule, part = match[1], match[2]
             done[rule] += 1
         elif (match := _STEPS.match(line)) and rule in STAGE_WORDS:
             steps, total = int(match[1]), int(match[2])
-            text = STAGE_WORDS[rule] if done[rule] == 1 else f"{done[rule]} {STAGE_WORDS[rule]}"
+            text = STAGE_WORDS[rule]
+            if part:
+                text += f", part {part}"
+            elif done[rule] > 1:
+                text = f"{done[rule]} {text}"
             if shown:
                 bar = bar or progress(total, "run", unit="step")
                 bar.say(text)

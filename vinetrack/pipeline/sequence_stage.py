@@ -84,8 +84,8 @@ def _diagnosed(target: Path, experiment: Path | None) -> tuple[Diagnosis, Sequen
     from vinetrack.experiment.folder import read_experiment
     from vinetrack.inference.fit_data import pairs_of
     from vinetrack.pipeline.model_stage import measured
+    from vinetrack.pipeline.run_folders import find_experiment
     from vinetrack.pipeline.source_experiment import experiment_behind
-    from vinetrack.pipeline.workflow import find_experiment
     from vinetrack.results.folder_layout import Results, ResultsError
     from vinetrack.results.stored_diagnosis import read_diagnosis
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import traceback
+from collections.abc import Collection
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,7 +43,13 @@ log = logging.getLogger(__name__)
 INTERNAL_FAULT = "could not be analysed: a fault of the program, written down in the log of this stage"
 
 
-def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, n_workers: int = 1) -> list[str]:
+def analyse_tracks(
+    experiment: Experiment,
+    folder: Path,
+    settings: RunSettings,
+    n_workers: int = 1,
+    only: Collection[str] | None = None,
+) -> list[str]:
     """Analyse every trial that comes as a track; write `tracks/`, `kinematics/` and `analysed/` of each.
 
     Trials whose row of the sheet is at fault get empty files here too.
@@ -57,6 +64,8 @@ def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, 
         Of the run.
     n_workers : int
         Number of processes.
+    only : collection of str, optional
+        Names of the trials; all by default.
 
     Returns
     -------
@@ -64,18 +73,19 @@ def analyse_tracks(experiment: Experiment, folder: Path, settings: RunSettings, 
         A line for every trial that failed: its name and why.
     """
     results = Results(folder)
-    for name, reason in experiment.failed.items():
+    failed = {name: reason for name, reason in experiment.failed.items() if only is None or name in only}
+    for name, reason in failed.items():
         write_empty(results, name, _bare_row(name, "failed", reason))
     model_of(experiment)
     work = partial(_analyse_track, results=results, settings=settings, experiment=experiment)
-    trials = [trial for trial in experiment.trials if trial.video is None]
+    trials = [trial for trial in experiment.trials if trial.video is None and (only is None or trial.name in only)]
     outcomes = list(map_trials(work, trials, n_workers, "tracks"))
     for trial, (reason, fault) in zip(trials, outcomes, strict=True):
         log.info("%s: %s", trial.name, reason or "analysed")
         if fault:
             log.error("trial %s:\n%s", trial.name, fault)
-    failed = {trial.name: reason for trial, (reason, _) in zip(trials, outcomes, strict=True) if reason}
-    return [f"{name}: {reason}" for name, reason in (*experiment.failed.items(), *failed.items())]
+    failed |= {trial.name: reason for trial, (reason, _) in zip(trials, outcomes, strict=True) if reason}
+    return [f"{name}: {reason}" for name, reason in failed.items()]
 
 
 def _analyse_track(trial: Trial, results: Results, settings: RunSettings, experiment: Experiment) -> tuple[str, str]:

@@ -6,25 +6,28 @@ Light on purpose: it is imported every time Snakemake looks at the workflow, bef
 from __future__ import annotations
 
 import atexit
-import difflib
 import json
-import os
-import re
 import shlex
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vinetrack.core.files import is_readable
-from vinetrack.core.problems import ExperimentError, Problem, format_problems
+from vinetrack.core.problems import ExperimentError, format_problems
 from vinetrack.figures.registry import PAPER_FIGURES
+from vinetrack.pipeline.run_folders import (
+    PACKAGE,
+    find_experiment,
+    find_nature,
+    is_pattern,
+    path_problems,
+    refuse_shared_results,
+)
 
 if TYPE_CHECKING:
     from vinetrack.experiment.settings import RunSettings
-
-PACKAGE = Path(__file__).parents[1]
 
 PAPER_TABLES = (
     "paper",
@@ -43,8 +46,13 @@ SHARED_FILES = ("trials.csv", "experiment.yaml", "corrections.csv")
 SNAKEFILE = PACKAGE / "pipeline" / "Snakefile"
 """The rules, in the package: `vinetrack run` runs them from anywhere, the Snakefile of a checkout includes them."""
 
-CLAIM = "experiment.json"
-"""File of a results folder that names its experiment from the beginning of a run; `provenance.json` comes last."""
+TRIALS_A_JOB = 100
+"""Chosen: trials that come as tracks, and trials whose figures are drawn, in one job of the workflow.
+
+With every file that a job writes Snakemake notes all files that the job reads, 50 µs each: 1,000 trials in one job took
+it six minutes, more than the work itself. At half there are twice as many processes to start, 2 to 4 s each; at twice,
+twice as many notes a trial, 60 ms.
+"""
 
 
 @dataclass(frozen=True)
@@ -52,7 +60,8 @@ class WorkflowPlan:
     """One run of the workflow.
 
     `trials` are all that get files (those that failed at the sheet too, with empty ones); `filmed` those of them that
-    come as recordings, each with its own inputs; `inputs` what all are read from; `unwatched` a fingerprint of inputs
+    come as recordings, each with its own inputs; `read_from` the tracks and traces of the others;
+    `inputs` what all are read from; `unwatched` a fingerprint of inputs
     that cannot stand in a rule; `nature` what is true in a shipped virtual experiment, whose measurements are made on
     first use by the virtual laboratory, and None in anybody's own; `published` whether the paper's numbers are set
     beside those of this experiment.
@@ -62,6 +71,7 @@ class WorkflowPlan:
     results: Path
     trials: tuple[str, ...]
     filmed: Mapping[str, tuple[str, ...]]
+    read_from: Mapping[str, tuple[str, ...]]
     inputs: tuple[Path, ...]
     unwatched: str
     settings: RunSettings
@@ -92,11 +102,36 @@ class WorkflowPlan:
         """Trials that do not come as recordings."""
         return tuple(trial for trial in self.trials if trial not in self.filmed)
 
-    @property
-    def track_inputs(self) -> list[str]:
-        """What trials that do not come as recordings are read from."""
-        of_recordings = {path for paths in self.filmed.values() for path in paths} - set(self.sheets)
-        return [path.as_posix() for path in self.inputs if path.as_posix() not in of_recordings]
+    def track_files(self, trials: Iterable[str]) -> list[str]:
+        """The tracks and traces of trials that do not come as recordings.
+
+        Parameters
+        ----------
+        trials : names; one that failed at the sheet has no files.
+
+        Returns
+        -------
+        list of str
+            Paths.
+        """
+        return [path for trial in trials for path in self.read_from.get(trial, ())]
+
+    @staticmethod
+    def parts(stage: str, trials: Sequence[str]) -> dict[str, list[str]]:
+        """Trials shared out over the jobs of a stage.
+
+        Parameters
+        ----------
+        stage : its name.
+        trials : names.
+
+        Returns
+        -------
+        dict of str to list of str
+            Names of the trials by the name of the job: the stage's own where one job does for all.
+        """
+        shares = [list(trials[first : first + TRIALS_A_JOB]) for first in range(0, len(trials), TRIALS_A_JOB)]
+        return {stage if len(shares) == 1 else f"{stage}_{number}": share for number, share in enumerate(shares, 1)}
 
     def per_trial(self, folder: str, suffix: str, trials: Iterable[str] | None = None) -> list[str]:
         """One result for each of these trials, by default all.
@@ -152,9 +187,20 @@ class WorkflowPlan:
         """Figures that stand beside the paper's: name, format and path."""
         return self._figures(PAPER_FIGURES, "") if self.published else []
 
-    def trial_figures(self) -> list[tuple[str, str, str]]:
-        """Figures of single trials: trial, format and path."""
-        return self._figures(self.trials, "trial_")
+    def trial_figures(self, trials: Iterable[str] | None = None) -> list[tuple[str, str, str]]:
+        """Figures of single trials.
+
+        Parameters
+        ----------
+        trials : iterable of str, optional
+            Names; all trials by default.
+
+        Returns
+        -------
+        list of (str, str, str)
+            Trial, format and path of each.
+        """
+        return self._figures(self.trials if trials is None else trials, "trial_")
 
     def figure_files(self) -> list[str]:
         """Paths of all figures."""
@@ -218,7 +264,7 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     target = getattr(experiment.settings.calibration, "image", None)
     targets = [folder / target] if target is not None and (is_virtual or is_readable(folder / target)) else []
     inputs = dict.fromkeys([*shared, *targets, *present])
-    watched = tuple(path for path in inputs if not _is_pattern(path))
+    watched = {path: None for path in inputs if not is_pattern(path)}
     filmed = {
         trial.name: tuple(
             path.as_posix()
@@ -228,12 +274,20 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
         for trial in experiment.trials
         if trial.video is not None
     }
+    read_from = {
+        trial.name: tuple(
+            path.as_posix() for path in (trial.track, trial.pressure_trace) if path is not None and path in watched
+        )
+        for trial in experiment.trials
+        if trial.video is None
+    }
     return WorkflowPlan(
         experiment=folder,
         results=results,
         trials=trials,
         filmed=filmed,
-        inputs=watched,
+        read_from=read_from,
+        inputs=tuple(watched),
         unwatched=_fingerprint(inputs),
         settings=settings,
         nature=nature,
@@ -241,133 +295,10 @@ def make_plan(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
     )
 
 
-def find_nature(folder: Path, base: Path) -> Path | None:
-    """What is true in an experiment that is shipped with a sheet alone; None for a folder of anybody's own.
-
-    The virtual laboratory has a file for each folder of `data/` that it makes, by the same name.
-
-    Parameters
-    ----------
-    folder : of an experiment.
-    base : the checkout in which `data/` may lie.
-
-    Returns
-    -------
-    nature : the file of what is true.
-    """
-    for nature in sorted((PACKAGE / "laboratory").glob("*.yaml")):
-        shipped = base / "data" / nature.stem
-        if folder.exists() and shipped.exists() and folder.samefile(shipped):
-            return nature
-    return None
-
-
-def refuse_shared_results(results: Path, experiment: Path) -> None:
-    """Refuse a results folder that holds another experiment's.
-
-    Parameters
-    ----------
-    results : the folder, which need not exist.
-    experiment : whose results are to go there.
-
-    Raises
-    ------
-    ExperimentError
-        If what is there was made from another experiment that still exists, naming both.
-    """
-    for name in ("provenance.json", CLAIM):
-        try:
-            made_from = Path(str(json.loads((results / name).read_text(encoding="utf-8"))["experiment"]))
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
-        if made_from.is_dir() and experiment.is_dir() and not made_from.samefile(experiment):
-            message = f"holds the results of {made_from}, not of {experiment.absolute()}"
-            remedy = "name another folder (vinetrack run --results DIR, snakemake --config results=DIR), or rename one"
-            raise ExperimentError([Problem(message=message, file=str(results), remedy=remedy)])
-
-
-def claim_results(results: Path, experiment: Path) -> None:
-    """Write down whose results a folder holds, before the first of them.
-
-    Parameters
-    ----------
-    results : the folder, made where it does not exist.
-    experiment : whose they are.
-    """
-    from vinetrack.core.tables import write_json
-
-    write_json(results / CLAIM, {"experiment": experiment.absolute().as_posix()})
-
-
-def _is_pattern(path: Path) -> bool:
-    """Whether Snakemake would take part of the path for a wildcard or a variable; it has no way to write such marks."""
-    return re.search(r"[{}]|<\w+>", str(path)) is not None
-
-
-def path_problems(*folders: Path) -> list[Problem]:
-    """What is wrong with the names of folders, which Snakemake would say in its own words.
-
-    Parameters
-    ----------
-    folders : of an experiment or of results.
-
-    Returns
-    -------
-    problems : an error for each that has braces or a word in angle brackets in its path.
-    """
-    return [
-        Problem(
-            message="has a brace or a word in < > in its path, which Snakemake cannot read", file=str(folder),
-            remedy="rename the folder, or run the stages one by one with vinetrack",
-        )
-        for folder in folders
-        if _is_pattern(folder)
-    ]  # fmt: skip
-
-
 def _fingerprint(inputs: Iterable[Path]) -> str:
     """Size and time of the inputs that Snakemake cannot watch, so that a change of them is seen all the same."""
-    stats = [(path.name, path.stat()) for path in inputs if _is_pattern(path) and path.exists()]
+    stats = [(path.name, path.stat()) for path in inputs if is_pattern(path) and path.exists()]
     return ";".join(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats)
-
-
-def find_experiment(folder: Path) -> Path:
-    """Return `folder` if it exists; else raise an ExperimentError that names the nearest folder that does.
-
-    Parameters
-    ----------
-    folder : Path
-        As the user named it.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    ExperimentError
-        If it does not exist.
-    """
-    if folder.exists():
-        return folder
-    parent = folder.absolute().parent
-    while not parent.is_dir():
-        parent = parent.parent
-    folders = sorted(path.name for path in parent.iterdir() if path.is_dir() and not path.name.startswith("."))
-    wanted = folder.absolute().relative_to(parent).parts[0]
-    near = difflib.get_close_matches(wanted, folders, 1, 0.5)
-    sheets = [name for name in folders if (parent / name / "trials.csv").is_file()][:3]
-    if near:
-        remedy = f"did you mean {_shown(parent / near[0])}?"
-    elif sheets:
-        remedy = f"there is {', '.join(_shown(parent / name) for name in sheets)}"
-    else:
-        remedy = f"the nearest that exists is {_shown(parent)}"
-    raise ExperimentError([Problem(message="does not exist", file=str(folder), remedy=remedy)])
-
-
-def _shown(path: Path) -> str:
-    return os.path.relpath(path)
 
 
 def plan_or_stop(config: Mapping[str, Any], base: Path) -> WorkflowPlan:
