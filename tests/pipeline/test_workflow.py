@@ -192,7 +192,7 @@ def test_a_recording_depends_on_its_own_file_the_sheets_and_the_target(tmp_path:
     shared = tuple(str(folder / name) for name in ("trials.csv", "experiment.yaml", "c.png"))
     assert plan.filmed == {"a": (*shared, str(folder / "a.mp4")), "b": shared}
     assert plan.tracked == ()
-    assert str(folder / "a.mp4") not in plan.track_inputs
+    assert plan.track_files(plan.trials) == []
 
 
 def test_a_users_own_effect_is_an_input_of_the_run(tmp_path: Path) -> None:
