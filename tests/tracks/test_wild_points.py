@@ -62,6 +62,23 @@ def test_a_wild_point_at_an_end_is_rejected(row):
     assert np.flatnonzero(out.flag == "rejected").tolist() == [row]
 
 
+@pytest.mark.parametrize("row", [150, 290])
+@pytest.mark.parametrize(
+    "time_of", [lambda t: t, lambda t: t + 0.2 * FRAME_S * np.sin(700 * t)], ids=["even", "uneven"]
+)
+def test_a_wild_point_that_lies_near_the_one_before_is_no_copy_and_rejected(row, time_of):
+    """A quarter of a step from the point before, and four times the noise of their difference."""
+    time_s = time_of(np.arange(300) * FRAME_S)
+    speed_m_s, noise_m = 6.0, 3e-5
+    y = speed_m_s * time_s + ar1(300, noise_m, 0.0, np.random.default_rng(20003))
+    y[row] = y[row - 1] + 0.2 * (y[row + 1] - y[row - 1]) / 2
+    track = make_track(time_s, y)
+    assert not wild_points(track.time_s, y, spare_copies=True)[row]
+    out = correct_frames(track)
+    assert np.flatnonzero(out.flag == "rejected").tolist() == [row]
+    np.testing.assert_array_equal(out.time_s, time_s)
+
+
 def test_a_wild_point_is_no_dropped_frame():
     """A point one step ahead, the size of a dropped frame's jump: the times stay as they are."""
     track = steady_track(noise_m=2e-5)

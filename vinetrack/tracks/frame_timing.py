@@ -7,7 +7,8 @@ dropped frame shows as one step of double length, and everything after it is one
 A jump is judged against the jump that a smooth motion with the track's own noise could show: by least squares of a
 parabola with a step on the nearest points on both sides. Times are moved only where one wild point would not explain
 it as well and points farther away agree: noise may have heavy tails. Points far off the motion around them are rejected
-first (`wild_points`): a dropped frame displaces all later points, a wild point comes back. Nothing is called where the
+first (`wild_points`): a dropped frame displaces all later points, a wild point comes back. One that comes to lie where
+the point before does is a copy's double, and waits until copies were judged. Nothing is called where the
 motion is slow beside the noise, where it speeds up so fast that a long step may be the motion itself (release), or
 where the times are irregular.
 
@@ -124,7 +125,11 @@ def correct_frames(track: Track) -> Track:
         for gaps in the times that were marked before. A repeated frame that was inserted is set half a frame after
         the frame it repeats, so that times still increase.
     """
-    track = reject_wild_points(track)
+    return reject_wild_points(_corrected(reject_wild_points(track, spare_copies=True)))
+
+
+def _corrected(track: Track) -> Track:
+    """The same of a track without wild points, but for those that may be copies."""
     spacing = np.diff(track.time_s)
     if track.time_s.size < 6 or not np.all(spacing > 0):
         return track

@@ -58,9 +58,10 @@ the last points by up to a step each. By reasoning: without it the last point be
 points of three steps at the ends stay."""
 
 COPY_STEPS = 0.3
-"""A point this close to the one before, in steps of the motion, is a repeated frame, which `frame_timing` judges.
-Chosen as `STILL` there, a little wider. By reasoning: at half, copies are rejected as wild before they are judged; at
-twice, wild points that happen to lie near the one before stay."""
+"""A point this close to the one before, in steps of the motion, may be a repeated frame: `frame_timing` judges it
+first, and what it does not take for a copy is looked at again. Chosen as `STILL` there, a little wider. By reasoning:
+at half, copies are rejected as wild before they are judged; at twice, wild points that happen to lie near the one
+before are in the way while frames are judged."""
 
 MOST_ROUNDS = 4
 """Rounds of rejection. Measured on three campaigns with 2 % of wild points: three rounds leave nothing to reject."""
@@ -162,12 +163,13 @@ def running_noise(distance_m: Floats, half_width: int = SCALE_HALF_WIDTH) -> Flo
     return np.asarray(view[middle])
 
 
-def wild_points(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
+def wild_points(time_s: Floats, position_m: Floats, *, spare_copies: bool = False) -> NDArray[np.bool_]:
     """Which points lie far off the motion around them, shape (n_points,).
 
     Parameters
     ----------
     time_s, position_m : arrays, shape (n_points,), s and m, finite, in order of time.
+    spare_copies : leave points that lie where the one before does, as repeated frames do.
 
     Returns
     -------
@@ -185,26 +187,28 @@ def wild_points(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
         kept = np.flatnonzero(~wild)
         if kept.size < FEWEST_POINTS:
             break
-        off = _far_off(time_s[kept], position_m[kept], limit)
+        off = _far_off(time_s[kept], position_m[kept], limit, spare_copies)
         if not off.any():
             break
         wild[kept[off]] = True
     return wild if np.mean(wild) <= MOST_REJECTED else np.zeros(n, dtype=bool)
 
 
-def reject_wild_points(track: Track) -> Track:
+def reject_wild_points(track: Track, *, spare_copies: bool = False) -> Track:
     """Flag wild points of a track `rejected`, and name them in its notes; those corrected by hand stay.
 
     Parameters
     ----------
     track : a row for every frame; positions may be NaN.
+    spare_copies : leave points that may be repeated frames, until these were judged.
 
     Returns
     -------
     a copy, or the track itself where no point is wild.
     """
     rows = np.flatnonzero(track.usable)
-    wild = rows[wild_points(track.time_s[rows], track.lead_position_m[rows])] if rows.size else rows
+    is_wild = wild_points(track.time_s[rows], track.lead_position_m[rows], spare_copies=spare_copies)
+    wild = rows[is_wild]
     # Where a person has looked, the person is right.
     wild = wild[~hand_corrected(track.flag[wild])] if wild.size else wild
     if not wild.size:
@@ -213,7 +217,7 @@ def reject_wild_points(track: Track) -> Track:
     for row in wild:
         flag[row] = join_flags(str(flag[row]), "rejected")
     rejected = replace(track, flag=flag)
-    note = f"{_count(wild.size)} far off the motion around and left out: {', '.join(_places(rejected))}"
+    note = f"{_count(wild.size)} far off the motion around and left out: {', '.join(_places(rejected, wild))}"
     return replace(rejected, notes=(*track.notes, note))
 
 
@@ -228,7 +232,11 @@ def listed_wild_points(tracks: Mapping[str, Track]) -> str:
     -------
     the sentence, or blank.
     """
-    places = [f"{name} at {place}" for name, track in tracks.items() for place in _places(track)]
+    places = [
+        f"{name} at {place}"
+        for name, track in tracks.items()
+        for place in _places(track, np.flatnonzero(["rejected" in str(flag) for flag in track.flag]))
+    ]
     if not places:
         return ""
     more = f" and {len(places) - MOST_NAMED} more" if len(places) > MOST_NAMED else ""
@@ -239,9 +247,8 @@ def _count(points: int) -> str:
     return "1 point lies" if points == 1 else f"{points} points lie"
 
 
-def _places(track: Track) -> list[str]:
+def _places(track: Track, wild: NDArray[np.int_]) -> list[str]:
     """Instant of every rejected point and its distance from the line between its usable neighbours, in words."""
-    wild = np.flatnonzero([("rejected" in str(flag)) for flag in track.flag])
     others = np.flatnonzero(track.usable)
     off_m = track.lead_position_m[wild] - np.interp(
         track.time_s[wild], track.time_s[others], track.lead_position_m[others]
@@ -253,7 +260,7 @@ def _places(track: Track) -> list[str]:
     ]
 
 
-def _far_off(time_s: Floats, position_m: Floats, limit: float) -> NDArray[np.bool_]:
+def _far_off(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> NDArray[np.bool_]:
     """Points beyond the limit that are the worst among their neighbours."""
     noise_m, _ = position_noise(time_s, position_m)
     # The likelihood of stretches takes wild points for noise where they are many; the median third difference does not.
@@ -264,9 +271,9 @@ def _far_off(time_s: Floats, position_m: Floats, limit: float) -> NDArray[np.boo
     step_m = np.abs(fit.speed_m_s) * float(np.median(np.diff(time_s)))
     from_end = np.minimum(np.arange(size.size), np.arange(size.size)[::-1])
     room_m = np.where(from_end < END_POINTS, END_STEPS * (from_end + 1) * step_m, 0.0)
-    after = np.concatenate([[math.inf], np.abs(np.diff(position_m))])
-    copy = after < COPY_STEPS * step_m
-    alone = (fit.share >= LEAST_SHARE) & (fit.near >= LEAST_NEAR) & ~copy
+    alone = (fit.share >= LEAST_SHARE) & (fit.near >= LEAST_NEAR)
+    if spare_copies:
+        alone[1:] &= np.abs(np.diff(position_m)) >= COPY_STEPS * step_m[1:]
     return np.asarray((size > limit * fit.gain * sigma_m + room_m) & alone & (sigma_m > 0))
 
 
