@@ -79,6 +79,18 @@ def test_a_wild_point_that_lies_near_the_one_before_is_no_copy_and_rejected(row,
     np.testing.assert_array_equal(out.time_s, time_s)
 
 
+@pytest.mark.parametrize("row", [0, 1, 298, 299])
+@pytest.mark.parametrize("steps", [-0.9, 0.9])
+def test_at_the_ends_a_motion_may_have_stopped_or_begun_and_not_the_other_way(row, steps):
+    """Growth of 5.6 mm a frame all along: what stops falls behind it, what has not begun is ahead of it."""
+    time_s = np.arange(300) * FRAME_S
+    y = 6.0 * time_s + ar1(300, 3e-5, 0.0, np.random.default_rng(20004))
+    track = displaced(make_track(time_s, y), np.array([row]), steps * 6.0 * FRAME_S)
+    assert np.flatnonzero(reject_wild_points(track).flag == "rejected").tolist() == (
+        [row] if (steps > 0) == (row > 1) else []
+    )
+
+
 def test_a_wild_point_is_no_dropped_frame():
     """A point one step ahead, the size of a dropped frame's jump: the times stay as they are."""
     track = steady_track(noise_m=2e-5)

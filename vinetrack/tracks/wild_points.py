@@ -53,9 +53,10 @@ efficiency, wider since only points far off matter here."""
 
 END_POINTS, END_STEPS = 2, 1.5
 """Within so many points of an end the motion may have stopped or begun between the frames: so many frames' steps for
-each point from the end are then no sign of a wild one. Chosen: growth ends or begins within a frame, which displaces
-the last points by up to a step each. By reasoning: without it the last point before a stop is rejected; at twice, wild
-points of three steps at the ends stay."""
+each point from the end are then no sign of a wild one, behind the motion at the end of a track and ahead of it at the
+beginning. Chosen: growth ends or begins within a frame, which displaces the last points by up to a step each. By
+reasoning: without it the last point before a stop is rejected; at twice, wild points of three steps at the ends
+stay."""
 
 COPY_STEPS = 0.3
 """A point this close to the one before, in steps of the motion, may be a repeated frame: `frame_timing` judges it
@@ -269,7 +270,8 @@ def _far_off(time_s: Floats, position_m: Floats, limit: float, spare_copies: boo
     sigma_m = np.maximum(np.maximum(running_noise(np.abs(fit.residual_m) / fit.gain), noise_m), fit.spread_m)
     size = np.abs(fit.residual_m)
     step_m = np.abs(fit.speed_m_s) * float(np.median(np.diff(time_s)))
-    from_end = np.minimum(np.arange(size.size), np.arange(size.size)[::-1])
+    behind = fit.residual_m * fit.speed_m_s < 0
+    from_end = np.where(behind, np.arange(size.size)[::-1], np.arange(size.size))
     room_m = np.where(from_end < END_POINTS, END_STEPS * (from_end + 1) * step_m, 0.0)
     alone = (fit.share >= LEAST_SHARE) & (fit.near >= LEAST_NEAR)
     if spare_copies:
