@@ -24,6 +24,7 @@ from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_rat
 from vinetrack.diagnosis.linear_power import power_of
 from vinetrack.diagnosis.lost_frames import frames_put_right, lost_in_fit, with_lost_frames
 from vinetrack.diagnosis.misfit_tests import MisfitTests
+from vinetrack.diagnosis.odd_trials import odd_trials, with_odd_trials
 from vinetrack.diagnosis.result import (
     ADEQUATE,
     AMBIGUOUS,
@@ -130,9 +131,19 @@ def diagnose(
         report("fitting the model")
         fit = initial_fit(model, pairs, questioned, profile=False)
         fit = replace(fit, left_out={**left_out, **fit.left_out})
-    effects, blind = testable(questioned, fit.predictor.data)
-    findings = select_effects(fit, effects, report)
-    result = _conclude(fit, findings, blind)
+    result = _questioned(fit, questioned, report)
+    if not isinstance(source, Fit):
+        result = with_odd_trials(
+            result,
+            odd_trials(fit.predictor.data),
+            lambda names: _questioned(
+                initial_fit(
+                    fit.model, [pair for pair in pairs if pair[0].name not in names], questioned, profile=False
+                ),
+                questioned,
+                report,
+            ),
+        )
     result = with_lost_frames(result, missing)
     if wild:
         result = replace(result, notes=(*result.notes, wild))
@@ -145,6 +156,12 @@ def diagnose(
     if advice:
         result = _with_advice(result, limits, report)
     return result
+
+
+def _questioned(fit: Fit, questioned: Sequence[Effect], report: Report) -> Diagnosis:
+    """What a fit lacks of these effects, in words and tables."""
+    effects, blind = testable(questioned, fit.predictor.data)
+    return _conclude(fit, select_effects(fit, effects, report), blind)
 
 
 def _settings(

@@ -113,7 +113,7 @@ def _scan(
     layout: ParameterMap, data: Sequence[FitTrial], predictor: Predictor, theta: Floats, trial_effects: Floats
 ) -> list[Floats]:
     """For each exponent the best B of every vine."""
-    speed = np.array([_speed(trial_data) for trial_data in data])
+    speed = np.array([middle_speed(trial_data) for trial_data in data])
     drive = np.array([_drive(trial_data) for trial_data in data])
     free_n = [k for k, number in enumerate(layout.free) if number.key == EXPONENT]
     key = layout.keys.index(DAMPING)
@@ -151,8 +151,18 @@ def _held_exponent(layout: ParameterMap) -> float:
     return float(layout.base[0, names.index(EXPONENT)]) if EXPONENT in names else 1.0
 
 
-def _speed(trial_data: FitTrial) -> float:
-    """Tail speed in the last part of the motion, m/s."""
+def middle_speed(trial_data: FitTrial) -> float:
+    """Speed of the tail from 40 to 85 % of the growth that was seen.
+
+    Parameters
+    ----------
+    trial_data : of one trial.
+
+    Returns
+    -------
+    float, m/s
+        Above 0.
+    """
     y = trial_data.lead_position_m - trial_data.lead_position_m[: max(trial_data.n_rest, 1)].mean()
     total = float(np.max(y))
     low, high = (int(np.argmax(y >= part * total)) for part in (0.4, 0.85))

@@ -24,6 +24,7 @@ from vinetrack.narrative.verdict_summary import joined, size
 if TYPE_CHECKING:
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
     from vinetrack.diagnosis.misfit_tests import MisfitTests
+    from vinetrack.diagnosis.odd_trials import OddTrial
     from vinetrack.diagnosis.selection import SelectionStep
 
 MEASUREMENT = "measurement"
@@ -235,6 +236,33 @@ def _runner_up(finding: SelectionStep) -> str:
     for name, why in finding.aside:
         text += f" {name} fits as well, but {why}."
     return text
+
+
+def odd_in_words(odd: Sequence[OddTrial], count: int) -> str:
+    """Return what to say of trials that do not go with the others.
+
+    Parameters
+    ----------
+    odd : at least one.
+    count : of all trials.
+
+    Returns
+    -------
+    str
+    """
+    names = joined([trial.name for trial in odd])
+    alone = len(odd) == 1
+    like = [
+        f"{'it' if alone else trial.name} moves as with {trial.like_Pa / 1e3:.3g} kPa, and"
+        f" {trial.stated_Pa / 1e3:.3g} kPa is stated"
+        for trial in odd
+        if trial.like_Pa > 0
+    ]
+    return (
+        f"{names} {'does' if alone else 'do'} not go with the other {count - len(odd)} trials"
+        f"{': ' if like else ''}{'; '.join(like)}. Look at {'its row' if alone else 'their rows'} in the sheet and at "
+        "what was filmed; `use: no` leaves a trial out."
+    )
 
 
 def dropped_in_words(trials: Sequence[str]) -> str:

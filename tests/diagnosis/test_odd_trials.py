@@ -1,0 +1,149 @@
+"""Rows of a sheet that belong to other recordings, in campaigns that scipy grows; seeds 20000 and up."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lsoda_vine import grown_position, vine_trial
+from vine_truth import make_track
+
+from vinetrack.core.records import Track, Trial
+from vinetrack.diagnosis.diagnose import diagnose
+from vinetrack.diagnosis.odd_trials import OddTrial, odd_trials, with_odd_trials
+from vinetrack.diagnosis.result import Diagnosis
+from vinetrack.inference.fit_data import FitError, prepare
+
+PRESSURES_KPA = (18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)
+
+
+def grown(name: str, kPa: float, seed: int, diameter_mm: float = 12.0) -> tuple[Trial, Track]:
+    trial = vine_trial("", kPa, diameter_mm, length_m=0.3, growth_angle_rad=np.pi / 2)
+    draw = np.random.default_rng(seed)
+    time = np.arange(0, 0.3, 0.001)
+    position = grown_position(trial, time - 0.02, 1.83 * np.exp(0.02 * draw.normal()), 0.37)
+    time, position = time[np.isfinite(position)], position[np.isfinite(position)]
+    trial = replace(trial, name=name, vine="12mm", condition=f"12mm_{kPa}")
+    return trial, make_track(time, position + draw.normal(0, 1e-4, time.size))
+
+
+@pytest.fixture(scope="module")
+def campaign() -> list[tuple[Trial, Track]]:
+    return [grown(f"t{k}", kPa, 20000 + k) for k, kPa in enumerate(PRESSURES_KPA)]
+
+
+def stated(pairs: list[tuple[Trial, Track]], **kPa: float) -> list[tuple[Trial, Track]]:
+    """The campaign with other pressures in these rows, and other conditions therefore."""
+    return [
+        (
+            replace(trial, pressure_Pa=1e3 * kPa[trial.name], condition=f"12mm_{kPa[trial.name]}")
+            if trial.name in kPa
+            else trial,
+            track,
+        )
+        for trial, track in pairs
+    ]
+
+
+def odd(pairs: list[tuple[Trial, Track]]) -> dict[str, float]:
+    return {trial.name: trial.like_Pa for trial in odd_trials(prepare(pairs)[0])}
+
+
+def test_trials_that_agree_are_none_of_them_odd(campaign):
+    assert odd(campaign) == {}
+
+
+def test_swapped_digits_are_named_with_the_pressure_that_was(campaign):
+    assert odd(stated(campaign, t2=12)) == {"t2": pytest.approx(21e3, rel=0.05)}
+
+
+def test_two_rows_that_were_exchanged_are_both_named(campaign):
+    assert odd(stated(campaign, t0=40, t11=18)) == {
+        "t0": pytest.approx(18e3, rel=0.05),
+        "t11": pytest.approx(40e3, rel=0.05),
+    }
+
+
+def test_a_trial_that_its_row_could_not_move_is_odd(campaign):
+    assert odd(stated(campaign, t5=2)) == {"t5": pytest.approx(25e3, rel=0.05)}
+
+
+def test_what_all_replicates_of_a_condition_share_is_no_slip(campaign):
+    assert odd(stated(campaign, t2=12, t3=12)) == {}
+
+
+def test_a_tenth_more_or_less_is_within_what_trials_differ_by(campaign):
+    assert odd(stated(campaign, t2=22.5)) == {}
+
+
+def test_few_trials_say_nothing_and_many_odd_ones_are_no_slips(campaign):
+    assert odd(stated(campaign[:7], t2=12)) == {}
+    assert odd(stated(campaign, t0=12, t4=10, t6=13, t9=15)) == {}
+
+
+def test_a_diagnosis_without_a_cause_names_the_row_and_says_what_the_others_say(campaign):
+    result = diagnose(stated(campaign, t2=12), candidates=["tail_friction"], ladder=False, advice=False)
+    assert result.verdict == "unexplained"
+    assert re.match(
+        r"t2 does not go with the other 11 trials: it moves as with 2[01][.\d]* kPa, and 12 kPa is stated\. Look at",
+        result.explanation,
+    )
+    assert "Without t2 the verdict is `adequate`" in result.explanation
+
+
+def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):
+    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
+    assert result.verdict == "adequate"
+    odd_ones = [OddTrial("t2", 12e3, 21e3), OddTrial("t5", 2e3, math.nan)]
+    outcome = with_odd_trials(result, odd_ones, lambda _: pytest.fail("there is nothing to ask"))
+    assert outcome.verdict == "adequate"
+    assert outcome.notes[-1].startswith(
+        "t2 and t5 do not go with the other 10 trials: t2 moves as with 21 kPa, and 12 kPa is stated. Look at their"
+    )
+
+
+@pytest.mark.parametrize("said", ["adequate", "unexplained"])
+def test_where_nothing_explains_all_trials_what_the_others_say_is_said(campaign, said):
+    """The verdict of all stays; that of the others stands beside it only where they are explained."""
+    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
+    last = replace(result.rounds[-1], verdict="unexplained")
+    unexplained = replace(result, rounds=(last,), explanation="Something is left.")
+    others = result if said == "adequate" else unexplained
+    asked: list[list[str]] = []
+    outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], lambda names: asked.append(names) or others)
+    assert asked == [["t2"]]
+    assert outcome.verdict == "unexplained"
+    if said == "adequate":
+        assert outcome.explanation.startswith("t2 does not go with")
+        assert f"Without t2 the verdict is `adequate`: {result.explanation} With t2: Something is left." in (
+            outcome.explanation
+        )
+    else:
+        assert outcome == unexplained
+
+
+def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(campaign):
+    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
+    unexplained = replace(result, rounds=(replace(result.rounds[-1], verdict="unexplained"),))
+
+    def without(_: list[str]) -> Diagnosis:
+        raise FitError("there is nothing to fit")
+
+    outcome = with_odd_trials(unexplained, [OddTrial("t2", 12e3, 21e3)], without)
+    assert outcome.notes[-1].startswith("t2 does not go with the other 11 trials")
+    assert outcome.explanation == unexplained.explanation
+
+
+def test_where_the_gauge_was_recorded_it_is_the_gauge_that_states_the_pressure(campaign):
+    data, _ = prepare(campaign)
+    data = [
+        replace(trial_data, trace=(trial_data.time_s, np.full(trial_data.time_s.size, pressure_Pa)))
+        for trial_data in data
+        for pressure_Pa in [12e3 if trial_data.trial.name == "t2" else trial_data.trial.pressure_Pa]
+    ]
+    (slip,) = odd_trials(data)
+    assert (slip.name, slip.stated_Pa) == ("t2", 12e3)
+    assert slip.like_Pa == pytest.approx(21e3, rel=0.05)
