@@ -127,6 +127,34 @@ def tube_each_replicate(laboratory: Laboratory, draw: Draw) -> Laboratory:
     return _tubes_by(laboratory, draw, lambda s: (s.vine, s.replicate), 0.08)
 
 
+def tubes_alike(sigma: float) -> Fault:
+    """Replicates with a tube each, whose B and P_y differ by so much."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        return _tubes_by(laboratory, draw, lambda s: (s.vine, s.replicate), sigma)
+
+    return apply
+
+
+def two_rows_exchanged(laboratory: Laboratory, draw: Draw) -> Laboratory:
+    """Two trials of a vine have each other's row in the sheet: their pressures differ by a third at least."""
+    shots = list(laboratory.shots)
+    pairs = [
+        (i, j)
+        for i, one in enumerate(shots)
+        for j, other in enumerate(shots)
+        if one.setting.vine == other.setting.vine
+        and one.setting.payload_g == other.setting.payload_g
+        and other.setting.pressure_kPa > 1.33 * one.setting.pressure_kPa
+    ]
+    i, j = pairs[draw.integers(len(pairs))]
+    shots[i], shots[j] = (
+        replace(shots[i], setting=shots[j].setting),
+        replace(shots[j], setting=shots[i].setting),
+    )
+    return replace(laboratory, shots=tuple(shots))
+
+
 def two_tubes_mixed(laboratory: Laboratory, draw: Draw) -> Laboratory:
     """Two tubes of each vine, whichever was at hand: B + 8 %, P_y + 0.3 kPa for the second."""
     shots = []

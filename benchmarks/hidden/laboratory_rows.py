@@ -331,7 +331,26 @@ def _clean_rows() -> list[Row]:
     return rows
 
 
-ROWS: Mapping[str, Row] = {row.name: row for row in (*_clean_rows(), *_camera_rows(), *_rig_rows(), *_order_rows())}
+def _everyday_rows() -> list[Row]:
+    """Everything at once, each a little: tubes that differ and wear, points half a percent of which are wild."""
+    usual = (faults.by_vine, faults.tubes_alike(0.04), faults.worn(0.001, 0.003), faults.wild_points(0.005, 1, 10))
+    unlike = (*ORDER, *SPECIMEN, *DAY)
+    nothing = replace(_names(*unlike, verdicts=("artefact", "ambiguous"), adequate=True), only=unlike)
+    rows = [Row("everyday", "everyday", nothing, usual, quiet=0.5, columns=WHO)]
+    for name in CLEAN_EFFECTS:
+        should = Should(("artefact", "ambiguous", "missing"), any_of=(name,), true=(name, *unlike))
+        wants = replace(EFFECTS[name][1], wide_chamber=False)
+        faulty = (*usual, faults.effect(name))
+        label = f"everyday_{name}"
+        rows.append(Row(label, label, should, faulty, wants, quiet=0.5, columns=WHO, least_sigma=CLEAR))
+    # The trials say of themselves that they do not go with the others; what they are is not for the verdict to say.
+    slip = Should(("adequate", "unexplained"))
+    return [*rows, Row("exchanged_rows", "exchanged_rows", slip, (faults.two_rows_exchanged,), quiet=0.5)]
+
+
+ROWS: Mapping[str, Row] = {
+    row.name: row for row in (*_clean_rows(), *_camera_rows(), *_rig_rows(), *_order_rows(), *_everyday_rows())
+}
 
 
 def campaign(name: str, seed: int, trials: tuple[int, int] = TRIALS, *, weighed: bool = True) -> Campaign:
