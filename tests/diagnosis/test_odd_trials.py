@@ -125,6 +125,33 @@ def test_where_nothing_explains_all_trials_what_the_others_say_is_said(campaign,
         assert outcome == unexplained
 
 
+@pytest.mark.parametrize("others_say", ["tail_friction", "air_drag", "nothing"])
+def test_a_name_stands_where_the_others_bear_it_out_and_is_taken_back_where_they_do_not(campaign, others_say):
+    result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
+    (row,) = [candidate for candidate in result.rounds[0].ranking if candidate.effect == "tail_friction"]
+    ranking = (replace(row, in_answer_set=True),)
+    last = replace(result.rounds[-1], verdict="missing", answer_set=("tail_friction",), ranking=ranking)
+    named = replace(result, rounds=(last,), effects=("tail_friction",), explanation="A friction is missing.")
+    others = {
+        "tail_friction": named,
+        "air_drag": replace(named, rounds=(replace(last, answer_set=("air_drag",)),)),
+        "nothing": result,
+    }[others_say]
+    outcome = with_odd_trials(named, [OddTrial("t2", 12e3, 21e3)], lambda _: others)
+    if others_say == "tail_friction":
+        assert (outcome.verdict, outcome.answer_set, outcome.effects) == (
+            "missing",
+            ("tail_friction",),
+            ("tail_friction",),
+        )
+        assert outcome.notes[-1].startswith("t2 does not go with the other 11 trials")
+        return
+    assert (outcome.verdict, outcome.answer_set, outcome.effects) == ("unexplained", (), ())
+    assert not any(candidate.in_answer_set for candidate in outcome.rounds[0].ranking)
+    assert f"Without t2 the verdict is `{others.verdict}`" in outcome.explanation
+    assert outcome.explanation.endswith("With t2: what the verdict would be rests on it alone. A friction is missing.")
+
+
 def test_where_the_others_cannot_be_fitted_the_row_is_named_all_the_same(campaign):
     result = diagnose(campaign, candidates=["tail_friction"], ladder=False, advice=False)
     unexplained = replace(result, rounds=(replace(result.rounds[-1], verdict="unexplained"),))

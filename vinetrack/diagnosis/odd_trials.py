@@ -7,8 +7,8 @@ without the model that failed: over the middle of its growth the tail moves abou
 
 with a bend c for what goes with another power of speed. What a trial leaves of a robust fit of these curves is held
 against what the others leave. Effects that the model lacks bend all trials of a condition alike; a pressure with its
-digits swapped does not. The verdict stays, for whether row or recording is wrong only the user can tell; but what the
-others say without it is said too.
+digits swapped does not. Whether row or recording is wrong only the user can tell: nothing is left out by itself, but
+what the others say without it is said too, and a name that rests on such trials alone is taken back.
 """
 
 from __future__ import annotations
@@ -160,10 +160,11 @@ def _curves(log_force: Floats, log_speed: Floats, place: Indices) -> Callable[[F
 
 
 def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callable[[list[str]], Diagnosis]) -> Diagnosis:
-    """What trials that do not go with the others mean for a diagnosis, where nothing else explains them.
+    """What trials that do not go with the others mean for a diagnosis.
 
-    Of an adequate model they are a note: what others scatter by does not allow for them. Where nothing explains all
-    trials, and the others are explained, that is said. A verdict that names something stays as it is.
+    Of an adequate model, and where the others bear a name out, they are a note. Where nothing explains all trials and
+    the others are explained, that is said. Where the others are explained and do not bear the name out, it rests on
+    these trials alone, and the verdict is `unexplained`.
 
     Parameters
     ----------
@@ -178,16 +179,38 @@ def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callabl
     if not odd:
         return result
     words = odd_in_words(odd, len(result.fits[0].trials))
+    noted = replace(result, notes=(*result.notes, words))
     if result.verdict == ADEQUATE:
-        return replace(result, notes=(*result.notes, words))
-    if UNEXPLAINED not in (result.verdict, result.final_verdict):
-        return result
+        return noted
     try:
         others = without([trial.name for trial in odd])
     except (FitError, SimulationError):
-        return replace(result, notes=(*result.notes, words))
+        return noted
+    nothing = UNEXPLAINED in (result.verdict, result.final_verdict)
     if UNEXPLAINED in (others.verdict, others.final_verdict):
-        return result
+        return result if nothing else noted
+    if not nothing and set(result.answer_set) & set(others.answer_set):
+        return noted
     names = joined([trial.name for trial in odd])
-    words = f"{words} Without {names} the verdict is `{others.verdict}`: {others.explanation}"
-    return replace(result, explanation=f"{words} With {names}: {result.explanation}")
+    words = f"{words} Without {names} the verdict is `{others.verdict}`: {others.explanation} With {names}:"
+    if nothing:
+        return replace(result, explanation=f"{words} {result.explanation}")
+    named = f"what the verdict would be rests on {'it' if len(odd) == 1 else 'them'} alone. {result.explanation}"
+    return _taken_back(result, f"{words} {named}")
+
+
+def _taken_back(result: Diagnosis, words: str) -> Diagnosis:
+    """A diagnosis whose names do not stand."""
+    first = result.rounds[0]
+    ranking = tuple(replace(candidate, in_answer_set=False) for candidate in first.ranking)
+    asked = replace(
+        first, verdict=UNEXPLAINED, answer_set=(), ranking=ranking, explanation=words, fits={}, sets=(), partial=()
+    )
+    return Diagnosis(
+        rounds=(replace(asked, partial_fits=()),),
+        effects=(),
+        explanation=words,
+        fits=result.fits[:1],
+        notes=result.notes,
+        power=result.power,
+    )
