@@ -72,6 +72,28 @@ def test_a_set_that_mends_everything_but_is_worth_no_more_than_chance_is_said_to
     assert step.aside == (("leak with air_drag", "it gains no more over the best smaller set than chance may"),)
 
 
+@pytest.mark.parametrize(
+    ("gained", "named"), [(970.0, [("artefact", "lens")]), (930.0, [("missing", "latch_release")])]
+)
+def test_a_lens_that_mends_nearly_all_comes_before_what_its_next_term_looks_like(
+    monkeypatch: pytest.MonkeyPatch, gained: float, named: list[tuple[str, str]]
+) -> None:
+    """Measured: a lens with a fifth order was `latch_release`, with a lens beside it."""
+    latch, lens = (
+        SimpleNamespace(name=name, kind=kind) for name, kind in (("latch_release", ""), ("lens", "measurement"))
+    )
+    singles = [SimpleNamespace(names=(e.name,), delta_chi2=gain) for e, gain in ((latch, 900.0), (lens, gained))]
+    pair = SimpleNamespace(names=("latch_release", "lens"), effects=(latch, lens), delta_chi2=1000.0, fit=None)
+    sets: Any = SimpleNamespace(
+        known=dict(enumerate(singles)), of_effects=lambda *_: None, search=SimpleNamespace(after=lambda _: None)
+    )
+    monkeypatch.setattr(selection, "_shared_step", lambda verdict, *parts: (verdict, parts[4]))
+    monkeypatch.setattr(selection, "_beside", lambda *_: SimpleNamespace(names=("lens",), effects=(lens,)))
+    monkeypatch.setattr(selection, "SelectionStep", lambda *_, **__: None)
+    steps = selection._of_sets(sets, sets, [pair], {}, sets)  # type: ignore[list-item]
+    assert [step for step in steps if step is not None] == named
+
+
 def test_every_round_says_which_effects_it_adds_together(three_missing: Diagnosis) -> None:
     first, second, *_ = three_missing.rounds
     assert len(first.sets) == 1

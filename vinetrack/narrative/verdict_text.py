@@ -98,6 +98,7 @@ def explain(finding: SelectionStep) -> str:
             f"A fault of the measurement, not of the physics: {which} explains the misfit of {model} "
             f"({_hypotheses(kept)}). It is not added to the model: "
             f"find the fault and measure again, or correct the sheet.{_remedies(finding)}{_with_the_fault(finding)}"
+            f"{_taken_up(kept[0].names)}"
         )
     text = (
         f"The misfit of {model} exceeds the noise of {trials}, and no effect of the catalogue nor any set of the best "
@@ -106,6 +107,17 @@ def explain(finding: SelectionStep) -> str:
     for name, why in finding.aside:
         text += f" The nearest is {name.replace('+', ' with ')}: {why}."
     return text + _partial_in_words(finding)
+
+
+def _taken_up(names: Sequence[str]) -> str:
+    """That effects beside a fault may stand for more of it; blank where there are none."""
+    if len(names) < 2:
+        return ""
+    takes = "takes" if len(names) == 2 else "take"
+    return (
+        f" What {names[0]} leaves, {joined(names[1:])} {takes} up here: look again once the fault is mended, for it may "
+        "be more of the same."
+    )
 
 
 def _partial_in_words(finding: SelectionStep) -> str:
