@@ -115,8 +115,8 @@ def _taken_up(names: Sequence[str]) -> str:
         return ""
     takes = "takes" if len(names) == 2 else "take"
     return (
-        f" What {names[0]} leaves, {joined(names[1:])} {takes} up here: look again once the fault is mended, for it may "
-        "be more of the same."
+        f" What {names[0]} leaves, {joined(names[1:])} {takes} up here: look again once the fault is mended, for it "
+        "may be more of the same."
     )
 
 
