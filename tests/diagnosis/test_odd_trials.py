@@ -16,6 +16,7 @@ from vinetrack.diagnosis.diagnose import diagnose
 from vinetrack.diagnosis.odd_trials import OddTrial, odd_trials, with_odd_trials
 from vinetrack.diagnosis.result import Diagnosis
 from vinetrack.inference.fit_data import FitError, prepare
+from vinetrack.narrative.verdict_summary import meaning, sentence
 
 PRESSURES_KPA = (18, 18, 21, 21, 25, 25, 29, 29, 34, 34, 40, 40)
 
@@ -92,6 +93,12 @@ def test_a_diagnosis_without_a_cause_names_the_row_and_says_what_the_others_say(
         result.explanation,
     )
     assert "Without t2 the verdict is `adequate`" in result.explanation
+    printed = str(result)
+    assert printed.startswith("unexplained: t2 does not go with the others, which are explained")
+    assert printed.rstrip().endswith("leave it out with `use: no`, and run again.")
+    assert Diagnosis.from_json(result.to_json()).odd_trials == result.odd_trials == ("t2",)
+    assert sentence(result) == "t2 does not go with the others, which are explained."
+    assert meaning(result).startswith("What the sheet says of a trial and how it moved contradict each other.")
 
 
 def test_an_odd_trial_of_an_adequate_campaign_is_a_note(campaign):

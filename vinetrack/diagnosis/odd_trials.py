@@ -191,7 +191,8 @@ def with_odd_trials(result: Diagnosis, odd: Sequence[OddTrial], without: Callabl
         return result if nothing else noted
     if not nothing and set(result.answer_set) & set(others.answer_set):
         return noted
-    names = joined([trial.name for trial in odd])
+    result = replace(result, odd_trials=tuple(trial.name for trial in odd))
+    names = joined(result.odd_trials)
     words = f"{words} Without {names} the verdict is `{others.verdict}`: {others.explanation} With {names}:"
     if nothing:
         return replace(result, explanation=f"{words} {result.explanation}")
@@ -213,4 +214,5 @@ def _taken_back(result: Diagnosis, words: str) -> Diagnosis:
         fits=result.fits[:1],
         notes=result.notes,
         power=result.power,
+        odd_trials=result.odd_trials,
     )

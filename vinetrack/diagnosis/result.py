@@ -203,7 +203,8 @@ class Diagnosis:
     `learned_table` the same as learned inside the fit.
     One that was read back has no `fits` but the numbers of the last model in `stored_parameters`; `refused` is the
     reason why no diagnosis could be made, blank where one was: there are no rounds then. `power` is what these trials
-    could have seen beside the last model.
+    could have seen beside the last model. `odd_trials` are single trials without which the others are explained, and
+    with which nothing is.
     """
 
     rounds: tuple[Round, ...]
@@ -222,6 +223,7 @@ class Diagnosis:
     stored_parameters: tuple[Number, ...] = ()
     refused: str = ""
     power: Power | None = None
+    odd_trials: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -306,6 +308,7 @@ class Diagnosis:
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
             "missing_force": None if self.missing_force is None else dict(self.missing_force),
             "notes": list(self.notes),
+            "odd_trials": list(self.odd_trials),
             "refused": self.refused or None,
             "power": None if self.power is None else self.power.to_json(),
         }
@@ -339,6 +342,7 @@ class Diagnosis:
             missing_force=content.get("missing_force"),
             notes=tuple(str(note) for note in content.get("notes") or ()),
             stored_parameters=tuple(Number.from_json(stored) for stored in content.get("parameters") or ()),
+            odd_trials=tuple(content.get("odd_trials") or ()),
             refused=str(content.get("refused") or ""),
             power=Power.from_json(content["power"]) if content.get("power") else None,
         )

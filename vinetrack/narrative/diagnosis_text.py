@@ -22,7 +22,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.narrative.between_text import difference_headline, trials_differ
 from vinetrack.narrative.power_text import could_have_seen, false_alarm_sentence, power_brief
-from vinetrack.narrative.verdict_summary import joined, sizes
+from vinetrack.narrative.verdict_summary import ODD_MEANING, joined, sentence, sizes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,9 +75,25 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     if diagnosis.next_experiment:
         lines += ["", str(diagnosis.next_experiment.get("text", ""))]
     lines += [f"! {note}" for note in diagnosis.notes]
-    if UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict):
-        lines += ["", GO_ON]
+    if onward := to_go_on(diagnosis):
+        lines += ["", onward]
     return "\n".join(lines)
+
+
+def to_go_on(diagnosis: Diagnosis) -> str:
+    """Return what to do next where nothing known explains the trials; blank elsewhere.
+
+    Parameters
+    ----------
+    diagnosis : in memory, or read back.
+
+    Returns
+    -------
+    str
+    """
+    if UNEXPLAINED not in (diagnosis.verdict, diagnosis.final_verdict):
+        return ""
+    return ODD_MEANING if diagnosis.odd_trials else GO_ON
 
 
 def verdict_line(diagnosis: Diagnosis) -> str:
@@ -99,6 +115,8 @@ def _rows(table: pd.DataFrame) -> Iterator[Any]:
 
 
 def _headline(diagnosis: Diagnosis) -> str:
+    if diagnosis.odd_trials:
+        return sentence(diagnosis).rstrip(".")
     if diagnosis.verdict == MISSING:
         return joined(list(diagnosis.effects)) + (" is missing" if len(diagnosis.effects) == 1 else " are missing")
     if diagnosis.verdict in (AMBIGUOUS, ARTEFACT) and diagnosis.answer_set:

@@ -39,6 +39,11 @@ TRIALS_DIFFER = (
     "What the model misses is a difference between trials, not physics: nothing was added. What to do is said below."
 )
 
+ODD_MEANING = (
+    "What the sheet says of a trial and how it moved contradict each other. What the others say is in the "
+    "verdict in full. Correct its row, or leave it out with `use: no`, and run again."
+)
+
 THEREAFTER = {
     MISSING: "A further effect is still missing.",
     AMBIGUOUS: "A further effect is missing, and these trials cannot tell which.",
@@ -135,9 +140,15 @@ def sentence(diagnosis: Diagnosis) -> str:
         return f"A fault of the measurement, not of the physics: {listed(answers, 'or')}."
     if verdict == ADEQUATE:
         return "No missing effect can be detected."
+    if diagnosis.odd_trials:
+        return f"{joined(diagnosis.odd_trials)} {_do_not_go(diagnosis)} with the others, which are explained."
     if verdict == UNEXPLAINED:
         return "The model fails, and no effect of the catalogue explains it."
     return "No diagnosis could be made."
+
+
+def _do_not_go(diagnosis: Diagnosis) -> str:
+    return "does not go" if len(diagnosis.odd_trials) == 1 else "do not go"
 
 
 def meaning(diagnosis: Diagnosis) -> str:
@@ -151,6 +162,8 @@ def meaning(diagnosis: Diagnosis) -> str:
     -------
     str
     """
+    if diagnosis.odd_trials:
+        return ODD_MEANING
     text = MEANINGS.get(diagnosis.verdict, diagnosis.refused)
     if diagnosis.verdict == ARTEFACT and trials_differ(list(diagnosis.answer_set)):
         text = TRIALS_DIFFER
@@ -207,6 +220,8 @@ def _significance(diagnosis: Diagnosis) -> Fact | None:
         best = max(scored, key=lambda row: abs(row.sigma), default=None)
         note = f"the best of {len(scored)} candidates: {plain(best.effect)}" if best else ""
         return Fact("Most significant candidate", f"{_sigmas(best)} σ", note) if best else None
+    if diagnosis.odd_trials:
+        return None
     if verdict == UNEXPLAINED and best is not None:
         note = f"{_sigmas(best)} σ better" + (f", but {best.reason}" if best.reason else "")
         return Fact("Nearest candidate", plain(best.effect), note)

@@ -17,8 +17,7 @@ import numpy as np
 
 from vinetrack.core.numbers import with_error
 from vinetrack.core.tables import write_csv, write_json
-from vinetrack.diagnosis.result import UNEXPLAINED
-from vinetrack.narrative.diagnosis_text import GO_ON, verdict_line
+from vinetrack.narrative.diagnosis_text import to_go_on, verdict_line
 from vinetrack.narrative.power_text import power_brief
 from vinetrack.narrative.verdict_summary import facts, joined, settled_rows
 from vinetrack.pipeline.model_stage import INTERNAL_FAULT, measured, model_errors
@@ -364,7 +363,7 @@ def diagnosis_lines(folder: Path) -> list[str]:
         *([f"{beside[0].upper()}{beside[1:]}"] if beside and beside not in headline else []),
         *_damping_line(diagnosis),
         *(f"! {note}" for note in diagnosis.notes),
-        *([GO_ON] if UNEXPLAINED in (diagnosis.verdict, diagnosis.final_verdict) else []),
+        *filter(None, [to_go_on(diagnosis)]),
     ]
 
 
