@@ -6,7 +6,7 @@
 
 Every campaign comes from a simulator that shares no code with the package (`benchmarks/hidden/`), is written as an
 experiment folder, and goes to `vinetrack.diagnose` as that folder. A row is one kind of laboratory
-(`benchmarks/hidden/laboratory_rows.py`), with the answers that are right about it. `--answers` keeps every answer as it
+(`benchmarks/hidden/laboratory_kinds.py`), with the answers that are right about it. `--answers` keeps every answer as it
 comes; begun again, what is there is not asked again. `--trials` are the fewest and the most trials of a campaign.
 
 Seeds 20000–20999 tune, 30000–39999 score: nothing may be tuned on those.
@@ -26,7 +26,8 @@ from pathlib import Path
 
 import pandas as pd
 from hidden.laboratory_folder import write_experiment, write_truth
-from hidden.laboratory_rows import ROWS, TRIALS, campaign
+from hidden.laboratory_kinds import TRIALS
+from hidden.laboratory_rows import ROWS, campaign
 from hidden.verdicts import Answer, judge
 from tqdm import tqdm
 

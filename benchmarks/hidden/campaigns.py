@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hidden.designs import Setting, Wants, design
+from hidden.designs import FILM_KG_M3, Setting, Wants, design
 from hidden.kinds import EFFECTS, INTERRUPTED, KINDS, OUTSIDERS, Scene
 from hidden.kinds import Hidden as Change
 from hidden.motion import Floats, Physics, Tube, follow
@@ -176,7 +176,7 @@ def _joined(changes: list[Change]) -> Change:
             {**out.values, **one.values},
             *(
                 getattr(out, name) + getattr(one, name)
-                for name in ("pressure_gain", "pressure_offset_Pa", "diameter", "scale", "bow_per_m", "clock")
+                for name in ("pressure_gain", "pressure_offset_Pa", "diameter", "film", "scale", "bow_per_m", "clock")
             ),
         )
     return out
@@ -210,6 +210,7 @@ def _stated(
             chamber=one.chamber_l / 1e3 if math.isfinite(one.chamber_l) else math.inf,
             inlet_area=math.pi * (one.inlet_mm / 1e3) ** 2 / 4 if math.isfinite(one.inlet_mm) else math.inf,
             has_bends=float(bool(one.bends_mm)),
+            film_density=FILM_KG_M3 * (1 + change.film),
         )
         trials.append(trial)
         tubes.append(tube)

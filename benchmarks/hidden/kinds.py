@@ -15,8 +15,8 @@ from hidden.designs import Setting, Wants
 class Hidden:
     """Changes that one hidden thing makes: to the physics, to the tube as stated, to what the camera reports.
 
-    `values` are the true parameters by the names that the catalogue uses, `pressure_*` and `diameter` what was of what
-    was read, `scale`, `bow` and `clock` what is reported of what was.
+    `values` are the true parameters by the names that the catalogue uses, `pressure_*`, `diameter` and `film` what was
+    of what was read, `scale`, `bow` and `clock` what is reported of what was.
     """
 
     physics: Mapping[str, float] = field(default_factory=dict)
@@ -24,6 +24,7 @@ class Hidden:
     pressure_gain: float = 0.0
     pressure_offset_Pa: float = 0.0
     diameter: float = 0.0
+    film: float = 0.0
     scale: float = 0.0
     bow_per_m: float = 0.0
     clock: float = 0.0
@@ -159,6 +160,11 @@ def _pressure_gauge(draw: Draw, scene: Scene) -> Hidden:
     return Hidden(values={"pressure_gauge.delta": delta}, pressure_offset_Pa=delta)
 
 
+def _film_mass(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
+    eps = _either(draw, 0.02, 0.2)
+    return Hidden(values={"film_mass.eps": eps}, film=eps)
+
+
 def _area_scale(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
     eps = _either(draw, 0.01, 0.05)
     return Hidden(values={"area_scale.eps": eps}, diameter=eps)
@@ -213,6 +219,7 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "pressure_gain": (_pressure_gain, Wants(quiet=True)),
     "pressure_gauge": (_pressure_gauge, Wants()),
     "area_scale": (_area_scale, Wants(quiet=True)),
+    "film_mass": (_film_mass, Wants(quiet=True)),
     "perspective": (_perspective, Wants()),
 }
 """Every effect of the catalogue that a vine released at its full pressure can show, at sizes that are plausible."""
@@ -220,7 +227,7 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
 INTERRUPTED: dict[str, tuple[Maker, Wants]] = {"static_yield": (_static_yield, Wants())}
 """Effects that show only where the pressure is let down and up again while the camera runs."""
 
-MEASUREMENT = ("length_scale", "time_base", "pressure_gain", "pressure_gauge", "area_scale", "perspective")
+MEASUREMENT = ("length_scale", "time_base", "pressure_gain", "pressure_gauge", "area_scale", "film_mass", "perspective")
 
 PAIRS: tuple[tuple[str, str], ...] = (
     ("tail_friction", "length_scale"),

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 import vinetrack as vt
+from hidden.designs import FILM_KG_M3
 from hidden.motion import Floats, Physics, Tube, follow
 from vinetrack.core.records import Bend, Trial
 
@@ -49,6 +50,7 @@ SIZES: dict[str, tuple[Mapping[str, float], Mapping[str, float]]] = {
     "pressure_gain": ({}, {"eps": 0.05}),
     "pressure_gauge": ({}, {"delta": 900.0}),
     "area_scale": ({}, {"eps": -0.03}),
+    "film_mass": ({}, {"eps": 0.08}),
     "perspective": ({}, {"k": 0.2}),
 }
 """Sizes by effect: as the generator names them, and as the catalogue does."""
@@ -99,6 +101,7 @@ def ours(effect: str, trial: Trial, times: Floats, B: float, n: float) -> Floats
         inlet_area=math.pi * trial.inlet_m**2 / 4,
         reel=float(trial.tail_store == "reel"),
         has_bends=float(bool(trial.bends)),
+        film_density=FILM_KG_M3 * (1 + values["eps"] if effect == "film_mass" else 1.0),
     )
     bends = np.array([(bend.start_m, bend.arc_m, bend.radius_m) for bend in trial.bends]).reshape(-1, 3)
     clock = 1 + eps if effect == "time_base" else 1.0

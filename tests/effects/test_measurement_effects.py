@@ -81,6 +81,17 @@ def test_area_scale_changes_area_and_film(vine: Vine) -> None:
     assert_same_motion(vine, {"area_scale.eps": 0.03}, acceleration)
 
 
+@pytest.mark.parametrize("vine", [BARE, LOADED], ids=["bare", "loaded"])
+def test_heavier_film_leaves_forces_and_payload(vine: Vine) -> None:
+    lam = 1.05 * 1200 * math.pi * vine.D * vine.t
+
+    def acceleration(_t: float, x: float, v: float) -> float:
+        m = lam * (vine.L - x / 2) + vine.payload
+        return (0.5 * (vine.P - vine.P_y) * vine.A + m * G - 0.5 * vine.B * v**N) / m
+
+    assert_same_motion(vine, {"film_mass.eps": 0.05}, acceleration)
+
+
 @pytest.mark.parametrize(("stated", "true"), [(LEVEL, LOADED), (LOADED, LEVEL)], ids=["hangs", "level"])
 def test_a_growth_angle_counted_from_the_level_has_the_weight_of_the_other_direction(stated: Vine, true: Vine) -> None:
     assert_same_motion(stated, {"growth_angle.f": 1.0}, lambda _t, x, v: true.base(x, v) / true.m(x))

@@ -81,6 +81,16 @@ def test_a_clock_is_a_gain_of_pressure_and_damping_on_the_level() -> None:
     assert gap(LOADED, slow, other) > 1e-4  # gravity does not follow the clock
 
 
+def test_heavy_film_is_a_slow_clock_on_the_level_without_payload() -> None:
+    # (1 + ε) m ẍ = F − B ẋⁿ is the motion of m in the time t/s, s² = 1 + ε, with B s⁻ⁿ.
+    s = 1.03
+    bare = Vine(**{**LEVEL.__dict__, "payload": 0.0})
+    heavy = {"film_mass.eps": s**2 - 1}
+    slow = {"time_base.eps": s - 1, "eversion_damping.B": bare.B * s**-0.37}
+    assert gap(bare, heavy, slow) < SAME
+    assert gap(LEVEL, heavy, slow) > 1e-4  # a payload is weighed for itself
+
+
 def test_area_is_a_gain_of_pressure_with_heavy_payload_and_exactly_with_weighed_film() -> None:
     # Film as weighed: what area_scale adds to λ is taken out of the thickness.
     weighed = Vine(**{**LOADED.__dict__, "t": LOADED.t / 1.03})

@@ -16,7 +16,8 @@ from hidden import laboratories as faults
 from hidden.balls import fallen
 from hidden.designs import Wants
 from hidden.laboratory_folder import write_experiment, write_truth
-from hidden.laboratory_rows import BARE, ROWS, campaign
+from hidden.laboratory_kinds import BARE
+from hidden.laboratory_rows import ROWS, campaign
 from hidden.motion import AIR, G, Physics, Tube, follow
 from hidden.shots import Camera, Laboratory, Shot, careful, film, opened, plan, seen
 from hidden.slack import follow_slack

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,13 +45,16 @@ class CandidateShape:
     """One way to try an effect: its first parameter is the size, the others are held at `other_values`.
 
     `step` is how much of the size is put in to see what it does; a `whole` one is a size in itself, because small
-    sizes of this effect do something else or nothing.
+    sizes of this effect do something else or nothing. With `vine`, it acts on the trials of that vine alone, and
+    `other_vines` are those without it.
     """
 
     effect: Effect
     other_values: tuple[float, ...]
     step: float
     whole: bool = False
+    vine: str = ""
+    other_vines: tuple[str, ...] = ()
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -105,13 +108,17 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
     return tuple(able), reasons
 
 
-def shapes_of(effect: Effect) -> list[CandidateShape]:
+def shapes_of(effect: Effect, vines: Sequence[str] = ()) -> list[CandidateShape]:
     """The ways in which an effect is tried: every combination of two or three plausible values of what shapes it.
+
+    One whose size each vine has for itself is tried in all vines alike, and in each of several alone.
 
     Parameters
     ----------
     effect
         An effect of the catalogue or of the user.
+    vines : sequence of str
+        Vines of the trials.
 
     Returns
     -------
@@ -125,6 +132,11 @@ def shapes_of(effect: Effect) -> list[CandidateShape]:
     if others or effect.finite:
         middle = [values for k, values in enumerate(combinations) if k == len(combinations) // 2]
         shapes += whole_shapes(effect, middle)
+    if size.shared == "vine" and len(vines) > 1:
+        shapes += [
+            replace(shapes[0], vine=vine, other_vines=tuple(other for other in vines if other != vine))
+            for vine in vines
+        ]
     return shapes
 
 

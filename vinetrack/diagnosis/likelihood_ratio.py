@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.diagnosis.candidates import is_plausible
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
@@ -120,7 +121,7 @@ def likelihood_ratio(
         effects=tuple(effects),
         fit=after,
         delta_chi2=fall,
-        sigma=math.copysign(math.sqrt(abs(fall)), fall) / ratio,
+        sigma=_in_sigmas(fall, effects, after) / ratio,
         plausible=plausible,
         reason=nothing or reason,
         credible=not nothing and plausibility(effects, after, CREDIBLE)[0],
@@ -138,13 +139,33 @@ def _compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
     for effect in effects:
         # Differences between groups are contrasts: each group's own may be uncertain where their differences are not.
         for parameter in () if effect.kind == BETWEEN_TRIALS else effect.parameters[:1]:
-            for number in after.numbers:
-                known = number.key == f"{effect.name}.{parameter.name}" and math.isfinite(number.sigma)
-                if known and abs(number.value - parameter.zero) < LEAST_SIGMAS * number.sigma:
-                    return (
-                        f"its size, {number.symbol} = {number.value:.2g} ± {number.sigma:.2g}, is compatible with none"
-                    )
+            key = f"{effect.name}.{parameter.name}"
+            known = [number for number in after.numbers if number.key == key and math.isfinite(number.sigma)]
+            # Where each vine has a size of its own, one that is not nothing is enough.
+            away = [abs(number.value - parameter.zero) / number.sigma for number in known if number.sigma > 0]
+            if away and max(away) < LEAST_SIGMAS:
+                number = known[0]
+                return f"its size, {number.symbol} = {number.value:.2g} ± {number.sigma:.2g}, is compatible with none"
     return ""
+
+
+def _in_sigmas(fall: float, effects: Sequence[Effect], after: Fit) -> float:
+    """A fall of −2 ln L in standard deviations of a normal deviate that is as rare, by Wilks' theorem.
+
+    One number for each effect, whatever shapes it has; but where each vine has a size of its own, as many.
+    """
+    by_vine = {f"{effect.name}.{p.name}" for effect in effects for p in effect.parameters if p.shared == "vine"}
+    count = sum(number.key in by_vine for number in after.numbers)
+    if count < 2 or fall <= 0:
+        return math.copysign(math.sqrt(abs(fall)), fall)
+    # Where the chance underflows, the first terms of its asymptotic series: Abramowitz & Stegun 6.5.32.
+    a, x = 0.5 * count, 0.5 * fall
+    chance = float(gammaincc(a, x))
+    if chance > 0:
+        log_chance = math.log(chance)
+    else:
+        log_chance = (a - 1) * math.log(x) - x - math.lgamma(a) + math.log1p((a - 1) / x)
+    return max(float(-ndtri_exp(log_chance - math.log(2))), 0.0)
 
 
 def plausibility(effects: Sequence[Effect], after: Fit, widened: float = 1.0) -> tuple[bool, str]:

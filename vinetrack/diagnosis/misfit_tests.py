@@ -288,7 +288,7 @@ class MisfitTests:
         return (
             Number(
                 key=f"{effect.name}.{parameter.name}",
-                vine="",
+                vine=self.answers.shapes[place].vine,
                 symbol=parameter.symbol,
                 unit=parameter.unit,
                 value=value,
@@ -319,7 +319,8 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTes
     MisfitTests
     """
     effects = tuple(effect for effect in effects if effect.name not in fit.model)
-    shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect)]
+    vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
+    shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, vines)]
     answers = effect_sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials)
     columns = systematics.put_back(fit_columns(fit))

@@ -214,7 +214,9 @@ def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
         size = float(np.clip(size, -reach, reach))
     if parameter.sign * size < 0 or size == 0:
         size = parameter.sign * abs(shape.step) or shape.step
-    values = (float(np.clip(parameter.zero + size, low, high)), *shape.other_values)
+    begun = float(np.clip(parameter.zero + size, low, high))
+    of_vines = dict.fromkeys(shape.other_vines, parameter.zero) | {shape.vine: begun}
+    values: tuple[Value, ...] = (of_vines if shape.vine else begun, *shape.other_values)
     return {f"{effect.name}.{known.name}": value for known, value in zip(effect.parameters, values, strict=True)}
 
 
@@ -395,11 +397,11 @@ def starts_of(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
     -------
     list of Start
     """
-    seen: set[tuple[float, ...]] = set()
+    seen: set[str] = set()
     starts: list[Start] = []
     for shape, size in shapes:
         start = start_of(shape, size)
-        key = tuple(round(float(value), 12) for value in start.values())  # type: ignore[arg-type]
+        key = repr(start)
         if key not in seen:
             seen.add(key)
             starts.append(((shape.effect,), start))

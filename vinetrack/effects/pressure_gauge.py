@@ -8,7 +8,8 @@ Read on one gauge, δ cancels in P − P_y and nothing changes.
 
 Easily taken for an error of P_y: in the base model P_y − δ is exactly the same, and no trial tells them apart.
 
-Reduce it by zeroing the gauge before each trial, and reading P_y on it too.
+Reduce it by zeroing the gauge before each trial, and reading P_y on it too: an error of P_y looks exactly the same, so
+measure that again as well.
 
 Source: the zero error of a gauge; Eq. (2) of Alvarez et al. (2025) knows P − P_y only.
 """

@@ -1,0 +1,92 @@
+"""Film that weighs other than thickness and density say: a size for each vine, asked of all and of each alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hidden.laboratory_folder import write_experiment
+from hidden.laboratory_rows import campaign
+from scipy.stats import norm
+
+import vinetrack as vt
+from vinetrack.diagnosis.candidates import shapes_of
+from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
+from vinetrack.diagnosis.likelihood_ratio import _compatible_with_nothing, _in_sigmas
+from vinetrack.diagnosis.multi_start import start_of, starts_of
+from vinetrack.effects import catalogue
+
+FILM, DRAG = catalogue()["film_mass"], catalogue()["air_drag"]
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory):
+    """The truth about two vines whose film is off by +1.4 and −8.3 per cent, and what is said of them."""
+    folder = tmp_path_factory.mktemp("film") / "e"
+    known = campaign("film_uneven", 909, (24, 26))
+    write_experiment(known, folder)
+    return known.truth["truths"], vt.diagnose(vt.read_experiment(folder), ladder=False, advice=False)
+
+
+def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
+    truths, said = answered
+    assert (said.verdict, said.answer_set) == ("artefact", ("film_mass",))
+    (named,) = [candidate for candidate in said.rounds[0].ranking if candidate.effect == "film_mass"]
+    assert len({number.vine for number in named.numbers}) == 2
+    for k, number in enumerate(named.numbers):
+        assert abs(number.value - truths[f"film_mass.eps.{k}"]) < 3 * number.sigma < 0.03
+
+
+def test_a_vine_is_asked_alone_where_there_are_several():
+    assert [shape.vine for shape in shapes_of(FILM)] == [""]
+    assert [shape.vine for shape in shapes_of(FILM, ["a"])] == [""]
+    assert [(s.vine, s.other_vines) for s in shapes_of(FILM, ["a", "b"])] == [("", ()), ("a", ("b",)), ("b", ("a",))]
+    assert not any(shape.vine for shape in shapes_of(DRAG, ["a", "b"]))
+
+
+def test_what_one_vine_answers_alone_adds_up_to_what_all_answer(answered):
+    fit = answered[1].fits[0]
+    vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
+    asked = effect_sensitivities(fit, shapes_of(FILM, vines))
+    assert [shape.vine for shape in asked.shapes] == ["", *vines]
+    for trial, columns in zip(fit.trials, asked.columns, strict=True):
+        alone = {vine: columns[:, 1 + k] for k, vine in enumerate(vines)}
+        assert np.any(alone.pop(trial.trial.vine))
+        assert not any(np.any(of_other) for of_other in alone.values())
+        np.testing.assert_allclose(columns[:, 1:].sum(axis=1), columns[:, 0], rtol=0.02, atol=1e-5)
+
+
+def test_a_fit_begins_from_the_vine_that_was_asked():
+    shapes = shapes_of(FILM, ["a", "b"])
+    assert start_of(shapes[0], 0.1) == {"film_mass.eps": 0.1}
+    assert start_of(shapes[2], 0.1) == {"film_mass.eps": {"a": 0.0, "b": 0.1}}
+    assert len(starts_of((shape, 0.1) for shape in [*shapes, shapes[1]])) == 3
+
+
+@pytest.mark.parametrize("fall", [4.0, 30.0, 3000.0])
+def test_sizes_of_several_vines_count_as_so_many_numbers(answered, fall):
+    fit = answered[1].fits[0]
+    assert _in_sigmas(fall, (DRAG,), fit) == math.sqrt(fall)
+    assert _in_sigmas(-fall, (FILM,), fit) == -math.sqrt(fall)
+    with_film = vt.refit(fit, fit.model + "film_mass")
+    got = _in_sigmas(fall, (FILM,), with_film)
+    # Of two numbers the chance of such a fall is exp(−fall/2).
+    assert got < math.sqrt(fall)
+    assert norm.logsf(got) + math.log(2) == pytest.approx(-fall / 2, rel=1e-6)
+
+
+def test_a_size_that_is_something_in_one_vine_is_something(answered):
+    after = vt.refit(answered[1].fits[0], answered[1].fits[0].model + "film_mass")
+    first, second = (number for number in after.numbers if number.key == "film_mass.eps")
+    nothing = replace(first, value=0.1 * first.sigma)
+    assert not _compatible_with_nothing((FILM,), _numbers(after, nothing, second))
+    again = replace(second, value=0.1 * second.sigma)
+    assert "compatible with none" in _compatible_with_nothing((FILM,), _numbers(after, nothing, again))
+
+
+def _numbers(fit, *changed):
+    """A fit with these numbers in place of its own of the same names."""
+    by_name = {number.name: number for number in changed}
+    return replace(fit, numbers=tuple(by_name.get(number.name, number) for number in fit.numbers))

@@ -1,0 +1,43 @@
+"""Film mass: the film of a vine weighs more or less than its thickness and density say.
+
+Matters for all that accelerates: film is sold to within 10 % of its thickness, and its density is 1200 kg/m³ unless the
+settings say otherwise, where polyethylene has 920. A light vine starts by its mass, and slows by it as it grows.
+
+    λ → (1 + ε) λ for each vine, what was of what was computed from thickness, diameter and density
+
+Easily taken for `time_base` and `area_scale`, which change the mass beside the forces; for `pressure_gain`, which
+changes the forces beside the mass; where several vines differ, for `n_by_vine` and `wall_stretch`.
+
+Reduce it by weighing a piece of each vine: its mass over its length is λ.
+
+Source: Eq. (2) of Alvarez et al. (2025); ASTM D6988 on the thickness of film.
+"""
+
+from vinetrack.effects import Parameter, Worked
+
+KIND = "measurement"
+NEEDS = ("thickness_um",)
+ORDER = 3  # convention: see `Effect`, its place among those of one hook
+EASILY_TAKEN_FOR = ("time_base", "area_scale", "pressure_gain", "fold_inertia", "reel_inertia")
+PARAMETERS = (
+    Parameter(
+        "eps",
+        "ε",
+        "1",
+        0.05,
+        bounds=(-0.6, 1.5),
+        shared="vine",
+        plausible=(-0.2, 0.2),
+        meaning="relative error of the film's mass per metre",
+    ),
+)
+
+
+def film_gain(s, rig, eps):  # noqa: ARG001, D103
+    return 1.0 + eps
+
+
+WORKED = (
+    Worked("film_gain", 1.05, "1 + 0.05", parameters={"eps": 0.05}),
+    Worked("film_gain", 1.0, "of no size", parameters={"eps": 0.0}),
+)
