@@ -342,7 +342,7 @@ def _film_rows() -> list[Row]:
         Row("film_density", "film_density", _names(*film, verdicts=between), (faults.film_of(920.0),), quiet=0.5),
     ]
     for name in FILM_EFFECTS:
-        should = Should(NAMED, any_of=(name,), true=(name, *film))
+        should = Should(NAMED, any_of=(name, *film), true=(name, *film))
         wants = replace(EFFECTS[name][1], wide_chamber=False)
         label = f"film_{name}"
         rows.append(Row(label, label, should, (uneven, faults.effect(name)), wants, quiet=0.5, least_sigma=CLEAR))

@@ -132,7 +132,7 @@ def beside_systematics(fit: Fit, base: Solution) -> Solution:
     Solution
         Each error has a prior of mean 0 and standard deviation 1; sensitivities stay those of the solution.
     """
-    return _beside(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials, positions=False))
+    return beside(fit, base, systematics_of(fit.predictor, fit.solution, fit.trials, positions=False))
 
 
 def beside_trace_errors(fit: Fit, base: Solution) -> Solution:
@@ -148,10 +148,22 @@ def beside_trace_errors(fit: Fit, base: Solution) -> Solution:
     Solution
         As of `beside_systematics`.
     """
-    return _beside(fit, base, recorded_pressures(fit.predictor, fit.solution))
+    return beside(fit, base, recorded_pressures(fit.predictor, fit.solution))
 
 
-def _beside(fit: Fit, base: Solution, errors: Systematics) -> Solution:
+def beside(fit: Fit, base: Solution, errors: Systematics) -> Solution:
+    """A solution with errors among its numbers, each with a prior of mean 0 and standard deviation 1.
+
+    Parameters
+    ----------
+    fit : the fit that is questioned.
+    base : its solution, smooth errors of position among its numbers where there are any.
+    errors : what one standard deviation of each does.
+
+    Returns
+    -------
+    Solution
+    """
     if not errors.n_felt:
         return base
     columns = [

@@ -127,17 +127,20 @@ class CandidateFits:
         """
         return any(hypothesis.fit.chi2_per_dof < SUSPECT for hypothesis in self.fitted.values())
 
-    def after(self, fit: Fit) -> MisfitTests:
+    def after(self, fit: Fit, *, film: bool = False) -> MisfitTests:
         """What one of its fits leaves; asked once, or, of many trials, again where other fits were asked since.
 
         Parameters
         ----------
         fit : one of the hypotheses' fits.
+        film : whether the film of each vine may weigh a little other than stated; asked anew each time.
 
         Returns
         -------
         MisfitTests
         """
+        if film:
+            return misfit_tests(with_curves(fit), self.questions.effects, LATER_LEVEL, film=True)
         for known, tests in self.tested:
             if known is fit:
                 return tests

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.diagnosis.candidates import is_plausible
+from vinetrack.diagnosis.film_allowance import film_gain
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
 from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_surprise
 from vinetrack.effects import Effect
@@ -57,6 +58,7 @@ class LikelihoodRatio:
     inflation: float = 1.0
     surprise: float = 0.0  #: by how much its sizes lie beyond what is plausible, on the scale of −2 ln L
     log_evidence: float = math.nan  #: ln of its marginal likelihood, see `vinetrack.diagnosis.weighing`
+    film_gain: float = 0.0  #: fall of −2 ln L with film a little off, see `vinetrack.diagnosis.film_allowance`
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,6 +130,7 @@ def likelihood_ratio(
         inflation=min(ratio**2, MOST_INFLATION),
         surprise=prior_surprise(after, parameters),
         log_evidence=log_evidence(after, parameters),
+        film_gain=film_gain(after),
     )
 
 
@@ -248,8 +251,9 @@ def _complexity(hypothesis: LikelihoodRatio) -> int:
 def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, str]]:
     """Hypotheses that cannot be excluded, best first, and for those set aside the reason in words, by their names.
 
-    Excluded is what is worse by 9 than the best, in −2 ln L as far as the scatter of trials bears it out plus what its
-    sizes lie beyond the plausible (`prior_surprise`). Set aside are those that hold a simpler one as a limit and are no
+    Excluded is what is worse by 9 than the best, in −2 ln L both with film as stated and with film that weighs a little other
+    (`film_gain`), as far as the scatter of trials bears it out, plus what its sizes lie beyond the plausible
+    (`prior_surprise`). Set aside are those that hold a simpler one as a limit and are no
     better by 9 than it, and those that need a size beyond what is plausible where another does not.
 
     Parameters
@@ -264,15 +268,19 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
         Reason by label.
     """
     highest = max(hypotheses, key=lambda ratio: ratio.fit.log_likelihood)
-    likely = [
-        hypothesis
-        for hypothesis in hypotheses
-        if 2 * (highest.fit.log_likelihood - hypothesis.fit.log_likelihood) <= ANSWER_SET * highest.inflation
-    ]
+
+    lowest_film = min(-2 * ratio.fit.log_likelihood - ratio.film_gain for ratio in hypotheses)
+
+    def behind(hypothesis: LikelihoodRatio) -> float:
+        as_stated = 2 * (highest.fit.log_likelihood - hypothesis.fit.log_likelihood)
+        film_off = -2 * hypothesis.fit.log_likelihood - hypothesis.film_gain - lowest_film
+        return min(as_stated, film_off) / highest.inflation
+
+    likely = [hypothesis for hypothesis in hypotheses if behind(hypothesis) <= ANSWER_SET]
     likely.sort(key=lambda ratio: -ratio.fit.log_likelihood)
 
     def misfit(hypothesis: LikelihoodRatio) -> float:
-        return -2 * hypothesis.fit.log_likelihood / highest.inflation + hypothesis.surprise
+        return behind(hypothesis) + hypothesis.surprise
 
     lowest = min(misfit(ratio) for ratio in likely)
     near = [ratio for ratio in likely if misfit(ratio) - lowest <= ANSWER_SET]
@@ -313,7 +321,8 @@ def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
 def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
     """Posterior weights of hypotheses by label; they add up to 1 over these.
 
-    The likelihood counts as far as the scatter of trials bears it out: ln L over the best one's inflation.
+    The likelihood counts as far as the scatter of trials bears it out: ln L over the best one's inflation. The film of the
+    vines is free within `systematics.FILM_ERROR` of what is stated.
 
     Parameters
     ----------
@@ -327,7 +336,9 @@ def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
         return {}
     inflation = max(hypotheses, key=lambda hypothesis: hypothesis.fit.log_likelihood).inflation
     tempered = [
-        hypothesis.log_evidence - hypothesis.fit.log_likelihood + hypothesis.fit.log_likelihood / inflation
+        hypothesis.log_evidence
+        - hypothesis.fit.log_likelihood
+        + (hypothesis.fit.log_likelihood + 0.5 * hypothesis.film_gain) / inflation
         for hypothesis in hypotheses
     ]
     return dict(zip((hypothesis.label for hypothesis in hypotheses), posterior_weights(tempered), strict=True))

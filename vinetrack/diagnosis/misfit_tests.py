@@ -303,7 +303,7 @@ class MisfitTests:
         )
 
 
-def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTests:
+def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: bool = False) -> MisfitTests:
     """Question a fit about these effects.
 
     Parameters
@@ -313,6 +313,8 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTes
         Candidates; those of the model are passed over.
     level : float
         Chance of a false alarm of all tests.
+    film : bool
+        Whether the film of each vine may weigh a little other than stated.
 
     Returns
     -------
@@ -322,7 +324,7 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float) -> MisfitTes
     vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
     shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, vines)]
     answers = effect_sensitivities(fit, shapes)
-    systematics = systematics_of(fit.predictor, fit.solution, fit.trials)
+    systematics = systematics_of(fit.predictor, fit.solution, fit.trials, film=film)
     columns = systematics.put_back(fit_columns(fit))
     sums = products_of(fit, columns, answers, systematics)
     structure = structure_of(fit, columns, systematics)

@@ -247,7 +247,7 @@ def _mending(
     something, those next to it are asked, as far as misjudged noise could have put them behind.
     """
     kept, aside = answer_set(hypotheses)
-    best = max(hypothesis.fit.log_likelihood for hypothesis in hypotheses)
+    best = _best_of(hypotheses)
     behind = sorted(
         (hypothesis for hypothesis in hypotheses if hypothesis not in kept),
         key=lambda hypothesis: -hypothesis.fit.log_likelihood,
@@ -255,13 +255,16 @@ def _mending(
     next_to_it = [
         hypothesis
         for hypothesis in behind
-        if hypothesis.label not in aside and 2 * (best - hypothesis.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
+        if hypothesis.label not in aside
+        and 2 * (best.fit.log_likelihood - hypothesis.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
     ]
     for group in (kept, next_to_it):
         mending: list[LikelihoodRatio] = []
         after: MisfitTests | None = None
         for hypothesis in group:
             asked = search.after(hypothesis.fit) if _is_believable(hypothesis) else None
+            if asked is not None and asked.something and hypothesis.film_gain > 0 and hypothesis.fit is not best.fit:
+                asked = search.after(hypothesis.fit, film=True)
             # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
             if asked is None or asked.something or (len(hypothesis.effects) > 1 and asked.whispers):
                 aside[hypothesis.label] = hypothesis.reason if asked is None else "something is left once it is added"

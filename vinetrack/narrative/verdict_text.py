@@ -18,6 +18,7 @@ from vinetrack.diagnosis.result import (
 )
 from vinetrack.dynamics.model import base_model
 from vinetrack.inference.fit_result import Number
+from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.narrative.between_text import difference_in_words, remedies_in_words, trials_differ
 from vinetrack.narrative.verdict_summary import joined, size
 
@@ -85,7 +86,8 @@ def explain(finding: SelectionStep) -> str:
     if finding.verdict == AMBIGUOUS:
         return (
             f"{model} lacks an effect, and these data cannot tell which: {joined(names, 'or')}. "
-            f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other.{_weights(kept)}{_remedies(finding)}"
+            f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other{_by_film(kept)}.{_weights(kept)}"
+            f"{_remedies(finding)}"
         )
     if finding.verdict == ARTEFACT and trials_differ(names):
         return (
@@ -182,6 +184,22 @@ def _weights(kept: Sequence[LikelihoodRatio]) -> str:
     weights = sorted(weights_of(kept).items(), key=lambda pair: -pair[1])
     each = ", ".join(f"{label.replace('+', ' with ')} {100 * weight:.0f} %" for label, weight in weights)
     return f" Posterior weights, with plausible sizes as priors: {each}."
+
+
+def _by_film(kept: Sequence[LikelihoodRatio]) -> str:
+    """Which of an answer set need film that weighs a little other than stated; blank where none does."""
+    from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
+
+    best = max(kept, key=lambda ratio: ratio.fit.log_likelihood)
+    limit = ANSWER_SET * best.inflation
+    need = [r for r in kept if 2 * (best.fit.log_likelihood - r.fit.log_likelihood) > limit]
+    if not need:
+        return ""
+    names = joined([ratio.label.replace("+", " with ") for ratio in need])
+    return (
+        f", {names} where the film weighs about {100 * FILM_ERROR:.0f} % more or less than thickness and density say: "
+        "weigh a piece of it"
+    )
 
 
 def _with_the_fault(finding: SelectionStep) -> str:
