@@ -6,8 +6,8 @@
 
 Every campaign comes from a simulator that shares no code with the package (`benchmarks/hidden/`), is written as an
 experiment folder, and goes to `vinetrack.diagnose` as that folder. A row is one kind of laboratory
-(`benchmarks/hidden/laboratory_kinds.py`), with the answers that are right about it. `--answers` keeps every answer as it
-comes; begun again, what is there is not asked again. `--trials` are the fewest and the most trials of a campaign.
+(`benchmarks/hidden/laboratory_kinds.py`), with the answers that are right about it. `--answers` keeps every answer as
+it comes; begun again, what is there is not asked again. `--trials` are the fewest and the most trials of a campaign.
 
 Seeds 20000–20999 tune, 30000–39999 score: nothing may be tuned on those.
 """

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.diagnosis.candidates import is_plausible
-from vinetrack.diagnosis.film_allowance import film_gain
+from vinetrack.diagnosis.film_allowance import FILM, film_gain
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
 from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_surprise
 from vinetrack.effects import Effect
@@ -251,8 +251,8 @@ def _complexity(hypothesis: LikelihoodRatio) -> int:
 def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRatio], dict[str, str]]:
     """Hypotheses that cannot be excluded, best first, and for those set aside the reason in words, by their names.
 
-    Excluded is what is worse by 9 than the best, in −2 ln L both with film as stated and with film that weighs a little other
-    (`film_gain`), as far as the scatter of trials bears it out, plus what its sizes lie beyond the plausible
+    Excluded is what is worse by 9 than the best, in −2 ln L both with film as stated and with film that weighs a little
+    other (`film_gain`), as far as the scatter of trials bears it out, plus what its sizes lie beyond the plausible
     (`prior_surprise`). Set aside are those that hold a simpler one as a limit and are no
     better by 9 than it, and those that need a size beyond what is plausible where another does not.
 
@@ -269,12 +269,16 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     """
     highest = max(hypotheses, key=lambda ratio: ratio.fit.log_likelihood)
 
-    lowest_film = min(-2 * ratio.fit.log_likelihood - ratio.film_gain for ratio in hypotheses)
+    film_alone = [-2 * ratio.fit.log_likelihood for ratio in hypotheses if ratio.names == (FILM,)]
+    off = {ratio.label: -2 * ratio.fit.log_likelihood - ratio.film_gain for ratio in hypotheses}
+    lowest_off = min(off.values())
 
     def behind(hypothesis: LikelihoodRatio) -> float:
         as_stated = 2 * (highest.fit.log_likelihood - hypothesis.fit.log_likelihood)
-        film_off = -2 * hypothesis.fit.log_likelihood - hypothesis.film_gain - lowest_film
-        return min(as_stated, film_off) / highest.inflation
+        # Beside film that is off, an effect has to gain something itself.
+        gained = film_alone[0] - off[hypothesis.label] if film_alone else math.inf
+        needed = gained > ANSWER_SET * highest.inflation
+        return min(as_stated, off[hypothesis.label] - lowest_off if needed else math.inf) / highest.inflation
 
     likely = [hypothesis for hypothesis in hypotheses if behind(hypothesis) <= ANSWER_SET]
     likely.sort(key=lambda ratio: -ratio.fit.log_likelihood)
@@ -321,8 +325,8 @@ def _comparable(hypothesis: LikelihoodRatio, other: LikelihoodRatio) -> bool:
 def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
     """Posterior weights of hypotheses by label; they add up to 1 over these.
 
-    The likelihood counts as far as the scatter of trials bears it out: ln L over the best one's inflation. The film of the
-    vines is free within `systematics.FILM_ERROR` of what is stated.
+    The likelihood counts as far as the scatter of trials bears it out: ln L over the best one's inflation. The film of
+    the vines is free within `systematics.FILM_ERROR` of what is stated.
 
     Parameters
     ----------

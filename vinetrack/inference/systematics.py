@@ -29,8 +29,8 @@ PRESSURE_ERROR_PA = 30.0
 """Standard deviation of a set pressure beside what the sheet states: read to a tenth of a kilopascal."""
 
 FILM_ERROR = 0.02
-"""Standard deviation of the mass of a vine's film, as part of it, that no sheet goes below. Chosen: a micrometer reads 50
-to 150 µm to one or two. At half a wrong scale stays likelier than a drag on film that is 2 % off, at twice sets of
+"""Standard deviation of the mass of a vine's film, as part of it, that no sheet goes below. Chosen: a micrometer reads
+50 to 150 µm to one or two. At half a wrong scale stays likelier than a drag on film that is 2 % off, at twice sets of
 answers grow."""
 
 PAYLOAD_STEP = 1e-2
