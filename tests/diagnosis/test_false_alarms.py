@@ -175,9 +175,11 @@ def test_systematic_errors_that_imitate_a_shape_are_integrated_out() -> None:
 
 
 def known_fit(log_likelihood: float, numbers: tuple[Number, ...] = (), covariance: Floats | None = None) -> Any:
-    """What a likelihood ratio asks of a fit of few trials."""
+    """What a likelihood ratio asks of a fit of few trials, whose film is free already."""
     matrix = np.diag([number.sigma**2 for number in numbers]) if covariance is None else covariance
-    return SimpleNamespace(log_likelihood=log_likelihood, numbers=numbers, covariance=matrix, trials=())
+    return SimpleNamespace(
+        log_likelihood=log_likelihood, numbers=numbers, covariance=matrix, trials=(), model=("film_mass",)
+    )
 
 
 def hypothesis(name: str, log_likelihood: float, inflation: float = 1.0) -> LikelihoodRatio:

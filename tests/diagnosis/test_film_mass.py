@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,11 +13,14 @@ from hidden.laboratory_rows import campaign
 from scipy.stats import norm
 
 import vinetrack as vt
+from vinetrack.diagnosis import likelihood_ratio
 from vinetrack.diagnosis.candidates import shapes_of
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
-from vinetrack.diagnosis.likelihood_ratio import _compatible_with_nothing, _in_sigmas
+from vinetrack.diagnosis.film_allowance import film_gain
+from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, _compatible_with_nothing, _in_sigmas, answer_set
 from vinetrack.diagnosis.multi_start import start_of, starts_of
 from vinetrack.effects import catalogue
+from vinetrack.inference.systematics import FILM_ERROR
 
 FILM, DRAG = catalogue()["film_mass"], catalogue()["air_drag"]
 
@@ -84,6 +88,49 @@ def test_a_size_that_is_something_in_one_vine_is_something(answered):
     assert not _compatible_with_nothing((FILM,), _numbers(after, nothing, second))
     again = replace(second, value=0.1 * second.sigma)
     assert "compatible with none" in _compatible_with_nothing((FILM,), _numbers(after, nothing, again))
+
+
+def test_film_gains_what_a_fit_with_free_film_gains_less_its_prior(answered):
+    fit = answered[1].fits[0]
+    free = vt.refit(fit, fit.model + "film_mass")
+    sizes = [number.value for number in free.numbers if number.key == "film_mass.eps"]
+    fall = 2 * (free.log_likelihood - fit.log_likelihood)
+    gained = film_gain(fit)
+    # The prior pulls sizes in, so it costs less than at the sizes of the free fit, and more than nothing.
+    assert fall - sum((size / FILM_ERROR) ** 2 for size in sizes) < gained < fall
+    assert film_gain(free) == 0
+
+
+def _ratio(effect, log_likelihood, gain=0.0):
+    fit = SimpleNamespace(log_likelihood=log_likelihood)
+    return LikelihoodRatio((effect,), fit, 0.0, 0.0, plausible=True, reason="", film_gain=gain)
+
+
+def _labels(*ratios):
+    return {ratio.label for ratio in answer_set(ratios)[0]}
+
+
+@pytest.fixture
+def unlike(monkeypatch):
+    """Hypotheses none of which predicts the curve of another."""
+    monkeypatch.setattr(likelihood_ratio, "_distance", lambda *_: 1e3)
+
+
+@pytest.mark.usefixtures("unlike")
+def test_what_is_as_likely_with_film_a_little_off_is_not_excluded():
+    scale, drag, leak = (catalogue()[name] for name in ("length_scale", "air_drag", "leak"))
+    best = _ratio(scale, 100.0)
+    assert _labels(best, _ratio(drag, 86.0)) == {"length_scale"}
+    assert _labels(best, _ratio(drag, 86.0, 27.0)) == {"length_scale", "air_drag"}
+    # With film off the drag is the likeliest, and the leak as far behind it as without.
+    assert _labels(best, _ratio(drag, 86.0, 50.0), _ratio(leak, 80.0, 50.0)) == {"length_scale", "air_drag"}
+
+
+@pytest.mark.usefixtures("unlike")
+def test_film_that_explains_all_alone_brings_in_nothing_beside_it():
+    drag = _ratio(DRAG, 86.0, 30.0)
+    assert _labels(_ratio(FILM, 100.0), drag) == {"film_mass"}
+    assert _labels(_ratio(FILM, 96.0), drag) == {"film_mass", "air_drag"}
 
 
 def _numbers(fit, *changed):

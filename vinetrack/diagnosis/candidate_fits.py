@@ -186,6 +186,7 @@ class CandidateFits:
         for climb in chosen if all_of_them else chosen[: self.most_fitted]:
             self._fit(climb)
         self._fit_what_is_contained()
+        self._begin_from_the_best()
         return list(self.fitted.values())
 
     def fit_in_full(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
@@ -210,6 +211,30 @@ class CandidateFits:
                 self._fit_from_prediction(name)
         self._fit_what_is_contained()
         return list(self.fitted.values())
+
+    def _begin_from_the_best(self) -> None:
+        """Fit rivals that the best would exclude from where it ended: releases found there may serve them too.
+
+        Where trials begin slowly a fit may settle in another minimum by a hair's breadth of its start.
+        """
+        believed = [known for known in self.fitted.values() if known.plausible and known.credible]
+        if not believed or is_poor_fit((best := _likeliest(believed)).fit.predictor, best.fit.solution):
+            return
+        rivals = [known for known in believed if ANSWER_SET < self._behind(known, best) < REACH_OF_CLIMBS * ALIKE_REACH]
+        for rival in sorted(rivals, key=lambda known: self._behind(known, best))[:STARTS_EACH]:
+            model = self.questions.fit.model
+            for effect in rival.effects:
+                model = model + effect
+            values = {
+                key: rival.fit.model.values[key] for key in model.parameter_names if key.split(".")[0] in rival.names
+            }
+            with contextlib.suppress(FitError, SimulationError, np.linalg.LinAlgError):
+                fit = refit(best.fit, model, start=values, thorough=False)
+                if fit.log_likelihood > rival.fit.log_likelihood - WORSE:
+                    self.fitted[rival.label] = likelihood_ratio(self.questions.fit, rival.effects, fit)
+
+    def _behind(self, rival: LikelihoodRatio, best: LikelihoodRatio) -> float:
+        return 2 * (best.fit.log_likelihood - rival.fit.log_likelihood)
 
     def _fit_what_is_contained(self) -> None:
         """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
@@ -306,7 +331,9 @@ class CandidateFits:
         if name in self.fitted and not math.isnan(climb.deviance):
             return
         self.report(f"fitting {name}")
-        best = max((fitted_one.fit.log_likelihood for fitted_one in self.fitted.values()), default=-math.inf)
+        # What fits best at a size that nobody believes is no reason to give up what is behind it.
+        believed = [known.fit.log_likelihood for known in self.fitted.values() if known.plausible and known.credible]
+        best = max(believed, default=-math.inf)
         led = math.isfinite(climb.deviance) or not self.explained
         if not self._is_new(climb, led=led):
             return
@@ -357,6 +384,10 @@ class CandidateFits:
     def _from_climb(self, climb: SubsetFit, best: float, *, led: bool, afresh: bool = False) -> LikelihoodRatio | None:
         fit = full_fit(self.questions.fit, climb, best, afresh=afresh, led=led)
         return None if fit is None else likelihood_ratio(self.questions.fit, climb.effects, fit)
+
+
+def _likeliest(hypotheses: Iterable[LikelihoodRatio]) -> LikelihoodRatio:
+    return max(hypotheses, key=lambda hypothesis: hypothesis.fit.log_likelihood)
 
 
 def _same_place(*fits: Fit) -> float:

@@ -1,9 +1,9 @@
 """How much likelier a hypothesis would be if the film weighed a little other than the sheet says.
 
 Which of two effects is likelier may hang on the mass of the film: a drag on film that is 1.5 % lighter than stated was
-less likely than a wrong scale, by Δχ² 27. So what is as likely as the best with the film of every vine free, within what
-nobody knows it better than, is not excluded. Whether anything is missing at all is asked without: there the film is a
-hypothesis of its own, `film_mass`.
+less likely than a wrong scale, by Δχ² 27. So what is as likely as the best with the film of every vine free, within
+what nobody knows it better than, is not excluded. Whether anything is missing at all is asked without: there the film
+is a hypothesis of its own, `film_mass`.
 """
 
 from __future__ import annotations

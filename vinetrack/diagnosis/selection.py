@@ -244,7 +244,8 @@ def _mending(
     """The hypotheses that cannot be excluded and leave nothing, why others were set aside, and what the best leaves.
 
     One that leaves something is excluded, and with it whatever it was better by: where all of the answer set leave
-    something, those next to it are asked, as far as misjudged noise could have put them behind.
+    something, those next to it are asked, as far as misjudged noise could have put them behind. What one leaves may be
+    film that weighs a little other than stated.
     """
     kept, aside = answer_set(hypotheses)
     best = _best_of(hypotheses)
@@ -261,10 +262,12 @@ def _mending(
     for group in (kept, next_to_it):
         mending: list[LikelihoodRatio] = []
         after: MisfitTests | None = None
-        for hypothesis in group:
-            asked = search.after(hypothesis.fit) if _is_believable(hypothesis) else None
-            if asked is not None and asked.something and hypothesis.film_gain > 0 and hypothesis.fit is not best.fit:
-                asked = search.after(hypothesis.fit, film=True)
+        for hypothesis, film in [(each, film) for film in (False, True) for each in group]:
+            # Film beside the best is looked for as a set, unless another as likely leaves nothing as it stands.
+            alone = hypothesis is best and not mending
+            if film and (hypothesis in mending or alone or hypothesis.film_gain < ANSWER_SET):
+                continue
+            asked = search.after(hypothesis.fit, film=film) if _is_believable(hypothesis) else None
             # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
             if asked is None or asked.something or (len(hypothesis.effects) > 1 and asked.whispers):
                 aside[hypothesis.label] = hypothesis.reason if asked is None else "something is left once it is added"
@@ -273,9 +276,17 @@ def _mending(
             elif not mending or hypothesis in answer_set([*mending, hypothesis])[0]:
                 mending.append(hypothesis)
                 after = after or asked
+                aside.pop(hypothesis.label, None)
         if mending:
-            return mending, aside, after
+            return sorted(mending, key=lambda ratio: -ratio.fit.log_likelihood), aside, after
+        if best.film_gain > ANSWER_SET and best.credible and not _has_a_shape(search.after(best.fit, film=True)):
+            break
     return [], aside, None
+
+
+def _has_a_shape(asked: MisfitTests) -> bool:
+    """Whether any candidate or smooth force would mend what is left, whatever the trials take upon themselves."""
+    return bool(asked.off or asked.shaped or asked.excess(asked.family) > 0)
 
 
 def _is_believable(hypothesis: LikelihoodRatio) -> bool:
