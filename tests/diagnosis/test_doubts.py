@@ -51,7 +51,7 @@ def asked(pairs: Pairs) -> MisfitTests:
 
 @pytest.fixture
 def without_doubts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    def none(*about: Any, film: bool) -> Systematics:
+    def none(*about: Any, film: bool) -> Systematics:  # noqa: ARG001
         return Systematics.none([trial.time_s.size for trial in about[-1]])
 
     monkeypatch.setattr(questions, "systematics_of", none)
