@@ -66,7 +66,7 @@ def test_a_set_that_mends_everything_but_is_worth_no_more_than_chance_is_said_to
     )
     questions: Any = SimpleNamespace(fit=SimpleNamespace(chi2_per_dof=2.0))
     monkeypatch.setattr(selection, "EffectSets", lambda *_: sets)
-    monkeypatch.setattr(selection, "_mending", lambda *_: ([pair], {}, questions))
+    monkeypatch.setattr(selection, "mending", lambda *_: ([pair], {}, questions))
     (step,) = selection._together(questions, questions, [pair], str)  # type: ignore[list-item]
     assert step.verdict == "unexplained"
     assert step.aside == (("leak with air_drag", "it gains no more over the best smaller set than chance may"),)

@@ -18,11 +18,10 @@ from vinetrack.diagnosis.effect_sets import MOST_EFFECTS, NO_BETTER, EffectSets
 from vinetrack.diagnosis.initial_fit import with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET,
-    MOST_INFLATION,
     LikelihoodRatio,
-    answer_set,
     likelihood_ratio,
 )
+from vinetrack.diagnosis.mending import best_of, is_believable, mending
 from vinetrack.diagnosis.misfit_tests import (
     FAR_OFF,
     FIRST_LEVEL,
@@ -126,10 +125,10 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     tried += between
     if slack is not None and not _is_better(tried, slack[0].kept[0]):
         return slack
-    if not questions.something and not differ and (not tried or _best_of(tried).sigma < SUSPECT_SIGMAS):
+    if not questions.something and not differ and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
-    if tried and again < MOST_AGAIN and _best_of(tried) not in between:
-        rival = without(fit, _best_of(tried).fit)
+    if tried and again < MOST_AGAIN and best_of(tried) not in between:
+        rival = without(fit, best_of(tried).fit)
         if rival.log_likelihood > fit.log_likelihood + NO_BETTER:
             return select_effects(rival, effects, report, again=again + 1)
     alone = None if _leaves_room(tried) else _alone(questions, search, tried)
@@ -146,7 +145,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
         return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
     tried = [hypothesis for hypothesis in tried if hypothesis not in between]
     credible = [hypothesis for hypothesis in tried if hypothesis.credible]
-    if not credible or not _stands_out(_best_of(credible), questions):
+    if not credible or not _any_stands_out(credible, questions):
         # A score that no refit bears out says nothing, unless it is high or the shape of what is left says it too.
         loud = questions.excess(questions.family) > LOUD
         fails = questions.fails or questions.off or loud
@@ -162,13 +161,13 @@ def _leaves_room(tried: Sequence[LikelihoodRatio]) -> bool:
     """
     if not tried:
         return True
-    best = _best_of(tried).fit
+    best = best_of(tried).fit
     return best.chi2_per_dof > FAR_OFF or scatters_much(best)
 
 
 def _is_better(tried: Sequence[LikelihoodRatio], than: LikelihoodRatio) -> bool:
     """Whether the best of these hypotheses is likelier than another."""
-    return bool(tried) and _best_of(tried).fit.log_likelihood > than.fit.log_likelihood + NO_BETTER
+    return bool(tried) and best_of(tried).fit.log_likelihood > than.fit.log_likelihood + NO_BETTER
 
 
 def _slack(questions: MisfitTests, effects: Sequence[Effect], report: Report) -> list[SelectionStep] | None:
@@ -195,9 +194,11 @@ def _stands_out(hypothesis: LikelihoodRatio, questions: MisfitTests) -> bool:
     return hypothesis.sigma >= questions.family.of(hypothesis.names[-1])
 
 
-def _best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:
-    """The hypothesis with the highest likelihood."""
-    return max(tried, key=lambda hypothesis: hypothesis.fit.log_likelihood)
+def _any_stands_out(tried: Sequence[LikelihoodRatio], questions: MisfitTests) -> bool:
+    """Whether the best does, or one that cannot be excluded beside it: each may scatter in its own way."""
+    best = best_of(tried)
+    reach = best.fit.log_likelihood - 0.5 * ANSWER_SET * best.inflation
+    return any(_stands_out(known, questions) for known in tried if known.fit.log_likelihood >= reach)
 
 
 def _alone(
@@ -206,10 +207,9 @@ def _alone(
     """Findings where one effect mends everything; None where none does."""
     if not tried:
         return None
-    best = _best_of(tried)
-    if not _stands_out(best, questions):
+    if not _any_stands_out(tried, questions):
         return None
-    kept, aside, after = _mending(tried, search)
+    kept, aside, after = mending(tried, search)
     if after is None:
         return None
     verdict = verdict_of(kept)
@@ -236,62 +236,6 @@ def _too_small(best: LikelihoodRatio, questions: MisfitTests) -> str:
         f"{best.label} would improve the fit by {best.sigma:.1f} σ, but it moves positions by only {moved_mm:.2g} mm, "
         "less than their systematic errors, and does not lower the error on left-out conditions; it is not counted"
     )
-
-
-def _mending(
-    hypotheses: Sequence[LikelihoodRatio], search: CandidateFits, sets: EffectSets | None = None
-) -> tuple[list[LikelihoodRatio], dict[str, str], MisfitTests | None]:
-    """The hypotheses that cannot be excluded and leave nothing, why others were set aside, and what the best leaves.
-
-    One that leaves something is excluded, and with it whatever it was better by: where all of the answer set leave
-    something, those next to it are asked, as far as misjudged noise could have put them behind. What one leaves may be
-    film that weighs a little other than stated.
-    """
-    kept, aside = answer_set(hypotheses)
-    best = _best_of(hypotheses)
-    behind = sorted(
-        (hypothesis for hypothesis in hypotheses if hypothesis not in kept),
-        key=lambda hypothesis: -hypothesis.fit.log_likelihood,
-    )
-    next_to_it = [
-        hypothesis
-        for hypothesis in behind
-        if hypothesis.label not in aside
-        and 2 * (best.fit.log_likelihood - hypothesis.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
-    ]
-    for group in (kept, next_to_it):
-        mending: list[LikelihoodRatio] = []
-        after: MisfitTests | None = None
-        for hypothesis, film in [(each, film) for film in (False, True) for each in group]:
-            # Film beside the best is looked for as a set, unless another as likely leaves nothing as it stands.
-            alone = hypothesis is best and not mending
-            if film and (hypothesis in mending or alone or hypothesis.film_gain < ANSWER_SET):
-                continue
-            asked = search.after(hypothesis.fit, film=film) if _is_believable(hypothesis) else None
-            # Two effects together can imitate much that no catalogue holds: nothing at all may be left of them.
-            if asked is None or asked.something or (len(hypothesis.effects) > 1 and asked.whispers):
-                aside[hypothesis.label] = hypothesis.reason if asked is None else "something is left once it is added"
-            elif sets is not None and len(hypothesis.effects) > 2 and (why := sets.superfluous(hypothesis)):
-                aside[hypothesis.label] = why
-            elif not mending or hypothesis in answer_set([*mending, hypothesis])[0]:
-                mending.append(hypothesis)
-                after = after or asked
-                aside.pop(hypothesis.label, None)
-        if mending:
-            return sorted(mending, key=lambda ratio: -ratio.fit.log_likelihood), aside, after
-        if best.film_gain > ANSWER_SET and best.credible and not _has_a_shape(search.after(best.fit, film=True)):
-            break
-    return [], aside, None
-
-
-def _has_a_shape(asked: MisfitTests) -> bool:
-    """Whether any candidate or smooth force would mend what is left, whatever the trials take upon themselves."""
-    return bool(asked.off or asked.shaped or asked.excess(asked.family) > 0)
-
-
-def _is_believable(hypothesis: LikelihoodRatio) -> bool:
-    """Whether its sizes can be an explanation; of three effects and more all must be plausible."""
-    return hypothesis.plausible and hypothesis.credible if len(hypothesis.effects) > 2 else hypothesis.credible
 
 
 def verdict_of(kept: Sequence[LikelihoodRatio]) -> str:
@@ -326,7 +270,7 @@ def _together(
         grown = sets.grow(size)
         if not grown or not any(hypothesis.credible for hypothesis in grown):
             break
-        kept, aside, after = _mending(grown, search, sets)
+        kept, aside, after = mending(grown, search, sets)
         if after is not None:
             if sets.is_better(kept[0]):
                 return _of_sets(questions, sets, kept, aside, after)
@@ -348,7 +292,7 @@ def _together(
 
 def _leads_nowhere(grown: Sequence[LikelihoodRatio], smaller: LikelihoodRatio) -> bool:
     """Whether larger sets are not worth their time: no size is plausible, or the best stays as far off as before."""
-    if not any(_is_believable(hypothesis) for hypothesis in grown):
+    if not any(is_believable(hypothesis) for hypothesis in grown):
         return True
     left = grown[0].fit.chi2_per_dof
     return left > FAR_OFF and left > LEFT * smaller.fit.chi2_per_dof
