@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from vinetrack.diagnosis.held_fits import TESTS_HELD, holds_many, let_go, with_curves
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, likelihood_ratio
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, best_of, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, SUSPECT, MisfitTests, misfit_tests
 from vinetrack.diagnosis.multi_start import SubsetFit, SubsetFitter, best_subset_fit, full_fit, start_of, starts_of
 from vinetrack.dynamics.model import Value
@@ -99,7 +99,7 @@ class CandidateFits:
     simplified: list[Fit] = field(default_factory=list)
     simpler: set[str] = field(default_factory=set)
     asked: set[Asked] = field(default_factory=set)
-    tested: list[tuple[Fit, MisfitTests]] = field(default_factory=list)
+    tested: list[tuple[Fit, bool, MisfitTests]] = field(default_factory=list)
     most_fitted: int = MOST_FITTED
 
     def __post_init__(self) -> None:
@@ -120,6 +120,11 @@ class CandidateFits:
         return sorted(names, key=lambda name: -self.questions.promise(name))
 
     @property
+    def believed(self) -> list[LikelihoodRatio]:
+        """Fitted hypotheses of plausible sizes."""
+        return [known for known in self.fitted.values() if known.plausible and known.credible]
+
+    @property
     def explained(self) -> bool:
         """Whether a hypothesis explains the tracks: what still stays far off once it is fitted is no rival.
 
@@ -133,21 +138,19 @@ class CandidateFits:
         Parameters
         ----------
         fit : one of the hypotheses' fits.
-        film : whether the film of each vine may weigh a little other than stated; asked anew each time.
+        film : whether the film of each vine may weigh a little other than stated.
 
         Returns
         -------
         MisfitTests
         """
-        if film:
-            return misfit_tests(with_curves(fit), self.questions.effects, LATER_LEVEL, film=True)
-        for known, tests in self.tested:
-            if known is fit:
+        for known, with_film, tests in self.tested:
+            if known is fit and with_film == film:
                 return tests
-        tests = misfit_tests(with_curves(fit), self.questions.effects, LATER_LEVEL)
+        tests = misfit_tests(with_curves(fit), self.questions.effects, LATER_LEVEL, film=film)
         if holds_many(fit):
             del self.tested[: max(len(self.tested) - TESTS_HELD + 1, 0)]
-        self.tested.append((fit, tests))
+        self.tested.append((fit, film, tests))
         return tests
 
     def singles(self, *, all_of_them: bool = False) -> list[LikelihoodRatio]:
@@ -217,11 +220,11 @@ class CandidateFits:
 
         Where trials begin slowly a fit may settle in another minimum by a hair's breadth of its start.
         """
-        believed = [known for known in self.fitted.values() if known.plausible and known.credible]
-        if not believed or is_poor_fit((best := _likeliest(believed)).fit.predictor, best.fit.solution):
+        believed = self.believed
+        if not believed or is_poor_fit((best := best_of(believed)).fit.predictor, best.fit.solution):
             return
-        rivals = [known for known in believed if ANSWER_SET < self._behind(known, best) < REACH_OF_CLIMBS * ALIKE_REACH]
-        for rival in sorted(rivals, key=lambda known: self._behind(known, best))[:STARTS_EACH]:
+        rivals = [known for known in believed if ANSWER_SET < known.behind(best) < REACH_OF_CLIMBS * ALIKE_REACH]
+        for rival in sorted(rivals, key=lambda known: known.behind(best))[:STARTS_EACH]:
             model = self.questions.fit.model
             for effect in rival.effects:
                 model = model + effect
@@ -232,9 +235,6 @@ class CandidateFits:
                 fit = refit(best.fit, model, start=values, thorough=False)
                 if fit.log_likelihood > rival.fit.log_likelihood - WORSE:
                     self.fitted[rival.label] = likelihood_ratio(self.questions.fit, rival.effects, fit)
-
-    def _behind(self, rival: LikelihoodRatio, best: LikelihoodRatio) -> float:
-        return 2 * (best.fit.log_likelihood - rival.fit.log_likelihood)
 
     def _fit_what_is_contained(self) -> None:
         """An effect that holds a simpler one as a limit stands only once that was fitted too, from where it ended."""
@@ -332,8 +332,7 @@ class CandidateFits:
             return
         self.report(f"fitting {name}")
         # What fits best at a size that nobody believes is no reason to give up what is behind it.
-        believed = [known.fit.log_likelihood for known in self.fitted.values() if known.plausible and known.credible]
-        best = max(believed, default=-math.inf)
+        best = max((known.fit.log_likelihood for known in self.believed), default=-math.inf)
         led = math.isfinite(climb.deviance) or not self.explained
         if not self._is_new(climb, led=led):
             return
@@ -384,10 +383,6 @@ class CandidateFits:
     def _from_climb(self, climb: SubsetFit, best: float, *, led: bool, afresh: bool = False) -> LikelihoodRatio | None:
         fit = full_fit(self.questions.fit, climb, best, afresh=afresh, led=led)
         return None if fit is None else likelihood_ratio(self.questions.fit, climb.effects, fit)
-
-
-def _likeliest(hypotheses: Iterable[LikelihoodRatio]) -> LikelihoodRatio:
-    return max(hypotheses, key=lambda hypothesis: hypothesis.fit.log_likelihood)
 
 
 def _same_place(*fits: Fit) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,6 +91,34 @@ class LikelihoodRatio:
     def others(self) -> tuple[Number, ...]:
         """All other numbers of its fit."""
         return tuple(number for number in self.fit.numbers if number.key.split(".")[0] not in self.names)
+
+    def behind(self, other: LikelihoodRatio) -> float:
+        """By how much it is worse than another, in −2 ln L.
+
+        Parameters
+        ----------
+        other : LikelihoodRatio
+
+        Returns
+        -------
+        float
+        """
+        return 2 * (other.fit.log_likelihood - self.fit.log_likelihood)
+
+
+def best_of(hypotheses: Iterable[LikelihoodRatio]) -> LikelihoodRatio:
+    """The hypothesis with the highest likelihood.
+
+    Parameters
+    ----------
+    hypotheses : iterable of LikelihoodRatio
+        At least one.
+
+    Returns
+    -------
+    LikelihoodRatio
+    """
+    return max(hypotheses, key=lambda hypothesis: hypothesis.fit.log_likelihood)
 
 
 def likelihood_ratio(
@@ -267,14 +295,14 @@ def answer_set(hypotheses: Sequence[LikelihoodRatio]) -> tuple[list[LikelihoodRa
     aside : dict
         Reason by label.
     """
-    highest = max(hypotheses, key=lambda ratio: ratio.fit.log_likelihood)
+    highest = best_of(hypotheses)
 
     film_alone = [-2 * ratio.fit.log_likelihood for ratio in hypotheses if ratio.names == (FILM,)]
     off = {ratio.label: -2 * ratio.fit.log_likelihood - ratio.film_gain for ratio in hypotheses}
     lowest_off = min(off.values())
 
     def behind(hypothesis: LikelihoodRatio) -> float:
-        as_stated = 2 * (highest.fit.log_likelihood - hypothesis.fit.log_likelihood)
+        as_stated = hypothesis.behind(highest)
         # Beside film that is off, an effect has to gain something itself.
         gained = film_alone[0] - off[hypothesis.label] if film_alone else math.inf
         needed = gained > ANSWER_SET * highest.inflation
@@ -338,7 +366,7 @@ def weights_of(hypotheses: Sequence[LikelihoodRatio]) -> dict[str, float]:
     """
     if not hypotheses:
         return {}
-    inflation = max(hypotheses, key=lambda hypothesis: hypothesis.fit.log_likelihood).inflation
+    inflation = best_of(hypotheses).inflation
     tempered = [
         hypothesis.log_evidence
         - hypothesis.fit.log_likelihood

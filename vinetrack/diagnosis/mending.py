@@ -6,23 +6,8 @@ from collections.abc import Sequence
 
 from vinetrack.diagnosis.candidate_fits import CandidateFits
 from vinetrack.diagnosis.effect_sets import EffectSets
-from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, answer_set
+from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, answer_set, best_of
 from vinetrack.diagnosis.misfit_tests import MisfitTests
-
-
-def best_of(tried: Sequence[LikelihoodRatio]) -> LikelihoodRatio:
-    """The hypothesis with the highest likelihood.
-
-    Parameters
-    ----------
-    tried : sequence of LikelihoodRatio
-        At least one.
-
-    Returns
-    -------
-    LikelihoodRatio
-    """
-    return max(tried, key=lambda hypothesis: hypothesis.fit.log_likelihood)
 
 
 def mending(
@@ -61,8 +46,7 @@ def mending(
     next_to_it = [
         hypothesis
         for hypothesis in behind
-        if hypothesis.label not in aside
-        and 2 * (best.fit.log_likelihood - hypothesis.fit.log_likelihood) < ANSWER_SET * MOST_INFLATION
+        if hypothesis.label not in aside and hypothesis.behind(best) < ANSWER_SET * MOST_INFLATION
     ]
     for group in (kept, next_to_it):
         whole: list[LikelihoodRatio] = []

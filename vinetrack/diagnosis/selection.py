@@ -19,9 +19,10 @@ from vinetrack.diagnosis.initial_fit import with_host
 from vinetrack.diagnosis.likelihood_ratio import (
     ANSWER_SET,
     LikelihoodRatio,
+    best_of,
     likelihood_ratio,
 )
-from vinetrack.diagnosis.mending import best_of, is_believable, mending
+from vinetrack.diagnosis.mending import is_believable, mending
 from vinetrack.diagnosis.misfit_tests import (
     FAR_OFF,
     FIRST_LEVEL,
@@ -197,8 +198,7 @@ def _stands_out(hypothesis: LikelihoodRatio, questions: MisfitTests) -> bool:
 def _any_stands_out(tried: Sequence[LikelihoodRatio], questions: MisfitTests) -> bool:
     """Whether the best does, or one that cannot be excluded beside it: each may scatter in its own way."""
     best = best_of(tried)
-    reach = best.fit.log_likelihood - 0.5 * ANSWER_SET * best.inflation
-    return any(_stands_out(known, questions) for known in tried if known.fit.log_likelihood >= reach)
+    return any(_stands_out(known, questions) for known in tried if known.behind(best) <= ANSWER_SET * best.inflation)
 
 
 def _alone(

@@ -188,14 +188,13 @@ def _weights(kept: Sequence[LikelihoodRatio]) -> str:
 
 def _by_film(kept: Sequence[LikelihoodRatio]) -> str:
     """Which of an answer set need film that weighs a little other than stated; blank where none does."""
-    from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET
+    from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, best_of
 
-    best = max(kept, key=lambda ratio: ratio.fit.log_likelihood)
-    limit = ANSWER_SET * best.inflation
-    need = [r for r in kept if 2 * (best.fit.log_likelihood - r.fit.log_likelihood) > limit]
+    best = best_of(kept)
+    need = [ratio.label.replace("+", " with ") for ratio in kept if ratio.behind(best) > ANSWER_SET * best.inflation]
     if not need:
         return ""
-    names = joined([ratio.label.replace("+", " with ") for ratio in need])
+    names = joined(need)
     return (
         f", {names} where the film weighs about {100 * FILM_ERROR:.0f} % more or less than thickness and density say: "
         "weigh a piece of it"
@@ -256,13 +255,14 @@ def _count_testable(questions: MisfitTests) -> int:
 
 
 def _runner_up(finding: SelectionStep) -> str:
+    from vinetrack.diagnosis.likelihood_ratio import best_of
+
     kept, aside = {result.names for result in finding.kept}, dict(finding.aside)
     others = [r for r in finding.tried if len(r.names) == 1 and r.names not in kept and r.label not in aside]
     text = ""
     if others:
-        best = max(others, key=lambda result: result.fit.log_likelihood)
-        behind = 2 * (finding.kept[0].fit.log_likelihood - best.fit.log_likelihood)
-        text = f" The next best, {best.names[0]}, is worse by Δχ² = {behind:.0f}."
+        best = best_of(others)
+        text = f" The next best, {best.names[0]}, is worse by Δχ² = {best.behind(finding.kept[0]):.0f}."
     for name, why in finding.aside:
         text += f" {name} fits as well, but {why}."
     return text
