@@ -9,13 +9,12 @@ is a hypothesis of its own, `film_mass`.
 from __future__ import annotations
 
 from vinetrack.diagnosis.between_gain import beside
+from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import deviance, estimate_spreads, marginal
 from vinetrack.inference.optimiser import Solution, is_poor_fit
 from vinetrack.inference.position_errors import smooth_errors
 from vinetrack.inference.systematics import film_errors
-
-FILM = "film_mass"
 
 
 def film_gain(fit: Fit) -> float:

@@ -247,7 +247,7 @@ def _numbers(
                 symbol=number.symbol,
                 unit=number.unit,
                 value=number.outside(float(theta[k])),
-                sigma=float(sigma[k]) * _slope(number, float(theta[k])),
+                sigma=float(sigma[k]) * number.slope(number.outside(float(theta[k]))),
                 low=_bound_outside(number, low),
                 high=_bound_outside(number, high),
                 dof=float(dof[k]),
@@ -264,13 +264,8 @@ def _bound_outside(number: FreeParameter, theta: float) -> float:
     return number.outside(float(theta)) if math.isfinite(theta) else math.inf * theta
 
 
-def _slope(number: FreeParameter, theta: float) -> float:
-    """∂value/∂(what the fit holds)."""
-    return number.outside(theta) if number.logarithmic else number.scale
-
-
 def _outside(layout: ParameterMap, numbers: Sequence[Number], covariance: Floats) -> Floats:
-    slopes = np.array([_slope(f, f.inside(n.value)) for f, n in zip(layout.free, numbers, strict=True)])
+    slopes = np.array([free.slope(number.value) for free, number in zip(layout.free, numbers, strict=True)])
     return np.asarray(covariance * slopes[:, None] * slopes)
 
 

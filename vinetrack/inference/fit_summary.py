@@ -17,6 +17,7 @@ from vinetrack.core.notebook import html_table
 from vinetrack.core.numbers import or_nan
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.model import Value, values_by_key
+from vinetrack.inference.film_influence import film_influence, film_messages
 from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, number_row, numbers_text
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class FitSummary(NumberTable):
 
     `names` are those of the effects; `covariance` is that of `numbers`, SI, in their order; `warnings` are those of the
     audit. `refused` is the reason why the model was not fitted, blank where it was: all else is empty then.
+    `moved_by_film`, shape (n_numbers,), is what a film of a mass 2 % off would add to the errors, beside them.
     """
 
     names: tuple[str, ...]
@@ -60,6 +62,7 @@ class FitSummary(NumberTable):
     trials: Mapping[str, TrialEstimates] = field(default_factory=dict)
     refused: str = ""
     between: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    moved_by_film: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def fitted_values(self) -> dict[str, Value]:
@@ -84,6 +87,7 @@ class FitSummary(NumberTable):
             "numbers": [number.to_json() for number in self.numbers],
             "covariance": self.covariance,
             "between_trials": self.between,
+            "moved_by_film": self.moved_by_film,
             "spreads": {name: asdict(spread) for name, spread in self.spreads.items()},
             "noise_m": self.noise_m,
             "noise_correlation": self.noise_correlation,
@@ -136,6 +140,7 @@ class FitSummary(NumberTable):
             },
             refused=str(content.get("refused") or ""),
             between=np.array(between, dtype=float) if between else np.empty((0, 0)),
+            moved_by_film=np.array([or_nan(cell) for cell in content.get("moved_by_film") or ()]),
         )
 
     def __repr__(self) -> str:
@@ -170,6 +175,7 @@ def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequenc
     FitSummary
     """
     keys = [entry.name for entry in fields(TrialEstimates)]
+    moved = film_influence(fit)
     return FitSummary(
         names=tuple(fit.model.names),
         numbers=fit.numbers,
@@ -180,9 +186,10 @@ def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequenc
         chi2_per_dof=fit.chi2_per_dof,
         log_likelihood=fit.log_likelihood,
         converged=fit.converged,
-        messages=(*fit.messages, *further_messages),
+        messages=(*fit.messages, *film_messages(fit.numbers, moved), *further_messages),
         warnings=tuple(warnings),
         left_out=fit.left_out,
         trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},
         between=np.zeros_like(fit.covariance) if fit.between is None else fit.between,
+        moved_by_film=moved,
     )

@@ -111,6 +111,19 @@ class FreeParameter:
         """
         return math.exp(theta) if self.logarithmic else theta * self.scale
 
+    def slope(self, value: float) -> float:
+        """By how much the value changes for a change of one in what the fit holds.
+
+        Parameters
+        ----------
+        value : float, SI
+
+        Returns
+        -------
+        float
+        """
+        return self.outside(self.inside(value)) if self.logarithmic else self.scale
+
 
 @dataclass(frozen=True)
 class ParameterMap:

@@ -99,7 +99,7 @@ def widened_covariance(
     Precision
     """
     systematics = systematics_of(predictor, solution, trials, positions=wide is None)
-    plain, robust, shared = _sandwich(predictor, wide or solution, systematics)
+    plain, robust, moved = _sandwich(predictor, wide or solution, systematics)
     diagonal = np.diag(plain)
     live = diagonal > 0
     ratio = np.ones(diagonal.size)
@@ -119,7 +119,9 @@ def widened_covariance(
         variance, few = _few_trials(*trial_information(wide or solution), wide or solution, plain)
         ratio[live] = np.sqrt(np.maximum(variance[live] / diagonal[live], 1.0))
     degrees = np.where(ratio > 1, np.minimum(at_most, few), at_most)
-    covariance = np.where(np.isfinite(known.covariance), known.covariance, 0.0) * ratio[:, None] * ratio + shared
+    covariance = (
+        np.where(np.isfinite(known.covariance), known.covariance, 0.0) * ratio[:, None] * ratio + moved @ moved.T
+    )
     unknown = np.flatnonzero(~np.isfinite(np.diag(known.covariance)))
     covariance[unknown, unknown] = np.inf
     return replace(known, covariance=covariance, degrees=degrees)
@@ -141,6 +143,24 @@ def robust_covariance(predictor: Predictor, solution: Solution) -> tuple[Floats,
     nothing = Systematics.none([trial_data.time_s.size for trial_data in predictor.data])
     plain, robust, _ = _sandwich(predictor, solution, nothing)
     return plain, robust
+
+
+def moved_by(predictor: Predictor, solution: Solution, systematics: Systematics) -> Floats:
+    """How far one standard deviation of each systematic error moves each free number, to first order.
+
+    Parameters
+    ----------
+    predictor : of the trials that were fitted.
+    solution : where the iterations ended.
+    systematics : Systematics
+        What each error does to positions.
+
+    Returns
+    -------
+    array, shape (n_free, count)
+        Scaled as the fit holds the numbers.
+    """
+    return _sandwich(predictor, solution, systematics)[2]
 
 
 def _few_trials(information: Floats, scores: Floats, solution: Solution, plain: Floats) -> tuple[Floats, Floats]:
@@ -212,7 +232,7 @@ def _scores(rows: Floats, index: np.ndarray, size: int) -> Floats:
 
 
 def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics) -> tuple[Floats, Floats, Floats]:
-    """Covariance by the noise model, by the scatter of trials, and what the doubts add, shape (n_free, n_free) each.
+    """Covariance by the noise model and by the scatter of trials, shape (n_free, n_free) each, and `moved_by`.
 
     Numbers at a bound stay there.
     """
@@ -245,8 +265,7 @@ def _sandwich(predictor: Predictor, solution: Solution, systematics: Systematics
     # What a trial does not feel, number or error, is counted in a last row and column, and left out.
     cross = np.zeros((size + 1, systematics.count + 1))
     np.add.at(cross, (problem.index[:, :, None], systematics.places[:, None, :]), blocks[:, :p, p + 1 :])
-    lever = plain @ cross[:size, : systematics.count]
-    return plain, robust, lever @ lever.T
+    return plain, robust, plain @ cross[:size, : systematics.count]
 
 
 def coarsest_groups(trials: Sequence[Trial]) -> list[str]:
