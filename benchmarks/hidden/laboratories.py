@@ -275,6 +275,16 @@ def smoothed(frames: tuple[int, ...], degree: int = 0) -> Fault:
     return apply
 
 
+def clicked(digit_m: float, kept_every: int) -> Fault:
+    """Positions are clicked by hand on one frame in several, to whole millimetres, say."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG001
+        camera = replace(laboratory.camera, digit_m=digit_m, kept_every=kept_every)
+        return replace(laboratory, camera=camera).known(digit_m=digit_m)
+
+    return apply
+
+
 def trace_off(low_ms: float, high_ms: float) -> Fault:
     """The pressure is recorded along, by a clock that is off by so much, either way."""
 

@@ -197,6 +197,8 @@ def _camera_rows() -> list[Row]:
             quiet=0.7,
             least_sigma=CLEAR,
         ),
+        Row("clicked", "clicked", ADEQUATE, (faults.clicked(1e-3, 4),)),
+        Row("clicked_every", "clicked_every", ADEQUATE, (faults.clicked(1e-3, 1),), quiet=0.5),
         Row("speed_noise", "speed_noise", ADEQUATE, (faults.blur(60e-6),), FAST, _very_fast, quiet=0.5),
         Row(
             "trace_clock",

@@ -57,7 +57,8 @@ class Camera:
     `gauge_rho` from frame to frame, is read `gauge_Hz` times a second (NaN: at every frame) in multiples of
     `gauge_digit_Pa`, and the file joined by lines in between or, where it `gauge_holds`, repeated. The file has
     multiples of `trace_digit_Pa`. Positions are `smoothed` over so many frames by polynomials of `smoothed_degree`, 0 a
-    moving average; at either end by as many frames as there are, as spreadsheets do.
+    moving average; at either end by as many frames as there are, as spreadsheets do. One frame in `kept_every` is
+    looked at, and its position written in multiples of `digit_m`.
     """
 
     noise_m: float
@@ -82,6 +83,8 @@ class Camera:
     sees_end: bool = False
     smoothed: int = 0
     smoothed_degree: int = 0
+    kept_every: int = 1
+    digit_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,7 @@ def film(laboratory: Laboratory, draw: Draw) -> tuple[Recording, ...] | None:
             continue
         extra = {"specimen": shot.specimen, "day": shot.day, "order": k + 1}
         cells = _cells(shot.setting, k) | {name: extra[name] for name in laboratory.columns}
+        cells["capture_fps"] = shot.setting.capture_hz / laboratory.camera.kept_every
         recordings.append((shot.setting, Recording(cells, *filmed)))
     if len(recordings) < 0.9 * len(laboratory.shots):
         return None
@@ -230,7 +234,11 @@ def _film(shot: Shot, camera: Camera, draw: Draw) -> tuple[Floats, Floats, Float
     trace = None
     if math.isfinite(camera.trace_late_s):
         trace = _recorded(times[:stop], gauge(times, gauge_Pa, camera.trace_late_s)[:stop], camera, draw) / 1e3
-    return times[:stop], _smoothed(position, camera), trace
+    position = _smoothed(position, camera)
+    if camera.digit_m > 0:
+        position = np.round(position / camera.digit_m) * camera.digit_m
+    kept = slice(int(draw.integers(camera.kept_every)) if camera.kept_every > 1 else 0, None, camera.kept_every)
+    return times[:stop][kept], position[kept], None if trace is None else trace[kept]
 
 
 def _smoothed(position: Floats, camera: Camera) -> Floats:

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from vine_truth import Vine, ar1, make_track, record
 
-from vinetrack.tracks.position_noise import rest_points, track_noise
+from vinetrack.tracks.position_noise import (
+    common_rounding_noise,
+    noise_but_for_faults,
+    rest_points,
+    rounding_noise,
+    track_noise,
+)
 
 FRAMES = np.arange(300) / 1069
 
@@ -106,3 +112,30 @@ def test_motion_from_the_first_frame_has_no_rest():
 
 def test_rest_without_end_is_all_rest():
     assert rest_points(ar1(200, 1e-4, 0.6, np.random.default_rng(1000))) == 200
+
+
+def rounded(seed: int, step_m: float = 1e-3) -> np.ndarray:
+    """A growth at rising speed, clicked to whole steps."""
+    time_s = np.arange(60) / 267
+    smooth = 0.01 + 0.3 * np.maximum(time_s - 0.03, 0) + 2 * np.maximum(time_s - 0.03, 0) ** 2
+    return np.round((smooth + 5e-5 * np.random.default_rng(seed).standard_normal(60)) / step_m) * step_m
+
+
+def test_rounding_of_most_tracks_is_that_of_all():
+    """A track at one speed shows none of it: 5 mm from frame to frame are multiples of any millimetre."""
+    even = 5e-3 * np.arange(20.0)
+    assert rounding_noise(even) == 0
+    assert common_rounding_noise([even, *map(rounded, range(3))]) == pytest.approx(1e-3 / np.sqrt(12))
+
+
+def test_rounding_that_few_tracks_share_is_not_that_of_all():
+    fine = [ar1(60, 1e-4, 0.0, np.random.default_rng(seed)) + rounded(seed, 1e-9) for seed in range(3)]
+    assert common_rounding_noise([*fine, rounded(1)]) == 0
+    assert common_rounding_noise([rounded(1), rounded(2, 2e-3), rounded(3, 5e-4), *fine[:1]]) == 0
+    assert common_rounding_noise([]) == 0
+
+
+def test_noise_of_rounded_positions_is_not_kept_below_rounding():
+    """Most points are at rest: the median third difference is zero, and hides that the others are rounded."""
+    y = np.concatenate([np.full(200, 0.01), rounded(1)])
+    assert noise_but_for_faults(np.arange(y.size) / 267, y)[0] == pytest.approx(1e-3 / np.sqrt(12), rel=0.05)

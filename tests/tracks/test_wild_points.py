@@ -144,3 +144,22 @@ def test_where_one_point_in_eight_is_wild_none_is_rejected() -> None:
     draw = np.random.default_rng(20002)
     track = displaced(steady_track(seed=20002), rows, draw.choice([-1, 1], rows.size) * 5e-3)
     assert not wild_points(track.time_s, track.lead_position_m).any()
+
+
+@pytest.mark.parametrize("step_m", [5e-4, 1e-3, 2e-3])
+@pytest.mark.parametrize("every", [1, 4])
+def test_rounded_positions_are_neither_wild_nor_miss_frames(step_m, every):
+    """Clicked to the millimetre, or written with few decimals, and at rest mostly: the noise is that of rounding."""
+    for seed in range(20020, 20026):
+        for vine, noise_m, rho in VINES:
+            track = record(vine, np.random.default_rng(seed), noise_m=noise_m, rho=rho).track
+            position_m = np.round(track.lead_position_m[::every] / step_m) * step_m
+            rounded = correct_frames(reject_wild_points(make_track(track.time_s[::every], position_m)))
+            assert not rounded.notes
+
+
+def test_a_wild_point_among_rounded_ones_is_rejected():
+    track = steady_track(n=600)
+    rounded = replace(track, lead_position_m=np.round(track.lead_position_m, 3))
+    out = reject_wild_points(displaced(rounded, np.array([20, 300]), np.array([5e-3, -6e-3])))
+    assert np.flatnonzero(out.flag == "rejected").tolist() == [20, 300]

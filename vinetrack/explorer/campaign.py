@@ -19,8 +19,9 @@ from vinetrack.diagnosis.initial_fit import host_for
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import Effect, EffectError, catalogue
-from vinetrack.inference.fit_data import FitTrial, prepare
+from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.left_out import rest_is_seen
+from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.starts import initial_trial_effects
 from vinetrack.pipeline.model_stage import measured
 from vinetrack.results.folder_layout import Results, ResultsError, read_result

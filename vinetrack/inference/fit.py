@@ -22,12 +22,13 @@ from vinetrack.core.records import Track
 from vinetrack.dynamics.model import Model, Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.assemble import assemble
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of, prepare
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, pairs_of
 from vinetrack.inference.fit_result import Fit, TrialFit
 from vinetrack.inference.left_out import predict_trials, prepared_pairs
 from vinetrack.inference.optimiser import MOST_ITERATIONS, POOR_FIT, FixedTerms, Solution, Watch
 from vinetrack.inference.parameters import BetweenTerm, make_layout
 from vinetrack.inference.prediction_band import with_bands
+from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.sensitivity import Predictor
 from vinetrack.inference.solving import solve_again, solve_from, solve_from_scratch, solve_onward
 from vinetrack.inference.starts import align, initial_trial_effects

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from vinetrack.core.problems import UserError
 from vinetrack.core.records import POSITION_SYSTEMATIC_M, Floats, Track, Trial
 from vinetrack.inference.gauge_noise import QuietTrace, quiet_traces
-from vinetrack.tracks.noise_shape import correlated_gain, noise_shape
 from vinetrack.tracks.position_noise import position_noise, rest_points, rough_noise
-from vinetrack.tracks.smoothed_positions import Smoothing, smoothing_of
+from vinetrack.tracks.smoothed_positions import Smoothing
 
 if TYPE_CHECKING:
     from vinetrack.experiment.folder import Experiment
@@ -60,6 +59,12 @@ VAGUE, FEWEST_CLEAR, MOSTLY = 3.0, 0.3, 0.5
 the whole rest before the motion, where more than the last part of it is left out. Chosen: a point of three times the
 error carries a ninth of the information; it is left out because a single noise holds for all points. At half many good
 points go, at twice blurred ones stay."""
+
+
+AT_MOST_TWO = 1.5
+"""Range of rounded positions at rest, in steps of the rounding, up to which they hide their noise. Derived: two
+neighbouring values are a step apart, three are two; noise of a third of a step shows three of them in twenty frames,
+and the mean is then good to a twentieth of a step."""
 
 
 class FitError(UserError, ValueError):
@@ -171,61 +176,12 @@ class FitTrial:
 Pairs = Iterable[tuple[Trial, Track]]
 
 
-def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dict[str, str]]:
-    """Trials that can be fitted, and for the others the reason why not, by name.
-
-    Parameters
-    ----------
-    pairs : iterable of (Trial, Track)
-    weighted : bool
-        Whether points are weighted where the noise of positions varies from one to the next.
-
-    Returns
-    -------
-    data : list of FitTrial
-    left_out : dict
-        Reason by name of trial.
-    """
-    data, left_out = [], {}
-    pairs = list(pairs)
-    smoothing = smoothing_of(pairs)
-    for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
-        try:
-            data.append(prepare_trial(trial, track, quiet, smoothing))
-        except FitError as error:
-            left_out[trial.name] = str(error)
-    return _with_noise_shape(data) if weighted else data, left_out
-
-
-def _with_noise_shape(data: list[FitTrial]) -> list[FitTrial]:
-    """The trials with their points weighted, where the noise of positions that somebody else measured varies.
-
-    A tracker's own points are left as they are: it states what each errs by, and leaves out the worst.
-    """
-    places = [i for i, trial_data in enumerate(data) if trial_data.slow_m is None]
-    shape = noise_shape(
-        [data[i].time_s for i in places], [data[i].lead_position_m for i in places], [data[i].stated_m for i in places]
-    )
-    if shape is None:
-        return data
-    # One correlation for all, as in a fit: that of a single track with unequal noise is hardly known.
-    correlation = np.average([data[i].correlation for i in places], weights=[data[i].time_s.size for i in places])
-    gain = correlated_gain(float(correlation))
-    weighted = list(data)
-    for i, sd_m in zip(places, shape.sd_m, strict=True):
-        typical_m = math.exp(float(np.mean(np.log(sd_m))))
-        weighted[i] = replace(
-            data[i],
-            relative_sd=sd_m / typical_m,
-            noise_m=typical_m / gain,
-            correlation=float(correlation),
-            blur_s=shape.blur_s,
-        )
-    return weighted
-
-
 def prepare_trial(
-    trial: Trial, track: Track, quiet: QuietTrace | None = None, smoothing: Smoothing | None = None
+    trial: Trial,
+    track: Track,
+    quiet: QuietTrace | None = None,
+    smoothing: Smoothing | None = None,
+    rounding_m: float = 0.0,
 ) -> FitTrial:
     """The usable points of a track, rest included, with what they say of their own noise.
 
@@ -237,6 +193,8 @@ def prepare_trial(
         Its recorded pressure without noise, from `quiet_traces`, where traces of other trials tell of it too.
     smoothing : Smoothing, optional
         How its positions were smoothed: of those that are alike one is kept.
+    rounding_m : float, m
+        Standard deviation of the error that rounding leaves in positions of the campaign, 0 where they are not rounded.
 
     Returns
     -------
@@ -251,7 +209,10 @@ def prepare_trial(
     usable = track.usable & ~_nearing_end(trial, track)
     vague, vague_rest = _vague(track, usable)
     usable &= ~vague
-    smoothing = smoothing if trial.video is None else None
+    smoothing, rounding_m = (smoothing, rounding_m) if trial.video is None else (None, 0.0)
+    if rounding_m > 0 and vague_rest is None:
+        alike, vague_rest = _rounded_alike(track, usable, rounding_m)
+        usable &= ~alike
     smoothed_frame_s = 0.0
     if smoothing is not None:
         # At either end a filter has no full window, and everybody fills it up in another way.
@@ -265,6 +226,7 @@ def prepare_trial(
     if np.any(steps <= 0):
         raise FitError("its times do not increase: sort the rows or drop repeated ones")
     noise_m, correlation = position_noise(time_s, position_m)
+    noise_m = max(noise_m, rounding_m)
     if track.pressure_Pa is None and _undriven(trial):
         raise FitError(
             f"its pressure, {trial.pressure_Pa / 1e3:g} kPa, lies below the yield pressure,"
@@ -275,7 +237,7 @@ def prepare_trial(
     moved_m = float(np.median(position_m[-3:]) - np.median(position_m[:3]))
     if not moved_m > MOVES_SIGMAS * noise_m or moved_m <= 0:
         raise FitError("its leading edge never moves forward beyond its noise")
-    n_rest = rest_points(position_m)
+    n_rest = 0 if vague_rest is not None else rest_points(position_m)
     moving = time_s.size - n_rest
     if 0 < moving < FEWEST_MOVING:
         raise FitError(
@@ -363,6 +325,26 @@ def _vague(track: Track, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], 
         )
     enough = np.count_nonzero(usable & ~vague) >= max(FEWEST_POINTS, FEWEST_CLEAR * np.count_nonzero(usable))
     return (vague, vague_rest) if enough else (np.zeros(usable.size, dtype=bool), None)
+
+
+def _rounded_alike(
+    track: Track, usable: NDArray[np.bool_], rounding_m: float
+) -> tuple[NDArray[np.bool_], VagueRest | None]:
+    """Points at standstill whose noise is too small to tell them from one another once they are rounded.
+
+    All of them err by the same then: they tell no more than one of them does. What the rest before the motion says of
+    the origin is kept with the error of one point, of a standstill at the end its first point.
+    """
+    places = np.flatnonzero(usable)
+    y = track.lead_position_m[places]
+    alike = np.zeros(usable.size, dtype=bool)
+    n_rest = rest_points(y)
+    if not 0 < n_rest < y.size or np.ptp(y[:n_rest]) > AT_MOST_TWO * math.sqrt(12) * rounding_m:
+        return alike, None
+    alike[places[:n_rest]] = True
+    stands = int(np.flatnonzero(y != y[-1])[-1]) + 1
+    alike[places[stands + 1 :]] = True
+    return alike, VagueRest(float(track.time_s[places[n_rest - 1]]), float(np.median(y[:n_rest])), rounding_m)
 
 
 def _undriven(trial: Trial) -> bool:

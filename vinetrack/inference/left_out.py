@@ -13,9 +13,9 @@ from vinetrack.core.records import Floats
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import EffectError
 from vinetrack.inference.assemble import trial_fit
-from vinetrack.inference.fit_data import FitError, FitTrial, Pairs, prepare_trial
-from vinetrack.inference.gauge_noise import quiet_traces
+from vinetrack.inference.fit_data import FitError, FitTrial, Pairs
 from vinetrack.inference.parameters import YIELD_PRESSURE, ParameterMap
+from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.sensitivity import (
     DAMPING_DEVIATION,
     ORIGIN,
@@ -27,7 +27,6 @@ from vinetrack.inference.sensitivity import (
 )
 from vinetrack.inference.starts import align, initial_trial_effects
 from vinetrack.inference.whitening import all_products, at_correlation
-from vinetrack.tracks.smoothed_positions import smoothing_of
 
 if TYPE_CHECKING:
     from vinetrack.inference.fit_result import Fit, TrialFit
@@ -209,13 +208,9 @@ def prepared_pairs(pairs: Pairs) -> list[FitTrial]:
     FitError
         If a trial cannot be used; the message names it.
     """
-    data, pairs = [], list(pairs)
-    smoothing = smoothing_of(pairs)
-    for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
-        try:
-            data.append(prepare_trial(trial, track, quiet, smoothing))
-        except FitError as error:
-            raise FitError(f"Trial {trial.name}: {error}.") from error
+    data, unusable = prepare(pairs, weighted=False)
+    for name, reason in unusable.items():
+        raise FitError(f"Trial {name}: {reason}.")
     return data
 
 

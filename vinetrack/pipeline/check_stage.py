@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,7 @@ def check_folder(folder: Path) -> Checked:
     from vinetrack.pipeline.run_folders import path_problems
     from vinetrack.planning.pressure_plausibility import pressure_problems, track_speed
     from vinetrack.tracks.importers import TrackError, load_track
+    from vinetrack.tracks.position_noise import common_rounding_noise
     from vinetrack.tracks.smoothed_positions import smoothing_of
     from vinetrack.video.recording_facts import axis_notes, direction_notes, facts_entry, facts_rows
     from vinetrack.video.survey import Surveyor
@@ -82,4 +84,10 @@ def check_folder(folder: Path) -> Checked:
     smoothing = smoothing_of(handed_in)
     if smoothing is not None:
         notes.append(smoothing.note)
+    rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in handed_in])
+    if rounding_m > 0:
+        notes.append(
+            f"Positions are rounded to {1e3 * math.sqrt(12) * rounding_m:.3g} mm, and rounding is most of their noise:"
+            " hand them in with all digits that were measured."
+        )
     return Checked(tuple(problems), tuple(map(facts_entry, seen)), tuple(lines), tuple(notes))

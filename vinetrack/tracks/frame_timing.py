@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, join_flags, with_flag
-from vinetrack.tracks.position_noise import position_noise, rough_noise
+from vinetrack.tracks.position_noise import noise_but_for_faults
 from vinetrack.tracks.wild_points import reject_wild_points
 
 CLEAR_STEP_SIGMAS = 8.0
@@ -138,7 +138,7 @@ def _corrected(track: Track) -> Track:
     if np.any(np.abs(frames - np.rint(frames)) > UNEVEN * np.maximum(np.rint(frames), 1.0)):
         return track
     out = _flag_visible_gaps(track, np.rint(frames).astype(int))
-    noise_m, rho = _noise(out)
+    noise_m, rho = noise_but_for_faults(out.time_s[out.usable], out.lead_position_m[out.usable])
     out = _retime_known_copies(out, step_s, noise_m, rho)
     tried = 0
     while (event := _next_event(out, tried, step_s, noise_m, rho)) is not None:
@@ -161,7 +161,7 @@ def lost_for_sure(track: Track) -> bool:
     """
     rows = np.flatnonzero(track.usable)
     frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / float(np.median(np.diff(track.time_s))))
-    noise_m, rho = _noise(track)
+    noise_m, rho = noise_but_for_faults(track.time_s[track.usable], track.lead_position_m[track.usable])
     for i in (np.flatnonzero(with_flag(track.flag[rows], "retimed")) - 1).tolist():
         missing = frame[i + 1] - frame[i] - 1
         as_filmed = np.where(np.arange(frame.size) > i, frame - missing, frame)
@@ -192,17 +192,6 @@ def _retime_known_copies(track: Track, step_s: float, noise_m: float, rho: float
         if event is not None and event.kind == "inserted":
             track = _apply(track, event, step_s)
     return track
-
-
-def _noise(track: Track) -> tuple[float, float]:
-    """Noise of the track, kept down where a fault in a short track would itself pass for noise.
-
-    The median third difference hardly knows of one fault; it is at most 1.84 times too small (ρ = 0.6).
-    """
-    usable = track.usable
-    position_m = track.lead_position_m[usable]
-    noise_m, rho = position_noise(track.time_s[usable], position_m)
-    return min(noise_m, 1.84 * rough_noise(position_m)), rho
 
 
 def _flag_visible_gaps(track: Track, frames: NDArray[np.int_]) -> Track:

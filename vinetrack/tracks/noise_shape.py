@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.tracks.position_noise import position_noise, rough_noise
+from vinetrack.tracks.position_noise import noise_but_for_faults
 from vinetrack.tracks.wild_points import FEWEST_POINTS, LEAST_SHARE, local_fit, running_noise
 
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
@@ -127,8 +127,8 @@ def correlated_gain(rho: float) -> float:
 
 
 def _local(time_s: Floats, position_m: Floats) -> _Local:
-    noise_m, _ = position_noise(time_s, position_m)
-    fit = local_fit(time_s, position_m, min(noise_m, 1.84 * rough_noise(position_m)))
+    noise_m, _ = noise_but_for_faults(time_s, position_m)
+    fit = local_fit(time_s, position_m, noise_m)
     distance_m = np.zeros(time_s.size)
     distance_m[2:-2] = np.abs(np.convolve(position_m, FOURTH, "valid")) / np.linalg.norm(FOURTH)
     spacing = np.diff(time_s) / np.median(np.diff(time_s))

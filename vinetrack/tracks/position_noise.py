@@ -9,6 +9,7 @@ of growth) are left out.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -49,6 +50,18 @@ Chosen: at ρ = 0.85 noise persists for six frames, half a stretch; seven points
 three degrees of freedom. By reasoning: a lower limit replaces truly slow noise by too small a ρ, a higher one lets
 curvature pass for noise."""
 
+OF_THIRD = 1.84
+"""By how much the median third difference may be too small for noise that remembers itself. Derived: at ρ = 0.6 third
+differences have 1/1.84² of the variance of white noise."""
+
+SAME_STEP = 0.01
+"""Relative difference of two steps of rounding that are the same. Chosen: steps in pixels are known to a thousandth,
+decimals exactly; half or twice tells the same of either."""
+
+MOSTLY_ROUNDING = math.sqrt(2.0)
+"""Noise of a track, in errors of rounding, below which most of it is rounding. Derived: noise as large as that error
+comes to √2 of it together, and shows in spite of the rounding."""
+
 
 def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
     """Standard deviation and lag-one correlation of the random error of single positions.
@@ -67,11 +80,9 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
     if position_m.size < 5:
         return 0.0, 0.0
     groups = []
-    n_rest = max(rest_points(position_m) - REST_MARGIN, 0)
-    if n_rest >= 2 * MOVING_STRETCH:
+    n_rest = _frames_at_rest(position_m)
+    if n_rest:
         groups.append(_stretches(time_s[:n_rest], position_m[:n_rest], REST_STRETCH, REST_ORDER))
-    else:
-        n_rest = 0
     n_moving = position_m.size - n_rest
     if n_rest < ENOUGH_REST_FRAMES or n_moving > n_rest:
         length = MOVING_STRETCH if n_moving < LONG_TRACK else 2 * MOVING_STRETCH
@@ -80,9 +91,74 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
     if correlation > SUSPECT_RHO:
         short = [_stretches(time_s, position_m, SHORTEST_STRETCH, MOVING_ORDER)]
         noise_m, correlation = min((noise_m, correlation), _restricted_likelihood(short))
+    floor_m = rounding_noise(position_m)
+    return (floor_m, 0.0) if noise_m < floor_m else (noise_m, correlation)
+
+
+def noise_but_for_faults(time_s: Floats, position_m: Floats) -> tuple[float, float]:
+    """`position_noise`, kept down where a fault in a short track would itself pass for noise.
+
+    The median third difference hardly knows of one fault, and is at most `OF_THIRD` times too small; of positions that
+    are rounded, and mostly at rest, it knows nothing at all.
+
+    Parameters
+    ----------
+    time_s, position_m : arrays, shape (n,), s and m, finite, in order of time.
+
+    Returns
+    -------
+    noise_m : float, m
+    correlation : float
+    """
+    noise_m, correlation = position_noise(time_s, position_m)
+    return max(min(noise_m, OF_THIRD * rough_noise(position_m)), rounding_noise(position_m)), correlation
+
+
+def _frames_at_rest(position_m: Floats) -> int:
+    """Points at rest that are enough for stretches of their own, else none."""
+    n_rest = max(rest_points(position_m) - REST_MARGIN, 0)
+    return n_rest if n_rest >= 2 * MOVING_STRETCH else 0
+
+
+def rounding_noise(position_m: Floats) -> float:
+    """Standard deviation of the error of positions that are rounded (whole pixels, printed decimals).
+
+    Parameters
+    ----------
+    position_m : array, shape (n,), m, finite, in order of time.
+
+    Returns
+    -------
+    float, m
+        0 where they are not rounded, or where it does not show.
+    """
     floor_m = _quantum(position_m) / math.sqrt(12)
-    moving_m = position_m[n_rest:] if n_moving >= SHORTEST_MOTION else position_m
-    return (floor_m, 0.0) if noise_m < floor_m and _jagged(moving_m, floor_m) else (noise_m, correlation)
+    moving_m = position_m[_frames_at_rest(position_m) :]
+    moving_m = moving_m if moving_m.size >= SHORTEST_MOTION else position_m
+    return floor_m if floor_m > 0 and _jagged(moving_m, floor_m) else 0.0
+
+
+def common_rounding_noise(tracks: Sequence[Floats]) -> float:
+    """`rounding_noise` of most of a campaign's tracks where it is most of their noise; it then holds for all of them.
+
+    Parameters
+    ----------
+    tracks : sequence of arrays, shape (n_points,), m
+        Positions of each track.
+
+    Returns
+    -------
+    float, m
+        0 where most are not rounded, or not alike, or are noisier than that.
+    """
+    floors_m = [rounding_noise(position_m) for position_m in tracks]
+    noises = sorted(
+        floor_m if rough_noise(position_m) < MOSTLY_ROUNDING * floor_m else 0.0
+        for floor_m, position_m in zip(floors_m, tracks, strict=True)
+    )
+    typical = noises[len(noises) // 2] if noises else 0.0
+    alike = sum(typical * (1 - SAME_STEP) <= noise <= typical * (1 + SAME_STEP) for noise in noises)
+    return typical if 2 * alike > len(noises) else 0.0
 
 
 def _jagged(position_m: Floats, floor_m: float) -> bool:

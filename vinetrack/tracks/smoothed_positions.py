@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.core.records import Floats, Track, Trial
+from vinetrack.tracks.position_noise import common_rounding_noise
 
 WINDOWS = (3, 5, 7, 9, 11, 13, 15, 17, 19, 21)
 """Frames that are averaged over or that a polynomial goes through. Chosen: what spreadsheets and filters offer; longer
@@ -106,9 +107,11 @@ def smoothing_of(pairs: Iterable[tuple[Trial, Track]]) -> Smoothing | None:
     Returns
     -------
     Smoothing or None
+        None for rounded positions too: what rounding does to a slow motion has no high frequencies either.
     """
-    spectra = [spectrum for trial, track in pairs if trial.video is None for spectrum in _spectra(track)]
-    if not spectra:
+    tracks = [track for trial, track in pairs if trial.video is None]
+    spectra = [spectrum for track in tracks for spectrum in _spectra(track)]
+    if not spectra or common_rounding_noise([track.lead_position_m[track.usable] for track in tracks]) > 0:
         return None
     spectra = sorted(spectra, key=lambda spectrum: -spectrum[0].size)[:MOST_STRETCHES]
     plain = max(_whittle(spectra, [_correlated(f, rho) for f, _ in spectra]) for rho in CORRELATIONS)

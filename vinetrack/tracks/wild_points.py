@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, hand_corrected, join_flags
-from vinetrack.tracks.position_noise import position_noise, rough_noise
+from vinetrack.tracks.position_noise import noise_but_for_faults
 
 HALF_WIDTH = 6
 """Neighbours on either side. Chosen: twelve leave eight degrees of freedom beside a cubic. With three on either side
@@ -263,9 +263,7 @@ def _places(track: Track, wild: NDArray[np.int_]) -> list[str]:
 
 def _far_off(time_s: Floats, position_m: Floats, limit: float, spare_copies: bool) -> NDArray[np.bool_]:
     """Points beyond the limit that are the worst among their neighbours."""
-    noise_m, _ = position_noise(time_s, position_m)
-    # The likelihood of stretches takes wild points for noise where they are many; the median third difference does not.
-    noise_m = min(noise_m, 1.84 * rough_noise(position_m))
+    noise_m, _ = noise_but_for_faults(time_s, position_m)
     fit = local_fit(time_s, position_m, noise_m)
     sigma_m = np.maximum(np.maximum(running_noise(np.abs(fit.residual_m) / fit.gain), noise_m), fit.spread_m)
     size = np.abs(fit.residual_m)
