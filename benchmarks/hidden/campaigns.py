@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -171,14 +171,9 @@ def _joined(changes: list[Change]) -> Change:
     """All changes at once."""
     out = Change()
     for one in changes:
-        out = Change(
-            {**out.physics, **one.physics},
-            {**out.values, **one.values},
-            *(
-                getattr(out, name) + getattr(one, name)
-                for name in ("pressure_gain", "pressure_offset_Pa", "diameter", "film", "scale", "bow_per_m", "clock")
-            ),
-        )
+        sizes = [each.name for each in fields(Change) if each.name not in ("physics", "values")]
+        added = {name: getattr(out, name) + getattr(one, name) for name in sizes}
+        out = Change({**out.physics, **one.physics}, {**out.values, **one.values}, **added)
     return out
 
 
@@ -205,7 +200,7 @@ def _stated(
             diameter=trial.diameter_m * (1 + change.diameter),
             thickness=trial.thickness_m,
             length=trial.length_m,
-            payload=trial.payload_kg * payloads[one.payload_g],
+            payload=trial.payload_kg * payloads[one.payload_g] + (change.payload_kg if one.payload_g else 0.0),
             cosine=math.cos(math.radians(one.angle_deg)),
             chamber=one.chamber_l / 1e3 if math.isfinite(one.chamber_l) else math.inf,
             inlet_area=math.pi * (one.inlet_mm / 1e3) ** 2 / 4 if math.isfinite(one.inlet_mm) else math.inf,

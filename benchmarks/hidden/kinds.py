@@ -16,7 +16,8 @@ class Hidden:
     """Changes that one hidden thing makes: to the physics, to the tube as stated, to what the camera reports.
 
     `values` are the true parameters by the names that the catalogue uses, `pressure_*`, `diameter` and `film` what was
-    of what was read, `scale`, `bow` and `clock` what is reported of what was.
+    of what was read, `payload_kg` what every payload weighed beside what was read, `scale`, `bow` and `clock` what is
+    reported of what was.
     """
 
     physics: Mapping[str, float] = field(default_factory=dict)
@@ -25,6 +26,7 @@ class Hidden:
     pressure_offset_Pa: float = 0.0
     diameter: float = 0.0
     film: float = 0.0
+    payload_kg: float = 0.0
     scale: float = 0.0
     bow_per_m: float = 0.0
     clock: float = 0.0
@@ -165,6 +167,12 @@ def _film_mass(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
     return Hidden(values={"film_mass.eps": eps}, film=eps)
 
 
+def _payload_mass(draw: Draw, scene: Scene) -> Hidden:
+    # A mount that was not weighed along, or a payload that was weighed with more than went in.
+    delta = scene.payload_kg * (_between(draw, 0.05, 0.5) if draw.uniform() < 0.7 else -_between(draw, 0.05, 0.3))
+    return Hidden(values={"payload_mass.delta": delta}, payload_kg=delta)
+
+
 def _area_scale(draw: Draw, scene: Scene) -> Hidden:  # noqa: ARG001
     eps = _either(draw, 0.01, 0.05)
     return Hidden(values={"area_scale.eps": eps}, diameter=eps)
@@ -220,6 +228,7 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
     "pressure_gauge": (_pressure_gauge, Wants()),
     "area_scale": (_area_scale, Wants(quiet=True)),
     "film_mass": (_film_mass, Wants(quiet=True)),
+    "payload_mass": (_payload_mass, Wants(payload=True)),
     "perspective": (_perspective, Wants()),
 }
 """Every effect of the catalogue that a vine released at its full pressure can show, at sizes that are plausible."""
@@ -227,7 +236,16 @@ EFFECTS: dict[str, tuple[Maker, Wants]] = {
 INTERRUPTED: dict[str, tuple[Maker, Wants]] = {"static_yield": (_static_yield, Wants())}
 """Effects that show only where the pressure is let down and up again while the camera runs."""
 
-MEASUREMENT = ("length_scale", "time_base", "pressure_gain", "pressure_gauge", "area_scale", "film_mass", "perspective")
+MEASUREMENT = (
+    "length_scale",
+    "time_base",
+    "pressure_gain",
+    "pressure_gauge",
+    "area_scale",
+    "film_mass",
+    "payload_mass",
+    "perspective",
+)
 
 PAIRS: tuple[tuple[str, str], ...] = (
     ("tail_friction", "length_scale"),

@@ -51,6 +51,7 @@ SIZES: dict[str, tuple[Mapping[str, float], Mapping[str, float]]] = {
     "pressure_gauge": ({}, {"delta": 900.0}),
     "area_scale": ({}, {"eps": -0.03}),
     "film_mass": ({}, {"eps": 0.08}),
+    "payload_mass": ({}, {"delta": 6e-3}),
     "perspective": ({}, {"k": 0.2}),
 }
 """Sizes by effect: as the generator names them, and as the catalogue does."""
@@ -95,7 +96,7 @@ def ours(effect: str, trial: Trial, times: Floats, B: float, n: float) -> Floats
         diameter=trial.diameter_m * (1 + eps if effect == "area_scale" else 1.0),
         thickness=trial.thickness_m,
         length=trial.length_m,
-        payload=trial.payload_kg,
+        payload=trial.payload_kg + (values["delta"] if effect == "payload_mass" and trial.payload_kg else 0.0),
         cosine=math.cos(trial.growth_angle_rad),
         chamber=trial.chamber_m3,
         inlet_area=math.pi * trial.inlet_m**2 / 4,

@@ -132,8 +132,9 @@ def test_the_kind_agrees_with_the_hooks_and_with_being_base(effect: Effect) -> N
     if effect.kind == "measurement":
         read_off = {"true_time", "trace_time", "observed_position", "row_delay", "gauge", "yield_gauge", "area"}
         read_off |= {"film_gain", "averaged_over"}
-        weight = {"tail_force"} if effect.name == "growth_angle" else set()  # it turns a force that is there
-        assert set(effect.functions) <= read_off | weight
+        # They turn, and add to, a weight and a mass that are there.
+        weight = {"growth_angle": {"tail_force"}, "payload_mass": {"tail_force", "added_mass"}}
+        assert set(effect.functions) <= read_off | weight.get(effect.name, set())
 
 
 @each_effect

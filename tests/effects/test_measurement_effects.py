@@ -92,6 +92,12 @@ def test_heavier_film_leaves_forces_and_payload(vine: Vine) -> None:
     assert_same_motion(vine, {"film_mass.eps": 0.05}, acceleration)
 
 
+@pytest.mark.parametrize("vine", [LOADED, LEVEL], ids=["hangs", "level"])
+def test_a_mount_that_was_not_weighed_is_payload(vine: Vine) -> None:
+    heavier = Vine(**{**vine.__dict__, "payload": vine.payload + 6e-3})
+    assert_same_motion(vine, {"payload_mass.delta": 6e-3}, lambda _t, x, v: heavier.base(x, v) / heavier.m(x))
+
+
 @pytest.mark.parametrize(("stated", "true"), [(LEVEL, LOADED), (LOADED, LEVEL)], ids=["hangs", "level"])
 def test_a_growth_angle_counted_from_the_level_has_the_weight_of_the_other_direction(stated: Vine, true: Vine) -> None:
     assert_same_motion(stated, {"growth_angle.f": 1.0}, lambda _t, x, v: true.base(x, v) / true.m(x))

@@ -13,7 +13,7 @@ from vinetrack.dynamics.simulate import simulate
 from vinetrack.effects import catalogue
 
 TIMES = np.linspace(0.0, 0.3, 200)
-DRAWN_LAST = ("film_mass",)
+DRAWN_LAST = ("film_mass", "payload_mass")
 """Effects that came after the seeds: the others keep the sizes that these seeds always gave them."""
 
 

@@ -91,6 +91,11 @@ def test_heavy_film_is_a_slow_clock_on_the_level_without_payload() -> None:
     assert gap(LEVEL, heavy, slow) > 1e-4  # a payload is weighed for itself
 
 
+def test_a_payload_that_was_not_weighed_is_a_reel_on_the_level() -> None:
+    assert gap(LEVEL, {"payload_mass.delta": 6e-3}, {"reel_inertia.M": 6e-3}) < SAME
+    assert gap(LOADED, {"payload_mass.delta": 6e-3}, {"reel_inertia.M": 6e-3}) > 1e-4  # a payload has weight
+
+
 def test_area_is_a_gain_of_pressure_with_heavy_payload_and_exactly_with_weighed_film() -> None:
     # Film as weighed: what area_scale adds to λ is taken out of the thickness.
     weighed = Vine(**{**LOADED.__dict__, "t": LOADED.t / 1.03})

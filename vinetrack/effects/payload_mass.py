@@ -1,0 +1,74 @@
+"""Payload mass: what rides in the vine weighs more or less than the sheet says, by the same in every loaded trial.
+
+Matters with a payload, most for a light one: its mount, tape, bolts or cable were not weighed along, or the balance was
+not zeroed. In a vine that runs at a few metres a second most of the mass that moves is payload.
+
+    m_pay → m_pay + δ in trials with a payload: inertia and weight
+
+Friction of the payload stays that of the mass stated.
+
+Easily taken for `payload_friction`, `growth_angle` or `area_scale`, which change a force beside the payload; where no
+trial is bare, for `film_mass`, and on the level exactly for `reel_inertia`.
+
+Reduce it by weighing the payload as it is put in, mount and tape included.
+
+Source: Eq. (2) of Alvarez et al. (2025).
+"""
+
+from vinetrack.core.constants import GRAVITY_M_S2
+from vinetrack.effects import Parameter, Worked
+
+KIND = "measurement"
+NEEDS = ("payload_g",)
+EASILY_TAKEN_FOR = ("payload_friction", "growth_angle", "area_scale", "reel_inertia", "film_mass")
+PARAMETERS = (
+    Parameter(
+        "delta",
+        "δ",
+        "kg",
+        5e-3,
+        bounds=(-1.0, 1.0),
+        plausible=(-0.02, 0.05),
+        meaning="mass of the payload beside what the sheet states",
+    ),
+)
+
+
+def added_mass(s, rig, delta):  # noqa: D103
+    if rig.payload_mass <= 0.0:
+        return 0.0 * s.lead_position
+    return max(delta, -rig.payload_mass) + 0.0 * s.lead_position
+
+
+def tail_force(s, rig, delta):  # noqa: D103
+    if rig.payload_mass <= 0.0:
+        return 0.0 * s.lead_position
+    return max(delta, -rig.payload_mass) * GRAVITY_M_S2 * rig.cos_angle + 0.0 * s.lead_position
+
+
+_STATE = {"lead_position": 0.1}
+WORKED = (
+    Worked(
+        "added_mass", 0.006, "a mount of 6 g", state=_STATE, rig={"payload_mass": 0.02}, parameters={"delta": 0.006}
+    ),
+    Worked(
+        "added_mass", -0.02, "no less than none", state=_STATE, rig={"payload_mass": 0.02}, parameters={"delta": -0.1}
+    ),
+    Worked("added_mass", 0.0, "no payload", state=_STATE, rig={"payload_mass": 0.0}, parameters={"delta": 0.006}),
+    Worked(
+        "tail_force",
+        0.05886,
+        "6 g × 9.81, straight down",
+        state=_STATE,
+        rig={"payload_mass": 0.02, "cos_angle": 1.0},
+        parameters={"delta": 0.006},
+    ),
+    Worked(
+        "tail_force",
+        0.0,
+        "no payload",
+        state=_STATE,
+        rig={"payload_mass": 0.0, "cos_angle": 1.0},
+        parameters={"delta": 0.006},
+    ),
+)
