@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import vinetrack as vt
 from vinetrack.cli.main import app
 from vinetrack.core.tables import write_json
-from vinetrack.inference.fit_summary import summary_of
+from vinetrack.inference.summary_of_fit import summary_of
 from vinetrack.pipeline.prediction_inputs import Asked, inputs_of, read_ground
 from vinetrack.planning.prediction import CURVE_COLUMNS
 

@@ -352,33 +352,6 @@ def slack_tail(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG00
     return replace(laboratory, shots=tuple(replace(shot, slack=True) for shot in laboratory.shots))
 
 
-def film_off(sigma: float) -> Fault:
-    """The film of each vine weighs more or less than thickness and density say, by so much."""
-
-    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
-        vines = list(dict.fromkeys(shot.setting.vine for shot in laboratory.shots))
-        factors = {vine: 1 + sigma * float(np.clip(draw.standard_normal(), -2, 2)) for vine in vines}
-        shots = tuple(_with_film(shot, factors[shot.setting.vine]) for shot in laboratory.shots)
-        known = {f"film_mass.eps.{k}": factor - 1 for k, factor in enumerate(factors.values())}
-        return replace(laboratory, shots=shots).known(film_sigma=sigma, **known)
-
-    return apply
-
-
-def film_of(density: float) -> Fault:
-    """The film has this density, kg/m³, and the settings do not say so."""
-
-    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG001
-        shots = tuple(_with_film(shot, density / shot.tube.film_density) for shot in laboratory.shots)
-        return replace(laboratory, shots=shots).known(film_density=density)
-
-    return apply
-
-
-def _with_film(shot: Shot, factor: float) -> Shot:
-    return replace(shot, tube=shot.tube._replace(film_density=factor * shot.tube.film_density))
-
-
 def inlet_half(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG001
     """Connectors half as wide as the vine, as the sheet says."""
     shots = []

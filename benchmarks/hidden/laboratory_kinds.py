@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from hidden import laboratories as faults
+from hidden import weights
 from hidden.designs import Setting, Wants
 from hidden.kinds import EFFECTS
 from hidden.shots import Fault
@@ -337,11 +338,11 @@ def _film_rows() -> list[Row]:
     """Film that weighs other than the sheet says, alone and beside an effect."""
     film = ("film_mass",)
     between = ("artefact", "ambiguous")
-    uneven = faults.film_off(0.05)
+    uneven = weights.film_off(0.05)
     two = {"wants": Wants(payload=False, vines=2), "accept": _two}
     rows = [
         Row("film_uneven", "film_uneven", _names(*film, verdicts=between, adequate=True), (uneven,), quiet=0.5, **two),
-        Row("film_density", "film_density", _names(*film, verdicts=between), (faults.film_of(920.0),), quiet=0.5),
+        Row("film_density", "film_density", _names(*film, verdicts=between), (weights.film_of(920.0),), quiet=0.5),
     ]
     for name in FILM_EFFECTS:
         should = Should(NAMED, any_of=(name, *film), true=(name, *film))
@@ -349,6 +350,17 @@ def _film_rows() -> list[Row]:
         label = f"film_{name}"
         rows.append(Row(label, label, should, (uneven, faults.effect(name)), wants, quiet=0.5, least_sigma=CLEAR))
     return rows
+
+
+def _payload_rows() -> list[Row]:
+    """Payloads that weigh other than the sheet says."""
+    verdicts, loaded = ("artefact", "ambiguous"), Wants(payload=True, vines=2)
+    always, mostly = (_names("payload_mass", verdicts=verdicts, adequate=adequate) for adequate in (False, True))
+    mount = weights.mount_forgotten(3, 10)
+    return [
+        Row("mount_forgotten", "mount_forgotten", always, (mount,), loaded, quiet=0.5),
+        Row("payload_mistyped", "payload_mistyped", mostly, (weights.payload_mistyped,), loaded, quiet=0.5),
+    ]
 
 
 def _everyday_rows() -> list[Row]:
@@ -370,5 +382,5 @@ def _everyday_rows() -> list[Row]:
 
 def every_row() -> Iterator[Row]:
     """All rows, those of careful laboratories first."""
-    for rows in (_clean_rows, _camera_rows, _rig_rows, _order_rows, _film_rows, _everyday_rows):
+    for rows in (_clean_rows, _camera_rows, _rig_rows, _order_rows, _film_rows, _payload_rows, _everyday_rows):
         yield from rows()

@@ -140,7 +140,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     a question where one comes close, else a list; blank where nothing is known.
 
     >>> did_you_mean("presure", ["pressure", "payload", "trial", "preview"])
-    'did you mean pressure? (or preview, payload)'
+    'did you mean pressure? (or preview, trial)'
     """
     nearest = difflib.get_close_matches(name, list(known), 3, 0.0)
     if not nearest:

@@ -89,8 +89,14 @@ UNITS: dict[str, Unit] = {
 it, all by definition (international yard and pound agreement, 1959); a psi is the weight of a pound (g = 9.80665 m/s²)
 on a square inch: 0.45359237 · 9.80665 / 0.0254² Pa."""
 
-DISPLAY_UNITS: dict[str, tuple[str, float]] = {"Pa": ("kPa", 1e-3), "1/Pa": ("1/kPa", 1e3), "1": ("", 1.0)}
-"""Unit shown in place of an SI unit, and the factor from SI: pressures of vines are printed in kPa; "1" has no unit."""
+DISPLAY_UNITS: dict[str, tuple[str, float]] = {
+    "Pa": ("kPa", 1e-3),
+    "1/Pa": ("1/kPa", 1e3),
+    "kg": ("g", 1e3),
+    "1": ("", 1.0),
+}
+"""Unit shown in place of an SI unit, and the factor from SI: pressures of vines are printed in kPa, what they carry and
+turn in grams; "1" has no unit."""
 
 SLIDER_UNITS = {**DISPLAY_UNITS, "m": ("mm", 1e3), "m²": ("cm²", 1e4)}
 """The same for a slider, which moves in steps that a hand can see; lengths of vines are of millimetres."""
@@ -112,8 +118,8 @@ def display_unit(unit: str, table: Mapping[str, tuple[str, float]] = DISPLAY_UNI
     name, factor
         The unit itself and 1.0 where nothing else is shown in its place.
 
-    >>> display_unit("Pa"), display_unit("kg")
-    (('kPa', 0.001), ('kg', 1.0))
+    >>> display_unit("Pa"), display_unit("m")
+    (('kPa', 0.001), ('m', 1.0))
     """
     return table.get(unit, (unit, 1.0))
 

@@ -1,13 +1,13 @@
 """A fit as `fit.json` holds it: everything that is quoted from a fit, without what it was computed with.
 
-`summary_of` takes it from a fit in memory and `FitSummary.from_json` from a file, so the keys of the file stand here
-alone.
+`vinetrack.inference.summary_of_fit` takes it from a fit in memory and `FitSummary.from_json` from a file, so the keys
+of the file stand here alone.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,7 @@ from vinetrack.core.notebook import html_table
 from vinetrack.core.numbers import or_nan
 from vinetrack.core.records import Floats
 from vinetrack.dynamics.model import Value, values_by_key
-from vinetrack.inference.film_influence import film_influence, film_messages
-from vinetrack.inference.fit_result import BetweenTrialSpread, Fit, Number, NumberTable, number_row, numbers_text
+from vinetrack.inference.fit_result import BetweenTrialSpread, Number, NumberTable, number_row, numbers_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -159,37 +158,3 @@ class FitSummary(NumberTable):
             return f"{' + '.join(self.names)} was not fitted: {self.refused}"
         head = f"{' + '.join(self.names)}, fitted to {len(self.trials)} trials"
         return "\n".join([head, *numbers_text(self)])
-
-
-def summary_of(fit: Fit, warnings: Sequence[str] = (), further_messages: Sequence[str] = ()) -> FitSummary:
-    """Return what is quoted from a fit.
-
-    Parameters
-    ----------
-    fit : the fit.
-    warnings : of the audit.
-    further_messages : beside those of the fit.
-
-    Returns
-    -------
-    FitSummary
-    """
-    keys = [entry.name for entry in fields(TrialEstimates)]
-    moved = film_influence(fit)
-    return FitSummary(
-        names=tuple(fit.model.names),
-        numbers=fit.numbers,
-        covariance=fit.covariance,
-        spreads=fit.spreads,
-        noise_m=fit.noise_m,
-        noise_correlation=fit.noise_correlation,
-        chi2_per_dof=fit.chi2_per_dof,
-        log_likelihood=fit.log_likelihood,
-        converged=fit.converged,
-        messages=(*fit.messages, *film_messages(fit.numbers, moved), *further_messages),
-        warnings=tuple(warnings),
-        left_out=fit.left_out,
-        trials={trial.name: TrialEstimates(*(getattr(trial, key) for key in keys)) for trial in fit.trials},
-        between=np.zeros_like(fit.covariance) if fit.between is None else fit.between,
-        moved_by_film=moved,
-    )

@@ -204,7 +204,7 @@ def write_diagnosis(results: Results, diagnosis: Diagnosis) -> dict[str, Any]:
     numbers = moved(diagnosis.fits, ("", *diagnosis.effects)) if len(diagnosis.fits) > 1 else empty_table(MOVED_COLUMNS)
     write_csv(folder / "moved.csv", numbers)
     if len(diagnosis.fits) > 1:
-        from vinetrack.inference.fit_summary import summary_of
+        from vinetrack.inference.summary_of_fit import summary_of
 
         write_json(results.final_fit, summary_of(diagnosis.fits[-1]).to_json())
     for name, table in predictions(diagnosis.fits[0], diagnosis.fits[-1]).items():

@@ -60,8 +60,9 @@ def fit_model(experiment: Experiment, folder: Path, settings: RunSettings) -> di
     from vinetrack.diagnosis.compare import COMPARISON_COLUMNS
     from vinetrack.diagnosis.payload_curve import CURVE_COLUMNS, payload_curves
     from vinetrack.dynamics.audit import COLUMNS as AUDIT_COLUMNS
-    from vinetrack.inference.fit_summary import FitSummary, summary_of
+    from vinetrack.inference.fit_summary import FitSummary
     from vinetrack.inference.model_check import CHECK_COLUMNS
+    from vinetrack.inference.summary_of_fit import summary_of
     from vinetrack.results.folder_layout import empty_table
 
     results = Results(folder)

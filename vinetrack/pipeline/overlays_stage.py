@@ -231,8 +231,8 @@ def pace(n_frames: int, seconds: float) -> tuple[float, int]:
     --------
     >>> pace(120, 6.0)
     (20.0, 1)
-    >>> pace(3000, 6.0)
-    (29.41, 17)
+    >>> pace(3420, 6.0)
+    (30.0, 19)
     """
     stride = max(round(n_frames / seconds / FASTEST_FPS), 1)
     return float(np.clip(n_frames / stride / seconds, SLOWEST_FPS, FASTEST_FPS)), stride

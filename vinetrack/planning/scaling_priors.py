@@ -67,7 +67,7 @@ def damping_prior(diameter_m: float, thickness_m: float) -> float:
 
     Examples
     --------
-    >>> round(guess_damping(25e-3, 100e-6), 2)
+    >>> round(damping_prior(25e-3, 100e-6), 2)
     3.32
     """
     largest = max(published.DAMPING_B)
