@@ -67,6 +67,20 @@ def worn(low: float, high: float) -> Fault:
     return apply
 
 
+def supply_falls(part: float) -> Fault:
+    """The pressure falls by this part of it over the campaign, evenly from trial to trial."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG001
+        rate = part / len(laboratory.shots)
+        shots = (
+            replace(shot, tube=shot.tube._replace(pressure=shot.tube.pressure * (1 - rate * k)))
+            for k, shot in enumerate(laboratory.shots)
+        )
+        return replace(laboratory, shots=tuple(shots)).known(**{"order_drift.P": -rate})
+
+    return apply
+
+
 def zero_by_day(sigma_kPa: float) -> Fault:
     """The gauge has another zero each of three to five days: the tube gets the pressure read plus that."""
 

@@ -110,6 +110,10 @@ def _order_rows() -> list[Row]:
         *_twice(
             Row("wear_random", "wear_random", quietly, (any_order, faults.worn(0.01, 0.03)), **some), columns=("order",)
         ),
+        *_twice(
+            Row("supply_falls", "supply_falls", guessed, (rising, faults.supply_falls(0.05)), BARE, quiet=0.5),
+            columns=("order",),
+        ),
         *_twice(Row("day_zeros_rising", "day_zeros_rising", guessed, (rising, *several), **some), columns=WHEN),
         *_twice(Row("day_zeros_random", "day_zeros_random", guessed, (any_order, *several), **some), columns=WHEN),
         *_twice(

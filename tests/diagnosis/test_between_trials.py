@@ -78,6 +78,23 @@ def test_wear_with_rising_pressures_is_not_called_physics(worn: Pairs) -> None:
     assert "Repeat six trials in random order" in result.explanation
 
 
+def test_a_supply_that_empties_while_pressures_rise_is_named_with_its_rate(trials: list[Trial]) -> None:
+    """Each trial has 0.15 % less than the one before of what the sheet says."""
+    true = [replace(trial, pressure_Pa=trial.pressure_Pa * (1 - 0.0015 * i)) for i, trial in enumerate(trials)]
+    pairs = made(true, range(len(true)), lambda _, __: 1.0, seed=7)
+    stated = [
+        (replace(trial, pressure_Pa=known.pressure_Pa), track)
+        for known, (trial, track) in zip(trials, pairs, strict=True)
+    ]
+    result = diagnosed(stated, (*PHYSICS, "pressure_gain", "film_mass"))
+    assert result.verdict in (ARTEFACT, AMBIGUOUS)
+    assert "order_drift" in result.answer_set
+    (drift,) = next(row for row in result.rounds[0].ranking if row.effect == "order_drift").numbers
+    assert drift.key == "order_drift.P"
+    assert abs(drift.value + 0.0015) < 3 * drift.sigma < 0.001
+    assert "pressure falls by" in result.explanation
+
+
 def test_gains_of_a_later_tube_from_every_trial_on_are_those_of_one_change_after_the_other(worn: Pairs) -> None:
     of_pairs = fit(vt.base_model(), worn, profile=False)
     smooth = smooth_errors(of_pairs.predictor, of_pairs.solution)

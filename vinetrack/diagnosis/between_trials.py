@@ -7,8 +7,9 @@ that follows the condition. So such differences are hypotheses of the diagnosis 
     ln B_j          = ln B_vine + Σ_g a_g z_gj + u_j
     P_j / P_set,j   = 1         + Σ_g b_g z_gj + v_j        u_j, v_j random from trial to trial
 
-with z_gj the number of trials that the vine (or specimen) of trial j has seen, or 1 in group g and 0 elsewhere
-(pressure: 1 kPa / P_set,j, a shift of the zero of the gauge or of P_y, which are the same to a force (P − P_y) A).
+with z_gj the number of trials that the vine (or specimen) of trial j has seen (pressure: all trials before, as a supply
+empties or a regulator creeps), or 1 in group g and 0 elsewhere (pressure: 1 kPa / P_set,j, a shift of the zero of the
+gauge or of P_y, which are the same to a force (P − P_y) A).
 Coefficients of groups are random effects with a prior, integrated out of the likelihood, so that a hypothesis with many
 groups pays for each of them; a drift has one coefficient, fixed. All are compared by the same Δχ² as effects are.
 """
@@ -61,8 +62,12 @@ few tenths of a kPa; at half and twice, ln L of a hypothesis moves by about ln 2
 DAY_B_SD, DAY_PA_SD = 0.03, 300.0
 """The same from day to day: film in other air, a gauge zeroed anew. Chosen: a gauge holds its zero to 0.3 kPa."""
 
-PLAUSIBLE_DRIFT = 0.05
-"""Change of ln B a trial that is still plausible. Chosen: a tube whose B rises by 5 % a trial is done for after ten."""
+PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01}
+"""Change of ln B a trial that is still plausible, and of ln P. Chosen: a tube whose B rises by 5 % a trial is done for
+after ten; a supply that loses 1 % a trial has lost a fifth after twenty, and somebody has looked at the gauge."""
+
+DRIFT_FORMS = 2
+"""Forms of a drift, of B and of the pressure. Derived: where the better one counts, chance is that of either."""
 
 FEWEST_TRIALS = 6
 """Trials from which a drift or a change is asked for: below, any order of a few pressures is like any other. Chosen:
@@ -205,7 +210,14 @@ def _widened_by(difference: Difference) -> tuple[str, ...]:
 
 def _effect_of(difference: Difference) -> Effect:
     """A stand-in for the effect that the tables of candidates and the answer set show."""
-    drift = (Parameter("B", "dlnB", "1/trial", 0.0, plausible=(-PLAUSIBLE_DRIFT, PLAUSIBLE_DRIFT)),)
+    drift = tuple(
+        Parameter(
+            term.key.split(".")[1], term.symbol, term.unit, 0.0,
+            plausible=(-PLAUSIBLE_DRIFT[term.key.split(".")[1]], PLAUSIBLE_DRIFT[term.key.split(".")[1]]),
+        )
+        for term in difference.terms
+        if difference.name == ORDER_DRIFT
+    )  # fmt: skip
     keys = [term.key for term in difference.terms] or list(difference.shared)
     parameters = tuple(Parameter(key.split(".")[1], key, "", 0.0) for key in keys)
     return Effect(
@@ -213,7 +225,7 @@ def _effect_of(difference: Difference) -> Effect:
         kind=BETWEEN_TRIALS,
         summary=BETWEEN_SUMMARIES[difference.name],
         text=BETWEEN_SUMMARIES[difference.name],
-        parameters=drift if difference.name == ORDER_DRIFT else parameters,
+        parameters=drift or parameters,
         functions={},
         needs=(),
         easily_taken_for=(),
@@ -236,21 +248,32 @@ def _tube(trial: Trial) -> str:
 
 
 def _drifts(trials: Sequence[Trial]) -> list[Difference]:
-    """Ln B by the number of trials that the tube has seen before."""
+    """Ln B by the number of trials that the tube has seen before; pressure by that of all trials before."""
     if len(trials) < FEWEST_TRIALS:
         return []
     ranks, stated = trial_order(trials)
-    uses, seen = np.zeros(ranks.size), Counter[str]()
-    for i in np.argsort(ranks):
+    order = np.argsort(ranks)
+    uses, before, seen = np.zeros(ranks.size), np.zeros(ranks.size), Counter[str]()
+    before[order] = np.arange(ranks.size)
+    for i in order:
         uses[i] = seen[_tube(trials[i])]
         seen[_tube(trials[i])] += 1
-    if not uses.any():
-        return []
-    term = BetweenTerm(
-        key=f"{ORDER_DRIFT}.B", symbol="dlnB", unit="1/trial", pressure=False, groups=("all",) * ranks.size,
-        regressor=uses, scale=0.01,
-    )  # fmt: skip
-    return [Difference(ORDER_DRIFT, (term,), stated=stated, confounded=confounded(uses[:, None], trials))]
+    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    forms = (("B", "dlnB", uses), ("P", "dlnP", before)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
+    return [
+        Difference(
+            ORDER_DRIFT,
+            (
+                BetweenTerm(
+                    f"{ORDER_DRIFT}.{name}", symbol, "1/trial", name == "P", ("all",) * ranks.size, past, scale=0.01
+                ),
+            ),
+            stated=stated,
+            confounded=confounded(past[:, None], trials),
+        )
+        for name, symbol, past in forms
+        if past.any()
+    ]
 
 
 def _groups(trials: Sequence[Trial]) -> list[Difference]:
@@ -363,7 +386,7 @@ def _estimated(fit: Fit, plain: Solution, base: Solution, difference: Difference
     if p < ASKED_AGAIN and difference.stated and difference.confounded:
         beside = linear_gain(fit, beside_systematics(fit, plain), difference)
         p = max(p, chance_of_gain(fit, difference, beside))
-    return replace(difference, gain=gain, p=p)
+    return replace(difference, gain=gain, p=min(p * (DRIFT_FORMS if difference.name == ORDER_DRIFT else 1), 1.0))
 
 
 def _fitted(before: Fit, difference: Difference) -> Fit | None:

@@ -44,7 +44,7 @@ N_BY_VINE, ORDER_DRIFT, SPECIMEN, DAY = ("n_by_vine", "order_drift", "specimen",
 
 BETWEEN_SUMMARIES = {
     N_BY_VINE: "the exponent n differs between the vines",
-    ORDER_DRIFT: "B drifts with the order of the trials",
+    ORDER_DRIFT: "B or the pressure drifts with the order of the trials",
     SPECIMEN: "specimens (tubes of one kind) differ",
     DAY: "B or the zero of the gauge differs from day to day",
 }

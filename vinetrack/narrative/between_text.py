@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 REMEDIES = {
     N_BY_VINE: "Give every vine its own n (`shared={'n': 'vine'}`) before asking for effects",
-    ORDER_DRIFT: "Repeat six trials in random order, and number all in the column `order`",
+    ORDER_DRIFT: "Repeat six trials in random order, and number all in the column `order`; read the gauge at each",
     SPECIMEN: "Film every specimen at several pressures, and name it in the column `specimen`",
     DAY: "Repeat some conditions on another day, and zero the gauge before each",
 }
@@ -70,7 +70,8 @@ def difference_in_words(result: LikelihoodRatio) -> str:
     if name == ORDER_DRIFT:
         slope = result.numbers[0]
         way = "rises" if slope.value > 0 else "falls"
-        return f"B {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % with every trial of a tube"
+        what, each = ("B", "every trial of a tube") if slope.key.endswith(".B") else ("pressure", "every trial")
+        return f"{what} {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % with {each}"
     parts = []
     in_B = [number for number in result.numbers if number.key.endswith(".B")]
     in_P = [number for number in result.numbers if number.key.endswith(".P")]
