@@ -39,6 +39,7 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
     assert (said.verdict, said.answer_set) == ("artefact", ("film_mass",))
     (named,) = [candidate for candidate in said.rounds[0].ranking if candidate.effect == "film_mass"]
     assert len({number.vine for number in named.numbers}) == 2
+    assert "filmed at a frame rate that is off by half of its ε" in said.explanation
     for k, number in enumerate(named.numbers):
         assert abs(number.value - truths[f"film_mass.eps.{k}"]) < 3 * number.sigma < 0.03
 

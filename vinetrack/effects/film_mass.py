@@ -6,7 +6,9 @@ settings say otherwise, where polyethylene has 920. A light vine starts by its m
     λ → (1 + ε) λ for each vine, what was of what was computed from thickness, diameter and density
 
 Easily taken for `time_base` and `area_scale`, which change the mass beside the forces; for `pressure_gain`, which
-changes the forces beside the mass; where several vines differ, for `n_by_vine` and `wall_stretch`.
+changes the forces beside the mass; where several vines differ, for `n_by_vine` and `wall_stretch`. Where one vine was
+filmed with other settings of the camera, a frame rate off by ε/2 or a scale off by −ε in its recordings alone is the
+same thing on the level without a payload, nearly so elsewhere.
 
 Reduce it by weighing a piece of each vine: its mass over its length is λ.
 

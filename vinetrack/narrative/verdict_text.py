@@ -17,6 +17,7 @@ from vinetrack.diagnosis.result import (
     MISSING,
 )
 from vinetrack.dynamics.model import base_model
+from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Number
 from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.narrative.between_text import difference_in_words, remedies_in_words, trials_differ
@@ -87,7 +88,7 @@ def explain(finding: SelectionStep) -> str:
         return (
             f"{model} lacks an effect, and these data cannot tell which: {joined(names, 'or')}. "
             f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other{_by_film(kept)}.{_weights(kept)}"
-            f"{_remedies(finding)}"
+            f"{_camera_of_a_vine(kept)}{_remedies(finding)}"
         )
     if finding.verdict == ARTEFACT and trials_differ(names):
         return (
@@ -99,8 +100,8 @@ def explain(finding: SelectionStep) -> str:
         return (
             f"A fault of the measurement, not of the physics: {which} explains the misfit of {model} "
             f"({_hypotheses(kept)}). It is not added to the model: "
-            f"find the fault and measure again, or correct the sheet.{_remedies(finding)}{_with_the_fault(finding)}"
-            f"{_taken_up(kept[0].names)}"
+            f"find the fault and measure again, or correct the sheet.{_camera_of_a_vine(kept)}{_remedies(finding)}"
+            f"{_with_the_fault(finding)}{_taken_up(kept[0].names)}"
         )
     text = (
         f"The misfit of {model} exceeds the noise of {trials}, and no effect of the catalogue nor any set of the best "
@@ -184,6 +185,24 @@ def _weights(kept: Sequence[LikelihoodRatio]) -> str:
     weights = sorted(weights_of(kept).items(), key=lambda pair: -pair[1])
     each = ", ".join(f"{label.replace('+', ' with ')} {100 * weight:.0f} %" for label, weight in weights)
     return f" Posterior weights, with plausible sizes as priors: {each}."
+
+
+def _camera_of_a_vine(kept: Sequence[LikelihoodRatio]) -> str:
+    """What else films that differ from vine to vine may be; blank where no answer says that they do.
+
+    ε of the mass is ε/2 of the frame rate of that vine's recordings, exactly so on the level without a payload, and
+    close to −ε of their scale: mass times acceleration is what is seen of any of them.
+    """
+    if not any(FILM in hypothesis.names and len(_films(hypothesis)) > 1 for hypothesis in kept):
+        return ""
+    return (
+        " A vine filmed at a frame rate that is off by half of its ε, or with a scale off by −ε, looks the same: check"
+        " the camera's settings of that vine too."
+    )
+
+
+def _films(hypothesis: LikelihoodRatio) -> set[str]:
+    return {number.vine for number in hypothesis.numbers if number.key.startswith(f"{FILM}.")}
 
 
 def _by_film(kept: Sequence[LikelihoodRatio]) -> str:
