@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from vinetrack.core.numbers import decimals
+from vinetrack.core.numbers import decimals, with_error
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.confounder import Confounder, left_open
 from vinetrack.diagnosis.result import (
@@ -15,10 +15,12 @@ from vinetrack.diagnosis.result import (
     ARTEFACT,
     BETWEEN_TRIALS,
     MISSING,
+    N_BY_VINE,
 )
 from vinetrack.dynamics.model import base_model
 from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Number
+from vinetrack.inference.parameters import EXPONENT
 from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.narrative.between_text import difference_in_words, remedies_in_words, trials_differ
 from vinetrack.narrative.verdict_summary import joined, size
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.selection import SelectionStep
 
 MEASUREMENT = "measurement"
+MOST_MOVED = 3
+"""Numbers that a fault has moved, named at most. Chosen to keep the sentence short; the ranking holds all of them."""
+
 WORTH_A_CHECK_SIGMA = 3.0
 """From which an error of measurement that falls short of its threshold is named as worth a check. Chosen: about one
 campaign in fifty has one by chance among its ten; at 2.5 one in ten, at 3.5 one in 200. It changes no verdict."""
@@ -94,6 +99,7 @@ def explain(finding: SelectionStep) -> str:
         return (
             f"Trials differ, and {model} holds otherwise: {_hypotheses(kept)}. That explains the misfit in {trials} "
             f"(Δχ² = {kept[0].delta_chi2:.0f}); no effect is needed beside it.{_remedies(finding)}"
+            f"{_with_the_fault(finding)}"
         )
     if finding.verdict == ARTEFACT:
         which = joined(names, "or")
@@ -221,15 +227,38 @@ def _by_film(kept: Sequence[LikelihoodRatio]) -> str:
 
 
 def _with_the_fault(finding: SelectionStep) -> str:
-    """Sizes of effects added before, fitted together with the fault: without it they are biased by it."""
+    """Numbers that are biased without the fault, fitted along with the likeliest one, and instead of what.
+
+    Those are all of effects added before, and of the base model n first, then others that leave their 95 % intervals.
+    B of a vine with an n of its own is another quantity.
+    """
     fit, best = finding.questions.fit, finding.kept[0]
-    added = [number for number in best.others if number.key.split(".")[0] not in base_model()]
+    if best.names[-1] == N_BY_VINE:
+        return ""
     before = {number.name: number for number in fit.numbers}
-    moved = [number for number in added if number.name in before and math.isfinite(number.sigma)]
+    moved = [
+        number
+        for number in best.others
+        if number.name in before and math.isfinite(number.sigma) and _is_biased(before[number.name], number)
+    ]
+    moved.sort(key=lambda number: number.key != EXPONENT)
     if not moved:
         return ""
-    instead = sizes_in_words([before[number.name] for number in moved])
-    return f" Fitted along with {best.names[-1]}, {sizes_in_words(moved)} instead of {instead}."
+    each = ", ".join(f"{size(number)} instead of {_value(before[number.name])}" for number in moved[:MOST_MOVED])
+    more = f", and {len(moved) - MOST_MOVED} more move" if len(moved) > MOST_MOVED else ""
+    return f" Fitted along with {best.names[-1]}, {each}{more}."
+
+
+def _is_biased(before: Number, with_fault: Number) -> bool:
+    if before.key.split(".")[0] not in base_model():
+        return True
+    return math.isfinite(before.sigma) and not before.low <= with_fault.value <= before.high
+
+
+def _value(entry: Number) -> str:
+    """A number without its symbol and unit."""
+    _, factor = display_unit(entry.unit)
+    return with_error(factor * entry.value, factor * entry.sigma if math.isfinite(entry.sigma) else None)
 
 
 def _hypotheses(kept: Sequence[LikelihoodRatio]) -> str:
