@@ -70,7 +70,10 @@ class Answer:
 
     @classmethod
     def of(cls, said: Mapping[str, Any]) -> Answer:
-        """From the file. Sizes come from the first round that states them, else from the last model."""
+        """From the file. Sizes come from the first round that states them, else from the last model.
+
+        Of the model's own numbers those count that a fault of the measurement was fitted along with, where one is named.
+        """
         rounds = said["rounds"]
         numbers: dict[str, Mapping[str, Any]] = {}
         confounders: dict[str, list[Mapping[str, Any]]] = {}
@@ -88,9 +91,16 @@ class Answer:
             said["final_verdict"],
             tuple(rounds[-1]["answer_set"]),
             numbers,
-            tuple(said["parameters"]),
+            _stated(said),
             confounders,
         )
+
+
+def _stated(said: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    """The model's numbers as the verdict states them."""
+    along = [c["along"] for c in said["rounds"][-1]["ranking"] if c["in_answer_set"] and c.get("along")]
+    named = said["final_verdict"] == "artefact" and along
+    return tuple(along[0] if named else said["parameters"])
 
 
 def matches(name: str, patterns: Iterable[str]) -> bool:

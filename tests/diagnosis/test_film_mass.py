@@ -13,6 +13,7 @@ from hidden.laboratory_rows import campaign
 from scipy.stats import norm
 
 import vinetrack as vt
+from vinetrack.core.numbers import with_error
 from vinetrack.diagnosis import likelihood_ratio
 from vinetrack.diagnosis.candidates import shapes_of
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
@@ -40,6 +41,9 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
     (named,) = [candidate for candidate in said.rounds[0].ranking if candidate.effect == "film_mass"]
     assert len({number.vine for number in named.numbers}) == 2
     assert "filmed at a frame rate that is off by half of its ε" in said.explanation
+    (n,) = [number for number in named.along if number.key == "eversion_damping.n"]
+    assert abs(n.value - truths["eversion_damping.n"]) < 2 * n.sigma
+    assert f"Fitted along with film_mass, n = {with_error(n.value, n.sigma)} instead of" in said.explanation
     for k, number in enumerate(named.numbers):
         assert abs(number.value - truths[f"film_mass.eps.{k}"]) < 3 * number.sigma < 0.03
 
