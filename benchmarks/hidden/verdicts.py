@@ -72,7 +72,7 @@ class Answer:
     def of(cls, said: Mapping[str, Any]) -> Answer:
         """From the file. Sizes come from the first round that states them, else from the last model.
 
-        Of the model's own numbers those count that a fault of the measurement was fitted along with, where one is named.
+        Of the model's own numbers those count that a named fault of the measurement was fitted along with.
         """
         rounds = said["rounds"]
         numbers: dict[str, Mapping[str, Any]] = {}
