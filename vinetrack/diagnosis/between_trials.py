@@ -211,13 +211,11 @@ def _widened_by(difference: Difference) -> tuple[str, ...]:
 def _effect_of(difference: Difference) -> Effect:
     """A stand-in for the effect that the tables of candidates and the answer set show."""
     drift = tuple(
-        Parameter(
-            term.key.split(".")[1], term.symbol, term.unit, 0.0,
-            plausible=(-PLAUSIBLE_DRIFT[term.key.split(".")[1]], PLAUSIBLE_DRIFT[term.key.split(".")[1]]),
-        )
+        Parameter(name, term.symbol, term.unit, 0.0, plausible=(-PLAUSIBLE_DRIFT[name], PLAUSIBLE_DRIFT[name]))
         for term in difference.terms
+        for name in [term.key.split(".")[1]]
         if difference.name == ORDER_DRIFT
-    )  # fmt: skip
+    )
     keys = [term.key for term in difference.terms] or list(difference.shared)
     parameters = tuple(Parameter(key.split(".")[1], key, "", 0.0) for key in keys)
     return Effect(

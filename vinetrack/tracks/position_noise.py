@@ -133,9 +133,11 @@ def rounding_noise(position_m: Floats) -> float:
         0 where they are not rounded, or where it does not show.
     """
     floor_m = _quantum(position_m) / math.sqrt(12)
+    if floor_m == 0:
+        return 0.0
     moving_m = position_m[_frames_at_rest(position_m) :]
     moving_m = moving_m if moving_m.size >= SHORTEST_MOTION else position_m
-    return floor_m if floor_m > 0 and _jagged(moving_m, floor_m) else 0.0
+    return floor_m if _jagged(moving_m, floor_m) else 0.0
 
 
 def common_rounding_noise(tracks: Sequence[Floats]) -> float:
@@ -151,10 +153,10 @@ def common_rounding_noise(tracks: Sequence[Floats]) -> float:
     float, m
         0 where most are not rounded, or not alike, or are noisier than that.
     """
-    floors_m = [rounding_noise(position_m) for position_m in tracks]
+    mostly = MOSTLY_ROUNDING / math.sqrt(12)
     noises = sorted(
-        floor_m if rough_noise(position_m) < MOSTLY_ROUNDING * floor_m else 0.0
-        for floor_m, position_m in zip(floors_m, tracks, strict=True)
+        rounding_noise(position_m) if rough_noise(position_m) < mostly * _quantum(position_m) else 0.0
+        for position_m in tracks
     )
     typical = noises[len(noises) // 2] if noises else 0.0
     alike = sum(typical * (1 - SAME_STEP) <= noise <= typical * (1 + SAME_STEP) for noise in noises)
