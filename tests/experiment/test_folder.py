@@ -177,6 +177,7 @@ def test_a_broken_cell_is_named_with_file_line_trial_and_column(
     ("column", "cell", "words"),
     [
         ("pressure_kPa", "2.5", "psi"),
+        ("yield_pressure_kPa", "0", "says that the vine grows at any pressure"),
         ("payload_g", "0.0356", "looks like kilograms"),
         ("thickness_um", "0.2", "looks like millimetres"),
         ("length_mm", "0.28", "looks like metres"),
@@ -195,6 +196,11 @@ def test_a_legal_oddity_is_a_warning(folder: Path, column: str, cell: str, words
     assert problem.severity == "warning"
     assert words in str(problem)
     assert len(experiment.trials) == 1
+
+
+def test_a_yield_pressure_of_zero_with_its_error_is_believed(folder: Path) -> None:
+    sheet = f"{HEADER},yield_pressure_sigma_kPa\na,a.csv,24,200,280,28,0,35.6,2\n"
+    assert read_experiment(write(folder, sheet)).problems == ()
 
 
 def test_a_pressure_that_looks_like_bar_is_a_warning(folder: Path) -> None:

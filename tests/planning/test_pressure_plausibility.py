@@ -50,6 +50,18 @@ def test_kpa_under_the_name_of_psi_is_suspected() -> None:
     assert "looks like kPa, not psi" in problem.message
 
 
+def test_absolute_pressures_are_suspected() -> None:
+    (problem,) = pressure_problems(
+        [(replace(t, pressure_Pa=t.pressure_Pa + t.ambient_pressure_Pa), v) for t, v in campaign()]
+    )
+    assert "looks like absolute pressure" in problem.message
+    assert problem.severity == "warning"
+
+
+def test_high_gauge_pressures_of_stiff_film_are_not_absolute() -> None:
+    assert pressure_problems([(replace(t, pressure_Pa=t.pressure_Pa + 101_325.0), v) for t, v in campaign(100.0)]) == []
+
+
 def test_a_film_that_no_unit_explains_brings_nothing() -> None:
     assert pressure_problems(campaign(100.0)) == []
 

@@ -12,7 +12,15 @@ import numpy as np
 from vinetrack.diagnosis.held_fits import TESTS_HELD, holds_many, let_go, with_curves
 from vinetrack.diagnosis.likelihood_ratio import ANSWER_SET, MOST_INFLATION, LikelihoodRatio, best_of, likelihood_ratio
 from vinetrack.diagnosis.misfit_tests import LATER_LEVEL, SUSPECT, MisfitTests, misfit_tests
-from vinetrack.diagnosis.multi_start import SubsetFit, SubsetFitter, best_subset_fit, full_fit, start_of, starts_of
+from vinetrack.diagnosis.multi_start import (
+    SubsetFit,
+    SubsetFitter,
+    best_subset_fit,
+    full_fit,
+    slips_of,
+    start_of,
+    starts_of,
+)
 from vinetrack.dynamics.model import Value
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect
@@ -275,7 +283,8 @@ class CandidateFits:
             self.report(f"trying {name}")
             places = self.questions.of(name)[:STARTS_EACH]
             sizes = self.questions.gains[1]
-            starts = starts_of((self.questions.answers.shapes[i], float(sizes[i])) for i in places)
+            shapes = self.questions.answers.shapes
+            starts = starts_of((shapes[i], float(sizes[i])) for i in places) + slips_of(shapes[places[0]].effect)
             climb = best_subset_fit(self.slope, starts, self.goal, search=True)
             if climb is None:
                 self.silent.add(name)

@@ -30,6 +30,10 @@ LADDER = (0.03, 0.06, 0.1, 0.15, 0.2, 0.28, 0.37, 0.48, 0.6, 0.75)
 """The same for a threshold: its answer jumps, and a start too far below or above leads nowhere. Chosen: steps of about
 1.3, less than the width of the jump."""
 
+BESIDE_A_SLIP = 0.5
+"""Part of its plausible range that an error may have beside a slip. Chosen: both at once are rare; at twice film that
+is 60 % too heavy would pass for half of its thickness, at half a tube measured flat that is 2 % off would be missed."""
+
 OF_A_TUBE = {
     "length_mm": "a tube",
     "thickness_um": "film",
@@ -200,8 +204,35 @@ def _typical_values(parameter: Parameter) -> tuple[float, ...]:
     return tuple((low + part * (high - low)) for part in (0.15, 0.5, 0.85))
 
 
+def slip_of(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0) -> tuple[float, str] | None:
+    """The slip in the sheet that a size is that of, but for an ordinary error beside it.
+
+    Parameters
+    ----------
+    parameter
+        Of an effect.
+    value, sigma : float
+        Size, a relative error, and its standard error.
+    reach : float
+        Standard errors by which what is left may lie outside of its range.
+
+    Returns
+    -------
+    (float, str) or None
+        Size that the slip leaves, and what was done; None where the size is that of none.
+    """
+    if parameter.plausible is None:
+        return None
+    low, high = (BESIDE_A_SLIP * end for end in parameter.plausible)
+    for size, done in parameter.slips:
+        left, room = (1 + value) / (1 + size) - 1, reach * sigma / (1 + size)
+        if low - room <= left <= high + room:
+            return size, done
+    return None
+
+
 def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: float = 3.0, widened: float = 1.0) -> bool:
-    """Whether a value lies in the plausible range, or no further outside than `reach` of its errors.
+    """Whether a value lies in the plausible range, no further outside than `reach` of its errors, or is that of a slip.
 
     `widened` is how many times further from zero it may lie.
 
@@ -220,7 +251,11 @@ def is_plausible(parameter: Parameter, value: float, sigma: float, *, reach: flo
     -------
     bool
     """
-    if parameter.plausible is None or value == parameter.zero:
+    if (
+        parameter.plausible is None
+        or value == parameter.zero
+        or slip_of(parameter, value, sigma, reach=reach) is not None
+    ):
         return True
     low, high = parameter.plausible
     if math.isfinite(parameter.period):

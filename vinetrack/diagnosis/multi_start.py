@@ -406,3 +406,21 @@ def starts_of(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
             seen.add(key)
             starts.append(((shape.effect,), start))
     return starts
+
+
+def slips_of(effect: Effect) -> list[Start]:
+    """Starts of one effect from what common slips in the sheet leave.
+
+    Parameters
+    ----------
+    effect
+
+    Returns
+    -------
+    list of Start
+    """
+    return [
+        ((effect,), {f"{effect.name}.{parameter.name}": size})
+        for parameter in effect.parameters
+        for size, _ in parameter.slips
+    ]

@@ -18,19 +18,24 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from vinetrack.core.records import Floats
-from vinetrack.diagnosis.candidates import plausible_range
+from vinetrack.diagnosis.candidates import plausible_range, slip_of
 from vinetrack.effects import Parameter
-from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.fit_result import Fit, Number
 
 EXPECTED = 4.0
 """Squared distance from the middle of a plausible range, in standard deviations of its prior, that is no surprise:
 the edge of the range."""
 
 
-def _prior_of(parameter: Parameter) -> tuple[float, float]:
-    """Mean and standard deviation of the prior that a plausible range stands for, in the parameter's unit."""
+def _prior_of(parameter: Parameter, number: Number) -> tuple[float, float]:
+    """Mean and standard deviation of the prior that a plausible range stands for, in the parameter's unit.
+
+    That of a size which a slip in the sheet leaves lies about that size: the error beside it is an ordinary one.
+    """
     low, high = plausible_range(parameter)
-    return 0.5 * (low + high), 0.25 * (high - low)
+    mean, sd = 0.5 * (low + high), 0.25 * (high - low)
+    slip = slip_of(parameter, number.value, number.sigma)
+    return (mean, sd) if slip is None else (slip[0] + (1 + slip[0]) * mean, (1 + slip[0]) * sd)
 
 
 def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
@@ -56,7 +61,7 @@ def prior_surprise(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
         parameter = parameters.get(number.key)
         if parameter is None or not math.isfinite(number.sigma) or number.value == parameter.zero:
             continue
-        mean, sd = _prior_of(parameter)
+        mean, sd = _prior_of(parameter, number)
         variance = number.sigma**2 + sd**2
         if variance > 0:
             total += max((number.value - mean) ** 2 / variance - EXPECTED, 0.0)
@@ -82,7 +87,7 @@ def log_evidence(fit: Fit, parameters: Mapping[str, Parameter]) -> float:
     for k, number in enumerate(fit.numbers):
         parameter = parameters.get(number.key)
         if parameter is not None and math.isfinite(number.sigma) and number.sigma > 0:
-            mean, sd = _prior_of(parameter)
+            mean, sd = _prior_of(parameter, number)
             if sd > 0:
                 places.append(k)
                 means.append(mean)

@@ -93,7 +93,8 @@ class Parameter:
     `vine`. `bounds` are what physics allows, `plausible` what an experimenter would believe. One that is `held` is
     known beforehand: a fit leaves it at its value unless told to find it. `tried` are values at which a diagnosis tries
     the effect where it is no size but a shape; without them two or three of the plausible range. Values a
-    `period` apart are the same.
+    `period` apart are the same. `slips` are sizes of a relative error that a common slip in the sheet leaves, each with
+    what was done: however large, such a size is plausible.
     """
 
     name: str
@@ -108,6 +109,7 @@ class Parameter:
     held: bool = False
     tried: tuple[float, ...] = ()
     period: float = math.inf
+    slips: tuple[tuple[float, str], ...] = ()
 
     @property
     def sign(self) -> int:

@@ -195,9 +195,15 @@ def _faults(effect: Effect) -> Iterable[str]:
             continue
         if parameter.plausible is not None and not _is_range(parameter.plausible):
             yield f"plausible of {parameter.name} must be two numbers, such as plausible=(0, 1)"
+        if not all(_is_slip(slip) for slip in parameter.slips):
+            yield f"slips of {parameter.name} must be pairs of a size and what was done"
         low, high = parameter.bounds
         if not (low <= parameter.default <= high or parameter.default == parameter.zero):
             yield f"the default of {parameter.name} lies outside its bounds"
+
+
+def _is_slip(pair: Any) -> bool:
+    return isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[0], Real) and isinstance(pair[1], str)
 
 
 def _is_range(pair: Any) -> bool:
@@ -294,7 +300,9 @@ def explanation(effect: Effect) -> list[str]:
     lines = [f"{effect.name} ({effect.kind})", "", *effect.text.splitlines(), ""]
     if effect.parameters:
         lines += ["Parameters, in files by the name in brackets:", *_parameter_table(effect), ""]
+    slips = [f"{p.symbol} = {size:.3g}, {done}" for p in effect.parameters for size, done in p.slips]
     facts = [
+        ("Sizes that a slip in the sheet leaves", "; ".join(slips)),
         ("Needs of the trial sheet", ", ".join(effect.needs)),
         ("Easily taken for", ", ".join(effect.easily_taken_for)),
         ("Replaces, while in the model", ", ".join(effect.replaces)),

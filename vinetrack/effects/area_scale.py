@@ -14,13 +14,28 @@ Reduce it by measuring the width of the flattened tube: the diameter is 2/π of 
 Source: the geometry of a tube; Eq. (2) of Alvarez et al. (2025).
 """
 
+import math
+
 from vinetrack.effects import Parameter, Worked
 
 KIND = "measurement"
 ORDER = 2  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("pressure_gain", "wall_stretch")
 PARAMETERS = (
-    Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.05, 0.05), meaning="relative error of D"),
+    Parameter(
+        "eps",
+        "ε",
+        "1",
+        0.02,
+        bounds=(-0.6, 1.5),
+        plausible=(-0.05, 0.05),
+        meaning="relative error of D",
+        slips=(
+            (2 / math.pi - 1, "the width of the flattened tube was taken for its diameter"),
+            (1.0, "the radius was taken for the diameter"),
+            (-0.5, "the diameter was taken for the radius, and doubled"),
+        ),
+    ),
 )
 
 

@@ -31,6 +31,10 @@ PARAMETERS = (
         shared="vine",
         plausible=(-0.2, 0.2),
         meaning="relative error of the film's mass per metre",
+        slips=(
+            (-0.5, "the film was measured folded, two layers for one"),
+            (1.0, "half the thickness was stated"),
+        ),
     ),
 )
 

@@ -19,7 +19,21 @@ KIND = "measurement"
 ORDER = 5  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("eversion_damping", "air_drag", "time_base")
 PARAMETERS = (
-    Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.1, 0.1), meaning="relative error of length"),
+    Parameter(
+        "eps",
+        "ε",
+        "1",
+        0.02,
+        bounds=(-0.65, 2.0),
+        plausible=(-0.1, 0.1),
+        meaning="relative error of length",
+        slips=(
+            (1.0, "the travel of the tail was taken for that of the edge, or a length of the target was stated twice"),
+            (-0.5, "half of a length of the target was stated"),
+            (1.54, "centimetres were taken for inches"),
+            (1 / 2.54 - 1, "inches were taken for centimetres"),
+        ),
+    ),
 )
 
 

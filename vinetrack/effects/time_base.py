@@ -18,7 +18,16 @@ from vinetrack.effects import Parameter, Worked
 KIND = "measurement"
 EASILY_TAKEN_FOR = ("length_scale", "pressure_gain")
 PARAMETERS = (
-    Parameter("eps", "ε", "1", 0.02, bounds=(-0.5, 0.5), plausible=(-0.1, 0.1), meaning="relative error of time"),
+    Parameter(
+        "eps",
+        "ε",
+        "1",
+        0.02,
+        bounds=(-0.6, 1.5),
+        plausible=(-0.1, 0.1),
+        meaning="relative error of time",
+        slips=((1.0, "half of the frame rate was stated"), (-0.5, "twice the frame rate was stated")),
+    ),
 )
 
 

@@ -262,6 +262,15 @@ def judge_pressures(row: Row) -> None:
     if row.travel_ratio == 2 and onset >= pressure:
         message = f"is not below the pressure of {pressure:g} kPa: nothing would move (psi? 1 psi is 6.895 kPa)"
         row.add(message, "yield_pressure_kPa", "warning", value=f"{onset:g}")
+    if (
+        row.travel_ratio == 2
+        and pressure > 0
+        and onset == 0
+        and not row.values.get("yield_pressure_sigma_kPa", 0.0) > 0
+    ):
+        message = "says that the vine grows at any pressure, which none does, and is believed to 0.2 kPa"
+        remedy = "raise the pressure slowly until the tip moves, or say in yield_pressure_sigma_kPa how little is known"
+        row.add(message, "yield_pressure_kPa", "warning", value="0", remedy=remedy)
     if row.travel_ratio == 1 and pressure > 0:
         message = "drives a body that moves as a whole (travel_ratio 1): is it a vine?"
         row.add(message, "pressure_kPa", "warning", value=f"{pressure:g}")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from vinetrack.core.numbers import decimals, with_error
 from vinetrack.core.units import display_unit
+from vinetrack.diagnosis.candidates import slip_of
 from vinetrack.diagnosis.confounder import Confounder, left_open
 from vinetrack.diagnosis.result import (
     ADEQUATE,
@@ -106,7 +107,8 @@ def explain(finding: SelectionStep) -> str:
         return (
             f"A fault of the measurement, not of the physics: {which} explains the misfit of {model} "
             f"({_hypotheses(kept)}). It is not added to the model: "
-            f"find the fault and measure again, or correct the sheet.{_camera_of_a_vine(kept)}{_remedies(finding)}"
+            f"find the fault and measure again, or correct the sheet.{_slips(kept)}{_camera_of_a_vine(kept)}"
+            f"{_remedies(finding)}"
             f"{_with_the_fault(finding)}{_taken_up(kept[0].names)}"
         )
     text = (
@@ -191,6 +193,19 @@ def _weights(kept: Sequence[LikelihoodRatio]) -> str:
     weights = sorted(weights_of(kept).items(), key=lambda pair: -pair[1])
     each = ", ".join(f"{label.replace('+', ' with ')} {100 * weight:.0f} %" for label, weight in weights)
     return f" Posterior weights, with plausible sizes as priors: {each}."
+
+
+def _slips(kept: Sequence[LikelihoodRatio]) -> str:
+    """Slips in the sheet that leave the sizes of an answer set; blank where none does."""
+    done: dict[str, str] = {}
+    for hypothesis in kept:
+        parameters = {f"{effect.name}.{p.name}": p for effect in hypothesis.effects for p in effect.parameters}
+        for entry in hypothesis.numbers:
+            if entry.key in parameters and (slip := slip_of(parameters[entry.key], entry.value, entry.sigma)):
+                done.setdefault(slip[1], entry.key.split(".")[0])
+    return "".join(
+        f" The size of {name} is what is left where {slip}: look there first." for slip, name in done.items()
+    )
 
 
 def _camera_of_a_vine(kept: Sequence[LikelihoodRatio]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,9 @@ def track_speed(track: Track) -> float:
 
 
 def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
-    """A warning where the speeds contradict the pressures as stated and agree with them in psi, or the reverse.
+    """A warning where the speeds contradict the pressures as stated and agree with them in another unit.
+
+    That may be psi, or kPa where psi are stated, or pressures counted from those of the air.
 
     Parameters
     ----------
@@ -82,6 +85,15 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
     as_stated = _middle_ratio(pairs, 1.0, 1.0)
     if not (as_stated < 1 / FAR_OFF or as_stated > FAR_OFF):
         return []
+    place: dict[str, Any] = {"file": "trials.csv", "column": "pressure_kPa", "severity": "warning"}
+    gauge = [(replace(each, pressure_Pa=each.pressure_Pa - each.ambient_pressure_Pa), speed) for each, speed in pairs]
+    less = _middle_ratio(gauge, 1.0, 1.0)
+    if 1 / NEAR < less < NEAR and all(trial.pressure_Pa > 0 for trial, _ in gauge):
+        message = (
+            f"looks like absolute pressure: the speeds seen imply {number(as_stated, 2)} times the damping that tubes"
+            f" of this size have, and {number(less, 2)} times once the pressure of the air is taken off"
+        )
+        return [Problem(message=message, remedy="state what the gauge shows beyond the pressure of the air", **place)]
     psi = convert(1.0, "psi", "kPa")
     factor, wrong = (psi, "psi, not kPa") if as_stated < 1 else (1 / psi, "kPa, not psi")
     for yield_factor in (1.0, factor):
@@ -92,8 +104,7 @@ def pressure_problems(speeds: Iterable[tuple[Trial, float]]) -> list[Problem]:
                 f"damping that tubes of this size have, and {number(converted, 2)} times in the other unit"
             )
             remedy = "name the column pressure_psi" if factor > 1 else "name the column pressure_kPa"
-            place: dict[str, Any] = {"file": "trials.csv", "column": "pressure_kPa"}
-            return [Problem(message=message, severity="warning", remedy=remedy, **place)]
+            return [Problem(message=message, remedy=remedy, **place)]
     return []
 
 
