@@ -366,6 +366,17 @@ def slack_tail(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG00
     return replace(laboratory, shots=tuple(replace(shot, slack=True) for shot in laboratory.shots))
 
 
+def chamber_misread(low: float, high: float) -> Fault:
+    """A closed chamber whose volume is this many times what the sheet says: hoses, a valve, a tank's nominal size."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        times, gamma = float(draw.uniform(low, high)), float(draw.uniform(1.0, 1.4))
+        shots = (replace(s, tube=s.tube._replace(chamber=times * s.tube.chamber)) for s in laboratory.shots)
+        return physics(gamma=gamma)(replace(laboratory, shots=tuple(shots)), draw).known(chamber_times=times)
+
+    return apply
+
+
 def inlet_half(laboratory: Laboratory, draw: Draw) -> Laboratory:  # noqa: ARG001
     """Connectors half as wide as the vine, as the sheet says."""
     shots = []

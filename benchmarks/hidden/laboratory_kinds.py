@@ -356,14 +356,17 @@ def _film_rows() -> list[Row]:
     return rows
 
 
-def _payload_rows() -> list[Row]:
-    """Payloads that weigh other than the sheet says."""
+def _stated_rows() -> list[Row]:
+    """Payloads and chambers that are other than the sheet says."""
     verdicts, loaded = ("artefact", "ambiguous"), Wants(payload=True, vines=2)
     always, mostly = (_names("payload_mass", verdicts=verdicts, adequate=adequate) for adequate in (False, True))
     mount = weights.mount_forgotten(3, 10)
+    depletion, closed = _names("reservoir_depletion"), Wants(payload=False, chamber=True)
     return [
         Row("mount_forgotten", "mount_forgotten", always, (mount,), loaded, quiet=0.5),
         Row("payload_mistyped", "payload_mistyped", mostly, (weights.payload_mistyped,), loaded, quiet=0.5),
+        Row("chamber_larger", "chamber_larger", depletion, (faults.chamber_misread(1.1, 1.4),), closed, quiet=0.5),
+        Row("chamber_smaller", "chamber_smaller", depletion, (faults.chamber_misread(0.7, 0.9),), closed, quiet=0.5),
     ]
 
 
@@ -386,5 +389,5 @@ def _everyday_rows() -> list[Row]:
 
 def every_row() -> Iterator[Row]:
     """All rows, those of careful laboratories first."""
-    for rows in (_clean_rows, _camera_rows, _rig_rows, _order_rows, _film_rows, _payload_rows, _everyday_rows):
+    for rows in (_clean_rows, _camera_rows, _rig_rows, _order_rows, _film_rows, _stated_rows, _everyday_rows):
         yield from rows()

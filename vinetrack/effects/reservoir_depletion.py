@@ -10,6 +10,9 @@ few per cent takes tens of per cent off a small gauge pressure. With 3.7 L and a
 by 15 % (γ = 1, slow enough to stay at room temperature) to 21 % (γ = 1.4, too fast to exchange heat); 7 kPa by 51 to
 71 %.
 
+V₀ counts hoses and whatever else is open to the vine. One that is off shows in γ: it is then that of the gas times the
+stated over the true volume, as long as V₀ is much more than is swept. A γ outside of 1 to 1.4 is an error of V₀.
+
 Easily taken for `tail_friction` in the first half of growth (all along with a reel), or for a `leak` at constant speed.
 Another chamber or another diameter tells them apart.
 
@@ -26,7 +29,15 @@ IN_TRACE = True
 ORDER = 1  # convention: see `Effect`, its place among those of one hook
 EASILY_TAKEN_FOR = ("tail_friction", "leak")
 PARAMETERS = (
-    Parameter("gamma", "γ", "1", 1.4, bounds=(1.0, 1.4), plausible=(1.0, 1.4), meaning="1 isothermal, 1.4 adiabatic"),
+    Parameter(
+        "gamma",
+        "γ",
+        "1",
+        1.4,
+        bounds=(0.3, 4.0),
+        plausible=(1.0, 1.4),
+        meaning="1 isothermal, 1.4 adiabatic; times the stated over the true volume of the chamber",
+    ),
 )
 
 

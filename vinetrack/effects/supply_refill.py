@@ -32,7 +32,15 @@ PARAMETERS = (
     Parameter(
         "tau", "τ_s", "s", 0.1, bounds=(0.0, 1e4), plausible=(0.01, 10.0), meaning="time in which the supply refills"
     ),
-    Parameter("gamma", "γ", "1", 1.4, bounds=(1.0, 1.4), plausible=(1.0, 1.4), meaning="1 isothermal, 1.4 adiabatic"),
+    Parameter(
+        "gamma",
+        "γ",
+        "1",
+        1.4,
+        bounds=(0.3, 4.0),
+        plausible=(1.0, 1.4),
+        meaning="1 isothermal, 1.4 adiabatic; times the stated over the true volume of the chamber",
+    ),
 )
 
 

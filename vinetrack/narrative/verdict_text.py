@@ -24,7 +24,7 @@ from vinetrack.inference.fit_result import Number
 from vinetrack.inference.parameters import EXPONENT
 from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.narrative.between_text import difference_in_words, remedies_in_words, trials_differ
-from vinetrack.narrative.verdict_summary import joined, size
+from vinetrack.narrative.verdict_summary import joined, known, size
 
 if TYPE_CHECKING:
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
@@ -33,6 +33,10 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.selection import SelectionStep
 
 MEASUREMENT = "measurement"
+CHAMBER_EXPONENTS = ("reservoir_depletion.gamma", "supply_refill.gamma")
+GAS_EXPONENTS = (1.0, 1.4)
+"""Exponents of air that takes up heat, and of air that does not. Derived: the ratio of its heat capacities is 1.4."""
+
 MOST_MOVED = 3
 """Numbers that a fault has moved, named at most. Chosen to keep the sentence short; the ranking holds all of them."""
 
@@ -88,13 +92,13 @@ def explain(finding: SelectionStep) -> str:
             )
             return text
         text += " With it in the model, no other candidate and no smooth force improves the fit."
-        return text + confounders_in_words(finding.confounded) + _runner_up(finding)
+        return text + _chamber(kept) + confounders_in_words(finding.confounded) + _runner_up(finding)
     names = list(finding.answer)
     if finding.verdict == AMBIGUOUS:
         return (
             f"{model} lacks an effect, and these data cannot tell which: {joined(names, 'or')}. "
             f"{_hypotheses(kept)}. They fit within Δχ² = 9 of each other{_by_film(kept)}.{_weights(kept)}"
-            f"{_camera_of_a_vine(kept)}{_remedies(finding)}"
+            f"{_chamber(kept)}{_camera_of_a_vine(kept)}{_remedies(finding)}"
         )
     if finding.verdict == ARTEFACT and trials_differ(names):
         return (
@@ -193,6 +197,21 @@ def _weights(kept: Sequence[LikelihoodRatio]) -> str:
     weights = sorted(weights_of(kept).items(), key=lambda pair: -pair[1])
     each = ", ".join(f"{label.replace('+', ' with ')} {100 * weight:.0f} %" for label, weight in weights)
     return f" Posterior weights, with plausible sizes as priors: {each}."
+
+
+def _chamber(kept: Sequence[LikelihoodRatio]) -> str:
+    """That a chamber is larger or smaller than stated, where γ says so; blank where it does not."""
+    for entry in (entry for hypothesis in kept for entry in hypothesis.numbers if entry.key in CHAMBER_EXPONENTS):
+        low, high = GAS_EXPONENTS
+        if not known(entry.sigma) or low - 2 * entry.sigma <= entry.value <= high + 2 * entry.sigma:
+            continue
+        larger = entry.value < low
+        by = (low if larger else high) / entry.value
+        return (
+            f" No gas has γ = {entry.value:.2f}: the chamber is at {'least' if larger else 'most'} {by:.2f} times what"
+            f" chamber_l says{'; count the hoses' if larger else ''}."
+        )
+    return ""
 
 
 def _slips(kept: Sequence[LikelihoodRatio]) -> str:
