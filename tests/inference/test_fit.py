@@ -191,9 +191,9 @@ def test_the_yield_pressure_stays_within_what_the_sheet_says(campaign: Campaign)
 
 def test_a_number_at_its_bound_is_said_in_words(depleting: Fit) -> None:
     gamma = depleting["gamma"]
-    assert gamma.bound == gamma.lower == 0.3
-    assert (gamma.low, gamma.method) == (0.3, "profile")
-    assert any("sits at its bound 0.3" in message for message in depleting.messages)
+    assert gamma.bound == gamma.lower == 0.6
+    assert (gamma.low, gamma.method) == (0.6, "profile")
+    assert any("sits at its bound 0.6" in message for message in depleting.messages)
 
 
 def test_a_number_held_by_its_bound_is_not_credited_with_what_it_would_explain_beyond(campaign: Campaign) -> None:

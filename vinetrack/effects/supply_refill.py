@@ -37,7 +37,7 @@ PARAMETERS = (
         "γ",
         "1",
         1.4,
-        bounds=(0.3, 4.0),
+        bounds=(0.6, 2.4),
         plausible=(1.0, 1.4),
         meaning="1 isothermal, 1.4 adiabatic; times the stated over the true volume of the chamber",
     ),
