@@ -53,7 +53,7 @@ from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import Solution
 from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm
-from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.position_errors import with_smooth_errors
 
 SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0
 """Standard deviation of ln B and of P_y among tubes of one kind. Chosen: tubes of a batch differ by 3 to 8 % in B and a
@@ -130,8 +130,7 @@ def differences(fit: Fit) -> list[Difference]:
     if DAMPING not in fit.predictor.layout.keys:
         return []
     trials = [trial.trial for trial in fit.trials]
-    smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
-    plain = smooth.solution if smooth else fit.solution
+    plain = with_smooth_errors(fit)
     base = beside_trace_errors(fit, plain)
     best: dict[str, Difference] = {}
     for difference in (*_law(fit, trials), *_drifts(trials), *_groups(trials), *_changes(fit, base, trials)):
@@ -250,14 +249,12 @@ def _drifts(trials: Sequence[Trial]) -> list[Difference]:
     if len(trials) < FEWEST_TRIALS:
         return []
     ranks, stated = trial_order(trials)
-    order = np.argsort(ranks)
-    uses, before, seen = np.zeros(ranks.size), np.zeros(ranks.size), Counter[str]()
-    before[order] = np.arange(ranks.size)
-    for i in order:
+    uses, seen = np.zeros(ranks.size), Counter[str]()
+    for i in np.argsort(ranks):
         uses[i] = seen[_tube(trials[i])]
         seen[_tube(trials[i])] += 1
     pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
-    forms = (("B", "dlnB", uses), ("P", "dlnP", before)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
+    forms = (("B", "dlnB", uses), ("P", "dlnP", ranks)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
     return [
         Difference(
             ORDER_DRIFT,

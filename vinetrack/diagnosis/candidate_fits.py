@@ -17,7 +17,7 @@ from vinetrack.diagnosis.multi_start import (
     SubsetFitter,
     best_subset_fit,
     full_fit,
-    slips_of,
+    slip_starts,
     start_of,
     starts_of,
 )
@@ -233,9 +233,7 @@ class CandidateFits:
             return
         rivals = [known for known in believed if ANSWER_SET < known.behind(best) < REACH_OF_CLIMBS * ALIKE_REACH]
         for rival in sorted(rivals, key=lambda known: known.behind(best))[:STARTS_EACH]:
-            model = self.questions.fit.model
-            for effect in rival.effects:
-                model = model + effect
+            model = self.questions.fit.model.with_effects(rival.effects)
             values = {
                 key: rival.fit.model.values[key] for key in model.parameter_names if key.split(".")[0] in rival.names
             }
@@ -284,7 +282,7 @@ class CandidateFits:
             places = self.questions.of(name)[:STARTS_EACH]
             sizes = self.questions.gains[1]
             shapes = self.questions.answers.shapes
-            starts = starts_of((shapes[i], float(sizes[i])) for i in places) + slips_of(shapes[places[0]].effect)
+            starts = starts_of((shapes[i], float(sizes[i])) for i in places) + slip_starts(shapes[places[0]].effect)
             climb = best_subset_fit(self.slope, starts, self.goal, search=True)
             if climb is None:
                 self.silent.add(name)
@@ -429,9 +427,7 @@ def simpler_forms(
                 continue
             asked.add(key)
             both = tuple(simpler if effect is held else effect for effect in pair.effects)
-            model = before.model
-            for effect in both:
-                model = model + effect
+            model = before.model.with_effects(both)
             values = pair.fit.model.values
             sizes = {f"{simpler.name}.{p.name}": values.get(f"{held.name}.{p.name}") for p in simpler.parameters}
             start = {key: size for key, size in sizes.items() if size is not None}

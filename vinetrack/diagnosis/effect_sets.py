@@ -168,11 +168,8 @@ class EffectSets:
         return None if known is None else replace(known, fit=with_curves(known.fit))
 
     def _refitted(self, fit: Fit, effects: Iterable[Effect]) -> Fit | None:
-        model = self.before.model
-        for effect in effects:
-            model = model + effect
         try:
-            return refit(fit, model, thorough=False)
+            return refit(fit, self.before.model.with_effects(effects), thorough=False)
         except (FitError, SimulationError, np.linalg.LinAlgError):
             return None
 

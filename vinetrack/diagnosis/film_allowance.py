@@ -13,7 +13,7 @@ from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.marginal_likelihood import deviance, estimate_spreads, marginal
 from vinetrack.inference.optimiser import Solution, is_poor_fit
-from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.systematics import film_errors
 
 
@@ -34,8 +34,7 @@ def film_gain(fit: Fit) -> float:
     errors = film_errors(fit.predictor, fit.solution, fit.trials)
     if not errors.n_felt:
         return 0.0
-    smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
-    base = smooth.solution if smooth else fit.solution
+    base = with_smooth_errors(fit)
     return max(_deviance(base, base) - _deviance(beside(fit, base, errors), base), 0.0)
 
 

@@ -10,10 +10,11 @@ import numpy as np
 from scipy.special import gammaincc, ndtri_exp
 
 from vinetrack.diagnosis.candidates import is_plausible
-from vinetrack.diagnosis.film_allowance import FILM, film_gain
+from vinetrack.diagnosis.film_allowance import film_gain
 from vinetrack.diagnosis.result import BETWEEN_TRIALS
 from vinetrack.diagnosis.weighing import log_evidence, posterior_weights, prior_surprise
 from vinetrack.effects import Effect
+from vinetrack.inference.film_influence import FILM
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.robust_covariance import FEWEST_CLUSTERS, robust_covariance
 

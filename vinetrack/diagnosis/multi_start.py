@@ -130,11 +130,7 @@ class SubsetFitter:
         -------
         SubsetFit or None
         """
-        model = self.fit.model
-        for effect in effects:
-            model = model + effect
-        fitted = self.fit.model.values
-        model = model.with_values({**fitted, **start})
+        model = self.fit.model.with_effects(effects).with_values({**self.fit.model.values, **start})
         layout = make_layout(model, self.data, fixed=self._fixed(model.parameter_names), shared={})
         predictor = Predictor(layout, self.data, self.fit.predictor.host)
         trial_effects = self.fit.solution.state.trial_effects[self.chosen].copy()
@@ -290,9 +286,7 @@ def full_fit(
     -------
     Fit or None
     """
-    model = before.model
-    for effect in climb.effects:
-        model = model + effect
+    model = before.model.with_effects(climb.effects)
     goal = before.log_likelihood + SHARE_OF_BEST * (best - before.log_likelihood) if climb.effects else -math.inf
     try:
         fit = refit(
@@ -408,7 +402,7 @@ def starts_of(shapes: Iterable[tuple[CandidateShape, float]]) -> list[Start]:
     return starts
 
 
-def slips_of(effect: Effect) -> list[Start]:
+def slip_starts(effect: Effect) -> list[Start]:
     """Starts of one effect from what common slips in the sheet leave.
 
     Parameters

@@ -34,7 +34,7 @@ PARAMETERS = (
         "γ",
         "1",
         1.4,
-        bounds=(0.6, 2.4),
+        bounds=(0.6, 2.4),  # chosen: a chamber 1.7 times the stated volume, and 0.6 times it
         plausible=(1.0, 1.4),
         meaning="1 isothermal, 1.4 adiabatic; times the stated over the true volume of the chamber",
     ),

@@ -14,7 +14,7 @@ import numpy as np
 from vinetrack.core.records import Floats
 from vinetrack.core.units import display_unit
 from vinetrack.inference.fit_result import Fit, Number
-from vinetrack.inference.position_errors import smooth_errors
+from vinetrack.inference.position_errors import with_smooth_errors
 from vinetrack.inference.robust_covariance import moved_by
 from vinetrack.inference.systematics import FILM_ERROR, film_errors
 
@@ -26,7 +26,8 @@ MATTERS = 1.0
 of the number would then be √2 times as large; at half 1.12 times, at twice 2.2 times. Wording alone depends on it."""
 
 MOST_NAMED = 4
-"""Numbers named with their movements at most, those moved furthest first. Chosen to keep the sentence short."""
+"""Numbers named with their movements at most, those moved furthest first. Chosen: two lines; at half n may stand alone,
+at twice it fills four. Wording alone."""
 
 
 def film_influence(fit: Fit) -> Floats:
@@ -50,9 +51,8 @@ def film_influence(fit: Fit) -> Floats:
     """
     if FILM in fit.model:
         return np.zeros(len(fit.numbers))
-    smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
     errors = film_errors(fit.predictor, fit.solution, fit.trials)
-    moved = moved_by(fit.predictor, smooth.solution if smooth else fit.solution, errors)[: len(fit.numbers)]
+    moved = moved_by(fit.predictor, with_smooth_errors(fit), errors)[: len(fit.numbers)]
     free = fit.predictor.layout.free
     slopes = np.array([each.slope(number.value) for each, number in zip(free, fit.numbers, strict=True)])
     return np.asarray(np.sqrt(np.sum(moved**2, axis=1)) * slopes)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,9 @@ from vinetrack.inference.mixed_effects import FitState, MixedProblem, newton_ste
 from vinetrack.inference.optimiser import SETTLED_SPREAD, FixedTerms, Solution, variances_moved
 from vinetrack.inference.sensitivity import ORIGIN, Predictor
 from vinetrack.inference.whitening import whiten
+
+if TYPE_CHECKING:
+    from vinetrack.inference.fit_result import Fit
 
 ORDERS = (1, 2, 3, 4)
 """Legendre orders of the shapes. Order 0 is the origin, which is free in every trial; a lens to lowest order is orders
@@ -264,3 +268,18 @@ def _moved(grams: Floats, change: Floats) -> Floats:
     turn = np.broadcast_to(np.eye(grams.shape[-1]), (len(grams), *grams.shape[-2:])).copy()
     turn[:, :-1, -1] = -change
     return np.asarray(np.swapaxes(turn, 1, 2)[:, None] @ grams @ turn[:, None])
+
+
+def with_smooth_errors(fit: Fit) -> Solution:
+    """Where a fit ended, the smooth errors of position among its numbers where there are any.
+
+    Parameters
+    ----------
+    fit : Fit
+
+    Returns
+    -------
+    Solution
+    """
+    smooth = smooth_errors(fit.predictor, fit.solution, fit.options.get("held"))
+    return smooth.solution if smooth else fit.solution

@@ -34,11 +34,11 @@ def prepare(pairs: Pairs, *, weighted: bool = True) -> tuple[list[FitTrial], dic
     """
     data, left_out = [], {}
     pairs = list(pairs)
-    smoothing = smoothing_of(pairs)
     # A track of few points, or at one speed, may happen to show nothing of it.
     rounding_m = common_rounding_noise(
         [track.lead_position_m[track.usable] for trial, track in pairs if trial.video is None]
     )
+    smoothing = smoothing_of(pairs, rounding_m)
     for (trial, track), quiet in zip(pairs, quiet_traces([track for _, track in pairs]), strict=True):
         try:
             data.append(prepare_trial(trial, track, quiet, smoothing, rounding_m))

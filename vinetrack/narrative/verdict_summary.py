@@ -251,6 +251,21 @@ def _sigmas(row: Candidate) -> str:
     return f"{sigma:.0f}" if sigma >= 9.5 else f"{sigma:.1f}"
 
 
+def value_alone(entry: Number) -> str:
+    """Return a fitted number with its standard error in its display unit, without symbol and unit: `1.170 ± 0.004`.
+
+    Parameters
+    ----------
+    entry : SI.
+
+    Returns
+    -------
+    str
+    """
+    _, factor = display_unit(entry.unit)
+    return with_error(factor * entry.value, factor * entry.sigma if known(entry.sigma) else None)
+
+
 def size(entry: Number) -> str:
     """Return a fitted number with its standard error in its display unit: `γ = 1.170 ± 0.004`.
 
@@ -266,8 +281,7 @@ def size(entry: Number) -> str:
     unit, factor = display_unit(entry.unit)
     if known(entry.bound):
         return f"{entry.title} = {number(factor * entry.bound)} {unit}".rstrip() + " (at its bound)"
-    sigma = factor * entry.sigma if known(entry.sigma) else None
-    text = f"{entry.title} = {with_error(factor * entry.value, sigma)} {unit}".strip()
+    text = f"{entry.title} = {value_alone(entry)} {unit}".strip()
     if entry.value < entry.lower or entry.value > entry.upper:
         text += " (negative, which it cannot be)" if entry.value < 0 <= entry.lower else " (outside its bounds)"
     return text

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from vinetrack.core.numbers import decimals, with_error
+from vinetrack.core.numbers import decimals
 from vinetrack.core.units import display_unit
 from vinetrack.diagnosis.candidates import slip_of
 from vinetrack.diagnosis.confounder import Confounder, left_open
@@ -24,7 +24,7 @@ from vinetrack.inference.fit_result import Number
 from vinetrack.inference.parameters import EXPONENT
 from vinetrack.inference.systematics import FILM_ERROR
 from vinetrack.narrative.between_text import difference_in_words, remedies_in_words, trials_differ
-from vinetrack.narrative.verdict_summary import joined, known, size
+from vinetrack.narrative.verdict_summary import joined, known, size, value_alone
 
 if TYPE_CHECKING:
     from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio
@@ -33,10 +33,6 @@ if TYPE_CHECKING:
     from vinetrack.diagnosis.selection import SelectionStep
 
 MEASUREMENT = "measurement"
-CHAMBER_EXPONENTS = ("reservoir_depletion.gamma", "supply_refill.gamma")
-GAS_EXPONENTS = (1.0, 1.4)
-"""Exponents of air that takes up heat, and of air that does not. Derived: the ratio of its heat capacities is 1.4."""
-
 MOST_MOVED = 3
 """Numbers that a fault has moved, named at most. Chosen to keep the sentence short; the ranking holds all of them."""
 
@@ -201,15 +197,17 @@ def _weights(kept: Sequence[LikelihoodRatio]) -> str:
 
 def _chamber(kept: Sequence[LikelihoodRatio]) -> str:
     """That a chamber is larger or smaller than stated, where γ says so; blank where it does not."""
-    for entry in (entry for hypothesis in kept for entry in hypothesis.numbers if entry.key in CHAMBER_EXPONENTS):
-        low, high = GAS_EXPONENTS
+    exponents = {f"{effect.name}.{p.name}": p for hypothesis in kept for effect in hypothesis.effects
+                 for p in effect.parameters if "chamber_l" in effect.needs and p.symbol == "γ"}  # fmt: skip
+    for entry in (entry for hypothesis in kept for entry in hypothesis.numbers if entry.key in exponents):
+        low, high = exponents[entry.key].plausible or (-math.inf, math.inf)
         if not known(entry.sigma) or low - 2 * entry.sigma <= entry.value <= high + 2 * entry.sigma:
             continue
         larger = entry.value < low
-        by = (low if larger else high) / entry.value
+        how, times, hint = ("least", low, "; count the hoses") if larger else ("most", high, "")
         return (
-            f" No gas has γ = {entry.value:.2f}: the chamber is at {'least' if larger else 'most'} {by:.2f} times what"
-            f" chamber_l says{'; count the hoses' if larger else ''}."
+            f" Air has a γ of {low:g} to {high:g}, not {entry.value:.2f}: the chamber is at {how}"
+            f" {times / entry.value:.2f} times what chamber_l says{hint}."
         )
     return ""
 
@@ -278,7 +276,7 @@ def _with_the_fault(finding: SelectionStep) -> str:
     moved.sort(key=lambda number: number.key != EXPONENT)
     if not moved:
         return ""
-    each = ", ".join(f"{size(number)} instead of {_value(before[number.name])}" for number in moved[:MOST_MOVED])
+    each = ", ".join(f"{size(number)} instead of {value_alone(before[number.name])}" for number in moved[:MOST_MOVED])
     more = f", and {len(moved) - MOST_MOVED} more move" if len(moved) > MOST_MOVED else ""
     return f" Fitted along with {best.names[-1]}, {each}{more}."
 
@@ -287,12 +285,6 @@ def _is_biased(before: Number, with_fault: Number) -> bool:
     if before.key.split(".")[0] not in base_model():
         return True
     return math.isfinite(before.sigma) and not before.low <= with_fault.value <= before.high
-
-
-def _value(entry: Number) -> str:
-    """A number without its symbol and unit."""
-    _, factor = display_unit(entry.unit)
-    return with_error(factor * entry.value, factor * entry.sigma if math.isfinite(entry.sigma) else None)
 
 
 def _hypotheses(kept: Sequence[LikelihoodRatio]) -> str:

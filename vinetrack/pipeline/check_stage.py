@@ -81,10 +81,10 @@ def check_folder(folder: Path) -> Checked:
     if 0 < len(surveyor.looked_into) < len(seen):
         lines.append(f"{len(surveyor.looked_into)} of {len(seen)} recordings were looked into, one of each condition")
     notes = [*experiment.blank_notes, *direction_notes(seen, trials, experiment.angle_blank), *axis_notes(seen, trials)]
-    smoothing = smoothing_of(handed_in)
+    rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in handed_in])
+    smoothing = smoothing_of(handed_in, rounding_m)
     if smoothing is not None:
         notes.append(smoothing.note)
-    rounding_m = common_rounding_noise([track.lead_position_m[track.usable] for _, track in handed_in])
     if rounding_m > 0:
         notes.append(
             f"Positions are rounded to {1e3 * math.sqrt(12) * rounding_m:.3g} mm, and rounding is most of their noise:"

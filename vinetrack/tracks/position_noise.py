@@ -77,8 +77,14 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
     correlation
         Lag-one correlation, 0 to 0.95; pulled to 0 where the track is too short to tell.
     """
+    noise_m, correlation, rounding_m = _noise_and_rounding(time_s, position_m)
+    return (rounding_m, 0.0) if noise_m < rounding_m else (noise_m, correlation)
+
+
+def _noise_and_rounding(time_s: Floats, position_m: Floats) -> tuple[float, float, float]:
+    """Noise and its correlation as if nothing were rounded, and the error of rounding."""
     if position_m.size < 5:
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     groups = []
     n_rest = _frames_at_rest(position_m)
     if n_rest:
@@ -91,8 +97,7 @@ def position_noise(time_s: Floats, position_m: Floats) -> tuple[float, float]:
     if correlation > SUSPECT_RHO:
         short = [_stretches(time_s, position_m, SHORTEST_STRETCH, MOVING_ORDER)]
         noise_m, correlation = min((noise_m, correlation), _restricted_likelihood(short))
-    floor_m = rounding_noise(position_m)
-    return (floor_m, 0.0) if noise_m < floor_m else (noise_m, correlation)
+    return noise_m, correlation, rounding_noise(position_m)
 
 
 def noise_but_for_faults(time_s: Floats, position_m: Floats) -> tuple[float, float]:
@@ -110,8 +115,9 @@ def noise_but_for_faults(time_s: Floats, position_m: Floats) -> tuple[float, flo
     noise_m : float, m
     correlation : float
     """
-    noise_m, correlation = position_noise(time_s, position_m)
-    return max(min(noise_m, OF_THIRD * rough_noise(position_m)), rounding_noise(position_m)), correlation
+    noise_m, correlation, rounding_m = _noise_and_rounding(time_s, position_m)
+    correlation = 0.0 if noise_m < rounding_m else correlation
+    return max(min(noise_m, OF_THIRD * rough_noise(position_m)), rounding_m), correlation
 
 
 def _frames_at_rest(position_m: Floats) -> int:

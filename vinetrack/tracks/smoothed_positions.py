@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from vinetrack.core.records import Floats, Track, Trial
-from vinetrack.tracks.position_noise import common_rounding_noise
 
 WINDOWS = (3, 5, 7, 9, 11, 13, 15, 17, 19, 21)
 """Frames that are averaged over or that a polynomial goes through. Chosen: what spreadsheets and filters offer; longer
@@ -97,21 +96,23 @@ def _weights(window: int, degree: int) -> Floats:
     return np.asarray(np.linalg.pinv(np.vander(places, degree + 1))[-1])
 
 
-def smoothing_of(pairs: Iterable[tuple[Trial, Track]]) -> Smoothing | None:
+def smoothing_of(pairs: Iterable[tuple[Trial, Track]], rounding_m: float = 0.0) -> Smoothing | None:
     """How the positions of a campaign were smoothed; None where they were not.
 
     Parameters
     ----------
     pairs : trials of one campaign with their tracks; recordings, whose positions nobody smoothed, are passed over.
+    rounding_m : error of rounding where it is most of their noise, as `common_rounding_noise` has it.
 
     Returns
     -------
     Smoothing or None
         None for rounded positions too: what rounding does to a slow motion has no high frequencies either.
     """
-    tracks = [track for trial, track in pairs if trial.video is None]
-    spectra = [spectrum for track in tracks for spectrum in _spectra(track)]
-    if not spectra or common_rounding_noise([track.lead_position_m[track.usable] for track in tracks]) > 0:
+    if rounding_m > 0:
+        return None
+    spectra = [spectrum for trial, track in pairs if trial.video is None for spectrum in _spectra(track)]
+    if not spectra:
         return None
     spectra = sorted(spectra, key=lambda spectrum: -spectrum[0].size)[:MOST_STRETCHES]
     plain = max(_whittle(spectra, [_correlated(f, rho) for f, _ in spectra]) for rho in CORRELATIONS)
