@@ -81,6 +81,37 @@ def supply_falls(part: float) -> Fault:
     return apply
 
 
+def regulator_reset(part: float) -> Fault:
+    """From a trial in the middle of the campaign on the pressure is lower by this part of it."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        first = int(draw.uniform(0.3, 0.7) * len(laboratory.shots))
+        shots = (
+            replace(shot, tube=shot.tube._replace(pressure=shot.tube.pressure * (1 - part))) if k >= first else shot
+            for k, shot in enumerate(laboratory.shots)
+        )
+        return replace(laboratory, shots=tuple(shots)).known(**{"order_drift.step": math.log1p(-part)})
+
+    return apply
+
+
+def gain_by_day(sigma: float) -> Fault:
+    """The regulator is set anew each of three to five days, to a few per cent of what the sheet says."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        days = int(draw.integers(3, 6))
+        gains = sigma * draw.standard_normal(days)
+        count = len(laboratory.shots)
+        shots = []
+        for k, shot in enumerate(laboratory.shots):
+            day = k * days // count
+            tube = shot.tube._replace(pressure=shot.tube.pressure * math.exp(gains[day]))
+            shots.append(replace(shot, tube=tube, day=str(day + 1)))
+        return replace(laboratory, shots=tuple(shots))
+
+    return apply
+
+
 def zero_by_day(sigma_kPa: float) -> Fault:
     """The gauge has another zero each of three to five days: the tube gets the pressure read plus that."""
 

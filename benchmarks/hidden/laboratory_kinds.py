@@ -114,6 +114,14 @@ def _order_rows() -> list[Row]:
             Row("supply_falls", "supply_falls", guessed, (rising, faults.supply_falls(0.05)), BARE, quiet=0.5),
             columns=("order",),
         ),
+        *_twice(
+            Row("regulator_reset", "regulator_reset", guessed, (rising, faults.regulator_reset(0.04)), BARE, quiet=0.5),
+            columns=("order",),
+        ),
+        *_twice(
+            Row("day_gains_rising", "day_gains_rising", guessed, (rising, faults.gain_by_day(0.03)), BARE, quiet=0.5),
+            columns=WHEN,
+        ),
         *_twice(Row("day_zeros_rising", "day_zeros_rising", guessed, (rising, *several), **some), columns=WHEN),
         *_twice(Row("day_zeros_random", "day_zeros_random", guessed, (any_order, *several), **some), columns=WHEN),
         *_twice(

@@ -11,8 +11,9 @@ from grown import Pairs, pairs_of, sheet
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
+from vinetrack.diagnosis.between_forms import confounded
 from vinetrack.diagnosis.between_gain import Difference, beside_systematics, gains_from_each, linear_gain
-from vinetrack.diagnosis.between_trials import between_fits, confounded, differences
+from vinetrack.diagnosis.between_trials import between_fits, differences
 from vinetrack.diagnosis.likelihood_ratio import MOST_INFLATION, LikelihoodRatio, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
@@ -93,6 +94,35 @@ def test_a_supply_that_empties_while_pressures_rise_is_named_with_its_rate(trial
     assert drift.key == "order_drift.P"
     assert abs(drift.value + 0.0015) < 3 * drift.sigma < 0.001
     assert "pressure falls by" in result.explanation
+
+
+def test_a_regulator_set_anew_in_mid_campaign_is_named_with_its_step_and_its_trial(trials: list[Trial]) -> None:
+    """From the eleventh trial on the tube gets 4 % less than the sheet says, pressures rising."""
+    true = [replace(trial, pressure_Pa=trial.pressure_Pa * (0.96 if i >= 10 else 1)) for i, trial in enumerate(trials)]
+    pairs = made(true, range(len(true)), lambda _, __: 1.0, seed=8)
+    stated = [
+        (replace(trial, pressure_Pa=known.pressure_Pa), track)
+        for known, (trial, track) in zip(trials, pairs, strict=True)
+    ]
+    result = diagnosed(stated, (*PHYSICS, "pressure_gain", "film_mass"))
+    assert result.verdict in (ARTEFACT, AMBIGUOUS)
+    assert "order_drift" in result.answer_set
+    (step,) = next(row for row in result.rounds[0].ranking if row.effect == "order_drift").numbers
+    assert step.key == "order_drift.step"
+    assert abs(step.value - np.log(0.96)) < 3 * step.sigma < 0.02
+    assert step.vine == f"from {trials[10].name} on"
+    assert "pressure is lower by" in result.explanation
+    assert f"% from {trials[10].name} on" in result.explanation
+
+
+def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> None:
+    """Where nothing differs, a change may begin anywhere: what is worth as much as one chance in a thousand is rare."""
+    pairs = made(trials, range(len(trials)), lambda _, __: 1.0, seed=9)
+    among = {difference.name: difference for difference in differences(fit(vt.base_model(), pairs, profile=False))}
+    drift = among["order_drift"]
+    assert drift.ways >= 3
+    assert drift.worth == pytest.approx(drift.gain - 2 * np.log(drift.ways))
+    assert drift.p > 0.003
 
 
 def test_gains_of_a_later_tube_from_every_trial_on_are_those_of_one_change_after_the_other(worn: Pairs) -> None:

@@ -42,8 +42,10 @@ class Difference:
         Whether the sheet has the columns it goes by.
     confounded
         Whether it follows the conditions so closely that replicates cannot tell it from an effect of the conditions.
+    ways
+        How many forms it is the best of, places where it may begin included.
     gain, p
-        Fall of −2 ln L by the linear estimate, and its chance where trials do not differ.
+        Fall of −2 ln L by the linear estimate, and its chance where trials do not differ, as the best of its forms.
     """
 
     name: str
@@ -51,8 +53,14 @@ class Difference:
     shared: Mapping[str, str] = field(default_factory=dict)
     stated: bool = True
     confounded: bool = True
+    ways: int = 1
     gain: float = 0.0
     p: float = 1.0
+
+    @property
+    def worth(self) -> float:
+        """Fall of −2 ln L less what the best of so many forms costs."""
+        return self.gain - 2 * math.log(self.ways)
 
 
 def chance_of_gain(fit: Fit, difference: Difference, gain: float) -> float:

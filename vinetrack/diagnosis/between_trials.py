@@ -8,71 +8,50 @@ that follows the condition. So such differences are hypotheses of the diagnosis 
     P_j / P_set,j   = 1         + Σ_g b_g z_gj + v_j        u_j, v_j random from trial to trial
 
 with z_gj the number of trials that the vine (or specimen) of trial j has seen (pressure: all trials before, as a supply
-empties or a regulator creeps), or 1 in group g and 0 elsewhere (pressure: 1 kPa / P_set,j, a shift of the zero of the
-gauge or of P_y, which are the same to a force (P − P_y) A).
+empties or a regulator creeps; or 1 from some trial on, as a regulator is set anew), or 1 in group g and 0 elsewhere
+(pressure: 1 kPa / P_set,j, a shift of the zero of the gauge or of P_y, which are the same to a force (P − P_y) A).
 Coefficients of groups are random effects with a prior, integrated out of the likelihood, so that a hypothesis with many
 groups pays for each of them; a drift has one coefficient, fixed. All are compared by the same Δχ² as effects are.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.between_forms import forms_of
 from vinetrack.diagnosis.between_gain import (
     Difference,
     beside_systematics,
     beside_trace_errors,
     chance_of_gain,
-    gains_from_each,
     linear_gain,
 )
 from vinetrack.diagnosis.likelihood_ratio import LikelihoodRatio, likelihood_ratio
 from vinetrack.diagnosis.result import (
     BETWEEN_SUMMARIES,
     BETWEEN_TRIALS,
-    DAY,
-    N_BY_VINE,
     ORDER_DRIFT,
     REFITTED,
-    SPECIMEN,
     Candidate,
 )
 from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.effects import Effect, Parameter
-from vinetrack.experiment.trial_order import trial_order
 from vinetrack.inference.fit import refit
 from vinetrack.inference.fit_data import FitError
 from vinetrack.inference.fit_result import Fit, Number
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.parameters import DAMPING, EXPONENT, BetweenTerm
+from vinetrack.inference.parameters import DAMPING
 from vinetrack.inference.position_errors import with_smooth_errors
 
-SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0
-"""Standard deviation of ln B and of P_y among tubes of one kind. Chosen: tubes of a batch differ by 3 to 8 % in B and a
-few tenths of a kPa; at half and twice, ln L of a hypothesis moves by about ln 2 for each coefficient of a group."""
-
-DAY_B_SD, DAY_PA_SD = 0.03, 300.0
-"""The same from day to day: film in other air, a gauge zeroed anew. Chosen: a gauge holds its zero to 0.3 kPa."""
-
-PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01}
-"""Change of ln B a trial that is still plausible, and of ln P. Chosen: a tube whose B rises by 5 % a trial is done for
-after ten; a supply that loses 1 % a trial has lost a fifth after twenty, and somebody has looked at the gauge."""
-
-DRIFT_FORMS = 2
-"""Forms of a drift, of B and of the pressure. Derived: where the better one counts, chance is that of either."""
-
-FEWEST_TRIALS = 6
-"""Trials from which a drift or a change is asked for: below, any order of a few pressures is like any other. Chosen:
-with six, one order in 360 is the strict one, either way. At half chance orders pass for drifts, at twice small
-campaigns are never asked."""
+PLAUSIBLE_DRIFT = {"B": 0.05, "P": 0.01, "step": 0.05}
+"""Change of ln B a trial that is still plausible, of ln P, and of ln P at once. Chosen: a tube whose B rises by 5 % a
+trial is done for after ten; a supply that loses 1 % a trial has lost a fifth after twenty, and somebody has looked at
+the gauge; a regulator is set to 5 %, as `pressure_gain` has it."""
 
 OUT_OF_REACH = 40.0
 """How far in −2 ln L the linear estimate may stay behind the best hypothesis and still be fitted. Chosen: well above
@@ -85,10 +64,6 @@ ASKED_AGAIN = 0.01
 """Chance below which a difference is also asked beside the errors that all replicates of a condition share. Chosen for
 time: three times the level of all tests of a first model, so that at half of it as at twice nothing that would be
 called goes unasked; beside more errors no difference gains chance."""
-
-SPREAD_OVER_CONDITIONS = 0.5
-"""A difference counts as confounded with the conditions where it varies within them by less than this part of what
-random order gives (1 on average). Chosen: replicates in adjacent places give under 0.1, random order 0.6 to 1.3."""
 
 FIRST_ITERATIONS, MORE_ITERATIONS = 14, 30
 """Iterations of the fit of a difference: at first, and in all. Chosen for time; a fit that has not settled by then says
@@ -129,13 +104,12 @@ def differences(fit: Fit) -> list[Difference]:
     """
     if DAMPING not in fit.predictor.layout.keys:
         return []
-    trials = [trial.trial for trial in fit.trials]
     plain = with_smooth_errors(fit)
     base = beside_trace_errors(fit, plain)
     best: dict[str, Difference] = {}
-    for difference in (*_law(fit, trials), *_drifts(trials), *_groups(trials), *_changes(fit, base, trials)):
+    for difference in forms_of(fit, base):
         estimated = _estimated(fit, plain, base, difference)
-        if estimated is not None and (difference.name not in best or estimated.gain > best[difference.name].gain):
+        if estimated is not None and (difference.name not in best or estimated.worth > best[difference.name].worth):
             best[difference.name] = estimated
     return list(best.values())
 
@@ -231,147 +205,6 @@ def _effect_of(difference: Difference) -> Effect:
     )
 
 
-def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
-    """N of every vine, where there are several with one n."""
-    free = [number for number in fit.predictor.layout.free if number.key == EXPONENT]
-    if len(free) != 1 or len({trial.vine for trial in trials}) < 2:
-        return []
-    return [Difference(N_BY_VINE, shared={EXPONENT: "vine"})]
-
-
-def _tube(trial: Trial) -> str:
-    """The tube that a trial was made with: its vine, and the specimen where it is known."""
-    return f"{trial.vine}, {trial.specimen}" if trial.specimen else trial.vine
-
-
-def _drifts(trials: Sequence[Trial]) -> list[Difference]:
-    """Ln B by the number of trials that the tube has seen before; pressure by that of all trials before."""
-    if len(trials) < FEWEST_TRIALS:
-        return []
-    ranks, stated = trial_order(trials)
-    uses, seen = np.zeros(ranks.size), Counter[str]()
-    for i in np.argsort(ranks):
-        uses[i] = seen[_tube(trials[i])]
-        seen[_tube(trials[i])] += 1
-    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
-    forms = (("B", "dlnB", uses), ("P", "dlnP", ranks)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
-    return [
-        Difference(
-            ORDER_DRIFT,
-            (
-                BetweenTerm(
-                    f"{ORDER_DRIFT}.{name}", symbol, "1/trial", name == "P", ("all",) * ranks.size, past, scale=0.01
-                ),
-            ),
-            stated=stated,
-            confounded=confounded(past[:, None], trials),
-        )
-        for name, symbol, past in forms
-        if past.any()
-    ]
-
-
-def _groups(trials: Sequence[Trial]) -> list[Difference]:
-    """Specimens and days that the sheet states."""
-    differences_found: list[Difference] = []
-    if all(trial.specimen for trial in trials):
-        tubes = tuple(_tube(trial) for trial in trials)
-        # A vine of which there is one tube has a B of its own already.
-        several = {vine for vine in (t.vine for t in trials) if len({_tube(t) for t in trials if t.vine == vine}) > 1}
-        groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
-        differences_found += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
-    if all(trial.day for trial in trials):
-        days = tuple(f"day {trial.day}" for trial in trials)
-        differences_found += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, stated=True)
-    return differences_found
-
-
-def _forms(
-    name: str, groups: Sequence[str], trials: Sequence[Trial], B_sd: float, pressure_sd_Pa: float, *, stated: bool
-) -> list[Difference]:
-    """Groups that differ in B, in pressure, or in both."""
-    if len({group for group in groups if group}) < 2 and stated:
-        return []
-    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
-    driven = np.isfinite(pressures_Pa) & (pressures_Pa > 0)
-    per_Pa = np.where(driven, 1 / np.where(driven, pressures_Pa, 1.0), 0.0)
-    groups = tuple(groups)
-    in_B = BetweenTerm(f"{name}.B", "ΔlnB", "", False, groups, np.ones(len(groups)), B_sd, B_sd)
-    in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, pressure_sd_Pa, pressure_sd_Pa)
-    member = np.array([[group == label for label in dict.fromkeys(groups) if label] for group in groups], dtype=float)
-    apart = confounded(member, trials)
-    return [
-        Difference(name, terms, stated=stated, confounded=apart)
-        for terms in ((in_B,), (in_P,), (in_B, in_P))
-        if not any(term.pressure for term in terms) or driven.any()
-    ]
-
-
-def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
-    """Where specimens are not stated: another tube of each vine from some trial on, or for each condition.
-
-    A tube for each condition can only be where replicates were made one after the other.
-    """
-    if all(trial.specimen for trial in trials) or len(trials) < FEWEST_TRIALS:
-        return []
-    ranks, _ = trial_order(trials)
-    groups = [""] * len(trials)
-    for vine in dict.fromkeys(trial.vine for trial in trials):
-        members = sorted((i for i, trial in enumerate(trials) if trial.vine == vine), key=lambda i: ranks[i])
-        begins = range(2, len(members) - 1)
-        if not begins:
-            continue
-        tube = f"{vine}, later tube"
-        whole = [tube if trial.vine == vine else group for trial, group in zip(trials, groups, strict=True)]
-        form = _forms(SPECIMEN, whole, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
-        first = begins[int(np.argmax(gains_from_each(fit, base, form, members, begins)))]
-        for i in members[first:]:
-            groups[i] = tube
-    conditions = [trial.condition for trial in trials]
-    changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
-    if _in_turn(ranks, conditions):
-        changes += _forms(SPECIMEN, conditions, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
-    return changes
-
-
-def _in_turn(ranks: Floats, conditions: Sequence[str]) -> bool:
-    """Whether the replicates of every condition were made one after the other."""
-    ordered = [conditions[i] for i in np.argsort(ranks)]
-    changes = sum(before != after for before, after in itertools.pairwise(ordered))
-    return 1 < len(set(conditions)) == changes + 1 < len(conditions)
-
-
-def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
-    """Whether regressors, shape (n_trials, k), hardly vary among the replicates of a condition.
-
-    The mean square within conditions over that within vines: 1 on average where trials are in random order. Without
-    replicates nothing tells them apart.
-
-    Parameters
-    ----------
-    regressors : array, shape (n_trials, k)
-    trials : sequence of Trial
-
-    Returns
-    -------
-    bool
-    """
-    within, inner = _square_within(regressors, [trial.condition for trial in trials])
-    whole, outer = _square_within(regressors, [trial.vine for trial in trials])
-    if inner == 0 or whole == 0:
-        return True
-    return within / inner < SPREAD_OVER_CONDITIONS * whole / max(outer, 1)
-
-
-def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
-    """Sum of squares about the means of groups, and its degrees of freedom."""
-    total, names = 0.0, sorted(set(groups))
-    for name in names:
-        member = values[np.array([group == name for group in groups])]
-        total += float(np.sum((member - member.mean(axis=0)) ** 2))
-    return total, len(groups) - len(names)
-
-
 def _estimated(fit: Fit, plain: Solution, base: Solution, difference: Difference) -> Difference | None:
     """The difference with its linear estimate; None where it cannot be laid out."""
     gain = linear_gain(fit, base, difference)
@@ -381,7 +214,7 @@ def _estimated(fit: Fit, plain: Solution, base: Solution, difference: Difference
     if p < ASKED_AGAIN and difference.stated and difference.confounded:
         beside = linear_gain(fit, beside_systematics(fit, plain), difference)
         p = max(p, chance_of_gain(fit, difference, beside))
-    return replace(difference, gain=gain, p=min(p * (DRIFT_FORMS if difference.name == ORDER_DRIFT else 1), 1.0))
+    return replace(difference, gain=gain, p=min(p * difference.ways, 1.0))
 
 
 def _fitted(before: Fit, difference: Difference) -> Fit | None:

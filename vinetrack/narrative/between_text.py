@@ -19,7 +19,7 @@ REMEDIES = {
     N_BY_VINE: "Give every vine its own n (`shared={'n': 'vine'}`) before asking for effects",
     ORDER_DRIFT: "Repeat six trials in random order, and number all in the column `order`; read the gauge at each",
     SPECIMEN: "Film every specimen at several pressures, and name it in the column `specimen`",
-    DAY: "Repeat some conditions on another day, and zero the gauge before each",
+    DAY: "Repeat some conditions on another day, and zero the gauge and set the regulator anew before each",
 }
 
 
@@ -69,6 +69,9 @@ def difference_in_words(result: LikelihoodRatio) -> str:
         )
     if name == ORDER_DRIFT:
         slope = result.numbers[0]
+        if slope.key.endswith(".step"):
+            way = "higher" if slope.value > 0 else "lower"
+            return f"pressure is {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % {slope.vine}"
         way = "rises" if slope.value > 0 else "falls"
         what, each = ("B", "every trial of a tube") if slope.key.endswith(".B") else ("pressure", "every trial")
         return f"{what} {way} by {_value(100 * abs(slope.value), 100 * slope.sigma)} % with {each}"
@@ -79,6 +82,8 @@ def difference_in_words(result: LikelihoodRatio) -> str:
         parts.append(f"in B by {_range(in_B, 100, '%')}")
     if in_P:
         parts.append(f"in pressure (zero of the gauge, or P_y) by {_range(in_P, 1e-3, 'kPa')}")
+    if gains := [number for number in result.numbers if number.key.endswith(".gain")]:
+        parts.append(f"in pressure (how a regulator was set) by {_range(gains, 100, '%')}")
     return f"{name}s differ {' and '.join(parts)}"
 
 

@@ -229,13 +229,13 @@ def _camera_of_a_vine(kept: Sequence[LikelihoodRatio]) -> str:
     """What else films that differ from vine to vine may be; blank where no answer says that they do.
 
     ε of the mass is ε/2 of the frame rate of that vine's recordings, exactly so on the level without a payload, and
-    close to −ε of their scale: mass times acceleration is what is seen of any of them.
+    close to −ε of their scale or of their pressures: mass times acceleration is what is seen of any of them.
     """
     if not any(FILM in hypothesis.names and len(_films(hypothesis)) > 1 for hypothesis in kept):
         return ""
     return (
-        " A vine filmed at a frame rate that is off by half of its ε, or with a scale off by −ε, looks the same: check"
-        " the camera's settings of that vine too."
+        " A vine filmed at a frame rate that is off by half of its ε, with a scale off by −ε, or at pressures off by −ε"
+        " looks the same: check the camera's settings and the gauge of that vine too."
     )
 
 

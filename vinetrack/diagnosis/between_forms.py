@@ -1,0 +1,232 @@
+"""The hypotheses that trials differ: what each changes, by which column of the sheet, how close to the conditions.
+
+Each has forms, of which the likeliest counts: a drift is one of B, of the pressure, or a step of the pressure from some
+trial on; specimens and days differ in B, in pressure, or in both. `between_trials` holds the model and compares them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from vinetrack.core.records import Floats, Trial
+from vinetrack.diagnosis.between_gain import Difference, gains_from_each
+from vinetrack.diagnosis.result import DAY, N_BY_VINE, ORDER_DRIFT, SPECIMEN
+from vinetrack.experiment.trial_order import trial_order
+from vinetrack.inference.fit_result import Fit
+from vinetrack.inference.optimiser import Solution
+from vinetrack.inference.parameters import EXPONENT, BetweenTerm
+
+SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0
+"""Standard deviation of ln B and of P_y among tubes of one kind. Chosen: tubes of a batch differ by 3 to 8 % in B and a
+few tenths of a kPa; at half and twice, ln L of a hypothesis moves by about ln 2 for each coefficient of a group."""
+
+DAY_B_SD, DAY_PA_SD, DAY_GAIN_SD = 0.03, 300.0, 0.03
+"""The same from day to day, and of ln P: film in other air, a gauge zeroed anew, a regulator set anew. Chosen: a gauge
+holds its zero to 0.3 kPa, a regulator is set by its dial to a few per cent."""
+
+EACH_SIDE = 2
+"""Trials that a change has before it and after it. Derived: a change of one trial alone is its random deviation."""
+
+FEWEST_TRIALS = 6
+"""Trials from which a drift or a change is asked for: below, any order of a few pressures is like any other. Chosen:
+with six, one order in 360 is the strict one, either way. At half chance orders pass for drifts, at twice small
+campaigns are never asked."""
+
+SPREAD_OVER_CONDITIONS = 0.5
+"""A difference counts as confounded with the conditions where it varies within them by less than this part of what
+random order gives (1 on average). Chosen: replicates in adjacent places give under 0.1, random order 0.6 to 1.3."""
+
+
+def forms_of(fit: Fit, base: Solution) -> list[Difference]:
+    """Every form of every hypothesis that these trials allow, `ways` counting the forms of its name.
+
+    Parameters
+    ----------
+    fit
+        The fit that is questioned.
+    base
+        Its solution, smooth errors of position and of recorded pressures among its numbers.
+
+    Returns
+    -------
+    list of Difference
+        Without their gains.
+    """
+    trials = [trial.trial for trial in fit.trials]
+    forms = [*_law(fit, trials), *_drifts(trials), *_steps(fit, base, trials), *_groups(trials)]
+    forms += _changes(fit, base, trials)
+    asked = Counter(difference.name for difference in forms)
+    return [replace(difference, ways=difference.ways * asked[difference.name]) for difference in forms]
+
+
+def _law(fit: Fit, trials: Sequence[Trial]) -> list[Difference]:
+    """N of every vine, where there are several with one n."""
+    free = [number for number in fit.predictor.layout.free if number.key == EXPONENT]
+    if len(free) != 1 or len({trial.vine for trial in trials}) < 2:
+        return []
+    return [Difference(N_BY_VINE, shared={EXPONENT: "vine"})]
+
+
+def _tube(trial: Trial) -> str:
+    """The tube that a trial was made with: its vine, and the specimen where it is known."""
+    return f"{trial.vine}, {trial.specimen}" if trial.specimen else trial.vine
+
+
+def _drifts(trials: Sequence[Trial]) -> list[Difference]:
+    """Ln B by the number of trials that the tube has seen before; pressure by that of all trials before."""
+    if len(trials) < FEWEST_TRIALS:
+        return []
+    ranks, stated = trial_order(trials)
+    uses, seen = np.zeros(ranks.size), Counter[str]()
+    for i in np.argsort(ranks):
+        uses[i] = seen[_tube(trials[i])]
+        seen[_tube(trials[i])] += 1
+    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    forms = (("B", "dlnB", uses), ("P", "dlnP", ranks)) if np.all(pressures_Pa > 0) else (("B", "dlnB", uses),)
+    return [
+        Difference(
+            ORDER_DRIFT,
+            (
+                BetweenTerm(
+                    f"{ORDER_DRIFT}.{name}", symbol, "1/trial", name == "P", ("all",) * ranks.size, past, scale=0.01
+                ),
+            ),
+            stated=stated,
+            confounded=confounded(past[:, None], trials),
+        )
+        for name, symbol, past in forms
+        if past.any()
+    ]
+
+
+def _steps(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
+    """Ln P of all trials from the likeliest one on, as a regulator is set anew."""
+    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    begins = range(EACH_SIDE, len(trials) - EACH_SIDE + 1)
+    if len(trials) < FEWEST_TRIALS or not np.all(pressures_Pa > 0):
+        return []
+    ranks, stated = trial_order(trials)
+    ordered = [int(i) for i in np.argsort(ranks)]
+    first = begins[int(np.argmax(gains_from_each(fit, base, _step(range(len(trials)), trials), ordered, begins)))]
+    return [replace(_step(ordered[first:], trials), stated=stated, ways=len(begins))]
+
+
+def _step(members: Sequence[int], trials: Sequence[Trial]) -> Difference:
+    """Ln P of some trials, in the order in which they were made, against that of the others."""
+    groups = [""] * len(trials)
+    for i in members:
+        groups[i] = f"from {trials[members[0]].name} on"
+    term = BetweenTerm(f"{ORDER_DRIFT}.step", "ΔlnP", "", True, tuple(groups), np.ones(len(trials)), scale=0.01)
+    member = np.array([[float(bool(group))] for group in groups])
+    return Difference(ORDER_DRIFT, (term,), confounded=confounded(member, trials))
+
+
+def _groups(trials: Sequence[Trial]) -> list[Difference]:
+    """Specimens and days that the sheet states."""
+    differences_found: list[Difference] = []
+    if all(trial.specimen for trial in trials):
+        tubes = tuple(_tube(trial) for trial in trials)
+        # A vine of which there is one tube has a B of its own already.
+        several = {vine for vine in (t.vine for t in trials) if len({_tube(t) for t in trials if t.vine == vine}) > 1}
+        groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
+        differences_found += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
+    if all(trial.day for trial in trials):
+        days = tuple(f"day {trial.day}" for trial in trials)
+        by_day = _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, stated=True)
+        gain = BetweenTerm(f"{DAY}.gain", "ΔlnP", "", True, days, np.ones(len(days)), DAY_GAIN_SD, DAY_GAIN_SD)
+        differences_found += by_day + [replace(form, terms=(gain,)) for form in by_day[1:2]]
+    return differences_found
+
+
+def _forms(
+    name: str, groups: Sequence[str], trials: Sequence[Trial], B_sd: float, pressure_sd_Pa: float, *, stated: bool
+) -> list[Difference]:
+    """Groups that differ in B, in pressure, or in both."""
+    if len({group for group in groups if group}) < 2 and stated:
+        return []
+    pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
+    driven = np.isfinite(pressures_Pa) & (pressures_Pa > 0)
+    per_Pa = np.where(driven, 1 / np.where(driven, pressures_Pa, 1.0), 0.0)
+    groups = tuple(groups)
+    in_B = BetweenTerm(f"{name}.B", "ΔlnB", "", False, groups, np.ones(len(groups)), B_sd, B_sd)
+    in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, pressure_sd_Pa, pressure_sd_Pa)
+    member = np.array([[group == label for label in dict.fromkeys(groups) if label] for group in groups], dtype=float)
+    apart = confounded(member, trials)
+    return [
+        Difference(name, terms, stated=stated, confounded=apart)
+        for terms in ((in_B,), (in_P,), (in_B, in_P))
+        if not any(term.pressure for term in terms) or driven.any()
+    ]
+
+
+def _changes(fit: Fit, base: Solution, trials: Sequence[Trial]) -> list[Difference]:
+    """Where specimens are not stated: another tube of each vine from some trial on, or for each condition.
+
+    A tube for each condition can only be where replicates were made one after the other.
+    """
+    if all(trial.specimen for trial in trials) or len(trials) < FEWEST_TRIALS:
+        return []
+    ranks, _ = trial_order(trials)
+    groups = [""] * len(trials)
+    for vine in dict.fromkeys(trial.vine for trial in trials):
+        members = sorted((i for i, trial in enumerate(trials) if trial.vine == vine), key=lambda i: ranks[i])
+        begins = range(EACH_SIDE, len(members) - EACH_SIDE + 1)
+        if not begins:
+            continue
+        tube = f"{vine}, later tube"
+        whole = [tube if trial.vine == vine else group for trial, group in zip(trials, groups, strict=True)]
+        form = _forms(SPECIMEN, whole, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)[-1]
+        first = begins[int(np.argmax(gains_from_each(fit, base, form, members, begins)))]
+        for i in members[first:]:
+            groups[i] = tube
+    conditions = [trial.condition for trial in trials]
+    changes = _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False) if any(groups) else []
+    if _in_turn(ranks, conditions):
+        changes += _forms(SPECIMEN, conditions, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=False)
+    return changes
+
+
+def _in_turn(ranks: Floats, conditions: Sequence[str]) -> bool:
+    """Whether the replicates of every condition were made one after the other."""
+    ordered = [conditions[i] for i in np.argsort(ranks)]
+    changes = sum(before != after for before, after in itertools.pairwise(ordered))
+    return 1 < len(set(conditions)) == changes + 1 < len(conditions)
+
+
+def confounded(regressors: Floats, trials: Sequence[Trial]) -> bool:
+    """Whether regressors, shape (n_trials, k), hardly vary among the replicates of a condition.
+
+    The mean square within conditions over that within vines: 1 on average where trials are in random order. Without
+    replicates nothing tells them apart.
+
+    Parameters
+    ----------
+    regressors : array, shape (n_trials, k)
+    trials : sequence of Trial
+
+    Returns
+    -------
+    bool
+    """
+    within, inner = _square_within(regressors, [trial.condition for trial in trials])
+    whole, outer = _square_within(regressors, [trial.vine for trial in trials])
+    if inner == 0 or whole == 0:
+        return True
+    return within / inner < SPREAD_OVER_CONDITIONS * whole / max(outer, 1)
+
+
+def _square_within(values: Floats, groups: Sequence[str]) -> tuple[float, int]:
+    """Sum of squares about the means of groups, and its degrees of freedom."""
+    total, names = 0.0, sorted(set(groups))
+    for name in names:
+        member = values[np.array([group == name for group in groups])]
+        total += float(np.sum((member - member.mean(axis=0)) ** 2))
+    return total, len(groups) - len(names)
+
+
+__all__ = ["confounded", "forms_of"]
