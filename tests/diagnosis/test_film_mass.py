@@ -14,6 +14,7 @@ from scipy.stats import norm
 
 import vinetrack as vt
 from vinetrack.core.numbers import with_error
+from vinetrack.core.records import Trial
 from vinetrack.diagnosis import likelihood_ratio
 from vinetrack.diagnosis.candidates import shapes_of
 from vinetrack.diagnosis.effect_sensitivities import effect_sensitivities
@@ -24,6 +25,7 @@ from vinetrack.effects import catalogue
 from vinetrack.inference.systematics import FILM_ERROR
 
 FILM, DRAG = catalogue()["film_mass"], catalogue()["air_drag"]
+TRIALS = [Trial(name="t1", vine="a"), Trial(name="t2", vine="b")]
 
 
 @pytest.fixture(scope="module")
@@ -49,17 +51,25 @@ def test_film_of_one_vine_that_is_lighter_is_named_with_each_size(answered):
 
 
 def test_a_vine_is_asked_alone_where_there_are_several():
-    assert [shape.vine for shape in shapes_of(FILM)] == [""]
-    assert [shape.vine for shape in shapes_of(FILM, ["a"])] == [""]
-    assert [(s.vine, s.other_vines) for s in shapes_of(FILM, ["a", "b"])] == [("", ()), ("a", ("b",)), ("b", ("a",))]
-    assert not any(shape.vine for shape in shapes_of(DRAG, ["a", "b"]))
+    assert [shape.group for shape in shapes_of(FILM)] == [""]
+    assert [shape.group for shape in shapes_of(FILM, TRIALS[:1])] == [""]
+    assert [(s.group, s.other_groups) for s in shapes_of(FILM, TRIALS)] == [("", ()), ("a", ("b",)), ("b", ("a",))]
+    assert not any(shape.group for shape in shapes_of(DRAG, TRIALS))
+
+
+def test_a_day_is_asked_alone_where_the_sheet_states_several_and_one_for_every_trial():
+    rate = catalogue()["time_base"]
+    known = [replace(trial, day=str(1 + k % 2)) for k, trial in enumerate(TRIALS)]
+    assert [shape.group for shape in shapes_of(rate, known)] == ["", "day 1", "day 2"]
+    assert [shape.group for shape in shapes_of(rate, [known[0], replace(known[1], day="")])] == [""]
+    assert [shape.group for shape in shapes_of(rate, known[:1])] == [""]
 
 
 def test_what_one_vine_answers_alone_adds_up_to_what_all_answer(answered):
     fit = answered[1].fits[0]
     vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
-    asked = effect_sensitivities(fit, shapes_of(FILM, vines))
-    assert [shape.vine for shape in asked.shapes] == ["", *vines]
+    asked = effect_sensitivities(fit, shapes_of(FILM, [trial.trial for trial in fit.trials]))
+    assert [shape.group for shape in asked.shapes] == ["", *vines]
     for trial, columns in zip(fit.trials, asked.columns, strict=True):
         alone = {vine: columns[:, 1 + k] for k, vine in enumerate(vines)}
         assert np.any(alone.pop(trial.trial.vine))
@@ -68,7 +78,7 @@ def test_what_one_vine_answers_alone_adds_up_to_what_all_answer(answered):
 
 
 def test_a_fit_begins_from_the_vine_that_was_asked():
-    shapes = shapes_of(FILM, ["a", "b"])
+    shapes = shapes_of(FILM, TRIALS)
     assert start_of(shapes[0], 0.1) == {"film_mass.eps": 0.1}
     assert start_of(shapes[2], 0.1) == {"film_mass.eps": {"a": 0.0, "b": 0.1}}
     assert len(starts_of((shape, 0.1) for shape in [*shapes, shapes[1]])) == 3

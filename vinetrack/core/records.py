@@ -126,6 +126,23 @@ class Trial:
     point_mass: str = ""
     corrections: tuple[Correction, ...] = ()
 
+    def group(self, shared: str) -> str:
+        """Name of the trials that have a number of their own together, where numbers are shared so.
+
+        Parameters
+        ----------
+        shared : str
+            `all`, `vine` or `day`.
+
+        Returns
+        -------
+        str
+            Blank for all, and where the day is unknown.
+        """
+        if shared == "day":
+            return f"day {self.day}" if self.day else ""
+        return self.vine if shared == "vine" else ""
+
     @property
     def area_m2(self) -> float:
         """Cross-section A = πD²/4."""

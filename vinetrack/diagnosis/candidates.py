@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vinetrack.core.records import Trial
 from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.trial_inputs import check_needs, stated
 from vinetrack.effects import Effect, EffectError, Parameter
 from vinetrack.inference.fit_data import FitTrial
+from vinetrack.inference.parameters import groups_of
 
 WIDE_RANGE = 10.0
 """Plausible values that differ by more than this factor are tried at geometric steps. Chosen: within a factor of ten a
@@ -49,16 +51,16 @@ class CandidateShape:
     """One way to try an effect: its first parameter is the size, the others are held at `other_values`.
 
     `step` is how much of the size is put in to see what it does; a `whole` one is a size in itself, because small
-    sizes of this effect do something else or nothing. With `vine`, it acts on the trials of that vine alone, and
-    `other_vines` are those without it.
+    sizes of this effect do something else or nothing. With `group`, it acts on the trials of that vine or day alone,
+    and `other_groups` are those without it.
     """
 
     effect: Effect
     other_values: tuple[float, ...]
     step: float
     whole: bool = False
-    vine: str = ""
-    other_vines: tuple[str, ...] = ()
+    group: str = ""
+    other_groups: tuple[str, ...] = ()
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -112,17 +114,17 @@ def testable(candidates: Sequence[Effect], data: Sequence[FitTrial]) -> tuple[tu
     return tuple(able), reasons
 
 
-def shapes_of(effect: Effect, vines: Sequence[str] = ()) -> list[CandidateShape]:
+def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateShape]:
     """The ways in which an effect is tried: every combination of two or three plausible values of what shapes it.
 
-    One whose size each vine has for itself is tried in all vines alike, and in each of several alone.
+    One whose size each vine or day has for itself is tried in all alike, and in each of several alone.
 
     Parameters
     ----------
     effect
         An effect of the catalogue or of the user.
-    vines : sequence of str
-        Vines of the trials.
+    trials : sequence of Trial
+        Those that are asked about.
 
     Returns
     -------
@@ -136,10 +138,11 @@ def shapes_of(effect: Effect, vines: Sequence[str] = ()) -> list[CandidateShape]
     if others or effect.finite:
         middle = [values for k, values in enumerate(combinations) if k == len(combinations) // 2]
         shapes += whole_shapes(effect, middle)
-    if size.shared == "vine" and len(vines) > 1:
+    groups = dict.fromkeys(groups_of(trials, size.shared))
+    if len(groups) > 1:
         shapes += [
-            replace(shapes[0], vine=vine, other_vines=tuple(other for other in vines if other != vine))
-            for vine in vines
+            replace(shapes[0], group=group, other_groups=tuple(other for other in groups if other != group))
+            for group in groups
         ]
     return shapes
 

@@ -131,7 +131,8 @@ def _change(fit: Fit, shape: CandidateShape, plain: Sequence[Trajectory]) -> lis
     """By how much the positions of every trial change with the step put in, m."""
     predictor, state = fit.predictor, fit.solution.state
     jobs = predictor.together(state.theta, state.trial_effects).with_effect(shape.values)
-    felt = [i for i, trial in enumerate(fit.trials) if not shape.vine or trial.trial.vine == shape.vine]
+    shared = shape.size.shared if shape.group else ""
+    felt = [i for i, trial in enumerate(fit.trials) if trial.trial.group(shared) == shape.group]
     moved = predictor.run_as(predictor.layout.model + shape.effect, jobs.take(np.array(felt)))
     change = [np.zeros(before.time_s.size) for before in plain]
     for i, trajectory in zip(felt, moved, strict=True):

@@ -184,10 +184,10 @@ def _compatible_with_nothing(effects: Sequence[Effect], after: Fit) -> str:
 def _in_sigmas(fall: float, effects: Sequence[Effect], after: Fit) -> float:
     """A fall of −2 ln L in standard deviations of a normal deviate that is as rare, by Wilks' theorem.
 
-    One number for each effect, whatever shapes it has; but where each vine has a size of its own, as many.
+    One number for each effect, whatever shapes it has; but where each vine or day has a size of its own, as many.
     """
-    by_vine = {f"{effect.name}.{p.name}" for effect in effects for p in effect.parameters if p.shared == "vine"}
-    count = sum(number.key in by_vine for number in after.numbers)
+    grouped = {f"{effect.name}.{p.name}" for effect in effects for p in effect.parameters if p.shared != "all"}
+    count = sum(number.key in grouped for number in after.numbers)
     if count < 2 or fall <= 0:
         return math.copysign(math.sqrt(abs(fall)), fall)
     # Where the chance underflows, the first terms of its asymptotic series: Abramowitz & Stegun 6.5.32.

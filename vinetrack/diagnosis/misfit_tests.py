@@ -288,7 +288,7 @@ class MisfitTests:
         return (
             Number(
                 key=f"{effect.name}.{parameter.name}",
-                vine=self.answers.shapes[place].vine,
+                vine=self.answers.shapes[place].group,
                 symbol=parameter.symbol,
                 unit=parameter.unit,
                 value=value,
@@ -321,8 +321,8 @@ def misfit_tests(fit: Fit, effects: Sequence[Effect], level: float, *, film: boo
     MisfitTests
     """
     effects = tuple(effect for effect in effects if effect.name not in fit.model)
-    vines = list(dict.fromkeys(trial.trial.vine for trial in fit.trials))
-    shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, vines)]
+    trials = [trial.trial for trial in fit.trials]
+    shapes: list[CandidateShape] = [shape for effect in effects for shape in shapes_of(effect, trials)]
     answers = effect_sensitivities(fit, shapes)
     systematics = systematics_of(fit.predictor, fit.solution, fit.trials, film=film)
     columns = systematics.put_back(fit_columns(fit))

@@ -211,8 +211,8 @@ def start_of(shape: CandidateShape, size: float) -> dict[str, Value]:
     if parameter.sign * size < 0 or size == 0:
         size = parameter.sign * abs(shape.step) or shape.step
     begun = float(np.clip(parameter.zero + size, low, high))
-    of_vines = dict.fromkeys(shape.other_vines, parameter.zero) | {shape.vine: begun}
-    values: tuple[Value, ...] = (of_vines if shape.vine else begun, *shape.other_values)
+    of_groups = dict.fromkeys(shape.other_groups, parameter.zero) | {shape.group: begun}
+    values: tuple[Value, ...] = (of_groups if shape.group else begun, *shape.other_values)
     return {f"{effect.name}.{known.name}": value for known, value in zip(effect.parameters, values, strict=True)}
 
 

@@ -16,7 +16,7 @@ from vinetrack.core.records import Floats
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
 
 Value = float | Mapping[str, float]
-"""A parameter's value: one number, or one for each vine by name."""
+"""A parameter's value: one number, or one for each vine or each day by name."""
 
 
 def values_by_key(numbers: Iterable[tuple[str, str, float]]) -> dict[str, Value]:
@@ -24,7 +24,7 @@ def values_by_key(numbers: Iterable[tuple[str, str, float]]) -> dict[str, Value]
 
     Parameters
     ----------
-    numbers : key (`effect.parameter`), vine (blank for all) and value, SI, of each.
+    numbers : key (`effect.parameter`), vine or day (blank for all) and value, SI, of each.
 
     Returns
     -------
@@ -44,7 +44,7 @@ class Model:
     """A sum of effects; `model + effect` and `model - effect` (or its name) give new models.
 
     `values` holds parameters by `effect.parameter` (B of `eversion_damping` is `"eversion_damping.B"`), SI; what is not
-    given stands at its default. A value shared per vine may be a mapping from the vine's name. `user_effects`
+    given stands at its default. A value may be a mapping from names of vines, or of days (`day 2`). `user_effects`
     holds the user's effects by name, which `model + name` looks up before the catalogue.
 
     Examples
@@ -173,12 +173,14 @@ class Model:
         """
         return replace(self, values={**self.values, **values})
 
-    def parameters_for(self, vine: str) -> Floats:
-        """Values of all parameters for one vine.
+    def parameters_for(self, vine: str, day: str = "") -> Floats:
+        """Values of all parameters for the trials of one vine, and of one day.
 
         Parameters
         ----------
         vine : name of the vine, for values that are given per vine.
+        day : name of the day's trials, as `Trial.group` has it, for values that are given per day; what only the
+            recordings of other days are known to have is nothing on this one.
 
         Returns
         -------
@@ -194,7 +196,9 @@ class Model:
         for effect in self.effects:
             for parameter in effect.parameters:
                 value = self.values.get(f"{effect.name}.{parameter.name}", parameter.default)
-                if isinstance(value, Mapping):
+                if isinstance(value, Mapping) and parameter.shared == "day":
+                    value = value.get(day, parameter.zero)
+                elif isinstance(value, Mapping):
                     if vine not in value:
                         raise EffectError(f"{effect.name}.{parameter.name} has no value for the vine {vine!r}.")
                     value = value[vine]

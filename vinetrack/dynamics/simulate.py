@@ -192,8 +192,9 @@ def prepare(
         len(trials), len(TrialInputs._fields)
     )
     if parameters is None:
-        of_vine = {vine: model.parameters_for(vine) for vine in {trial.vine for trial in trials}}
-        parameters = np.array([of_vine[trial.vine] for trial in trials])
+        groups = [(trial.vine, trial.group("day")) for trial in trials]
+        of_group = {group: model.parameters_for(*group) for group in set(groups)}
+        parameters = np.array([of_group[group] for group in groups])
     bends = [bends_of(trial) for trial in trials]
     given = [np.asarray(t, dtype=float) for t in times_s]
     stamps = np.concatenate(given) if given else np.empty(0)

@@ -89,12 +89,12 @@ class TrialInputs(NamedTuple):
 class Parameter:
     """A number of an effect that can be fitted.
 
-    `zero` is the value at which the effect vanishes; `shared` says over what one value holds: `all` trials or one
-    `vine`. `bounds` are what physics allows, `plausible` what an experimenter would believe. One that is `held` is
-    known beforehand: a fit leaves it at its value unless told to find it. `tried` are values at which a diagnosis tries
-    the effect where it is no size but a shape; without them two or three of the plausible range. Values a
-    `period` apart are the same. `slips` are sizes of a relative error that a common slip in the sheet leaves, each with
-    what was done: however large, such a size is plausible.
+    `zero` is the value at which the effect vanishes; `shared` says over what one value holds: `all` trials, one `vine`,
+    or one `day` where the sheet states it for every trial. `bounds` are what physics allows, `plausible` what an
+    experimenter would believe. One that is `held` is known beforehand: a fit leaves it at its value unless told to find
+    it. `tried` are values at which a diagnosis tries the effect where it is no size but a shape; without them two or
+    three of the plausible range. Values a `period` apart are the same. `slips` are sizes of a relative error that a
+    common slip in the sheet leaves, each with what was done: however large, such a size is plausible.
     """
 
     name: str

@@ -358,6 +358,6 @@ def _cells(effect: Effect, p: Parameter) -> tuple[str, ...]:
     # A shape, such as an exponent or a length, does not make an effect vanish: its `zero` is its default.
     zero = "–" if p.zero == p.default else f"{p.zero:g}"
     bounds = f"{p.bounds[0]:g} to {p.bounds[1]:g}"
-    shared = "each vine" if p.shared == "vine" else "all"
+    shared = "all" if p.shared == "all" else f"each {p.shared}"
     meaning = f"{p.meaning} [{effect.name}.{p.name}]{', known beforehand' if p.held else ''}"
     return p.symbol, p.unit, f"{p.default:g}", bounds, plausible, zero, shared, meaning

@@ -25,6 +25,7 @@ PARAMETERS = (
         "1",
         0.02,
         bounds=(-0.65, 2.0),
+        shared="day",
         plausible=(-0.1, 0.1),
         meaning="relative error of length",
         slips=(

@@ -24,6 +24,7 @@ PARAMETERS = (
         "1",
         0.02,
         bounds=(-0.6, 1.5),
+        shared="day",
         plausible=(-0.1, 0.1),
         meaning="relative error of time",
         slips=((1.0, "half of the frame rate was stated"), (-0.5, "twice the frame rate was stated")),

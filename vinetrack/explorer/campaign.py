@@ -21,6 +21,7 @@ from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.left_out import rest_is_seen
+from vinetrack.inference.parameters import groups_of
 from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.starts import initial_trial_effects
 from vinetrack.pipeline.model_stage import measured
@@ -130,7 +131,21 @@ class Campaign:
     @cached_property
     def vines(self) -> tuple[str, ...]:
         """In the order of the sheet."""
-        return tuple(dict.fromkeys(seen.data.trial.vine for seen in self.trials))
+        return self.groups("vine")
+
+    def groups(self, shared: str) -> tuple[str, ...]:
+        """Names of the trials that have a number of their own together, in the order of the sheet.
+
+        Parameters
+        ----------
+        shared : `all`, `vine` or `day`.
+
+        Returns
+        -------
+        tuple of str
+            One blank name where the number is that of all trials.
+        """
+        return tuple(dict.fromkeys(groups_of([seen.data.trial for seen in self.trials], shared)))
 
     @cached_property
     def labels(self) -> Mapping[str, str]:

@@ -110,7 +110,9 @@ def first_choice(campaign: Campaign) -> ModelChoice:
 
 
 def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -> list[SizeControl]:
-    """The sliders of an effect: one a number, or one a vine where each has its own; ranges hold the present value.
+    """The sliders of an effect: one a number, or one a vine or day where each has its own.
+
+    Ranges hold the present value.
 
     Parameters
     ----------
@@ -124,7 +126,7 @@ def sizes_of(campaign: Campaign, effect: Effect, numbers: Mapping[str, float]) -
     """
     sizes = []
     for parameter in effect.parameters:
-        for vine in campaign.vines if parameter.shared == "vine" else ("",):
+        for vine in campaign.groups(parameter.shared):
             bare = SizeControl(effect.name, parameter, vine, 0.0, 1.0)
             low, high = slider_range(bare.key, parameter, numbers.get(bare.name, parameter.default))
             sizes.append(replace(bare, low=low, high=high))

@@ -225,7 +225,8 @@ def _known_yield(fit: Fit, trial_data: FitTrial) -> FitTrial:
 
 def _nothing_free(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap:
     try:
-        base = np.array([fit.model.parameters_for(trial_data.trial.vine) for trial_data in data])
+        trials = [trial_data.trial for trial_data in data]
+        base = np.array([fit.model.parameters_for(trial.vine, trial.group("day")) for trial in trials])
     except EffectError as error:
         raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
     base = base.reshape(len(data), len(fit.model.parameter_names))

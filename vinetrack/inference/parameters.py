@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Floats, Trial
 from vinetrack.dynamics.model import Model
 from vinetrack.effects import Parameter
 from vinetrack.inference.fit_data import FitError, FitTrial
@@ -60,7 +60,7 @@ class BetweenTerm:
 
 @dataclass(frozen=True)
 class FreeParameter:
-    """One number that a fit moves, SI. `vine` is blank where it is the same for all trials.
+    """One number that a fit moves, SI. `vine` is whose it is, a vine's or a day's; blank where it is that of all.
 
     `prior_sd` is infinite where only the data speak. A prior's mean is `start`.
     """
@@ -261,7 +261,7 @@ def make_layout(
         Names to hold at the value of the model, or to find although held. The parameter's own name will do where it is
         the only one of that name.
     shared : mapping, optional
-        `"all"` or `"vine"` by name, in place of what the effect says.
+        `"all"`, `"vine"` or `"day"` by name, in place of what the effect says.
     between : sequence of BetweenTerm
         Differences between trials that are fitted along.
 
@@ -280,19 +280,20 @@ def make_layout(
     wanted = {_find_name(name, names) for name in free}
     sharing = {_find_name(name, names): how for name, how in (shared or {}).items()}
     for name, how in sharing.items():
-        if how not in ("all", "vine"):
-            raise FitError(f"{name} is shared by {how!r}: say 'all' or 'vine'.")
+        if how not in ("all", "vine", "day"):
+            raise FitError(f"{name} is shared by {how!r}: say 'all', 'vine' or 'day'.")
     chosen = [name for name in known if name not in held and (name in wanted or not known[name].held)]
-    vines = [trial_data.trial.vine for trial_data in data]
+    trials = [trial_data.trial for trial_data in data]
+    base = np.array([model.parameters_for(trial.vine, trial.group("day")) for trial in trials])
+    base = base.reshape(len(data), len(model.parameter_names))
     numbers: list[FreeParameter] = []
     index = np.full((len(data), 0), -1)
     for name in chosen:
-        how = sharing.get(name, known[name].shared)
-        members = list(dict.fromkeys(vines)) if how == "vine" else [""]
-        places = {vine: len(numbers) + i for i, vine in enumerate(members)}
-        numbers += [_number(model, name, known[name], vine, vines) for vine in members]
-        column = np.array([places[vine if how == "vine" else ""] for vine in vines])
-        index = np.column_stack([index, column])
+        groups = groups_of(trials, sharing.get(name, known[name].shared))
+        members = list(dict.fromkeys(groups))
+        places = {group: len(numbers) + i for i, group in enumerate(members)}
+        numbers += [_number(name, known[name], group, base[groups.index(group)], model) for group in members]
+        index = np.column_stack([index, [places[group] for group in groups]])
     keys = list(chosen)
     if YIELD_PRESSURE in names and YIELD_PRESSURE not in held:
         yield_numbers, column = _yield_pressures(data, len(numbers))
@@ -303,8 +304,28 @@ def make_layout(
         place = {group: len(numbers) + i for i, group in enumerate(members)} | {"": -1}
         numbers += [_coefficient(term, group) for group in members]
         keys, index = [*keys, term.key], np.column_stack([index, [place[group] for group in term.groups]])
-    base = np.array([model.parameters_for(vine) for vine in vines]).reshape(len(data), len(model.parameter_names))
     return ParameterMap(model, tuple(numbers), tuple(keys), index.astype(int), base, tuple(between))
+
+
+def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
+    """For each trial the name of those that share a number with it; blank for all.
+
+    Days count where the sheet states several, and one for every trial.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+    shared : str
+        `all`, `vine` or `day`.
+
+    Returns
+    -------
+    list of str
+    """
+    groups = [trial.group(shared) for trial in trials]
+    if shared == "day" and (not all(groups) or len(set(groups)) == 1):
+        return [""] * len(groups)
+    return groups
 
 
 def _coefficient(term: BetweenTerm, group: str) -> FreeParameter:
@@ -338,8 +359,8 @@ def _find_name(name: str, names: Sequence[str]) -> str:
     raise FitError(f"No parameter of the model is named {name!r}: say {' or '.join(near)}.")
 
 
-def _number(model: Model, name: str, parameter: Parameter, vine: str, vines: Sequence[str]) -> FreeParameter:
-    value = model.parameters_for(vine or vines[0])[model.parameter_names.index(name)]
+def _number(name: str, parameter: Parameter, vine: str, values: Floats, model: Model) -> FreeParameter:
+    value = float(values[model.parameter_names.index(name)])
     low, high = parameter.plausible or parameter.bounds
     width = high - low if math.isfinite(high - low) else max(abs(parameter.default), 1.0)
     tries = (low + 0.5 * width,) if math.isfinite(low) and name not in (DAMPING, EXPONENT) else ()

@@ -34,7 +34,7 @@ from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.intervals import student
 from vinetrack.inference.mixed_effects import FitState, inverse_among, spreads
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.parameters import YIELD_PRESSURE, ParameterMap, make_layout
+from vinetrack.inference.parameters import ParameterMap, make_layout
 from vinetrack.inference.pooling import pool, trial_information
 from vinetrack.inference.position_errors import position_shapes
 from vinetrack.inference.robust_covariance import root_of
@@ -264,13 +264,12 @@ def _loadings_of_new(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: Trial
 def _laid_over(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
     """The numbers of the fit as a trial's own layout holds them, and their places in the fit, -1 for new ones."""
     theta, places = layout.start, np.full(len(layout.free), -1)
-    stated = f"{trial_data.trial.vine}, {trial_data.trial.yield_pressure_Pa / 1e3:g} kPa"
+    trial = trial_data.trial
+    stated = f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"
+    groups = {"", trial.vine, trial.group("day"), stated}
     for k, free in enumerate(layout.free):
         for place, number in enumerate(fit.numbers):
-            same = number.name == free.name or (
-                number.key == free.key == YIELD_PRESSURE and number.vine in (trial_data.trial.vine, stated)
-            )
-            if same:
+            if number.key == free.key and number.vine in groups:
                 theta[k], places[k] = free.inside(number.value), place
     return theta, places
 
