@@ -112,6 +112,24 @@ def gain_by_day(sigma: float) -> Fault:
     return apply
 
 
+def camera_of_a_day(low: float, high: float, *, clock: bool) -> Fault:
+    """On the second of two days the frame rate, or the scale, is off by so much, either way."""
+
+    def apply(laboratory: Laboratory, draw: Draw) -> Laboratory:
+        error = float(draw.choice([-1.0, 1.0])) * float(draw.uniform(low, high))
+        count = len(laboratory.shots)
+        shots = []
+        for k, shot in enumerate(laboratory.shots):
+            second = 2 * k >= count
+            off = error if second else 0.0
+            shots.append(
+                replace(shot, day="2" if second else "1", scale=0.0 if clock else off, clock=off if clock else 0.0)
+            )
+        return replace(laboratory, shots=tuple(shots))
+
+    return apply
+
+
 def zero_by_day(sigma_kPa: float) -> Fault:
     """The gauge has another zero each of three to five days: the tube gets the pressure read plus that."""
 

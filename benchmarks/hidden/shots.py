@@ -31,7 +31,7 @@ class Shot:
 
     `valve_s` is the time in which a valve opens, after `valve_law`: "exponential" with this time constant and the power
     `valve_power` of the time in the exponent, or "smooth" over this time. `specimen` says which tube of its vine, `day`
-    when.
+    when. `scale` and `clock` are relative errors of this recording, beside those of the camera.
     """
 
     setting: Setting
@@ -43,6 +43,8 @@ class Shot:
     valve_law: str = "exponential"
     valve_power: float = 1.0
     slack: bool = False
+    scale: float = 0.0
+    clock: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,9 @@ def film(laboratory: Laboratory, draw: Draw) -> tuple[Recording, ...] | None:
     """
     recordings = []
     for k, shot in enumerate(laboratory.shots):
-        filmed = _film(shot, laboratory.camera, draw)
+        camera = laboratory.camera
+        camera = replace(camera, scale=camera.scale + shot.scale, clock=camera.clock + shot.clock)
+        filmed = _film(shot, camera, draw)
         if filmed is None:
             continue
         extra = {"specimen": shot.specimen, "day": shot.day, "order": k + 1}

@@ -172,7 +172,7 @@ def test_parameters_have_symbol_unit_meaning_and_bounds_that_hold_the_default(ef
     assert math.isfinite(high)
     assert low < high
     assert low <= parameter.default <= high
-    assert parameter.shared in ("all", "vine")
+    assert parameter.shared in ("all", "vine", "day")
     assert parameter.plausible is not None
     assert low <= parameter.plausible[0] < parameter.plausible[1] <= high
 

@@ -14,7 +14,7 @@ from vinetrack.dynamics.model import Model
 from vinetrack.dynamics.trial_inputs import check_needs, stated
 from vinetrack.effects import Effect, EffectError, Parameter
 from vinetrack.inference.fit_data import FitTrial
-from vinetrack.inference.parameters import groups_of
+from vinetrack.inference.parameters import group_names
 
 WIDE_RANGE = 10.0
 """Plausible values that differ by more than this factor are tried at geometric steps. Chosen: within a factor of ten a
@@ -138,7 +138,7 @@ def shapes_of(effect: Effect, trials: Sequence[Trial] = ()) -> list[CandidateSha
     if others or effect.finite:
         middle = [values for k, values in enumerate(combinations) if k == len(combinations) // 2]
         shapes += whole_shapes(effect, middle)
-    groups = dict.fromkeys(groups_of(trials, size.shared))
+    groups = group_names(trials, size.shared)
     if len(groups) > 1:
         shapes += [
             replace(shapes[0], group=group, other_groups=tuple(other for other in groups if other != group))

@@ -21,7 +21,7 @@ from vinetrack.dynamics.trial_inputs import check_needs
 from vinetrack.effects import Effect, EffectError, catalogue
 from vinetrack.inference.fit_data import FitTrial
 from vinetrack.inference.left_out import rest_is_seen
-from vinetrack.inference.parameters import groups_of
+from vinetrack.inference.parameters import group_names
 from vinetrack.inference.prepared_trials import prepare
 from vinetrack.inference.starts import initial_trial_effects
 from vinetrack.pipeline.model_stage import measured
@@ -145,7 +145,7 @@ class Campaign:
         tuple of str
             One blank name where the number is that of all trials.
         """
-        return tuple(dict.fromkeys(groups_of([seen.data.trial for seen in self.trials], shared)))
+        return tuple(group_names([seen.data.trial for seen in self.trials], shared))
 
     @cached_property
     def labels(self) -> Mapping[str, str]:

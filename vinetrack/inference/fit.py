@@ -71,7 +71,7 @@ def fit(
         Parameters to hold at the model's values, or to fit although known beforehand (g). `n` will do for
         `eversion_damping.n` where no other effect has an n; the yield pressure is `P_y`.
     shared : mapping, optional
-        `"all"` or `"vine"` by name of parameter, in place of what the effect says.
+        `"all"`, `"vine"` or `"day"` by name of parameter, in place of what the effect says.
     start : mapping, optional
         Values of further parameters to begin from, SI; B and n are always looked for.
     spreads : (float, float), optional
@@ -181,7 +181,7 @@ def refit(
     fixed, free : iterable of str, optional
         In place of what the fit was told.
     shared : mapping, optional
-        `"all"` or `"vine"` by name of parameter, beside what the fit was told.
+        `"all"`, `"vine"` or `"day"` by name of parameter, beside what the fit was told.
     between : sequence of BetweenTerm, optional
         Differences between trials to fit along, in place of those of the fit.
     start : mapping, optional

@@ -289,8 +289,8 @@ def make_layout(
     numbers: list[FreeParameter] = []
     index = np.full((len(data), 0), -1)
     for name in chosen:
-        groups = groups_of(trials, sharing.get(name, known[name].shared))
-        members = list(dict.fromkeys(groups))
+        how = sharing.get(name, known[name].shared)
+        groups, members = groups_of(trials, how), group_names(trials, how)
         places = {group: len(numbers) + i for i, group in enumerate(members)}
         numbers += [_number(name, known[name], group, base[groups.index(group)], model) for group in members]
         index = np.column_stack([index, [places[group] for group in groups]])
@@ -326,6 +326,24 @@ def groups_of(trials: Sequence[Trial], shared: str) -> list[str]:
     if shared == "day" and (not all(groups) or len(set(groups)) == 1):
         return [""] * len(groups)
     return groups
+
+
+def group_names(trials: Sequence[Trial], shared: str) -> list[str]:
+    """Names of the groups of trials that share a number.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+    shared : str
+        `all`, `vine` or `day`.
+
+    Returns
+    -------
+    list of str
+        Vines in the order of the trials, days in their own: 2 before 10.
+    """
+    names = list(dict.fromkeys(groups_of(trials, shared)))
+    return sorted(names, key=lambda name: (len(name), name)) if shared == "day" else names
 
 
 def _coefficient(term: BetweenTerm, group: str) -> FreeParameter:
