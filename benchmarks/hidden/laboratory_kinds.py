@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from hidden import laboratories as faults
-from hidden import weights
+from hidden import over_time, weights
 from hidden.designs import Setting, Wants
 from hidden.kinds import EFFECTS
 from hidden.shots import Fault
@@ -101,8 +101,9 @@ def _order_rows() -> list[Row]:
     guessed = _names(*unlike, verdicts=between, adequate=True)
     quietly = replace(_names(*unlike, verdicts=("artefact",), adequate=True), only=unlike)
     rising, any_order = faults.in_rising_order, faults.by_vine
+    set_anew, set_daily = over_time.regulator_reset(0.04), over_time.gain_by_day(0.03)
     some = {"wants": BARE, "accept": _one_or_two}
-    several = (faults.new_tubes(7, 0.03), faults.worn(0.005, 0.005), faults.zero_by_day(0.2))
+    several = (faults.new_tubes(7, 0.03), faults.worn(0.005, 0.005), over_time.zero_by_day(0.2))
     rows = [
         *_twice(
             Row("wear_ordered", "wear_ordered", tied, (rising, faults.worn(0.01, 0.03)), **some), columns=("order",)
@@ -111,15 +112,22 @@ def _order_rows() -> list[Row]:
             Row("wear_random", "wear_random", quietly, (any_order, faults.worn(0.01, 0.03)), **some), columns=("order",)
         ),
         *_twice(
-            Row("supply_falls", "supply_falls", guessed, (rising, faults.supply_falls(0.05)), BARE, quiet=0.5),
+            Row("supply_falls", "supply_falls", guessed, (rising, over_time.supply_falls(0.05)), BARE, quiet=0.5),
             columns=("order",),
         ),
         *_twice(
-            Row("regulator_reset", "regulator_reset", guessed, (rising, faults.regulator_reset(0.04)), BARE, quiet=0.5),
+            Row(
+                "regulator_reset",
+                "regulator_reset",
+                guessed,
+                (rising, set_anew),
+                BARE,
+                quiet=0.5,
+            ),
             columns=("order",),
         ),
         *_twice(
-            Row("day_gains_rising", "day_gains_rising", guessed, (rising, faults.gain_by_day(0.03)), BARE, quiet=0.5),
+            Row("day_gains_rising", "day_gains_rising", guessed, (rising, set_daily), BARE, quiet=0.5),
             columns=WHEN,
         ),
         *_twice(Row("day_zeros_rising", "day_zeros_rising", guessed, (rising, *several), **some), columns=WHEN),
@@ -141,7 +149,7 @@ def _order_rows() -> list[Row]:
 
 def _camera_rows() -> list[Row]:
     two = {"wants": Wants(payload=False, vines=2), "accept": _two}
-    by_vine, moved = faults.by_vine, faults.camera_of_a_day
+    by_vine, moved = faults.by_vine, over_time.camera_of_a_day
     on_two_days = {"columns": WHEN, "quiet": 0.5}
     return [
         Row("rate_day", "rate_day", _names("time_base"), (by_vine, moved(0.04, 0.08, clock=True)), **on_two_days),

@@ -11,7 +11,8 @@ from hidden.laboratory_rows import campaign
 
 import vinetrack as vt
 from vinetrack.core.records import Trial
-from vinetrack.inference.parameters import group_names, groups_of
+from vinetrack.inference.parameters import group_names, groups_of, make_layout
+from vinetrack.inference.prediction_band import laid_over
 
 RATE = "time_base.eps"
 
@@ -67,3 +68,12 @@ def test_a_fit_with_a_number_for_each_day_predicts_the_trials_of_each(answered):
     known = vt.predict(fitted, pairs)
     unknown = vt.predict(fitted, [(replace(trial, day=""), track) for trial, track in pairs])
     assert np.mean([trial.rms_m for trial in known]) < 0.6 * np.mean([trial.rms_m for trial in unknown])
+
+
+def test_a_band_around_a_prediction_takes_over_the_error_of_the_number_of_its_day(answered):
+    fitted = vt.fit(vt.base_model() + "time_base", answered[0], profile=False)
+    data = next(one for one in fitted.predictor.data if one.trial.day == "2")
+    layout = make_layout(fitted.model, [data])
+    _, places = laid_over(fitted, layout, data)
+    place = places[layout.keys.index(RATE)]
+    assert fitted.numbers[place].name == f"{RATE}[day 2]"

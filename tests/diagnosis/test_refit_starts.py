@@ -7,6 +7,10 @@ import pytest
 from hidden_truth import grown
 
 import vinetrack as vt
+import vinetrack.inference.fit
+from vinetrack.diagnosis.multi_start import SubsetFitter, full_fit
+from vinetrack.inference.parameters import YIELD_PRESSURE
+from vinetrack.inference.solving import solve_onward
 
 HIDDEN = {
     "pressure_damping": ({"pressure_damping.beta": 1.5e-5}, {}),
@@ -26,6 +30,26 @@ def test_a_hidden_effect_is_found_from_where_the_model_without_it_ended(name):
     assert found.chi2_per_dof < 1.3
     for key, size in values.items():
         assert abs(found[key].value - size) < 4 * found[key].sigma
+
+
+def test_a_full_fit_begins_at_the_yield_pressures_that_a_part_of_the_trials_found(monkeypatch):
+    """A friction at rest beside the yield pressure that was found without it would hold the vine back altogether."""
+    begun = []
+
+    def watched(predictor, before, theta, *held, **more):
+        layout = predictor.layout
+        begun.append(dict(zip((number.name for number in layout.free), layout.values(theta), strict=True)))
+        return solve_onward(predictor, before, theta, *held, **more)
+
+    base = vt.fit(vt.base_model(), grown({"pressure_damping.beta": 1.5e-5}, seed=33), profile=False)
+    climb = SubsetFitter(base).climb((vt.effects.pressure_damping,), {"pressure_damping.beta": 1e-5}, iterations=9)
+    yields_Pa = {number.name: number.value for number in base.numbers if number.key == YIELD_PRESSURE}
+    assert climb.yields_Pa.keys() == yields_Pa.keys()
+    assert any(abs(climb.yields_Pa[name] - value) > 1.0 for name, value in yields_Pa.items())
+    monkeypatch.setattr(vinetrack.inference.fit, "solve_onward", watched)
+    assert full_fit(base, climb) is not None
+    for name, value in climb.yields_Pa.items():
+        assert begun[0][name] == pytest.approx(value)
 
 
 def test_an_effect_that_adds_nothing_makes_no_fit_worse():

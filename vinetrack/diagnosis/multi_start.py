@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -70,12 +70,17 @@ for time."""
 
 @dataclass(frozen=True)
 class SubsetFit:
-    """Where a climb ended: −2 ln L on its trials, the values to begin a full fit from, and whether it is far off."""
+    """Where a climb ended: −2 ln L on its trials, what to begin a full fit from, and whether it is far off.
+
+    `yields_Pa` are yield pressures by the name of their number: beside a friction at rest, those that were found
+    without it may hold a vine back altogether.
+    """
 
     effects: tuple[Effect, ...]
     deviance: float
     values: Mapping[str, Value]
     far_off: bool = False
+    yields_Pa: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -149,8 +154,8 @@ class SubsetFitter:
         level = deviance(part, solution.problem, solution.state, CLIMB_SPREADS, restricted=False)
         if not math.isfinite(level):
             return None
-        values, far_off = _values(layout, solution.state.theta), is_poor_fit(predictor, solution)
-        return SubsetFit(tuple(effects), level, values, far_off)
+        values, yields_Pa = _values(layout, solution.state.theta)
+        return SubsetFit(tuple(effects), level, values, is_poor_fit(predictor, solution), yields_Pa)
 
     def here(self) -> float:
         """−2 ln L where a few steps from the fit itself end; infinite where it cannot be followed."""
@@ -162,12 +167,12 @@ class SubsetFitter:
         return tuple(name for name in held if name in names or any(name == full.split(".")[1] for full in names))
 
 
-def _values(layout: ParameterMap, theta: Floats) -> dict[str, Value]:
-    """Parameters by name, those of single vines as mappings; yield pressures have priors and find their way."""
-    return values_by_key(
-        (number.key, number.vine, float(value))
-        for number, value in zip(layout.free, layout.values(theta), strict=True)
-        if number.key != YIELD_PRESSURE
+def _values(layout: ParameterMap, theta: Floats) -> tuple[dict[str, Value], dict[str, float]]:
+    """Parameters by name, those of single vines as mappings, and yield pressures, Pa, by the name of their number."""
+    numbers = list(zip(layout.free, layout.values(theta).tolist(), strict=True))
+    return (
+        values_by_key((number.key, number.vine, value) for number, value in numbers if number.key != YIELD_PRESSURE),
+        {number.name: value for number, value in numbers if number.key == YIELD_PRESSURE},
     )
 
 
@@ -293,6 +298,7 @@ def full_fit(
             before,
             model,
             start=climb.values,
+            yields_Pa=climb.yields_Pa,
             most_iterations=FIRST_OF_FIT,
             thorough=False,
             afresh=afresh,

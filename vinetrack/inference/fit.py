@@ -161,6 +161,7 @@ def refit(
     shared: Mapping[str, str] | None = None,
     between: Sequence[BetweenTerm] | None = None,
     start: Mapping[str, Value] | None = None,
+    yields_Pa: Mapping[str, float] | None = None,
     hold_spreads: bool = False,
     hold_noise: bool = False,
     profile: bool = False,
@@ -186,6 +187,8 @@ def refit(
         Differences between trials to fit along, in place of those of the fit.
     start : mapping, optional
         Values of parameters to begin from, of a new effect above all: a time constant begun at zero stays there.
+    yields_Pa : mapping, optional
+        Yield pressures to begin from, Pa, by the name of their number, in place of those that the fit found.
     hold_spreads, hold_noise : bool
         Keep spreads and noise of the fit instead of estimating them again.
     profile : bool
@@ -239,7 +242,7 @@ def refit(
     host = before.predictor.host
     predictor = Predictor(layout, data, host if host is not None and set(model.names) <= set(host.names) else None)
     theta = layout.start
-    values = {number.name: number.value for number in before.numbers}
+    values = {number.name: number.value for number in before.numbers} | dict(yields_Pa or {})
     for k, number in enumerate(layout.free):
         if number.name in values and number.key not in (start or {}):
             theta[k] = number.inside(float(np.clip(values[number.name], number.lower, number.upper)))

@@ -242,7 +242,7 @@ def _own_loadings(spread: Floats, columns: Floats, trial_data: FitTrial) -> Floa
 def _loadings_of_new(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: TrialFit) -> tuple[Floats, Floats]:
     """What one standard deviation of each error does to a new trial, m, and the variance of its noise, m²."""
     layout = make_layout(fit.model, [trial_data], **{key: fit.options[key] for key in ("fixed", "free", "shared")})
-    theta, places = _laid_over(fit, layout, trial_data)
+    theta, places = laid_over(fit, layout, trial_data)
     predictor = Predictor(layout, [trial_data], fit.predictor.host)
     trial_effects = np.array([[trial.release_s, trial.origin_m, 0.0, 0.0]])
     columns = predictor.linearise(theta, trial_effects)[0]
@@ -261,8 +261,24 @@ def _loadings_of_new(fit: Fit, basis: _Basis, trial_data: FitTrial, trial: Trial
     return _aligned(loadings, columns[:, -1], columns[:, :2], trial_data, fit.noise_correlation, state, noise)[:2]
 
 
-def _laid_over(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
-    """The numbers of the fit as a trial's own layout holds them, and their places in the fit, -1 for new ones."""
+def laid_over(fit: Fit, layout: ParameterMap, trial_data: FitTrial) -> tuple[Floats, np.ndarray]:
+    """The numbers of a fit as the layout of one trial holds them.
+
+    Parameters
+    ----------
+    fit : Fit
+    layout : ParameterMap
+        Of that trial alone.
+    trial_data : FitTrial
+        The trial, in the fit or not.
+
+    Returns
+    -------
+    theta : array, shape (n_free,)
+        Scaled; those of its vine and its day where each has its own.
+    places : array of int, shape (n_free,)
+        Places among the numbers of the fit, -1 for new ones.
+    """
     theta, places = layout.start, np.full(len(layout.free), -1)
     trial = trial_data.trial
     stated = f"{trial.vine}, {trial.yield_pressure_Pa / 1e3:g} kPa"
