@@ -33,6 +33,7 @@ from vinetrack.dynamics.simulate import SimulationError
 from vinetrack.inference.fit_problem import floor
 from vinetrack.inference.marginal_likelihood import estimate_noise
 from vinetrack.inference.mixed_effects import (
+    SPREAD_COLUMNS,
     FitState,
     MixedProblem,
     inverse_among,
@@ -75,6 +76,11 @@ class Pooled:
     between: Floats
 
 
+FARTHEST_DEVIATION = 3.0
+"""Deviation of a trial's ln B, or relative one of its pressure, at which a step has left where the model is nearly
+linear. Chosen: twenty times B; at half as at twice the steps that end there are the same, those that diverge."""
+
+
 def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None:
     """Weigh the trials of a fit by noise and disagreement.
 
@@ -111,6 +117,8 @@ def pool(predictor: Predictor, solution: Solution, shared: int) -> Pooled | None
             return pooled
         step = step * min(1.0, LONGEST_STEP / longest)
         state = _moved(pooled.solution, state, step)
+        if np.max(np.abs(state.trial_effects[:, SPREAD_COLUMNS])) > FARTHEST_DEVIATION:
+            return None
         try:
             columns = predictor.linearise(state.theta[:shared], state.trial_effects)
         except SimulationError:
