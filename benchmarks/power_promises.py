@@ -12,6 +12,7 @@ again, with new scatter, noise and order, and with the effect at the promised si
 promised size is plausible. The table holds how often the effect was in the answer set or added, beside the probability
 promised, with the exact binomial interval of 95 %; and how often the campaigns without an effect raised an alarm. An
 effect counts as found, too, where a simpler law is named that it holds as a limit and that fits as well.
+`--each 0` asks the campaigns without an effect alone, and for the promised rate of alarms the first one only.
 `--answers` keeps every answer as it comes; after `--minutes` no seed is begun.
 
 Seeds 21000–21999 tune, 31500–31999 score: nothing may be tuned on those.
@@ -185,18 +186,23 @@ def is_scored(entry: EffectPower, probability: float) -> bool:
 
 
 def campaign(
-    seed: int, design: str, effects: list[str], each: int, probability: float, tried: Counter[str]
+    seed: int, design: str, effects: list[str], each: int, probability: float, lines: list[Line]
 ) -> Iterator[Line]:
     """All answers of one seed: the campaign without an effect, and some effects at their promised sizes."""
+    tried = Counter(str(line["effect"]) for line in lines)
     with tempfile.TemporaryDirectory() as holder:
         null = Path(holder) / "null"
         laboratory = laboratory_of(seed, design)
         count = write(laboratory, seed, "", null)
         if not count:
             return
+        about: Line = {"seed": seed, "design": design, "n_trials": count}
+        alarms = [line["promised"] for line in lines if line["design"] == design and not line["effect"]]
+        if not each and alarms:
+            yield diagnosed(null, "", {**about, "effect": "", "promised": alarms[0]})
+            return
         begun = time.perf_counter()
         power = vt.power(null, *effects)
-        about: Line = {"seed": seed, "design": design, "n_trials": count}
         print(f"# {seed} {design}: power {time.perf_counter() - begun:.1f} s, {len(power.effects)} effects", flush=True)
         yield diagnosed(null, "", {**about, "effect": "", "promised": power.false_alarm_rate})
         order = np.random.default_rng([seed, 4]).permutation(len(power.effects))
@@ -279,8 +285,7 @@ def main() -> None:
             continue
         if time.monotonic() - begun > 60 * given.minutes:
             break
-        tried = Counter(str(line["effect"]) for line in lines)
-        for line in campaign(seed, given.design, effects, given.each, given.probability, tried):
+        for line in campaign(seed, given.design, effects, given.each, given.probability, list(lines)):
             lines.append(line)
             print(json.dumps(line, default=str), flush=True)
             if given.answers is not None:
