@@ -48,6 +48,15 @@ def made(trials: Sequence[Trial], order: Sequence[int], factor: Change, seed: in
     return [pairs[i] for i in range(len(trials))]
 
 
+def misread(trials: Sequence[Trial], true: Sequence[Trial], seed: int) -> Pairs:
+    """Trials made in the order of the sheet at their true pressures, which the sheet does not state."""
+    pairs = made(true, range(len(true)), lambda _, __: 1.0, seed=seed)
+    return [
+        (replace(trial, pressure_Pa=known.pressure_Pa), track)
+        for known, (trial, track) in zip(trials, pairs, strict=True)
+    ]
+
+
 def shuffled(count: int, seed: int) -> list[int]:
     return [int(i) for i in np.random.default_rng(seed).permutation(count)]
 
@@ -82,12 +91,7 @@ def test_wear_with_rising_pressures_is_not_called_physics(worn: Pairs) -> None:
 def test_a_supply_that_empties_while_pressures_rise_is_named_with_its_rate(trials: list[Trial]) -> None:
     """Each trial has 0.15 % less than the one before of what the sheet says."""
     true = [replace(trial, pressure_Pa=trial.pressure_Pa * (1 - 0.0015 * i)) for i, trial in enumerate(trials)]
-    pairs = made(true, range(len(true)), lambda _, __: 1.0, seed=7)
-    stated = [
-        (replace(trial, pressure_Pa=known.pressure_Pa), track)
-        for known, (trial, track) in zip(trials, pairs, strict=True)
-    ]
-    result = diagnosed(stated, (*PHYSICS, "pressure_gain", "film_mass"))
+    result = diagnosed(misread(trials, true, seed=7), (*PHYSICS, "pressure_gain", "film_mass"))
     assert result.verdict in (ARTEFACT, AMBIGUOUS)
     assert "order_drift" in result.answer_set
     (drift,) = next(row for row in result.rounds[0].ranking if row.effect == "order_drift").numbers
@@ -99,12 +103,7 @@ def test_a_supply_that_empties_while_pressures_rise_is_named_with_its_rate(trial
 def test_a_regulator_set_anew_in_mid_campaign_is_named_with_its_step_and_its_trial(trials: list[Trial]) -> None:
     """From the eleventh trial on the tube gets 4 % less than the sheet says, pressures rising."""
     true = [replace(trial, pressure_Pa=trial.pressure_Pa * (0.96 if i >= 10 else 1)) for i, trial in enumerate(trials)]
-    pairs = made(true, range(len(true)), lambda _, __: 1.0, seed=8)
-    stated = [
-        (replace(trial, pressure_Pa=known.pressure_Pa), track)
-        for known, (trial, track) in zip(trials, pairs, strict=True)
-    ]
-    result = diagnosed(stated, (*PHYSICS, "pressure_gain", "film_mass"))
+    result = diagnosed(misread(trials, true, seed=8), (*PHYSICS, "pressure_gain", "film_mass"))
     assert result.verdict in (ARTEFACT, AMBIGUOUS)
     assert "order_drift" in result.answer_set
     (step,) = next(row for row in result.rounds[0].ranking if row.effect == "order_drift").numbers
