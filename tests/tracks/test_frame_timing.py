@@ -186,6 +186,24 @@ def test_wild_points_of_heavy_tails_move_no_times(rho):
     assert len(moved) <= 1
 
 
+def growing_noise(seed: int, far_m: float = 8e-4) -> Track:
+    """Steady growth of 5 mm a frame after a rest, with noise that grows with the distance from the lamp."""
+    draw = np.random.default_rng(seed)
+    position_m = np.concatenate([np.zeros(40), 5e-3 * np.arange(1, 141)])
+    position_m = position_m + (2e-5 + far_m * position_m / position_m[-1]) * draw.standard_normal(position_m.size)
+    return make_track(np.arange(position_m.size) / CAPTURE_FPS, position_m)
+
+
+def test_noise_that_grows_along_the_way_moves_no_times():
+    for seed in range(40):
+        assert not any("retimed" in flag for flag in flags(correct_frames(growing_noise(seed))).values())
+
+
+def test_a_dropped_frame_is_found_beside_noise_that_grows_along_the_way():
+    found = sum("retimed" in flags(correct_frames(dropped(growing_noise(seed), 80))).get(80, "") for seed in range(20))
+    assert found >= 18
+
+
 def test_release_is_not_a_dropped_frame():
     time_s = np.arange(100) * FRAME_S
     y = 0.5 * 4000 * np.maximum(time_s - time_s[50], 0) ** 2

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, join_flags, with_flag
 from vinetrack.tracks.position_noise import noise_but_for_faults
-from vinetrack.tracks.wild_points import reject_wild_points
+from vinetrack.tracks.wild_points import reject_wild_points, running_noise
 
 CLEAR_STEP_SIGMAS = 8.0
 """Motion is well above noise where one frame's step exceeds this many standard deviations of a position."""
@@ -97,6 +97,10 @@ printed to 0.1 ms at 500 frames a second err by 0.025 of a frame. By reasoning: 
 are left alone; at twice irregular times are corrected as if even."""
 
 
+THIRD_DIFFERENCE = math.sqrt(20.0)
+"""Standard deviation of third differences of white noise of unit variance. Derived: 1² + 3² + 3² + 1² = 20."""
+
+
 _Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
 """Frame numbers and positions before and after."""
 
@@ -138,10 +142,9 @@ def _corrected(track: Track) -> Track:
     if np.any(np.abs(frames - np.rint(frames)) > UNEVEN * np.maximum(np.rint(frames), 1.0)):
         return track
     out = _flag_visible_gaps(track, np.rint(frames).astype(int))
-    noise_m, rho = noise_but_for_faults(out.time_s[out.usable], out.lead_position_m[out.usable])
-    out = _retime_known_copies(out, step_s, noise_m, rho)
+    out = _retime_known_copies(out, step_s)
     tried = 0
-    while (event := _next_event(out, tried, step_s, noise_m, rho)) is not None:
+    while (event := _next_event(out, tried, step_s)) is not None:
         out = _apply(out, event, step_s)
         tried = event.row
     return out
@@ -161,26 +164,39 @@ def lost_for_sure(track: Track) -> bool:
     """
     rows = np.flatnonzero(track.usable)
     frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / float(np.median(np.diff(track.time_s))))
-    noise_m, rho = noise_but_for_faults(track.time_s[track.usable], track.lead_position_m[track.usable])
+    noise_m, rho = _noise(track)
     for i in (np.flatnonzero(with_flag(track.flag[rows], "retimed")) - 1).tolist():
         missing = frame[i + 1] - frame[i] - 1
         as_filmed = np.where(np.arange(frame.size) > i, frame - missing, frame)
         around = as_filmed, track.lead_position_m[rows]
-        jump = _jump(*around, slice(0, i + 1), slice(i + 1, None), noise_m, rho) if i >= 0 else None
-        if jump is None or math.isfinite(_jump_far_around(*around, i, noise_m)):
+        jump = _jump(*around, slice(0, i + 1), slice(i + 1, None), noise_m[i], rho) if i >= 0 else None
+        if jump is None or math.isfinite(_jump_far_around(*around, i, noise_m[i])):
             return True
         if jump[0] > ALONE * JUMP_SIGMAS * jump[1]:
             return True
     return False
 
 
-def _retime_known_copies(track: Track, step_s: float, noise_m: float, rho: float) -> Track:
+def _noise(track: Track) -> tuple[Floats, float]:
+    """Standard deviation of each usable point of a track, m, and the correlation of their noise from point to point.
+
+    Of the whole track, or, where that is more, of the points around: an edge far from the lamp is noisier than at rest,
+    and its noise makes jumps there.
+    """
+    y = track.lead_position_m[track.usable]
+    whole_m, rho = noise_but_for_faults(track.time_s[track.usable], y)
+    if y.size <= 2 * WIDE_SIDE_POINTS:
+        return np.full(y.size, whole_m), rho
+    around_m = running_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE, WIDE_SIDE_POINTS)
+    return np.fmax(whole_m, np.pad(around_m, (1, 2), mode="edge")), rho
+
+
+def _retime_known_copies(track: Track, step_s: float) -> Track:
     """Later times moved back behind repeated frames that the picture showed, where the motion says they were inserted.
 
     A repeated picture tells that a frame is a copy, not whether it took the place of another.
     """
-    copies = np.flatnonzero(with_flag(track.flag, "duplicate"))
-    for row in copies:
+    for row in np.flatnonzero(with_flag(track.flag, "duplicate")):
         with_copy = track.usable
         with_copy[row] = bool(np.isfinite(track.lead_position_m[row]))
         rows = np.flatnonzero(with_copy)
@@ -188,7 +204,8 @@ def _retime_known_copies(track: Track, step_s: float, noise_m: float, rho: float
         if not with_copy[row] or i < 0:
             continue
         frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
-        event = _judge_repeat(frame, track.lead_position_m[rows], i, noise_m, rho, rows)
+        noise_m, rho = _noise(replace(track, flag=np.where(with_copy & ~track.usable, "", track.flag)))
+        event = _judge_repeat(frame, track.lead_position_m[rows], i, noise_m[i], rho, rows)
         if event is not None and event.kind == "inserted":
             track = _apply(track, event, step_s)
     return track
@@ -218,19 +235,20 @@ def frames_are(frames: int) -> str:
     return "1 frame is" if frames == 1 else f"{frames} frames are"
 
 
-def _next_event(track: Track, after: int, step_s: float, noise_m: float, rho: float) -> _Event | None:
+def _next_event(track: Track, after: int, step_s: float) -> _Event | None:
     """The first fault on a row beyond `after`."""
     rows = np.flatnonzero(track.usable)
     if rows.size < 6:
         return None
+    noise_m, rho = _noise(track)
     frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
     y = track.lead_position_m[rows]
     speed = np.diff(y) / np.diff(frame)
     stated = track.lead_position_sigma_m[rows]
-    for i in _suspects(speed, np.fmax(noise_m, np.fmax(stated[:-1], stated[1:]))):
+    for i in _suspects(speed, np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))):
         if rows[i + 1] <= after:
             continue
-        event = _judge_drop(frame, y, i, noise_m, rho, rows) or _judge_repeat(frame, y, i, noise_m, rho, rows)
+        event = _judge_drop(frame, y, i, noise_m[i], rho, rows) or _judge_repeat(frame, y, i, noise_m[i], rho, rows)
         if event is not None:
             return event
     return None
