@@ -153,7 +153,13 @@ def _camera_rows() -> list[Row]:
     on_two_days = {"columns": WHEN, "quiet": 0.5}
     return [
         Row("rate_day", "rate_day", _names("time_base"), (by_vine, moved(0.04, 0.08, clock=True)), **on_two_days),
-        Row("scale_day", "scale_day", _names("length_scale"), (by_vine, moved(0.02, 0.05, clock=False)), **on_two_days),
+        Row(
+            "scale_day",
+            "scale_day",
+            _names("length_scale", adequate=True),
+            (by_vine, moved(0.02, 0.05, clock=False)),
+            **on_two_days,
+        ),
         Row("wild_1pct", "wild_1pct", ADEQUATE, (faults.wild_points(0.01, 1, 10),)),
         Row("wild_2pct_3mm", "wild_2pct_3mm", ADEQUATE, (faults.wild_points(0.02, 3, 3),)),
         Row(

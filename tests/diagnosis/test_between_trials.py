@@ -114,6 +114,22 @@ def test_a_regulator_set_anew_in_mid_campaign_is_named_with_its_step_and_its_tri
     assert f"% from {trials[10].name} on" in result.explanation
 
 
+def test_a_regulator_set_anew_every_day_is_named_by_its_gains(trials: list[Trial]) -> None:
+    """Three days, pressures rising; the tube gets 5 % more on the second and 4 % less on the third."""
+    count = len(trials)
+    known = [replace(trial, day=str(1 + 3 * i // count)) for i, trial in enumerate(trials)]
+    gains = {"1": 1.0, "2": 1.05, "3": 0.96}
+    true = [replace(trial, pressure_Pa=trial.pressure_Pa * gains[trial.day]) for trial in known]
+    result = diagnosed(misread(known, true, seed=10), (*PHYSICS, "pressure_gain", "film_mass"))
+    assert result.verdict in (ARTEFACT, AMBIGUOUS)
+    assert "day" in result.answer_set
+    numbers = next(row for row in result.rounds[0].ranking if row.effect == "day").numbers
+    assert {number.key for number in numbers} == {"day.gain"}
+    size = {number.vine: number.value for number in numbers}
+    assert size["day 2"] - size["day 3"] == pytest.approx(np.log(1.05 / 0.96), abs=0.025)
+    assert "how a regulator was set" in result.explanation
+
+
 def test_the_best_of_many_places_is_no_more_than_chance(trials: list[Trial]) -> None:
     """Where nothing differs, a change may begin anywhere: what is worth as much as one chance in a thousand is rare."""
     pairs = made(trials, range(len(trials)), lambda _, __: 1.0, seed=9)
