@@ -13,7 +13,7 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.between_forms import confounded
 from vinetrack.diagnosis.between_gain import Difference, beside_systematics, gains_from_each, linear_gain
-from vinetrack.diagnosis.between_trials import between_fits, differences
+from vinetrack.diagnosis.between_trials import between_fits, called, differences, suspected
 from vinetrack.diagnosis.likelihood_ratio import MOST_INFLATION, LikelihoodRatio, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
@@ -170,6 +170,21 @@ def test_the_order_of_the_rows_is_taken_and_said_where_the_sheet_has_none(worn: 
     result = diagnosed([(replace(trial, order=np.nan), track) for trial, track in worn], PHYSICS)
     assert "order_drift" in result.answer_set
     assert "The order of the rows was taken" in result.explanation
+
+
+def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_model(trials: list[Trial]) -> None:
+    """It decides nothing where the sheet states no order; but B and n hold it, and a reader must know."""
+    pairs = made(trials, range(len(trials)), lambda _, seen: 1 + 0.01 * seen, seed=11)
+    unstated = [(replace(trial, order=np.nan), track) for trial, track in pairs]
+    questioned = fit(vt.base_model(), unstated, profile=False)
+    among = differences(questioned)
+    assert "order_drift" in {difference.name for difference in suspected(among, 0.003)}
+    assert not called(among, 0.003)
+    result = diagnosed(unstated, ("air_drag",))
+    assert result.verdict == ADEQUATE
+    assert "But trials seem to differ" in result.explanation
+    assert "B rises by" in result.explanation
+    assert "The order of the rows was taken for that of the trials" in result.explanation
 
 
 def test_wear_in_random_order_is_no_effect(trials: list[Trial]) -> None:

@@ -131,11 +131,31 @@ def called(among: Sequence[Difference], level: float) -> list[Difference]:
     -------
     list of Difference
     """
-    return [
-        difference
-        for difference in among
-        if difference.stated and difference.confounded and difference.p < level / len(among)
-    ]
+    return [difference for difference in _significant(among, level) if difference.stated]
+
+
+def suspected(among: Sequence[Difference], level: float) -> list[Difference]:
+    """Differences as significant as those that are called, by an order or by tubes that the sheet does not state.
+
+    Rows need not stand in the order in which trials were made, so these decide nothing; but a model that is adequate
+    stands beside them.
+
+    Parameters
+    ----------
+    among : sequence of Difference
+        Those that were estimated.
+    level : float
+        Chance of a false alarm of them all.
+
+    Returns
+    -------
+    list of Difference
+    """
+    return [difference for difference in _significant(among, level) if not difference.stated]
+
+
+def _significant(among: Sequence[Difference], level: float) -> list[Difference]:
+    return [difference for difference in among if difference.confounded and difference.p < level / len(among)]
 
 
 def between_fits(
@@ -264,4 +284,4 @@ def between_candidates(
     ]
 
 
-__all__ = ["BetweenRatio", "Difference", "between_candidates", "between_fits", "called", "differences"]
+__all__ = ["BetweenRatio", "Difference", "between_candidates", "between_fits", "called", "differences", "suspected"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vinetrack.diagnosis.between_trials import between_fits, called, differences
+from vinetrack.diagnosis.between_trials import between_fits, called, differences, suspected
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.confounded_sizes import confounders_of
 from vinetrack.diagnosis.confounder import Confounder
@@ -70,7 +70,8 @@ class SelectionStep:
 
     `kept` are the hypotheses in the answer set (of sets of effects: the rest of them, given what was added before),
     `tried` all that were fitted, `aside` what was set aside and why, by name; `confounded` are sizes that may hold
-    another effect. `partial` are steps, each of one effect more, that mend most of what nothing mends in full.
+    another effect. `unstated` are differences between trials that an adequate model stands beside, by an order that the
+    sheet does not state. `partial` are steps, each of one effect more, that mend most of what nothing mends in full.
     """
 
     verdict: str
@@ -83,6 +84,7 @@ class SelectionStep:
     note: str = ""
     confounded: tuple[Confounder, ...] = ()
     partial: tuple[LikelihoodRatio, ...] = ()
+    unstated: tuple[LikelihoodRatio, ...] = ()
 
 
 def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again: int = 0) -> list[SelectionStep]:
@@ -115,7 +117,8 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     among = differences(fit)
     differ = bool(called(among, FIRST_LEVEL))
     if not questions.something and not questions.suspect and not differ:
-        return [SelectionStep(ADEQUATE, questions)]
+        unstated = between_fits(fit, suspected(among, FIRST_LEVEL), 0.0, report)
+        return [SelectionStep(ADEQUATE, questions, unstated=tuple(unstated))]
     slack = _slack(questions, effects, report) if questions.something else None
     if slack is not None and not _leaves_room(slack[0].kept) and not slack[-1].questions.suspect:
         return slack

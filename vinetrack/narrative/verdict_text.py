@@ -316,7 +316,19 @@ def _adequate(finding: SelectionStep, model: str, trials: str) -> str:
         kind = next(effect.kind for effect in questions.effects if effect.name == names[place])
         if kind == MEASUREMENT and questions.possible[place] >= WORTH_A_CHECK_SIGMA:
             text += f" It is an error of measurement, and soon checked: see `vinetrack effects {names[place]}`."
-    return text
+    return f"{text}{_unstated(finding)}"
+
+
+def _unstated(finding: SelectionStep) -> str:
+    """Differences between trials by an order that the sheet does not state; blank where there are none."""
+    if not finding.unstated:
+        return ""
+    best = max(finding.unstated, key=lambda result: result.delta_chi2)
+    trials = [trial.trial for trial in finding.questions.fit.trials]
+    return (
+        f" But trials seem to differ, and the numbers of the model hold what that does: {difference_in_words(best)}"
+        f" (Δχ² = {best.delta_chi2:.0f}).{remedies_in_words([best], trials)}"
+    )
 
 
 def _count_testable(questions: MisfitTests) -> int:
