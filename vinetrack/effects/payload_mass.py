@@ -1,4 +1,4 @@
-"""Payload mass: what rides in the vine weighs more or less than the sheet says, by the same in every loaded trial.
+"""Payload mass: what rides in a vine weighs more or less than the sheet says, by the same in each of its loaded trials.
 
 Matters with a payload, most for a light one: its mount, tape, bolts or cable were not weighed along, or the balance was
 not zeroed. In a vine that runs at a few metres a second most of the mass that moves is payload.
@@ -28,6 +28,7 @@ PARAMETERS = (
         "kg",
         5e-3,
         bounds=(-1.0, 1.0),
+        shared="vine",
         plausible=(-0.02, 0.05),
         meaning="mass of the payload beside what the sheet states",
     ),
