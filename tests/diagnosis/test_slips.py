@@ -62,7 +62,7 @@ def test_what_is_left_beside_a_slip_must_be_an_ordinary_error():
 
 
 def test_an_ordinary_error_is_no_slip():
-    """But film a fifth too light is polyethylene sooner than film that much too thin, which is sold to within a tenth."""
+    """But film a fifth too light is polyethylene sooner than too thin: film is sold to within a tenth."""
     for name, part in (("area_scale", 1.0), ("length_scale", 1.0), ("time_base", 1.0), ("film_mass", 0.5)):
         parameter = catalogue()[name].parameters[0]
         assert parameter.slips
