@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hidden import laboratories as faults
+from hidden import over_time
 from hidden.balls import fallen
 from hidden.designs import Wants
 from hidden.laboratory_folder import write_experiment, write_truth
@@ -135,7 +136,7 @@ def test_a_tube_a_condition_is_shared_by_its_replicates_and_by_no_other():
 
 def test_a_day_has_one_zero():
     laboratory, draw = drawn()
-    after = faults.zero_by_day(0.2)(laboratory, draw)
+    after = over_time.zero_by_day(0.2)(laboratory, draw)
     shifts: dict[str, set[float]] = {}
     for a, b in zip(laboratory.shots, after.shots, strict=True):
         shifts.setdefault(b.day, set()).add(round(b.tube.pressure - a.tube.pressure, 6))

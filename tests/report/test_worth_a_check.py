@@ -24,7 +24,7 @@ def round_of(effect: str, kind: str, sigma: float) -> SimpleNamespace:
         largest=lambda _effect: ({}, True),
         best_z=lambda _name: (0.0, 0),
     )
-    return SimpleNamespace(questions=questions, verdict=ADEQUATE, note="")
+    return SimpleNamespace(questions=questions, verdict=ADEQUATE, note="", unstated=())
 
 
 @pytest.mark.parametrize(
