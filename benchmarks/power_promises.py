@@ -285,7 +285,7 @@ def main() -> None:
             continue
         if time.monotonic() - begun > 60 * given.minutes:
             break
-        for line in campaign(seed, given.design, effects, given.each, given.probability, list(lines)):
+        for line in campaign(seed, given.design, effects, given.each, given.probability, lines):
             lines.append(line)
             print(json.dumps(line, default=str), flush=True)
             if given.answers is not None:

@@ -116,14 +116,7 @@ def _order_rows() -> list[Row]:
             columns=("order",),
         ),
         *_twice(
-            Row(
-                "regulator_reset",
-                "regulator_reset",
-                guessed,
-                (rising, set_anew),
-                BARE,
-                quiet=0.5,
-            ),
+            Row("regulator_reset", "regulator_reset", guessed, (rising, set_anew), BARE, quiet=0.5),
             columns=("order",),
         ),
         *_twice(

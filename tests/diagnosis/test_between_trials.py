@@ -13,7 +13,7 @@ import vinetrack as vt
 from vinetrack.core.records import Trial
 from vinetrack.diagnosis.between_forms import confounded
 from vinetrack.diagnosis.between_gain import Difference, beside_systematics, gains_from_each, linear_gain
-from vinetrack.diagnosis.between_trials import between_fits, called, differences, suspected
+from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.likelihood_ratio import MOST_INFLATION, LikelihoodRatio, robust_ratio
 from vinetrack.diagnosis.result import ADEQUATE, AMBIGUOUS, ARTEFACT, MISSING, Diagnosis
 from vinetrack.diagnosis.selection import verdict_of
@@ -178,8 +178,9 @@ def test_wear_that_only_the_order_of_the_rows_shows_is_told_beside_an_adequate_m
     unstated = [(replace(trial, order=np.nan), track) for trial, track in pairs]
     questioned = fit(vt.base_model(), unstated, profile=False)
     among = differences(questioned)
-    assert "order_drift" in {difference.name for difference in suspected(among, 0.003)}
-    assert not called(among, 0.003)
+    apart = significant(among, 0.003)
+    assert "order_drift" in {difference.name for difference in apart}
+    assert not any(difference.stated for difference in apart)
     result = diagnosed(unstated, ("air_drag",))
     assert result.verdict == ADEQUATE
     assert "But trials seem to differ" in result.explanation

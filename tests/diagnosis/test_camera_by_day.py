@@ -26,6 +26,11 @@ def answered(tmp_path_factory):
     return experiment, vt.diagnose(experiment, ladder=False, advice=False)
 
 
+@pytest.fixture(scope="module")
+def fitted(answered):
+    return vt.fit(vt.base_model() + "time_base", answered[0], profile=False)
+
+
 def test_a_frame_rate_that_was_off_on_one_day_is_named_with_the_day(answered):
     said = answered[1]
     assert said.verdict == "artefact"
@@ -57,9 +62,7 @@ def test_what_only_another_day_is_known_to_have_is_nothing_on_this_one():
     assert model.parameters_for("v")[place] == 0.0
 
 
-def test_a_fit_with_a_number_for_each_day_predicts_the_trials_of_each(answered):
-    model = vt.base_model() + "time_base"
-    fitted = vt.fit(model, answered[0], profile=False)
+def test_a_fit_with_a_number_for_each_day_predicts_the_trials_of_each(fitted):
     days = {number.vine: number for number in fitted.numbers if number.key == RATE}
     assert set(days) == {"day 1", "day 2"}
     off, sigma = days["day 2"].value - days["day 1"].value, days["day 2"].sigma
@@ -70,9 +73,8 @@ def test_a_fit_with_a_number_for_each_day_predicts_the_trials_of_each(answered):
     assert np.mean([trial.rms_m for trial in known]) < 0.6 * np.mean([trial.rms_m for trial in unknown])
 
 
-def test_a_band_around_a_prediction_takes_over_the_error_of_the_number_of_its_day(answered):
-    fitted = vt.fit(vt.base_model() + "time_base", answered[0], profile=False)
-    data = next(one for one in fitted.predictor.data if one.trial.day == "2")
+def test_a_band_around_a_prediction_takes_over_the_error_of_the_number_of_its_day(fitted):
+    data = next(data for data in fitted.predictor.data if data.trial.day == "2")
     layout = make_layout(fitted.model, [data])
     _, places = laid_over(fitted, layout, data)
     place = places[layout.keys.index(RATE)]

@@ -19,7 +19,7 @@ from vinetrack.diagnosis.result import DAY, N_BY_VINE, ORDER_DRIFT, SPECIMEN
 from vinetrack.experiment.trial_order import trial_order
 from vinetrack.inference.fit_result import Fit
 from vinetrack.inference.optimiser import Solution
-from vinetrack.inference.parameters import EXPONENT, BetweenTerm
+from vinetrack.inference.parameters import EXPONENT, BetweenTerm, groups_of
 
 SPECIMEN_B_SD, SPECIMEN_PA_SD = 0.06, 300.0
 """Standard deviation of ln B and of P_y among tubes of one kind. Chosen: tubes of a batch differ by 3 to 8 % in B and a
@@ -27,7 +27,7 @@ few tenths of a kPa; at half and twice, ln L of a hypothesis moves by about ln 2
 
 DAY_B_SD, DAY_PA_SD, DAY_GAIN_SD = 0.03, 300.0, 0.03
 """The same from day to day, and of ln P: film in other air, a gauge zeroed anew, a regulator set anew. Chosen: a gauge
-holds its zero to 0.3 kPa, a regulator is set by its dial to a few per cent."""
+holds its zero to 0.3 kPa, a regulator is set by its dial to a few per cent; at half and twice as of specimens."""
 
 EACH_SIDE = 2
 """Trials that a change has before it and after it. Derived: a change of one trial alone is its random deviation."""
@@ -39,7 +39,8 @@ campaigns are never asked."""
 
 SPREAD_OVER_CONDITIONS = 0.5
 """A difference counts as confounded with the conditions where it varies within them by less than this part of what
-random order gives (1 on average). Chosen: replicates in adjacent places give under 0.1, random order 0.6 to 1.3."""
+random order gives (1 on average). Chosen: replicates in adjacent places give under 0.1, random order 0.6 to 1.3; at
+half both are still on their sides, at twice half of all random orders count as confounded."""
 
 
 def forms_of(fit: Fit, base: Solution) -> list[Difference]:
@@ -135,18 +136,22 @@ def _groups(trials: Sequence[Trial]) -> list[Difference]:
         several = {vine for vine in (t.vine for t in trials) if len({_tube(t) for t in trials if t.vine == vine}) > 1}
         groups = tuple(tube if trial.vine in several else "" for tube, trial in zip(tubes, trials, strict=True))
         differences_found += _forms(SPECIMEN, groups, trials, SPECIMEN_B_SD, SPECIMEN_PA_SD, stated=True)
-    if all(trial.day for trial in trials):
-        days = tuple(f"day {trial.day}" for trial in trials)
-        by_day = _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, stated=True)
-        gain = BetweenTerm(f"{DAY}.gain", "ΔlnP", "", True, days, np.ones(len(days)), DAY_GAIN_SD, DAY_GAIN_SD)
-        differences_found += by_day + [replace(form, terms=(gain,)) for form in by_day[1:2]]
+    days = groups_of(trials, "day")
+    differences_found += _forms(DAY, days, trials, DAY_B_SD, DAY_PA_SD, gain_sd=DAY_GAIN_SD, stated=True)
     return differences_found
 
 
 def _forms(
-    name: str, groups: Sequence[str], trials: Sequence[Trial], B_sd: float, pressure_sd_Pa: float, *, stated: bool
+    name: str,
+    groups: Sequence[str],
+    trials: Sequence[Trial],
+    B_sd: float,
+    pressure_sd_Pa: float,
+    *,
+    gain_sd: float = 0.0,
+    stated: bool,
 ) -> list[Difference]:
-    """Groups that differ in B, in pressure, or in both."""
+    """Groups that differ in B, in pressure, or in both; with `gain_sd`, by a factor of the pressure too."""
     if len({group for group in groups if group}) < 2 and stated:
         return []
     pressures_Pa = np.array([trial.pressure_Pa for trial in trials])
@@ -155,11 +160,12 @@ def _forms(
     groups = tuple(groups)
     in_B = BetweenTerm(f"{name}.B", "ΔlnB", "", False, groups, np.ones(len(groups)), B_sd, B_sd)
     in_P = BetweenTerm(f"{name}.P", "ΔP", "Pa", True, groups, per_Pa, pressure_sd_Pa, pressure_sd_Pa)
+    in_gain = BetweenTerm(f"{name}.gain", "ΔlnP", "", True, groups, np.ones(len(groups)), gain_sd, gain_sd)
     member = np.array([[group == label for label in dict.fromkeys(groups) if label] for group in groups], dtype=float)
     apart = confounded(member, trials)
     return [
         Difference(name, terms, stated=stated, confounded=apart)
-        for terms in ((in_B,), (in_P,), (in_B, in_P))
+        for terms in ((in_B,), (in_P,), (in_B, in_P), *([(in_gain,)] if gain_sd else []))
         if not any(term.pressure for term in terms) or driven.any()
     ]
 

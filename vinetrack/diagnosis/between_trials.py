@@ -114,47 +114,24 @@ def differences(fit: Fit) -> list[Difference]:
     return list(best.values())
 
 
-def called(among: Sequence[Difference], level: float) -> list[Difference]:
-    """Differences that alone make a model inadequate: significant, stated by the sheet, and confounded with conditions.
+def significant(among: Sequence[Difference], level: float) -> list[Difference]:
+    """Differences that are no chance, and that follow the conditions so closely that they may pass for physics.
 
     One that random order or replicates keep apart from the conditions is a random deviation of the trials, which the
-    fit allows for. `level` is the chance of a false alarm of them all (Bonferroni).
+    fit allows for. Those that the sheet states make a model inadequate of themselves. The others go by the order of the
+    rows, which need not be that of the trials: they decide nothing, and are told beside a model that is adequate.
 
     Parameters
     ----------
     among : sequence of Difference
         Those that were estimated.
     level : float
-        Chance of a false alarm of them all.
+        Chance of a false alarm of them all (Bonferroni).
 
     Returns
     -------
     list of Difference
     """
-    return [difference for difference in _significant(among, level) if difference.stated]
-
-
-def suspected(among: Sequence[Difference], level: float) -> list[Difference]:
-    """Differences as significant as those that are called, by an order or by tubes that the sheet does not state.
-
-    Rows need not stand in the order in which trials were made, so these decide nothing; but a model that is adequate
-    stands beside them.
-
-    Parameters
-    ----------
-    among : sequence of Difference
-        Those that were estimated.
-    level : float
-        Chance of a false alarm of them all.
-
-    Returns
-    -------
-    list of Difference
-    """
-    return [difference for difference in _significant(among, level) if not difference.stated]
-
-
-def _significant(among: Sequence[Difference], level: float) -> list[Difference]:
     return [difference for difference in among if difference.confounded and difference.p < level / len(among)]
 
 
@@ -284,4 +261,4 @@ def between_candidates(
     ]
 
 
-__all__ = ["BetweenRatio", "Difference", "between_candidates", "between_fits", "called", "differences", "suspected"]
+__all__ = ["BetweenRatio", "Difference", "between_candidates", "between_fits", "differences", "significant"]

@@ -165,7 +165,7 @@ def _speeds(
 
 def _runs(fit: Fit, trials: Sequence[Trial], changed: Number | None, instants: Sequence[Floats]) -> list[Trajectory]:
     """Motions with the fitted numbers, but for one that was changed."""
-    theta = np.tile(fit.model.parameters_for(trials[0].vine), (len(trials), 1))
+    theta = np.tile(fit.model.parameters_of(trials[0]), (len(trials), 1))
     moved = list(trials)
     for number in (*fit.numbers, *([changed] if changed is not None else [])):
         if number.key == YIELD_PRESSURE and _concerns(number, trials[0]):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vinetrack.diagnosis.between_trials import between_fits, called, differences, suspected
+from vinetrack.diagnosis.between_trials import between_fits, differences, significant
 from vinetrack.diagnosis.candidate_fits import CandidateFits, Report
 from vinetrack.diagnosis.confounded_sizes import confounders_of
 from vinetrack.diagnosis.confounder import Confounder
@@ -115,9 +115,10 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     report("questioning the model")
     questions = misfit_tests(fit, effects, FIRST_LEVEL)
     among = differences(fit)
-    differ = bool(called(among, FIRST_LEVEL))
+    apart = significant(among, FIRST_LEVEL)
+    differ = any(difference.stated for difference in apart)
     if not questions.something and not questions.suspect and not differ:
-        unstated = between_fits(fit, suspected(among, FIRST_LEVEL), 0.0, report)
+        unstated = between_fits(fit, apart, 0.0, report)
         return [SelectionStep(ADEQUATE, questions, unstated=tuple(unstated))]
     slack = _slack(questions, effects, report) if questions.something else None
     if slack is not None and not _leaves_room(slack[0].kept) and not slack[-1].questions.suspect:

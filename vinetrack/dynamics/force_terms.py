@@ -102,7 +102,7 @@ class _Asker:
     """Calls the hooks of a model's effects with the parameters of one trial's vine."""
 
     def __init__(self, model: Model, trial: Trial) -> None:
-        theta = model.parameters_for(trial.vine, trial.group("day"))
+        theta = model.parameters_of(trial)
         values = iter(theta.tolist())
         self.arguments = {effect.name: [next(values) for _ in effect.parameters] for effect in model.effects}
         acting = effects_on(model, theta[None, :])[0]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.notebook import html_table
-from vinetrack.core.records import Floats
+from vinetrack.core.records import Floats, Trial
 from vinetrack.effects import BASE_EFFECTS, Effect, EffectError, find_effect
 
 Value = float | Mapping[str, float]
@@ -204,6 +204,25 @@ class Model:
                     value = value[vine]
                 numbers.append(float(value))
         return np.array(numbers)
+
+    def parameters_of(self, trial: Trial) -> Floats:
+        """Values of all parameters for one trial: those of its vine and of its day.
+
+        Parameters
+        ----------
+        trial : Trial
+
+        Returns
+        -------
+        array, shape (n_parameters,)
+            As of `parameters_for`.
+
+        Raises
+        ------
+        EffectError
+            If a value is given per vine and that of the trial is not among them.
+        """
+        return self.parameters_for(trial.vine, trial.group("day"))
 
     def __repr__(self) -> str:
         return f"Model({' + '.join(self.names)})"

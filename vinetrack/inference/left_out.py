@@ -225,8 +225,7 @@ def _known_yield(fit: Fit, trial_data: FitTrial) -> FitTrial:
 
 def _nothing_free(fit: Fit, data: Sequence[FitTrial]) -> ParameterMap:
     try:
-        trials = [trial_data.trial for trial_data in data]
-        base = np.array([fit.model.parameters_for(trial.vine, trial.group("day")) for trial in trials])
+        base = np.array([fit.model.parameters_of(trial_data.trial) for trial_data in data])
     except EffectError as error:
         raise FitError(f"{error} A vine that was not in the fit cannot be predicted.") from error
     base = base.reshape(len(data), len(fit.model.parameter_names))

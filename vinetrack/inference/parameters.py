@@ -284,7 +284,7 @@ def make_layout(
             raise FitError(f"{name} is shared by {how!r}: say 'all', 'vine' or 'day'.")
     chosen = [name for name in known if name not in held and (name in wanted or not known[name].held)]
     trials = [trial_data.trial for trial_data in data]
-    base = np.array([model.parameters_for(trial.vine, trial.group("day")) for trial in trials])
+    base = np.array([model.parameters_of(trial) for trial in trials])
     base = base.reshape(len(data), len(model.parameter_names))
     numbers: list[FreeParameter] = []
     index = np.full((len(data), 0), -1)

@@ -66,7 +66,7 @@ def grow(trials: Sequence[Trial], nature: Nature) -> list[VirtualTrial]:
     draws = [_draw(nature.seed, 0, trial.name) for trial in trials]
     errors = _yield_errors(trials, nature)
     true, damping = [], []
-    theta = np.array([model.parameters_for(trial.vine) for trial in trials])
+    theta = np.array([model.parameters_of(trial) for trial in trials])
     column = model.parameter_names.index("eversion_damping.B") if "eversion_damping" in model else None
     for i, (trial, draw) in enumerate(zip(trials, draws, strict=True)):
         set_Pa = trial.pressure_Pa * (1 + nature.pressure_scatter * draw.standard_normal())

@@ -289,7 +289,7 @@ def steady_speed(model: Model, trial: Trial) -> float:
     -------
     float
     """
-    values = dict(zip(model.parameter_names, model.parameters_for(trial.vine).tolist(), strict=True))
+    values = dict(zip(model.parameter_names, model.parameters_of(trial).tolist(), strict=True))
     force_N = max(trial.pressure_Pa - trial.yield_pressure_Pa, 0.0) * trial.area_m2
     return float((force_N / values[DAMPING]) ** (1 / values[EXPONENT]))
 

@@ -194,7 +194,7 @@ def final_speeds(vine_inputs: Sequence[PredictiveInputs], at_fraction: float) ->
     """
     trials = [inputs.trial for inputs in vine_inputs]
     model = vine_inputs[0].model
-    rows = np.array([inputs.model.parameters_for(inputs.trial.vine) for inputs in vine_inputs])
+    rows = np.array([inputs.model.parameters_of(inputs.trial) for inputs in vine_inputs])
     ends = simulate_many(model, trials, [np.array([0.0, LONGEST_S])] * len(trials), parameters=rows)
     over = np.array([end.end_time_s if end.status == "ended" else LONGEST_S for end in ends])
     times = [end * (1 - 1e-9) * np.linspace(0.0, 1.0, POINTS) for end in over]

@@ -77,7 +77,7 @@ class PredictiveInputs:
     @property
     def medians(self) -> dict[str, float]:
         """Every number, SI, as it stands with nothing uncertain."""
-        values = dict(zip(self.model.parameter_names, self.model.parameters_for(self.trial.vine).tolist(), strict=True))
+        values = dict(zip(self.model.parameter_names, self.model.parameters_of(self.trial).tolist(), strict=True))
         return {**values, PRESSURE: self.trial.pressure_Pa, YIELD: self.trial.yield_pressure_Pa}
 
     def draw(self, count: int, seed: int, only: Iterable[str] | None = None) -> Draws:

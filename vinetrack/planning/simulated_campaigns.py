@@ -135,7 +135,7 @@ def make(
         )
         for trial, factor in zip(trials, pressures, strict=True)
     ]
-    theta = np.array([model.parameters_for(trial.vine) for trial in trials])
+    theta = np.array([model.parameters_of(trial) for trial in trials])
     theta[:, model.parameter_names.index(DAMPING)] *= np.exp(spreads[1] * draw.standard_normal(count))
     longest_s = [2 * of_trial.longest_s for of_trial in cameras]
     last = [np.array([0.0, end_s]) for end_s in longest_s]

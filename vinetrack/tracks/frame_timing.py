@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Track, join_flags, with_flag
-from vinetrack.tracks.position_noise import noise_but_for_faults
+from vinetrack.tracks.position_noise import THIRD_DIFFERENCE, noise_but_for_faults
 from vinetrack.tracks.wild_points import reject_wild_points, running_noise
 
 CLEAR_STEP_SIGMAS = 8.0
@@ -97,10 +97,6 @@ printed to 0.1 ms at 500 frames a second err by 0.025 of a frame. By reasoning: 
 are left alone; at twice irregular times are corrected as if even."""
 
 
-THIRD_DIFFERENCE = math.sqrt(20.0)
-"""Standard deviation of third differences of white noise of unit variance. Derived: 1² + 3² + 3² + 1² = 20."""
-
-
 _Sides = tuple[tuple[Floats, Floats], tuple[Floats, Floats]]
 """Frame numbers and positions before and after."""
 
@@ -142,9 +138,10 @@ def _corrected(track: Track) -> Track:
     if np.any(np.abs(frames - np.rint(frames)) > UNEVEN * np.maximum(np.rint(frames), 1.0)):
         return track
     out = _flag_visible_gaps(track, np.rint(frames).astype(int))
-    out = _retime_known_copies(out, step_s)
+    noise_m, rho = _noise(out)
+    out = _retime_known_copies(out, step_s, noise_m, rho)
     tried = 0
-    while (event := _next_event(out, tried, step_s)) is not None:
+    while (event := _next_event(out, tried, step_s, noise_m, rho)) is not None:
         out = _apply(out, event, step_s)
         tried = event.row
     return out
@@ -169,8 +166,8 @@ def lost_for_sure(track: Track) -> bool:
         missing = frame[i + 1] - frame[i] - 1
         as_filmed = np.where(np.arange(frame.size) > i, frame - missing, frame)
         around = as_filmed, track.lead_position_m[rows]
-        jump = _jump(*around, slice(0, i + 1), slice(i + 1, None), noise_m[i], rho) if i >= 0 else None
-        if jump is None or math.isfinite(_jump_far_around(*around, i, noise_m[i])):
+        jump = _jump(*around, slice(0, i + 1), slice(i + 1, None), noise_m[rows[i]], rho) if i >= 0 else None
+        if jump is None or math.isfinite(_jump_far_around(*around, i, noise_m[rows[i]])):
             return True
         if jump[0] > ALONE * JUMP_SIGMAS * jump[1]:
             return True
@@ -178,20 +175,22 @@ def lost_for_sure(track: Track) -> bool:
 
 
 def _noise(track: Track) -> tuple[Floats, float]:
-    """Standard deviation of each usable point of a track, m, and the correlation of their noise from point to point.
+    """Standard deviation of a position at each row of a track, m, and the correlation of the noise from row to row.
 
     Of the whole track, or, where that is more, of the points around: an edge far from the lamp is noisier than at rest,
     and its noise makes jumps there.
     """
-    y = track.lead_position_m[track.usable]
-    whole_m, rho = noise_but_for_faults(track.time_s[track.usable], y)
-    if y.size <= 2 * WIDE_SIDE_POINTS:
-        return np.full(y.size, whole_m), rho
-    around_m = running_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE, WIDE_SIDE_POINTS)
-    return np.fmax(whole_m, np.pad(around_m, (1, 2), mode="edge")), rho
+    usable = track.usable
+    y = track.lead_position_m[usable]
+    whole_m, rho = noise_but_for_faults(track.time_s[usable], y)
+    noise_m = np.full(usable.size, whole_m)
+    if y.size > 2 * WIDE_SIDE_POINTS:
+        around_m = running_noise(np.abs(np.diff(y, 3)) / THIRD_DIFFERENCE, WIDE_SIDE_POINTS)
+        noise_m[usable] = np.fmax(whole_m, np.pad(around_m, (1, 2), mode="edge"))
+    return noise_m, rho
 
 
-def _retime_known_copies(track: Track, step_s: float) -> Track:
+def _retime_known_copies(track: Track, step_s: float, noise_m: Floats, rho: float) -> Track:
     """Later times moved back behind repeated frames that the picture showed, where the motion says they were inserted.
 
     A repeated picture tells that a frame is a copy, not whether it took the place of another.
@@ -204,8 +203,7 @@ def _retime_known_copies(track: Track, step_s: float) -> Track:
         if not with_copy[row] or i < 0:
             continue
         frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
-        noise_m, rho = _noise(replace(track, flag=np.where(with_copy & ~track.usable, "", track.flag)))
-        event = _judge_repeat(frame, track.lead_position_m[rows], i, noise_m[i], rho, rows)
+        event = _judge_repeat(frame, track.lead_position_m[rows], i, noise_m[rows[i]], rho, rows)
         if event is not None and event.kind == "inserted":
             track = _apply(track, event, step_s)
     return track
@@ -235,16 +233,16 @@ def frames_are(frames: int) -> str:
     return "1 frame is" if frames == 1 else f"{frames} frames are"
 
 
-def _next_event(track: Track, after: int, step_s: float) -> _Event | None:
+def _next_event(track: Track, after: int, step_s: float, noise_m: Floats, rho: float) -> _Event | None:
     """The first fault on a row beyond `after`."""
     rows = np.flatnonzero(track.usable)
     if rows.size < 6:
         return None
-    noise_m, rho = _noise(track)
     frame = np.rint((track.time_s[rows] - track.time_s[rows[0]]) / step_s)
     y = track.lead_position_m[rows]
     speed = np.diff(y) / np.diff(frame)
     stated = track.lead_position_sigma_m[rows]
+    noise_m = noise_m[rows]
     for i in _suspects(speed, np.fmax(noise_m[:-1], np.fmax(stated[:-1], stated[1:]))):
         if rows[i + 1] <= after:
             continue

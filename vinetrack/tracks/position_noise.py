@@ -50,6 +50,9 @@ Chosen: at ρ = 0.85 noise persists for six frames, half a stretch; seven points
 three degrees of freedom. By reasoning: a lower limit replaces truly slow noise by too small a ρ, a higher one lets
 curvature pass for noise."""
 
+THIRD_DIFFERENCE = math.sqrt(20.0)
+"""Standard deviation of third differences of white noise of unit variance. Derived: 1² + 3² + 3² + 1² = 20."""
+
 OF_THIRD = 1.84
 """By how much the median third difference may be too small for noise that remembers itself. Derived: at ρ = 0.6 third
 differences have 1/1.84² of the variance of white noise."""
@@ -219,7 +222,7 @@ def rough_noise(position_m: Floats) -> float:
     if position_m.size < 5:
         return 0.0
     third = np.diff(position_m, 3)
-    return float(np.median(np.abs(third))) / 0.6745 / math.sqrt(20)
+    return float(np.median(np.abs(third))) / 0.6745 / THIRD_DIFFERENCE
 
 
 def rest_points(position_m: Floats) -> int:
