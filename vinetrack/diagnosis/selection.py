@@ -118,8 +118,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     apart = significant(among, FIRST_LEVEL)
     differ = any(difference.stated for difference in apart)
     if not questions.something and not questions.suspect and not differ:
-        unstated = between_fits(fit, apart, 0.0, report)
-        return [SelectionStep(ADEQUATE, questions, unstated=tuple(unstated))]
+        return [SelectionStep(ADEQUATE, questions, unstated=tuple(between_fits(fit, apart, 0.0, report)))]
     slack = _slack(questions, effects, report) if questions.something else None
     if slack is not None and not _leaves_room(slack[0].kept) and not slack[-1].questions.suspect:
         return slack
@@ -127,11 +126,13 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     search.singles()
     tried = search.fit_in_full()
     between = between_fits(fit, among, max((hypothesis.delta_chi2 for hypothesis in tried), default=0.0), report)
+    by_rows = {difference.name for difference in apart if not difference.stated}
+    unstated = tuple(hypothesis for hypothesis in between if hypothesis.names[0] in by_rows)
     tried += between
     if slack is not None and not _is_better(tried, slack[0].kept[0]):
         return slack
     if not questions.something and not differ and (not tried or best_of(tried).sigma < SUSPECT_SIGMAS):
-        return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
+        return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search, unstated=unstated)]
     if tried and again < MOST_AGAIN and best_of(tried) not in between:
         rival = without(fit, best_of(tried).fit)
         if rival.log_likelihood > fit.log_likelihood + NO_BETTER:
@@ -147,7 +148,7 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
     if alone is not None:
         return alone
     if not questions.something and not questions.suspect:
-        return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search)]
+        return [SelectionStep(ADEQUATE, questions, tried=tuple(tried), search=search, unstated=unstated)]
     tried = [hypothesis for hypothesis in tried if hypothesis not in between]
     credible = [hypothesis for hypothesis in tried if hypothesis.credible]
     if not credible or not _any_stands_out(credible, questions):
@@ -155,7 +156,8 @@ def select_effects(fit: Fit, effects: Sequence[Effect], report: Report, *, again
         loud = questions.excess(questions.family) > LOUD
         fails = questions.fails or questions.off or loud
         verdict = UNEXPLAINED if fails else ADEQUATE
-        return [SelectionStep(verdict, questions, tried=tuple(tried), search=search)]
+        told = unstated if verdict == ADEQUATE else ()
+        return [SelectionStep(verdict, questions, tried=tuple(tried), search=search, unstated=told)]
     return _together(questions, search, tried, report)
 
 

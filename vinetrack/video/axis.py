@@ -143,8 +143,8 @@ def find_axis(luma: NDArray[Any] | SmallPictures, grows: bool = True) -> Axis:
     return _to_picture(best, seen.factor, seen.shape)
 
 
-def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
-    """Whether most of what grows along `axis` is a front that passes once.
+def order_along(luma: NDArray[Any] | SmallPictures, axis: Axis) -> float:
+    """How much of what grows along `axis` is a front that passes once.
 
     Where hardly any of what changes along it stays (LEAST_GROWN), all that changes there is asked instead.
 
@@ -155,7 +155,7 @@ def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
 
     Returns
     -------
-    False where the vine bends or sweeps away.
+    its share, 0 to 1: less than ORDERLY where the vine bends or sweeps away.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def is_orderly(luma: NDArray[Any] | SmallPictures, axis: Axis) -> bool:
     if len(grown[0]) >= max(12, LEAST_GROWN * len(line[0])):
         line = grown
     agree, _, _ = agreeing(*line, n_times, angle, np.array(scaled.from_px), band)
-    return bool(line[3][agree].sum() >= ORDERLY * line[3].sum())
+    return float(line[3][agree].sum() / line[3].sum())
 
 
 def _beside(pixels: Pixels, axis: Axis, band: float) -> tuple[Floats, Floats, Floats, Floats]:

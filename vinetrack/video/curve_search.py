@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vinetrack.core.records import Floats
 from vinetrack.video.axis import ORDERLY, Axis, agreeing, find_axis
 from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_complaint
-from vinetrack.video.curved_strip import orderly_along
+from vinetrack.video.curved_strip import order_along_curve
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
 
@@ -168,7 +168,7 @@ def _band(small: SmallPictures) -> Band | None:
 
 def _orderly(luma: NDArray[Any], curve: CurvedAxis) -> bool:
     try:
-        return orderly_along(luma, curve)
+        return order_along_curve(luma, curve) >= ORDERLY
     except RecordingError:
         return False
 

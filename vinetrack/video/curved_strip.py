@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats
 from vinetrack.experiment.cells import LEAST_APART_PX
-from vinetrack.video.axis import Axis, is_orderly
+from vinetrack.video.axis import Axis, order_along
 from vinetrack.video.curved_axis import CurvedAxis, axis_through, curve_complaint
 from vinetrack.video.frames import RecordingError
 from vinetrack.video.small_pictures import SmallPictures
@@ -154,8 +154,8 @@ def shake_along(strip: Strip, edge_px: Floats) -> Floats:
     return np.asarray(np.sum(strip.shift_px * strip.axis.direction_at(known), axis=1))
 
 
-def orderly_along(luma: NDArray[Any], axis: CurvedAxis) -> bool:
-    """Whether most of what changes along a curve is a front that passes once; see `axis.is_orderly`.
+def order_along_curve(luma: NDArray[Any], axis: CurvedAxis) -> float:
+    """How much of what changes along a curve is a front that passes once; see `axis.order_along`.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def orderly_along(luma: NDArray[Any], axis: CurvedAxis) -> bool:
 
     Returns
     -------
-    False where what moves leaves the curve as well.
+    its share, 0 to 1: little where what moves leaves the curve as well.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def orderly_along(luma: NDArray[Any], axis: CurvedAxis) -> bool:
         Where nothing moves along the curve.
     """
     straight = laid_straight(luma, axis, min(axis.width_px, max(axis.largest_half_px - 1, 2.0)))
-    return is_orderly(SmallPictures(straight.luma), straight.axis)
+    return order_along(SmallPictures(straight.luma), straight.axis)
 
 
 def refuse_poor_curve(axis: Axis, half_px: float, shape: tuple[int, ...]) -> None:

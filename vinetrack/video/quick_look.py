@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Trial
-from vinetrack.video.axis import Axis, is_orderly
+from vinetrack.video.axis import ORDERLY, Axis, order_along
 from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis
-from vinetrack.video.curved_strip import curve_parts, cut_along
-from vinetrack.video.edge import Outline, outline, rough_growth
+from vinetrack.video.edge import rough_growth
 from vinetrack.video.frames import Recording, RecordingError, iterate_frames
 from vinetrack.video.small_pictures import SmallPictures
-from vinetrack.video.strip import Strip, squared
-from vinetrack.video.track import CENTRINGS, centred, whereabouts
+from vinetrack.video.track import whereabouts
+from vinetrack.video.tube_strip import tube_strip
 
 LOOKED_AT = 100
 """Chosen: frames of a recording that are looked at. At half of them a vine that grows within a tenth of the recording
@@ -68,10 +67,12 @@ def look_at(recording: Recording, trial: Trial, axis: Axis | None, count: int | 
     every = max(1, -(-min(count or MOST_DECODED, MOST_DECODED) // most))
     luma = np.stack(list(islice(iterate_frames(recording), 0, MOST_DECODED, every)))
     try:
-        axis_found, orderly = whereabouts(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
-        if trial.travel_ratio == 1 or not orderly:
+        axis_found, order = whereabouts(luma, axis, replace(trial, diameter_m=math.nan), math.nan)
+        grows = trial.travel_ratio == 2 and order >= ORDERLY
+        about = tube_strip(luma, axis_found, order) if grows else None
+        if about is None:
             return Look(axis_found)
-        strip, sides = _about_the_tube(luma, axis_found)
+        strip, sides = about
         growth_px, px_per_frame = rough_growth(strip)
     except (RecordingError, ValueError):
         return Look()
@@ -99,21 +100,9 @@ def proposed_axis(luma: NDArray[Any]) -> Axis:
     """
     small = SmallPictures(luma)
     axis = find_growth_axis(small, luma)
-    if not isinstance(axis, CurvedAxis) and not is_orderly(small, axis):
-        return axis
+    order = 1.0 if isinstance(axis, CurvedAxis) else order_along(small, axis)
     try:
-        return _about_the_tube(luma, axis)[0].axis
+        about = tube_strip(luma, axis, order) if order >= ORDERLY else None
     except ValueError:
         return axis
-
-
-def _about_the_tube(luma: NDArray[Any], axis: Axis) -> tuple[Strip, Outline]:
-    """A strip that is centred on the tube, and the tube's outline in it."""
-    strip = cut_along(luma, squared(axis), 0.65 * axis.width_px + 3)
-    sides = outline(strip, curve_parts(axis))
-    for _ in range(2 * CENTRINGS):
-        before, strip = strip, centred(luma, strip, sides)
-        if strip is before:
-            break
-        sides = outline(strip, curve_parts(axis))
-    return strip, sides
+    return axis if about is None else about[0].axis

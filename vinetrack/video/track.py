@@ -11,22 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vinetrack.core.records import Floats, Indices, Track, Trial
-from vinetrack.video.axis import Axis, centred_on_motion, find_axis, is_orderly
+from vinetrack.video.axis import Axis, centred_on_motion, find_axis, order_along
 from vinetrack.video.capture_clock import capture_exposure, capture_rate
 from vinetrack.video.curve_search import find_growth_axis
 from vinetrack.video.curved_axis import CurvedAxis
 from vinetrack.video.curved_strip import (
-    SETTLED_PX,
-    beside_curve,
     curve_found,
-    curve_parts,
-    cut_along,
-    orderly_along,
+    order_along_curve,
     path_error_px,
     refuse_poor_curve,
     shake_along,
 )
 from vinetrack.video.event_frames import read_event
+from vinetrack.video.follow import Positions, follow
 from vinetrack.video.frame_faults import odd_frames, repeated_frames
 from vinetrack.video.frames import Frames, RecordingError, inspect_recording
 from vinetrack.video.hand_corrections import corrected_by_hand
@@ -40,37 +37,18 @@ from vinetrack.video.point_quality import (
     calibrated_sigma,
     judge,
 )
-from vinetrack.video.slow_errors import ARRIVAL_PX, SLOW_PX
 from vinetrack.video.small_pictures import SmallPictures
 from vinetrack.video.sound_frames import sound_stretch
-from vinetrack.video.strip import Strip, recut, squared
+from vinetrack.video.strip import Strip
 from vinetrack.video.track_scale import in_metres
 
 if TYPE_CHECKING:
-    from vinetrack.video.body import EndOfWay
     from vinetrack.video.calibration import AxisScale
-    from vinetrack.video.edge import EdgeFit, Outline
 
 
 FEWEST_FRAMES = 5
 """Derived: fourth differences take five."""
 
-CENTRINGS = 3
-"""Times the strip may be cut anew: what lay outside the first shows only in the second. Chosen; it is cut anew only
-while the axis moves by more than OFF_CENTRE_PX, so that more cost little."""
-APART_PX = 1.0
-"""Bands of the edge that disagree by more cannot all be its own. Chosen: 25 times FLOOR_PX. By reasoning: at half tips
-of crumpled film count as doubtful, at twice an edge half behind a door does not."""
-BRIGHT = 1.5
-"""Amplitude above which something else adds to the edge. Chosen about as far above 1 as PALE of `hidden_tip` lies
-below, in ratio. By reasoning: nearer 1 glints make points doubtful; at twice payloads before the edge pass."""
-ODD_RATIO, LEAST_MISFIT = 6.0, 0.3
-"""A frame that fits so many times worse than usual is doubtful, where usual is no less than this. Chosen: a compressed
-picture at rest leaves hardly any misfit. By reasoning: at half textured film makes points doubtful; at twice a hand
-before the tip does not."""
-VAGUE_PX, VAGUE_RATIO = 1.0, 5.0
-"""A point known worse than this, and so many times worse than usual, is doubtful. Chosen as APART_PX; the ratio spares
-recordings in which all points are vague. At half fast frames of blurred recordings are doubtful, at twice none is."""
 ROOM = 0.08
 """Width added to a given axis, as a part of its length. Derived: the far end of an axis 2.3 degrees off lies off by
 0.04 of it, on either side."""
@@ -82,9 +60,6 @@ decides which of two messages is given."""
 
 STEADIED_PX = 0.1
 """Error of a camera's shake taken off by what stands still: measured 0.1-0.15 px, mostly of its slow part."""
-OFF_CENTRE_PX = 0.8
-"""Tilt of the axis, over its length, or shift that is left alone: the tip's rows then lag by under a tenth of it.
-Chosen; at half the strip is cut once more, at twice rows lag by up to 0.16 px."""
 
 
 @dataclass(frozen=True)
@@ -117,24 +92,6 @@ class Tracking:
     def strip_rows(self) -> Indices:
         """Frame of each row of `kymograph`, shape (n_rows,)."""
         return np.arange(len(self.track.time_s)) if self.strip_frames is None else self.strip_frames
-
-
-@dataclass(frozen=True)
-class _Edge:
-    """Positions along the axis by frame, px, from whichever tracker; `reach_px` is what must be seen ahead of one."""
-
-    edge_px: Floats
-    sigma_px: Floats
-    unsure: NDArray[np.bool_]
-    blur_px: float
-    exposure_frames: float
-    reach_px: float
-    apart_sigma_px: Floats | float = 0.0
-    bands_sigma_px: Floats | float = 0.0
-    slow_px: Floats | float = SLOW_PX
-    end: EndOfWay | None = None
-    width_px: tuple[float, float] = (math.nan, math.nan)
-    seen_exposure: tuple[float, float] = (math.nan, math.nan)
 
 
 def track_recording(
@@ -214,8 +171,8 @@ def track_frames(
     kept = np.flatnonzero(sound & ~rejected)
     luma = frames.luma if len(kept) == len(frames) else frames.luma[kept]
     try:
-        given, (axis, orderly) = axis is not None, whereabouts(luma, axis, trial, m_per_px)
-        strip, edge_fit = _follow(luma, trial, axis, exposure_s * capture_fps, orderly)
+        given, (axis, order) = axis is not None, whereabouts(luma, axis, trial, m_per_px)
+        strip, edge_fit = follow(luma, trial, axis, exposure_s * capture_fps, order)
     except RecordingError as error:
         raise RecordingError(f"{name}: {error}") from error
     repeated = repeated_frames(strip, edge_fit.edge_px)
@@ -256,7 +213,7 @@ def track_frames(
             notes += cut_short(edge_fit.edge_px, verdict, trial.length_m / scale, name)
     if isinstance(strip.axis, CurvedAxis) and not given:
         notes.append(f"{name}: {curve_found(strip.axis)}")
-    if not orderly:
+    if not edge_fit.is_edge:
         notes.append(
             f"{name}: the vine bends or sweeps away from the axis; only how far along it its tip has come is followed, "
             "to about a pixel"
@@ -283,8 +240,8 @@ def track_frames(
     )  # fmt: skip
 
 
-def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, bool]:
-    """The axis, with a width, and whether what changes along it is one front that passes once and stays.
+def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: float | None) -> tuple[Axis, float]:
+    """The axis, with a width, and how much of what changes along it is one front that passes once and stays.
 
     Parameters
     ----------
@@ -295,7 +252,8 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
 
     Returns
     -------
-    axis, px; and False where the vine bends or sweeps away.
+    axis, px; and its share of what changes along it: less than `axis.ORDERLY` where the vine bends or sweeps away, 1
+    for a body.
     """
     given = axis is not None
     if isinstance(axis, CurvedAxis):
@@ -306,63 +264,25 @@ def whereabouts(luma: NDArray[Any], axis: Axis | None, trial: Trial, m_per_px: f
     axis = axis if axis is not None else find_axis(small, grows=False)
     axis = replace(axis, width_px=2 * _half_width(axis, trial, m_per_px))
     if isinstance(axis, CurvedAxis):
-        return axis, True
+        return axis, 1.0  # see `find_growth_axis`, which has asked the same
     if given:
-        # Room for an axis that is a few degrees off; it is centred on what moves, here or in `_follow`.
+        # Room for an axis that is a few degrees off; it is centred on what moves, here or by `tube_strip`.
         axis = replace(axis, width_px=axis.width_px + ROOM * axis.length_px)
         if trial.travel_ratio == 1:
             axis = centred_on_motion(small, axis)
-    return axis, trial.travel_ratio == 1 or is_orderly(small, axis)
+    return axis, 1.0 if trial.travel_ratio == 1 else order_along(small, axis)
 
 
 def _along_given_curve(
     luma: NDArray[Any], axis: CurvedAxis, trial: Trial, m_per_px: float | None
-) -> tuple[CurvedAxis, bool]:
-    """A given curve with a width, that of its strip at most; and whether what changes along it is one front."""
+) -> tuple[CurvedAxis, float]:
+    """A given curve with a width, that of its strip at most; and how much of what changes along it is one front."""
     half = _half_width(axis, trial, m_per_px)
     known = np.isfinite(axis.width_px) or np.isfinite(trial.diameter_m * (m_per_px or trial.m_per_px))
     refuse_poor_curve(axis, half if known else math.nan, luma.shape[1:])
     wide = min(2 * half + ROOM * axis.length_px, 2 * axis.largest_half_px)
     axis = replace(axis, width_px=max(wide, 2 * half) if known else wide)
-    return axis, trial.travel_ratio == 1 or orderly_along(luma, axis)
-
-
-def _follow(luma: NDArray[Any], trial: Trial, axis: Axis, exposure_frames: float, orderly: bool) -> tuple[Strip, _Edge]:
-    """Strip and positions; the axis is centred on what moves along it."""
-    half = axis.width_px / 2
-    if trial.travel_ratio == 1:
-        from vinetrack.video.body import track_body
-
-        strip = cut_along(luma, axis, 1.5 * half + 12)
-        fit = track_body(strip)
-        place = np.where(fit.unseen, np.nan, fit.position_px)
-        return strip, _Edge(place, fit.sigma_px, fit.unsure, fit.half_px, exposure_frames, fit.half_px, end=fit.end)
-    from vinetrack.video.edge import outline, track_edge
-
-    try:
-        if not orderly:
-            from vinetrack.video.kymograph import track_arrival
-
-            strip = cut_along(luma, axis, min(8 * half, 0.3 * max(luma.shape[1:])))
-            edge, sigma = track_arrival(strip)
-            return strip, _Edge(
-                edge, sigma, np.zeros(len(edge), dtype=bool), 1.0, exposure_frames, 2.0, slow_px=ARRIVAL_PX
-            )
-        strip = cut_along(luma, squared(axis), 1.3 * half + 3)
-        for _ in range(2 * CENTRINGS if axis.bends else CENTRINGS):
-            before, sides = strip, outline(strip, curve_parts(axis))
-            strip = centred(luma, strip, sides)
-            if strip is before:
-                break
-        front = track_edge(strip, exposure_frames, sides=sides if strip is before else None)
-    except ValueError as error:
-        raise RecordingError(str(error)) from error
-    reach = 3 * front.blur_px + 1
-    return strip, _Edge(
-        front.edge_px, front.sigma_px, _unsure(front), front.blur_px, front.exposure_frames, reach,
-        front.apart_sigma_px, front.bands_sigma_px, front.slow_px, width_px=(sides.width_px, sides.width_sigma_px),
-        seen_exposure=(front.seen_exposure_frames, front.fast_px_per_frame),
-    )  # fmt: skip
+    return axis, 1.0 if trial.travel_ratio == 1 else order_along_curve(luma, axis)
 
 
 def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
@@ -375,51 +295,8 @@ def _half_width(axis: Axis, trial: Trial, m_per_px: float | None) -> float:
     return 0.1 * axis.length_px
 
 
-def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
-    """The strip about the tube's own centreline; the same one where it is centred already.
-
-    A given axis keeps its ends' places along itself: only what lies across is corrected.
-
-    Parameters
-    ----------
-    luma : brightness, shape (n_frames, height, width).
-    strip : cut from it.
-    sides : of the tube in that strip.
-
-    Returns
-    -------
-    the strip.
-    """
-    shift, slope, half = sides.shift_px, sides.slope, sides.half_px
-    room = (strip.values.shape[1] - 1) / 2 - half - 3
-    if isinstance(strip.axis, CurvedAxis):
-        curve, away = beside_curve(strip.axis, sides)
-        if away < SETTLED_PX and 0 <= room < 0.3 * half + 6:
-            return strip
-        return cut_along(luma, curve, half * 1.15 + 5, strip)
-    tilt = slope * strip.axis.length_px
-    middle = shift + tilt / 2
-    if abs(middle) + abs(tilt) / 2 < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
-        return strip
-    start = strip.axis.points(np.array(0.0), shift)
-    stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
-    turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
-    return recut(strip, luma, squared(turned), half * 1.15 + 5)
-
-
-def _unsure(fit: EdgeFit) -> NDArray[np.bool_]:
-    """Frames whose neighbourhood does not look like the edge elsewhere."""
-    from vinetrack.video.hidden_tip import PALE
-
-    usual = float(np.nanmedian(fit.misfit))
-    odd = (fit.amplitude < PALE) | (fit.amplitude > BRIGHT) | (fit.misfit > ODD_RATIO * max(usual, LEAST_MISFIT))
-    odd |= (fit.apart_sigma_px > APART_PX) | fit.hidden
-    vague = fit.sigma_px > np.maximum(VAGUE_PX, VAGUE_RATIO * np.nanmedian(fit.sigma_px))
-    return np.asarray(odd | vague)
-
-
 def _assemble(
-    frames: Frames, kept: NDArray[np.int_], edge_fit: _Edge, errors_px: tuple[Floats, Floats], verdict: Judgement,
+    frames: Frames, kept: NDArray[np.int_], edge_fit: Positions, errors_px: tuple[Floats, Floats], verdict: Judgement,
     capture_fps: float, exposure_s: float, notes: list[str],
 ) -> Track:  # fmt: skip
     """A row for every decoded frame; those rejected, or after the end of what follows the axis, have no position."""

@@ -1,0 +1,89 @@
+"""The strip about the tube: centred on what the front left behind, and whether that is a tube along the axis at all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vinetrack.video.axis import Axis
+from vinetrack.video.curved_axis import CurvedAxis
+from vinetrack.video.curved_strip import SETTLED_PX, beside_curve, curve_parts, cut_along
+from vinetrack.video.edge import Outline, outline
+from vinetrack.video.strip import Strip, recut, squared
+
+CENTRINGS = 3
+"""Times the strip may be cut anew: what lay outside the first shows only in the second. Chosen; it is cut anew only
+while the axis moves by more than OFF_CENTRE_PX, so that more cost little."""
+OFF_CENTRE_PX = 0.8
+"""Tilt of the axis, over its length, or shift that is left alone: the tip's rows then lag by under a tenth of it.
+Chosen; at half the strip is cut once more, at twice rows lag by up to 0.16 px."""
+LIKE_A_TUBE = 0.3
+"""Share of what changes along the axis that is a front passing once, times the share of the stretches behind it that
+are of one width, from which it is a tube along the axis. Measured: 0.41 at least of 40 tubes beside long doors
+(`benchmarks/long_doors.py`, seeds 71001-71040); 0.05 to 0.23 of a real vine that sweeps to and fro, its axis moved by a
+pixel or its pictures by one grey level in twenty. At half such a vine is followed as a tube, wrongly, where rounding
+has it so; at twice a few of the tubes with doors are followed to about a pixel."""
+
+
+def tube_strip(luma: NDArray[Any], axis: Axis, order: float) -> tuple[Strip, Outline] | None:
+    """Cut the strip about the tube that grows along an axis.
+
+    Parameters
+    ----------
+    luma : brightness, shape (n_frames, height, width).
+    axis : roughly along the tube, with a width that holds it, px.
+    order : share of what changes along the axis that is a front passing once, see `axis.order_along`.
+
+    Returns
+    -------
+    the strip, centred on the tube, and the tube's outline in it; None where what the front leaves behind is no tube
+    along the axis.
+
+    Raises
+    ------
+    ValueError
+        Where nothing in the strip changes as a passing front does.
+    """
+    strip = cut_along(luma, squared(axis), 0.65 * axis.width_px + 3)
+    for _ in range(2 * CENTRINGS if axis.bends else CENTRINGS):
+        before, sides = strip, outline(strip, curve_parts(axis))
+        strip = centred(luma, strip, sides)
+        if strip is before:
+            break
+    else:
+        sides = outline(strip, curve_parts(axis))
+    return (strip, sides) if order * sides.alike >= LIKE_A_TUBE else None
+
+
+def centred(luma: NDArray[Any], strip: Strip, sides: Outline) -> Strip:
+    """The strip about the tube's own centreline; the same one where it is centred already.
+
+    A given axis keeps its ends' places along itself: only what lies across is corrected.
+
+    Parameters
+    ----------
+    luma : brightness, shape (n_frames, height, width).
+    strip : cut from it.
+    sides : of the tube in that strip.
+
+    Returns
+    -------
+    the strip.
+    """
+    shift, slope, half = sides.shift_px, sides.slope, sides.half_px
+    room = (strip.values.shape[1] - 1) / 2 - half - 3
+    if isinstance(strip.axis, CurvedAxis):
+        curve, away = beside_curve(strip.axis, sides)
+        if away < SETTLED_PX and 0 <= room < 0.3 * half + 6:
+            return strip
+        return cut_along(luma, curve, half * 1.15 + 5, strip)
+    tilt = slope * strip.axis.length_px
+    middle = shift + tilt / 2
+    if abs(middle) + abs(tilt) / 2 < OFF_CENTRE_PX and 0 <= room < 0.3 * half + 6:
+        return strip
+    start = strip.axis.points(np.array(0.0), shift)
+    stop = strip.axis.points(np.array(strip.axis.length_px), shift + tilt)
+    turned = Axis((float(start[0]), float(start[1])), (float(stop[0]), float(stop[1])), 2 * half)
+    return recut(strip, luma, squared(turned), half * 1.15 + 5)
