@@ -55,6 +55,18 @@ def test_a_slack_tail_is_found_where_the_fit_has_bent_its_trials_until_none_push
     assert slack.sigma > 5
 
 
+def test_where_the_rule_makes_scattering_trials_far_worse_none_is_fitted_in_full(monkeypatch: pytest.MonkeyPatch):
+    """A payload that the true tail pushes, which a tail that cannot push never does."""
+    taut = fit(vt.base_model(), grown(60.0, "taut"), profile=False)
+    asked: list[object] = []
+    monkeypatch.setattr("vinetrack.diagnosis.slack_hypothesis.scatters_much", lambda _: True)
+    for name in ("refit", "full_fit"):
+        monkeypatch.setattr(f"vinetrack.diagnosis.slack_hypothesis.{name}", lambda *given, **_: asked.append(given))
+    assert pushes(taut)
+    assert slack_fit(taut) is None
+    assert not asked
+
+
 @pytest.mark.parametrize("suspect", [False, True])
 def test_a_rule_that_leaves_a_suspect_fit_stands_only_where_no_effect_does_better(
     monkeypatch: pytest.MonkeyPatch, *, suspect: bool

@@ -157,6 +157,11 @@ class SubsetFitter:
         values, yields_Pa = _values(layout, solution.state.theta)
         return SubsetFit(tuple(effects), level, values, is_poor_fit(predictor, solution), yields_Pa)
 
+    @property
+    def points(self) -> int:
+        """How many points the trials of a climb have."""
+        return sum(trial_data.time_s.size for trial_data in self.data)
+
     def here(self) -> float:
         """−2 ln L where a few steps from the fit itself end; infinite where it cannot be followed."""
         climb = self.climb((), {}, iterations=FIRST_ITERATIONS, align_first=False)
@@ -251,14 +256,13 @@ def best_subset_fit(
     if not first:
         return None
     best = min(first, key=lambda subset_fit: subset_fit.deviance)
-    points = sum(trial_data.time_s.size for trial_data in slope.data)
-    if best.deviance - goal > HOPELESS * points:
+    if best.deviance - goal > HOPELESS * slope.points:
         return best
     for _ in range(3):
         again = slope.climb(best.effects, best.values, iterations=MORE_ITERATIONS, search=search)
         if again is None:
             break
-        least = CREEPING * points if search and again.far_off else 0.1
+        least = CREEPING * slope.points if search and again.far_off else 0.1
         creeps = again.deviance > best.deviance - least
         best = min((best, again), key=lambda subset_fit: subset_fit.deviance)
         if creeps:
@@ -331,8 +335,7 @@ def from_other_starts(fit: Fit) -> Fit:
     if len(starts) == 1:
         return fit
     slope = SubsetFitter(fit)
-    points = sum(trial_data.time_s.size for trial_data in slope.data)
-    return _from(slope, starts, slope.here(), LOWER_PER_POINT * points)
+    return _from(slope, starts, slope.here(), LOWER_PER_POINT * slope.points)
 
 
 def other_exponents(fit: Fit) -> list[Start]:
